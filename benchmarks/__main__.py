@@ -24,7 +24,9 @@ def measure_section(section: ResultSection) -> str:
     needs = " Wall time: use a quiet machine." if section.needs_quiet_machine else ""
     report(f"\n## {section.title}\n")
     del lines[:]
-    report(f"Measured by `python -m benchmarks {section.name} --write` on {day} ({machine}).{needs}\n")
+    report(
+        f"Measured by `python -m benchmarks {section.name} --write` on {day} ({machine}).{needs}\n"
+    )
     section.measure(report)
     return "\n".join(lines)
 
@@ -34,9 +36,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     names = [section.name for section in SECTIONS]
     parser.add_argument(
-        "sections", metavar="SECTION", nargs="*", help=f"one or more of {', '.join(names)}; all of them"
+        "sections",
+        metavar="SECTION",
+        nargs="*",
+        help=f"one or more of {', '.join(names)}; all of them",
     )
-    parser.add_argument("--list", action="store_true", help="list the sections, and measure nothing")
+    parser.add_argument(
+        "--list", action="store_true", help="list the sections, and measure nothing"
+    )
     parser.add_argument("--write", action="store_true", help=f"keep the tables in {RESULTS.name}")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.sections if name not in names]
@@ -44,7 +51,11 @@ def main() -> int:
         parser.error(f"there is no section {unknown[0]!r}; there are {', '.join(names)}")
     for section in SECTIONS:
         if arguments.list:
-            clock = "wall time, needs a quiet machine" if section.needs_quiet_machine else "on any machine"
+            clock = (
+                "wall time, needs a quiet machine"
+                if section.needs_quiet_machine
+                else "on any machine"
+            )
             print(f"{section.name:10}{section.title} ({clock})")
         elif section.name in arguments.sections or not arguments.sections:
             text = measure_section(section)

@@ -37,8 +37,16 @@ def make_reports(sync: int) -> list[bytes]:
     count = sync % COUNTER_MODULUS
     frames = []
     for node in range(1, JOINTS + 1):
-        frames.append(joint_state.encode(node, angle=0.1 * node, velocity=-0.2, torque=1.5, count=count, state=2))
-        frames.append(contact.encode(node, force_x=1.0, force_y=-20.0, along=0.05, bearing=1.0, touched=1, count=count))
+        frames.append(
+            joint_state.encode(
+                node, angle=0.1 * node, velocity=-0.2, torque=1.5, count=count, state=2
+            )
+        )
+        frames.append(
+            contact.encode(
+                node, force_x=1.0, force_y=-20.0, along=0.05, bearing=1.0, touched=1, count=count
+            )
+        )
     return [RAW_FRAME.pack(frame.id, len(frame.data), frame.data) for frame in frames]
 
 
@@ -74,7 +82,9 @@ def report_frame_costs(report: Callable[[str], None], repeat_count: int) -> floa
 def _open_socket_pair() -> Iterator[tuple[socket.socket, socket.socket]]:
     """Open a sender and a receiver that does not block, on vcan0 or as a pair of local sockets."""
     if is_up(CHANNEL):
-        sender, receiver = (socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) for _ in range(2))
+        sender, receiver = (
+            socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) for _ in range(2)
+        )
         sender.bind((CHANNEL,))
         receiver.bind((CHANNEL,))
     else:

@@ -23,7 +23,9 @@ from snakesim_hal.base.process import make_child_environment, make_python_comman
 HERE = Path(__file__).parent
 RESULTS = HERE / "RESULTS.md"
 TITLE = "A tick before and after"
-HEADER = "| what | before | after | ratio after / before | goal | result |\n|---|---|---|---|---|---|"
+HEADER = (
+    "| what | before | after | ratio after / before | goal | result |\n|---|---|---|---|---|---|"
+)
 MEASUREMENT_TIMEOUT_S = 600
 
 
@@ -129,9 +131,13 @@ def find_commit(checkout: Path) -> str:
 def main() -> int:
     """Measure, print, and keep the table if that is requested."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.checkouts", description=__doc__)
-    parser.add_argument("base", metavar="BASE", type=Path, help="folder of the other checkout, measured as `before`")
+    parser.add_argument(
+        "base", metavar="BASE", type=Path, help="folder of the other checkout, measured as `before`"
+    )
     names = [goal.name for goal in GOALS]
-    parser.add_argument("--goals", nargs="+", choices=names, default=names, help="what to measure; all of them")
+    parser.add_argument(
+        "--goals", nargs="+", choices=names, default=names, help="what to measure; all of them"
+    )
     parser.add_argument("--rounds", type=int, default=7, help="measurements of each checkout (7)")
     parser.add_argument("--write", action="store_true", help=f"keep the table in {RESULTS.name}")
     arguments = parser.parse_args()
@@ -145,7 +151,9 @@ def main() -> int:
             lines.append(format_goal(goal, before, after))
             print(lines[-1], flush=True)
     if arguments.write:
-        replace_section(RESULTS, TITLE, "\n".join([*describe_measurement(base, arguments.rounds), *lines]))
+        replace_section(
+            RESULTS, TITLE, "\n".join([*describe_measurement(base, arguments.rounds), *lines])
+        )
     return 0
 
 

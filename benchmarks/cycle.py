@@ -43,7 +43,12 @@ def measure_cycle() -> CycleTimes:
         run(
             *("--backend", "can", "--clock-mode", "realtime", "--duration", "10"),
             *("--set", f"rate_hz={RATE_HZ}", "--set", f"backend.log={bus_log}"),
-            *("--controller", "benchmarks/stamped.py:Stamped", "--set", f"control.path={command_log}"),
+            *(
+                "--controller",
+                "benchmarks/stamped.py:Stamped",
+                "--set",
+                f"control.path={command_log}",
+            ),
         )
         ready_s = np.loadtxt(command_log)
         sync_s, bursts_s = _read_frame_times(bus_log)
@@ -100,5 +105,7 @@ def make_load_table() -> list[str]:
             if computed < 1:
                 difference = f"{100 * (measured / computed - 1):+.1f} %"
             decision = "accepts it" if computed <= MAX_LOAD else "refuses it"
-            rows.append(f"| {joints} | {rate_hz} Hz | {computed:.1%} | {measured:.1%} | {difference} | {decision} |")
+            rows.append(
+                f"| {joints} | {rate_hz} Hz | {computed:.1%} | {measured:.1%} | {difference} | {decision} |"
+            )
     return rows

@@ -20,22 +20,29 @@ START_TIMEOUT_S = 20.0  # for the other process to import Zenoh and to connect
 ECHO_ROUNDS = 2000
 
 
-def declare_publisher(session: zenoh.Session, key: str, congestion: zenoh.CongestionControl = BLOCK) -> zenoh.Publisher:
+def declare_publisher(
+    session: zenoh.Session, key: str, congestion: zenoh.CongestionControl = BLOCK
+) -> zenoh.Publisher:
     """Declare a publisher with the highest priority, as SnakeSIM's own publishers of state and commands have it."""
     return session.declare_publisher(
         key, express=True, priority=zenoh.Priority.REAL_TIME, congestion_control=congestion
     )
 
 
-def answer_requests(session: zenoh.Session, reply: bytes, congestion: zenoh.CongestionControl = BLOCK) -> None:
+def answer_requests(
+    session: zenoh.Session, reply: bytes, congestion: zenoh.CongestionControl = BLOCK
+) -> None:
     """Send the reply for every request, until the process is killed."""
     publisher = declare_publisher(session, REPLY, congestion)
-    requests = session.declare_subscriber(REQUEST, zenoh.handlers.FifoChannel(16))  # a temporary one would be closed
+    # A temporary one would be closed.
+    requests = session.declare_subscriber(REQUEST, zenoh.handlers.FifoChannel(16))
     for _ in requests:
         publisher.put(reply)
 
 
-def measure_echo_us(request: bytes, reply: bytes, round_count: int = ECHO_ROUNDS, period_s: float = 0.0) -> float:
+def measure_echo_us(
+    request: bytes, reply: bytes, round_count: int = ECHO_ROUNDS, period_s: float = 0.0
+) -> float:
     """Return the median round trip of `measure_echo_times_us`."""
     return statistics.median(measure_echo_times_us(request, reply, round_count, period_s))
 

@@ -29,7 +29,11 @@ from snakesim_sim_backend.laws.version import choose_laws
 
 RESULTS = Path(__file__).parent / "ENVIRONMENTS.md"
 SCENARIOS = ("peg_row", "surveyed_clutter", "mamba_flat", "mamba_hills")
-JOINT_OBSERVATIONS = {"observe": ("angle_rad", "velocity_rad_s", "torque_nm"), "new_field": False, "duration": 3600}
+JOINT_OBSERVATIONS = {
+    "observe": ("angle_rad", "velocity_rad_s", "torque_nm"),
+    "new_field": False,
+    "duration": 3600,
+}
 FRAME_SKIP = 5  # ticks in a step: 50 ms of robot time; a step of Swimmer has 40 ms
 ROUNDS = 5
 SINGLE_ROUND_S = 0.5  # of one environment on one core
@@ -112,7 +116,9 @@ def make_bare_chain(robot: RobotFile) -> mujoco.MjModel:
             limits = f'range="{joint.limits.lower_rad} {joint.limits.upper_rad}"'
             links += f'<body name="link_{i}" pos="{lengths_m[i - 1]} 0 0">'
             links += f'<joint name="{joint.name}" axis="{axis}" {limits} armature="{joint.motor.armature_kg_m2}"/>'
-            gains = f'kp="{joint.motor.stiffness_nm_per_rad}" kv="{joint.motor.damping_nm_s_per_rad}"'
+            gains = (
+                f'kp="{joint.motor.stiffness_nm_per_rad}" kv="{joint.motor.damping_nm_s_per_rad}"'
+            )
             torques = f'forcerange="{-joint.limits.torque_nm} {joint.limits.torque_nm}"'
             motors += f'<position joint="{joint.name}" {gains} {torques}/>'
             exclusions += f'<exclude body1="link_{i - 1}" body2="link_{i}"/>'
@@ -160,7 +166,9 @@ def make_bare_batch_step(scenario: str, count: int) -> Step:
 
 def make_vector_step(scenario: str, count: int) -> Step:
     """Return a function that makes a step of many environments whose episodes do not end."""
-    envs = SnakeVectorEnv(count, scenario=scenario, frame_skip=FRAME_SKIP, thread_count=THREADS, **JOINT_OBSERVATIONS)
+    envs = SnakeVectorEnv(
+        count, scenario=scenario, frame_skip=FRAME_SKIP, thread_count=THREADS, **JOINT_OBSERVATIONS
+    )
     wave = TravelingWave(len(envs.single_action_space.sample()))
     envs.reset(seed=1)
     shape = envs.action_space.shape
@@ -176,7 +184,9 @@ def make_swimmer_step() -> Step:
     return lambda: env.step(action)
 
 
-def measure_steps_per_s(step: Step, seconds: float, clock: Callable[[], float] = time.process_time) -> float:
+def measure_steps_per_s(
+    step: Step, seconds: float, clock: Callable[[], float] = time.process_time
+) -> float:
     """Repeat a step, and return the number of steps in a second of the clock.
 
     Args:
@@ -235,8 +245,12 @@ def format_vector_row(scenario: str, count: int) -> str:
     steps = [make_vector_step(scenario, count), make_bare_batch_step(scenario, count)]
     rounds: list[list[float]] = []  # of each of the steps: per s, and per CPU s
     for _ in range(ROUNDS):
-        rounds.append([rate for step in steps for rate in measure_both_clocks(step, VECTOR_ROUND_S)])
-    per_s, per_cpu_s, bare_per_s, bare_per_cpu_s = (count * rate for rate in compute_column_medians(rounds))
+        rounds.append(
+            [rate for step in steps for rate in measure_both_clocks(step, VECTOR_ROUND_S)]
+        )
+    per_s, per_cpu_s, bare_per_s, bare_per_cpu_s = (
+        count * rate for rate in compute_column_medians(rounds)
+    )
     return (
         f"| `{scenario}` | {count} | {per_s:.0f} | {bare_per_s:.0f} | {format_ratio(rounds, 0, 2)} | "
         f"{per_cpu_s:.0f} | {bare_per_cpu_s:.0f} | {format_ratio(rounds, 1, 3)} |"
@@ -281,7 +295,9 @@ def format_rows_per_degree_of_freedom() -> list[str]:
     ]
     rounds: list[list[float]] = []
     for _ in range(ROUNDS):
-        rounds.append([measure_steps_per_s(environment.step, SINGLE_ROUND_S) for environment in compared])
+        rounds.append(
+            [measure_steps_per_s(environment.step, SINGLE_ROUND_S) for environment in compared]
+        )
     rows: list[str] = []
     for environment, rate in zip(compared, compute_column_medians(rounds), strict=True):
         freedoms = environment.degrees_of_freedom
@@ -307,9 +323,15 @@ def main() -> int:
     machine = platform.machine()
     load_average = f"{os.getloadavg()[0]:.1f} on {len(os.sched_getaffinity(0))} cores"
     report("# Environments: steps per second\n")
-    report(INTRODUCTION.format(machine=machine, python=platform.python_version(), load=load_average, laws=laws))
+    report(
+        INTRODUCTION.format(
+            machine=machine, python=platform.python_version(), load=load_average, laws=laws
+        )
+    )
     report(ONE_CORE)
-    report("| scenario | environment | without limiter | physics | bare chain | of physics | time of bare |")
+    report(
+        "| scenario | environment | without limiter | physics | bare chain | of physics | time of bare |"
+    )
     report("|---|---|---|---|---|---|---|")
     for scenario in SCENARIOS:
         report(format_single_row(scenario))
@@ -320,7 +342,9 @@ def main() -> int:
     for scenario in SCENARIOS:
         for count in VECTOR_SIZES:
             report(format_vector_row(scenario, count))
-    report("\nPer degree of freedom, beside Gymnasium's swimmer (no limiter, noise, obstacles or motors), per CPU s:\n")
+    report(
+        "\nPer degree of freedom, beside Gymnasium's swimmer (no limiter, noise, obstacles or motors), per CPU s:\n"
+    )
     columns = "degrees of freedom | steps | physics steps in each | 1000 physics steps x freedoms | robot s x freedoms"
     report(f"| environment | {columns} |")
     report("|---|---|---|---|---|---|")

@@ -22,7 +22,9 @@ from snakesim_operator.recording.writer import RecordingWriter
 
 def measure_recorded_loop() -> float:
     """Return how many seconds of robot time a run with a recording of all messages makes in a second of CPU time."""
-    config = load_scenario("peg_row", [parse_set_option(f"duration_s={whole.IN_PROCESS_S:g}")]).config
+    config = load_scenario(
+        "peg_row", [parse_set_option(f"duration_s={whole.IN_PROCESS_S:g}")]
+    ).config
     with tempfile.TemporaryDirectory() as folder, InProcessRun(config) as run:
         session = run.network.create_session()
         began_s = time.process_time()

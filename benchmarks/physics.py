@@ -36,7 +36,9 @@ def load_config(*sets: str) -> RunConfig:
 
 def open_simulator(config: RunConfig, laws: LawsVersion | None = None) -> SimBackend:
     """Open the simulator as the host opens it, or with a certain version of the laws."""
-    settings = decode_plugin_settings(SimBackend, config.backends.get("sim", {}), "benchmarks", "backends.sim")
+    settings = decode_plugin_settings(
+        SimBackend, config.backends.get("sim", {}), "benchmarks", "backends.sim"
+    )
     return SimBackend(config, settings, laws=laws)
 
 
@@ -81,7 +83,8 @@ class BareMujoco:
 
     def __init__(self, config: RunConfig) -> None:
         self._moving = open_simulator(config)
-        self._bare = open_simulator(config, "python")  # its model has no plugins, so `mj_step` computes no laws
+        # Its model has no plugins, so `mj_step` computes no laws.
+        self._bare = open_simulator(config, "python")
         self._state = np.empty(mujoco.mj_stateSize(self._bare.sim.model, STATE_WITHOUT_LAWS))
 
     def measure_us(self, setpoints: Sequence[SafeSetpoints]) -> float:
@@ -126,7 +129,8 @@ class TickCpuTimes:
     published_us: list[float] = field(default_factory=list[float])  # with all sensors published
     own_us: list[float] = field(default_factory=list[float])  # the same without the physics
     physics_us: list[float] = field(default_factory=list[float])  # of the physics alone
-    python_us: list[float] = field(default_factory=list[float])  # of the physics with the Python version of the laws
+    # Of the physics with the Python version of the laws.
+    python_us: list[float] = field(default_factory=list[float])
     mujoco_us: list[float] = field(default_factory=list[float])  # of `mj_step` alone
 
 
@@ -145,7 +149,8 @@ def measure_tick_times(config: RunConfig) -> TickCpuTimes:
     ):
         first = full.sample(0, 0)
         readers = [
-            other.declare_reader(key, type(message)) for key, message in ((JOINTS, first.joints), *first.by_key.items())
+            other.declare_reader(key, type(message))
+            for key, message in ((JOINTS, first.joints), *first.by_key.items())
         ]
         publisher = SamplePublisher(session)
         tick = 0
@@ -177,7 +182,13 @@ def encode_tick(config: RunConfig) -> tuple[bytes, bytes]:
     backend.close()
     limits_nm = [joint.torque_limit_nm for joint in robot.joints]
     hold_command = make_joint_command(
-        robot, samples.joints.angle_rad, tick=LONG_NUMBER, sequence=LONG_NUMBER, torque_limit_nm=limits_nm
+        robot,
+        samples.joints.angle_rad,
+        tick=LONG_NUMBER,
+        sequence=LONG_NUMBER,
+        torque_limit_nm=limits_nm,
     )
-    state = encode(samples.joints) + b"".join(encode(message) for message in samples.by_key.values())
+    state = encode(samples.joints) + b"".join(
+        encode(message) for message in samples.by_key.values()
+    )
     return state, encode(hold_command)

@@ -14,7 +14,12 @@ from snakesim_gnc.navigation.path_search.specified_growth import NumpyExpander
 from snakesim_gnc.navigation.plan import HORIZON_M
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.route import compute_yaw_segments_m
-from snakesim_hal.model.scenario import compute_start_pose, load_scenario, parse_set_option, place_obstacles
+from snakesim_hal.model.scenario import (
+    compute_start_pose,
+    load_scenario,
+    parse_set_option,
+    place_obstacles,
+)
 
 SEEDS = (1, 2, 3, 4, 5)  # of the fields
 SEARCH = SearchParameters(body_length_m=1.54, radius_m=0.04, segment_m=0.11)  # planar13
@@ -34,7 +39,9 @@ class PlanningCosts:
             RuntimeError: the C library cannot be loaded here.
         """
         if not is_native_available():
-            raise RuntimeError("the C library of the planner cannot be loaded: run `python -m snakesim_native.compile`")
+            raise RuntimeError(
+                "the C library of the planner cannot be loaded: run `python -m snakesim_native.compile`"
+            )
         native_us: list[float] = []
         python_us: list[float] = []
         for grid, body_w in self._scenes:
@@ -52,10 +59,14 @@ def format_rates(native_us: list[float], python_us: list[float]) -> str:
 
 def _make_scene(seed: int) -> tuple[ObstacleGrid, Floats]:
     """Return the map of a random field, and the body (n, 2) before it."""
-    config = load_scenario("surveyed_clutter", [parse_set_option(f"scene.random_field.0.seed={seed}")]).config
+    config = load_scenario(
+        "surveyed_clutter", [parse_set_option(f"scene.random_field.0.seed={seed}")]
+    ).config
     start = compute_start_pose(config)
     segments_m = compute_yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
-    nodes_w = compute_chain_points(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments_m)
+    nodes_w = compute_chain_points(
+        start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments_m
+    )
     obstacles = [placed.obstacle for placed in place_obstacles(config)]
     return ObstacleGrid(obstacles), resample_evenly(nodes_w.T)
 

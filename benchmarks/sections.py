@@ -19,7 +19,13 @@ from benchmarks.environments import (
 from benchmarks.physics import encode_tick, load_config, measure_tick_times
 from benchmarks.planning import PlanningCosts, format_rates
 from benchmarks.size import measure_install_mb
-from benchmarks.table import GOAL_HEADER, RATIO_HEADER, format_maximum_row, format_minimum_row, format_row
+from benchmarks.table import (
+    GOAL_HEADER,
+    RATIO_HEADER,
+    format_maximum_row,
+    format_minimum_row,
+    format_row,
+)
 from benchmarks.whole import (
     CONTROL_IN_HOST,
     find_highest_rate_hz,
@@ -42,7 +48,8 @@ EXTRAS = ("", "can", "sim", "record", "report", "console", "train", "all")
 LISTED_PACKAGES = 6  # the largest ones of each installation
 
 # Goals.
-MAX_LAWS_RATIO = 1.3  # a user who wants our friction should pay less for it than for a second simulation
+# A user who wants our friction should pay less for it than for a second simulation.
+MAX_LAWS_RATIO = 1.3
 MAX_PHYSICS_RATIO = 1.0  # with our laws a chain should cost no more than with MuJoCo's own contacts
 MAX_ENVIRONMENT_RATIO = 1.1  # learning should not be slower than with an environment of one's own
 MAX_BATCH_RATIO = 1 / 0.7
@@ -50,7 +57,8 @@ MAX_OWN_US = 150.0  # of 10 ms: the rest of the period belongs to the controller
 MIN_SPEED = 8.0  # times real time: a suite of 100 runs of 20 s then takes four minutes on one core
 MIN_RECORDED_SPEED = 6.5
 MAX_LOCKSTEP_US = 1300.0  # 7.7 times real time, with every part in a process of its own
-MAX_LATENCY_RATIO = 2.0  # of the transport alone: checks and controller should cost no more than the network
+# Of the transport alone: checks and controller should cost no more than the network.
+MAX_LATENCY_RATIO = 2.0
 MAX_LATENCY_IN_HOST_RATIO = 1.5
 MAX_PLANNING_RATIO = 0.17  # 1 500 000 nodes/s instead of 250 000
 
@@ -67,16 +75,32 @@ class ResultSection:
 
 def report_physics(report: Report) -> None:
     """Report what a user would have without our laws, our environments, or SnakeSIM."""
-    report("CPU time of a control period (10 ms, five physics steps), or of a step of an environment (50 ms).\n")
+    report(
+        "CPU time of a control period (10 ms, five physics steps), or of a step of an environment (50 ms).\n"
+    )
     report(RATIO_HEADER)
     times = measure_tick_times(load_config())
     subject = "physics of `triplet`, with our ground and friction and the contact sensor"
     report(
-        format_row(subject, "`mj_step` of the same states, without", times.physics_us, times.mujoco_us, MAX_LAWS_RATIO)
+        format_row(
+            subject,
+            "`mj_step` of the same states, without",
+            times.physics_us,
+            times.mujoco_us,
+            MAX_LAWS_RATIO,
+        )
     )
-    report(format_row("the same", "the same with the laws in Python", times.physics_us, times.python_us, None))
+    report(
+        format_row(
+            "the same", "the same with the laws in Python", times.physics_us, times.python_us, None
+        )
+    )
     for scenario in CHAINS:
-        steps = [make_physics_step(scenario), make_environment_step(scenario), make_bare_step(scenario)]
+        steps = [
+            make_physics_step(scenario),
+            make_environment_step(scenario),
+            make_bare_step(scenario),
+        ]
         physics_us, environment_us, bare_us = _measure_in_turn(steps)
         chain = "`mj_step` of the same chain with MuJoCo's own contacts"
         subject = f"physics of `{scenario}`, {STEP_TICKS}"
@@ -84,9 +108,19 @@ def report_physics(report: Report) -> None:
         subject = f"environment of `{scenario}`, one step"
         report(format_row(subject, chain, environment_us, bare_us, MAX_ENVIRONMENT_RATIO))
     scenario = CHAINS[0]
-    vector_us, batch_us = _measure_in_turn([make_vector_step(scenario, MANY), make_bare_batch_step(scenario, MANY)])
+    vector_us, batch_us = _measure_in_turn(
+        [make_vector_step(scenario, MANY), make_bare_batch_step(scenario, MANY)]
+    )
     subject = f"{MANY} environments of `{scenario}`, one step"
-    report(format_row(subject, f"`mujoco.batch.Batch` of {MANY} such chains", vector_us, batch_us, MAX_BATCH_RATIO))
+    report(
+        format_row(
+            subject,
+            f"`mujoco.batch.Batch` of {MANY} such chains",
+            vector_us,
+            batch_us,
+            MAX_BATCH_RATIO,
+        )
+    )
     report("\n[Environments](ENVIRONMENTS.md) has more scenarios, and Gymnasium's `Swimmer-v5`.")
 
 
@@ -105,12 +139,20 @@ def report_tick(report: Report) -> None:
     own_us = measure_tick_times(load_config()).own_us
     report(
         format_maximum_row(
-            "simulator tick of `triplet` without physics: sensors, publishing, motors", own_us, MAX_OWN_US, "µs"
+            "simulator tick of `triplet` without physics: sensors, publishing, motors",
+            own_us,
+            MAX_OWN_US,
+            "µs",
         )
     )
     speeds = [measure_loop_in_process() for _ in range(ROUNDS)]
     report(
-        format_minimum_row("robot time of `peg_row` in one process, for a second of CPU time", speeds, MIN_SPEED, "s")
+        format_minimum_row(
+            "robot time of `peg_row` in one process, for a second of CPU time",
+            speeds,
+            MIN_SPEED,
+            "s",
+        )
     )
 
 
@@ -122,9 +164,19 @@ def report_runs(report: Report) -> None:
     recorded = [measure_speed_in_process() for _ in rounds]
     lockstep_us = [measure_tick_us("--no-record") for _ in rounds]
     subject = "`snakesim run peg_row --in-process"
-    report(format_minimum_row(f"{subject} --no-record`, beside real time", unrecorded, MIN_SPEED, "times"))
-    report(format_minimum_row(f"{subject}`, beside real time", recorded, MIN_RECORDED_SPEED, "times"))
-    report(format_maximum_row("lockstep tick of `triplet`, five processes", lockstep_us, MAX_LOCKSTEP_US, "µs"))
+    report(
+        format_minimum_row(
+            f"{subject} --no-record`, beside real time", unrecorded, MIN_SPEED, "times"
+        )
+    )
+    report(
+        format_minimum_row(f"{subject}`, beside real time", recorded, MIN_RECORDED_SPEED, "times")
+    )
+    report(
+        format_maximum_row(
+            "lockstep tick of `triplet`, five processes", lockstep_us, MAX_LOCKSTEP_US, "µs"
+        )
+    )
 
 
 def report_latency(report: Report) -> None:
@@ -137,19 +189,43 @@ def report_latency(report: Report) -> None:
     for _ in range(LATENCY_ROUNDS):
         latencies_us.append(measure_latency_us())
         in_host_us.append(measure_latency_us(*CONTROL_IN_HOST))
-        echo_us = measure_echo_us(state, command, round_count=LATENCY_ECHO_ROUNDS, period_s=config.period_ns * 1e-9)
+        echo_us = measure_echo_us(
+            state, command, round_count=LATENCY_ECHO_ROUNDS, period_s=config.period_ns * 1e-9
+        )
         echoes_us.append(echo_us)
     report(RATIO_HEADER)
     subject = "realtime state-to-command, p50, controller included"
-    report(format_row(subject, "raw echo of the same bytes at 100 Hz", latencies_us, echoes_us, MAX_LATENCY_RATIO))
+    report(
+        format_row(
+            subject,
+            "raw echo of the same bytes at 100 Hz",
+            latencies_us,
+            echoes_us,
+            MAX_LATENCY_RATIO,
+        )
+    )
     subject = f"{subject}, in the host"
-    report(format_row(subject, "the same raw echo", in_host_us, echoes_us, MAX_LATENCY_IN_HOST_RATIO))
-    report(format_row("the same, in the host", "control in a process of its own", in_host_us, latencies_us, 1.0))
+    report(
+        format_row(subject, "the same raw echo", in_host_us, echoes_us, MAX_LATENCY_IN_HOST_RATIO)
+    )
+    report(
+        format_row(
+            "the same, in the host",
+            "control in a process of its own",
+            in_host_us,
+            latencies_us,
+            1.0,
+        )
+    )
     report("")
     for where, arguments in (("", ()), (", control in the host", CONTROL_IN_HOST)):
         highest_hz, fractions = find_highest_rate_hz(*arguments)
-        rates = ", ".join(f"{rate_hz} Hz {100 * fraction:.1f} %" for rate_hz, fraction in fractions.items())
-        report(f"- Highest rate at which 99 % of ticks get their command in time{where}: {highest_hz} Hz ({rates}).")
+        rates = ", ".join(
+            f"{rate_hz} Hz {100 * fraction:.1f} %" for rate_hz, fraction in fractions.items()
+        )
+        report(
+            f"- Highest rate at which 99 % of ticks get their command in time{where}: {highest_hz} Hz ({rates})."
+        )
 
 
 def report_planning(report: Report) -> None:
@@ -163,7 +239,9 @@ def report_planning(report: Report) -> None:
         python_us += python_round_us
     report(RATIO_HEADER)
     subject = "path search in C, CPU time of 1000 nodes"
-    report(format_row(subject, "the same search in Python", native_us, python_us, MAX_PLANNING_RATIO))
+    report(
+        format_row(subject, "the same search in Python", native_us, python_us, MAX_PLANNING_RATIO)
+    )
     report(f"\n{format_rates(native_us, python_us)}")
 
 

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 RATIO_HEADER = (
-    "| what | against | ours, µs | theirs, µs | ratio (median) | goal | result |\n|---|---|---|---|---|---|---|"
+    "| what | against | ours, µs | theirs, µs | ratio (median) | goal | result "
+    "|\n|---|---|---|---|---|---|---|"
 )
 GOAL_HEADER = "| what | median (range) | goal | result |\n|---|---|---|---|"
 HEADING = "## "
@@ -13,7 +14,11 @@ MIN_INTEGER = 100  # numbers from here on are written without decimals
 
 
 def format_row(
-    subject: str, reference: str, ours_us: Sequence[float], theirs_us: Sequence[float], max_ratio: float | None
+    subject: str,
+    reference: str,
+    ours_us: Sequence[float],
+    theirs_us: Sequence[float],
+    max_ratio: float | None,
 ) -> str:
     """Return one row of a table of ratios: a measurement, its reference, and the ratio of the two.
 
@@ -24,7 +29,9 @@ def format_row(
         theirs_us: measurements of the reference, in µs; each was taken in the same round as its counterpart.
         max_ratio: the goal; None if there is none.
     """
-    ratio = statistics.median(ours / theirs for ours, theirs in zip(ours_us, theirs_us, strict=True))
+    ratio = statistics.median(
+        ours / theirs for ours, theirs in zip(ours_us, theirs_us, strict=True)
+    )
     verdict = "| |" if max_ratio is None else f"<= {max_ratio:g} | {_judge(ratio <= max_ratio)} |"
     medians = f"{statistics.median(ours_us):.0f} | {statistics.median(theirs_us):.0f}"
     return f"| {subject} | {reference} | {medians} | {ratio:.2f} | {verdict}"
@@ -33,7 +40,9 @@ def format_row(
 def format_interval(values: Sequence[float]) -> str:
     """Return the median of some values with their range, such as `10.6 (10.5 to 10.7)`."""
     median = statistics.median(values)
-    return f"{_format_number(median)} ({_format_number(min(values))} to {_format_number(max(values))})"
+    return (
+        f"{_format_number(median)} ({_format_number(min(values))} to {_format_number(max(values))})"
+    )
 
 
 def _format_number(value: float) -> str:
@@ -69,7 +78,9 @@ def replace_section(page: Path, title: str, text: str) -> None:
     """
     heading = f"{HEADING}{title}"
     introduction, *sections = page.read_text(encoding="utf-8").split(f"\n{HEADING}")
-    blocks = {section.partition("\n")[0]: section.partition("\n")[2].strip() for section in sections}
+    blocks = {
+        section.partition("\n")[0]: section.partition("\n")[2].strip() for section in sections
+    }
     blocks[title] = text.strip()
     body = "".join(f"\n\n{HEADING}{name}\n\n{block}" for name, block in blocks.items())
     assert heading in body

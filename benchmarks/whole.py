@@ -31,7 +31,9 @@ def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
     """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        command = make_python_command("-m", "snakesim_operator", "run", scenario, "--out", str(out), *arguments)
+        command = make_python_command(
+            "-m", "snakesim_operator", "run", scenario, "--out", str(out), *arguments
+        )
         for attempts_left in reversed(range(ATTEMPTS)):
             completed = subprocess.run(
                 command,
@@ -42,7 +44,10 @@ def run(*arguments: str, scenario: str = "triplet") -> RunSummary:
             )
             if completed.returncode == 0:
                 break
-            print(f"stopped, tried again: snakesim run {scenario} {' '.join(arguments)}", file=sys.stderr)
+            print(
+                f"stopped, tried again: snakesim run {scenario} {' '.join(arguments)}",
+                file=sys.stderr,
+            )
         summary = (out / SUMMARY_FILENAME).read_bytes()
         return msgspec.json.decode(summary, type=RunSummary)
 
@@ -63,13 +68,17 @@ def measure_speed_in_process(*arguments: str) -> float:
     Args:
         arguments: further arguments of `snakesim run`.
     """
-    summary = run("--in-process", "--duration", f"{IN_PROCESS_S:g}", *arguments, scenario=IN_PROCESS_SCENARIO)
+    summary = run(
+        "--in-process", "--duration", f"{IN_PROCESS_S:g}", *arguments, scenario=IN_PROCESS_SCENARIO
+    )
     return IN_PROCESS_S / summary.wall_s
 
 
 def measure_loop_in_process() -> float:
     """Return how many seconds of robot time a run without a recording makes in a second of CPU time."""
-    config = load_scenario(IN_PROCESS_SCENARIO, [parse_set_option(f"duration_s={IN_PROCESS_S:g}")]).config
+    config = load_scenario(
+        IN_PROCESS_SCENARIO, [parse_set_option(f"duration_s={IN_PROCESS_S:g}")]
+    ).config
     with InProcessRun(config) as in_process_run:
         began_s = time.process_time()
         for _ in in_process_run.iterate_ticks():
@@ -94,7 +103,9 @@ def find_highest_rate_hz(*arguments: str) -> tuple[int, dict[int, float]]:
     answered_fractions: dict[int, float] = {}
     highest_hz = 0
     for rate_hz in RATES_HZ:
-        summary = run("--clock-mode", "realtime", "--duration", "3", "--set", f"rate_hz={rate_hz}", *arguments)
+        summary = run(
+            "--clock-mode", "realtime", "--duration", "3", "--set", f"rate_hz={rate_hz}", *arguments
+        )
         answered_fractions[rate_hz] = summary.answered_fraction or 0.0
         if answered_fractions[rate_hz] < MIN_ANSWERED_FRACTION:
             break

@@ -45,9 +45,13 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command")
     commands.required = True
     setup_command = commands.add_parser("setup", help="make .venv")
-    setup_command.add_argument("--python", default="", help="the interpreter to use (default: search)")
+    setup_command.add_argument(
+        "--python", default="", help="the interpreter to use (default: search)"
+    )
     lock_command = commands.add_parser("lock", help="rewrite the hashed lock files")
-    lock_command.add_argument("--upgrade", action="store_true", help="take the newest versions allowed")
+    lock_command.add_argument(
+        "--upgrade", action="store_true", help="take the newest versions allowed"
+    )
     arguments = parser.parse_args()
     os.chdir(str(ROOT))
     if arguments.command == "setup":
@@ -78,7 +82,13 @@ def set_up(requested: str) -> None:
 def lock(upgrade: bool) -> None:
     """Resolve the lock files for every supported Python and platform, without any address in them."""
     install_uv(find_python(""))
-    resolve = (UV, *COMPILE.split(), "--custom-compile-command", "make lock", *["--upgrade"] * upgrade)
+    resolve = (
+        UV,
+        *COMPILE.split(),
+        "--custom-compile-command",
+        "make lock",
+        *["--upgrade"] * upgrade,
+    )
     run(*resolve, "--all-extras", "--group", "dev", "pyproject.toml", "--output-file", LOCK)
     run(*resolve, "--group", "bootstrap", "--output-file", UV_LOCK)
     run(*resolve, "--group", "wheels", "--output-file", WHEELS_LOCK)
@@ -192,7 +202,13 @@ def fetch_environment() -> "dict[str, str]":
     }
     # The first two override a pip.conf that asks for --user or for an active environment. The last one keeps
     # `python -m` from taking modules from the folder in which `make setup` was typed.
-    return dict(kept, PIP_USER="0", PIP_REQUIRE_VIRTUALENV="0", PIP_DISABLE_PIP_VERSION_CHECK="1", PYTHONSAFEPATH="1")
+    return dict(
+        kept,
+        PIP_USER="0",
+        PIP_REQUIRE_VIRTUALENV="0",
+        PIP_DISABLE_PIP_VERSION_CHECK="1",
+        PYTHONSAFEPATH="1",
+    )
 
 
 if __name__ == "__main__":

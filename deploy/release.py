@@ -43,7 +43,9 @@ print(load_shared_library(LAWS_LIBRARY).problem)
 
 def main() -> int:
     """Run all steps in order. Returns the exit code."""
-    argparse.ArgumentParser(description="Build and check the distributions of a release.").parse_args()
+    argparse.ArgumentParser(
+        description="Build and check the distributions of a release."
+    ).parse_args()
     shutil.rmtree(OUT, ignore_errors=True)
     OUT.mkdir(parents=True)
     version = read_version()
@@ -58,20 +60,29 @@ def main() -> int:
         print(f"release: {file.relative_to(ROOT)}  {file.stat().st_size / 1e6:.1f} MB")
     print(f"release: {version} is ready")
     if not_judged:
-        print(f"release: UNKNOWN: the vulnerability service did not judge {not_judged} packages; audit.json lists them")
+        print(
+            f"release: UNKNOWN: the vulnerability service did not judge {not_judged} packages; audit.json lists them"
+        )
     return 0
 
 
 def read_version() -> str:
     """Return the version in `pyproject.toml`."""
-    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "version"
+    ]
 
 
 def check_version_everywhere(version: str) -> None:
     """Exit if the changelog or the citation file names another version."""
-    for name, expected in (("CHANGELOG.md", f"## [{version}]"), ("CITATION.cff", f"version: {version}")):
+    for name, expected in (
+        ("CHANGELOG.md", f"## [{version}]"),
+        ("CITATION.cff", f"version: {version}"),
+    ):
         if expected not in (ROOT / name).read_text(encoding="utf-8"):
-            sys.exit(f"release: {name} does not contain {expected!r}, the version in pyproject.toml")
+            sys.exit(
+                f"release: {name} does not contain {expected!r}, the version in pyproject.toml"
+            )
 
 
 def build_distributions() -> None:
@@ -79,7 +90,15 @@ def build_distributions() -> None:
     sys.path.insert(0, str(ROOT))
     wheels = importlib.import_module("deploy.wheels")
     wheels.build_wheels(OUT / "dist")
-    options = ("--quiet", "--sdist", "--no-build-isolation", "--python", BIN / "python", "--out-dir", OUT / "dist")
+    options = (
+        "--quiet",
+        "--sdist",
+        "--no-build-isolation",
+        "--python",
+        BIN / "python",
+        "--out-dir",
+        OUT / "dist",
+    )
     run(UV, "build", *options, ROOT)
 
 
@@ -113,7 +132,9 @@ def read_locked_versions() -> str:
     """Return the lines `name==version ; marker` of the lock, without hashes."""
     lines = LOCK.read_text(encoding="utf-8").splitlines()
     return "\n".join(
-        line.removesuffix("\\").rstrip() for line in lines if "==" in line and not line.startswith((" ", "#"))
+        line.removesuffix("\\").rstrip()
+        for line in lines
+        if "==" in line and not line.startswith((" ", "#"))
     )
 
 
@@ -122,7 +143,9 @@ def run_main_job(version: str) -> None:
     command = OUT / "env" / "bin" / "snakesim"
     printed = run(command, "--version", folder=OUT).strip()
     if printed != f"snakesim {version}":
-        sys.exit(f"release: the installed command prints {printed!r} instead of 'snakesim {version}'")
+        sys.exit(
+            f"release: the installed command prints {printed!r} instead of 'snakesim {version}'"
+        )
     python = OUT / "env" / "bin" / "python"
     problem = run(python, "-c", FIND_LAWS_PROBLEM, folder=OUT).strip()
     if problem:
@@ -159,14 +182,18 @@ def audit_dependencies() -> int:
     packages = json.loads(report.read_text(encoding="utf-8"))["dependencies"]
     vulnerable = [package["name"] for package in packages if package.get("vulns")]
     if vulnerable:
-        sys.exit(f"release: known vulnerabilities in {', '.join(vulnerable)}; see {report.relative_to(ROOT)}")
+        sys.exit(
+            f"release: known vulnerabilities in {', '.join(vulnerable)}; see {report.relative_to(ROOT)}"
+        )
     return sum("skip_reason" in package for package in packages)
 
 
 def run(*command: object, folder: Path = ROOT) -> str:
     """Run a program and return what it prints. Exits with its messages if it fails."""
     words = [str(word) for word in command]
-    finished = subprocess.run(words, cwd=folder, env=_make_environment(), capture_output=True, text=True, check=False)
+    finished = subprocess.run(
+        words, cwd=folder, env=_make_environment(), capture_output=True, text=True, check=False
+    )
     if finished.returncode != 0:
         sys.exit(f"release: failed: {' '.join(words)}\n{finished.stdout}{finished.stderr}")
     return finished.stdout
@@ -174,7 +201,11 @@ def run(*command: object, folder: Path = ROOT) -> str:
 
 def _make_environment() -> Mapping[str, str]:
     """Return the environment without what would let this repository's packages be imported."""
-    return {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    return {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
+    }
 
 
 if __name__ == "__main__":

@@ -84,7 +84,8 @@ def compile_libraries(processor: Processor, folder: Path) -> None:
 def build_wheel(processor: Processor, compiled: Path, folder: Path) -> Path:
     """Build the wheel with these compiled libraries."""
     option = f"--config-setting=--build-option=--plat-name={processor.platform}"
-    shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)  # setuptools would add what an earlier build left there
+    # Setuptools would add what an earlier build left there.
+    shutil.rmtree(ROOT / "build" / "lib", ignore_errors=True)
     run(
         *(UV, "build", "--quiet", "--wheel", "--no-build-isolation", "--python", PYTHON),
         *(option, "--out-dir", folder, ROOT),
@@ -107,7 +108,10 @@ def check_wheel(wheel: Path, processor: Processor) -> None:
             elf_number = int.from_bytes(content[18:20], "little")
             if not content.startswith(b"\x7fELF") or elf_number != processor.elf_number:
                 sys.exit(f"wheels: {name} in {wheel.name} is not for {processor.machine}")
-            versions = [(int(major), int(minor)) for major, minor in re.findall(rb"GLIBC_(\d+)\.(\d+)", content)]
+            versions = [
+                (int(major), int(minor))
+                for major, minor in re.findall(rb"GLIBC_(\d+)\.(\d+)", content)
+            ]
             if max(versions, default=OLDEST_GLIBC) > OLDEST_GLIBC:
                 sys.exit(f"wheels: {name} in {wheel.name} needs glibc {max(versions)}")
 
@@ -116,7 +120,12 @@ def run(*command: object, environment: dict[str, str] | None = None) -> None:
     """Run a program. Exits with its messages if it fails."""
     words = [str(word) for word in command]
     finished = subprocess.run(
-        words, cwd=ROOT, env=dict(os.environ, **(environment or {})), capture_output=True, text=True, check=False
+        words,
+        cwd=ROOT,
+        env=dict(os.environ, **(environment or {})),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if finished.returncode != 0:
         sys.exit(f"wheels: failed: {' '.join(words)}\n{finished.stdout}{finished.stderr}")

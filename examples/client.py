@@ -10,7 +10,12 @@ import zenoh
 ENDPOINT, ROBOT = sys.argv[1:] or ("tcp/127.0.0.1:7447", "planar13")
 JOINT, TURN_RAD = "joint_3", 0.1
 QUIET = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
-LINK = {"mode": "client", "connect": {"endpoints": [ENDPOINT]}, "namespace": ROBOT, "scouting": QUIET}
+LINK = {
+    "mode": "client",
+    "connect": {"endpoints": [ENDPOINT]},
+    "namespace": ROBOT,
+    "scouting": QUIET,
+}
 FORM = "application/msgpack;snakesim.{}/1"
 SILENCE_S = 15  # longer than the 10 s for which lockstep waits for another service
 BLOCK = zenoh.CongestionControl.BLOCK  # lose no command, so that lockstep goes on
@@ -27,7 +32,9 @@ def newest(arrivals, meanwhile=lambda: time.sleep(0.0005), known=None):
 
 
 def ask(key, message, *meanwhile, **request):
-    answer = newest(session.get(key, payload=msgpack.packb(request), encoding=FORM.format(message)), *meanwhile)
+    answer = newest(
+        session.get(key, payload=msgpack.packb(request), encoding=FORM.format(message)), *meanwhile
+    )
     return answer if answer["ok"] else sys.exit(f"{key}: {answer['reason']}")
 
 
@@ -35,10 +42,17 @@ def command(turn_rad=0.0):
     """At the next clock, the last sample of a tick, answer the newest joint state."""
     clock = newest(clocks)
     state.update(newest(joints, known=state))
-    answers = {"tick": state["tick"], "arm_session": clock["arm_session"], "sequence": time.monotonic_ns()}
+    answers = {
+        "tick": state["tick"],
+        "arm_session": clock["arm_session"],
+        "sequence": time.monotonic_ns(),
+    }
     target = [*start[:number], start[number] + turn_rad, *start[number + 1 :]]
-    payload = msgpack.packb({**rights, **answers, "mode": [1] * len(target), "target": target})  # mode 1: rad
-    session.put("actuator/joints", payload, encoding=FORM.format("JointCommand"), congestion_control=BLOCK)
+    # Mode 1: rad.
+    payload = msgpack.packb({**rights, **answers, "mode": [1] * len(target), "target": target})
+    session.put(
+        "actuator/joints", payload, encoding=FORM.format("JointCommand"), congestion_control=BLOCK
+    )
 
 
 with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
@@ -46,15 +60,29 @@ with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
     number = [joint["name"] for joint in robot["joints"]].index(JOINT)
     joints = session.declare_subscriber("sensor/joints", zenoh.handlers.RingChannel(1))
     clocks = session.declare_subscriber("hal/clock", zenoh.handlers.RingChannel(1))
-    present = session.liveliness().declare_token("alive/control")  # last: from the next tick on, a run waits for it
+    # Last: from the next tick on, a run waits for it.
+    present = session.liveliness().declare_token("alive/control")
     start = (state := newest(joints))["angle_rad"]
     lease = ask("hal/lease", "LeaseRequest", action="acquire", holder="control")
-    rights = {"lease_epoch": lease["epoch"], "layout": robot["layout"], "valid_for_ns": robot["lease_ns"]}
+    rights = {
+        "lease_epoch": lease["epoch"],
+        "layout": robot["layout"],
+        "valid_for_ns": robot["lease_ns"],
+    }
     for _ in range(5):  # commands flow before the robot is armed
         command()
     meant = {key: robot[key] for key in ("robot", "backend", "config_hash", "host")}
     ask("hal/lifecycle", "LifecycleRequest", command, action="arm", requester="client.py", **meant)
     for tick in range(2 * round(1e9 / robot["period_ns"])):  # a second to turn, and one to arrive
         command(min(tick * robot["period_ns"] * 1e-9, 1.0) * TURN_RAD)
-    ask("hal/lifecycle", "LifecycleRequest", lambda: command(TURN_RAD), action="disarm", requester="client.py", **meant)
-    print(f"{JOINT} turned by {state['angle_rad'][number] - start[number]:+.3f} rad; the robot is disarmed")
+    ask(
+        "hal/lifecycle",
+        "LifecycleRequest",
+        lambda: command(TURN_RAD),
+        action="disarm",
+        requester="client.py",
+        **meant,
+    )
+    print(
+        f"{JOINT} turned by {state['angle_rad'][number] - start[number]:+.3f} rad; the robot is disarmed"
+    )

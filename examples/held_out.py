@@ -9,7 +9,8 @@ example `backend=can`. Every scene is one episode of 40 s.
 import sys
 from dataclasses import dataclass
 
-from snakesim.environments import SnakeEnv  # before NumPy, so that its arithmetic is that of `snakesim run`
+# Before NumPy, so that its arithmetic is that of `snakesim run`.
+from snakesim.environments import SnakeEnv
 
 # isort: split
 import numpy as np

@@ -9,10 +9,18 @@ import zenoh
 
 ENDPOINT, ROBOT = sys.argv[1:] or ("tcp/127.0.0.1:7447", "planar13")
 QUIET = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
-LINK = {"mode": "client", "connect": {"endpoints": [ENDPOINT]}, "namespace": ROBOT, "scouting": QUIET}
+LINK = {
+    "mode": "client",
+    "connect": {"endpoints": [ENDPOINT]},
+    "namespace": ROBOT,
+    "scouting": QUIET,
+}
 
 with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
-    clocks, until = session.declare_subscriber("hal/clock", zenoh.handlers.RingChannel(1)), time.monotonic() + 5
+    clocks, until = (
+        session.declare_subscriber("hal/clock", zenoh.handlers.RingChannel(1)),
+        time.monotonic() + 5,
+    )
     while time.monotonic() < until:
         now_ns = msgpack.unpackb(clocks.recv().payload.to_bytes())["timestamp_ns"]
         wish = {
@@ -22,5 +30,9 @@ with zenoh.open(zenoh.Config.from_json5(json.dumps(LINK))) as session:
             "heading_w_rad": 0.3,
             "valid_for_ns": 500000000,
         }
-        session.put("operator/intent", msgpack.packb(wish), encoding="application/msgpack;snakesim.LocomotionIntent/1")
+        session.put(
+            "operator/intent",
+            msgpack.packb(wish),
+            encoding="application/msgpack;snakesim.LocomotionIntent/1",
+        )
         time.sleep(0.1)

@@ -26,8 +26,14 @@ STEPS = 45  # to either side
 class Whisker(CustomSample, frozen=True, kw_only=True):
     """A hair at a link, and how far what it touches has bent it."""
 
-    bend_rad: Annotated[float, bounded(-1.6, 1.6, "rad"), about("from its rest, positive to the left; 0: it is free")]
-    bend_max_rad: Annotated[float, bounded(0.1, 1.6, "rad"), about("it bends no further: there it is pressed flat")]
+    bend_rad: Annotated[
+        float,
+        bounded(-1.6, 1.6, "rad"),
+        about("from its rest, positive to the left; 0: it is free"),
+    ]
+    bend_max_rad: Annotated[
+        float, bounded(0.1, 1.6, "rad"), about("it bends no further: there it is pressed flat")
+    ]
 
     def find_contradiction(self) -> str:
         if abs(self.bend_rad) <= self.bend_max_rad:
@@ -53,14 +59,19 @@ class WhiskerModel(SensorModel):
         self._settings, self._noise = settings, scope.noise
         self._mount = SensorMount(sensor, scope)
         step_rad = settings.bend_max_rad / STEPS
-        self._bends_rad = step_rad * np.array(sorted(range(-STEPS, STEPS + 1), key=abs))  # the least bent first
-        fan = np.stack([np.cos(self._bends_rad), np.sin(self._bends_rad), np.zeros(2 * STEPS + 1)], -1)
+        # The least bent first.
+        self._bends_rad = step_rad * np.array(sorted(range(-STEPS, STEPS + 1), key=abs))
+        fan = np.stack(
+            [np.cos(self._bends_rad), np.sin(self._bends_rad), np.zeros(2 * STEPS + 1)], -1
+        )
         self._rays = RayBundle(self._mount, scope, fan * settings.length_m, 1.0)
 
     def read(self, tick, timestamp_ns):
         upper_rad = self._settings.bend_max_rad
         free = np.flatnonzero(self._rays.cast() >= 1.0)  # in lengths of the hair
-        bend_rad = self._bends_rad[free[0]] if len(free) else math.copysign(upper_rad, self._bends_rad[1])
+        bend_rad = (
+            self._bends_rad[free[0]] if len(free) else math.copysign(upper_rad, self._bends_rad[1])
+        )
         bend_rad += self._settings.noise_rad * self._noise.standard_normal()
         return Whisker(
             tick=tick,

@@ -34,7 +34,13 @@ if TYPE_CHECKING:
     from snakesim.result import Result
     from snakesim.robot import Robot
     from snakesim.runs import load, run
-    from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
+    from snakesim_hal.controller import (
+        Controller,
+        ControllerCommand,
+        Observation,
+        Telemetry,
+        make_position_setpoints,
+    )
     from snakesim_hal.model.files import FileStruct as Parameters
     from snakesim_hal.model.kinematics import compute_body_points_w
 
@@ -94,7 +100,9 @@ def use_common_arithmetic() -> None:
 
 def __getattr__(name: str) -> Any:
     if name not in LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+        raise AttributeError(
+            f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}"
+        )
     module, attribute = LAZY[name]
     return getattr(import_module(module), attribute)
 

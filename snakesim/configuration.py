@@ -51,7 +51,9 @@ def _convert_to_plain_value(value: Any) -> Any:
     return value
 
 
-def load_and_validate_config(scenario: str, overrides: list[KeyOverride], *, processes: bool) -> RunConfig:
+def load_and_validate_config(
+    scenario: str, overrides: list[KeyOverride], *, processes: bool
+) -> RunConfig:
     """Load a scenario with overrides, check that all its plugins are installed, and return the configuration.
 
     Args:
@@ -63,7 +65,9 @@ def load_and_validate_config(scenario: str, overrides: list[KeyOverride], *, pro
     Raises:
         ConfigError: A value is wrong, a plugin is missing, or the clock mode is not possible.
     """
-    clock_override = next((override for override in overrides if override.key == "clock_mode"), None)
+    clock_override = next(
+        (override for override in overrides if override.key == "clock_mode"), None
+    )
     if clock_override is None and not processes:
         overrides = [*overrides, KeyOverride("clock_mode", "lockstep", "one process")]
     loaded = load_scenario(scenario, overrides)

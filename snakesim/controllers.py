@@ -51,7 +51,10 @@ def resolve_controller(controller: ControllerArgument) -> tuple[str, type[Contro
             code="python/invalid-argument",
         )
     if not callable(controller):
-        raise ConfigError(f"controller={controller!r:.60}: give {ALLOWED_CONTROLLERS}", code="python/invalid-argument")
+        raise ConfigError(
+            f"controller={controller!r:.60}: give {ALLOWED_CONTROLLERS}",
+            code="python/invalid-argument",
+        )
     name = _make_valid_name(controller)
     try:
         inspect.signature(controller).bind(0.0, None)
@@ -82,19 +85,25 @@ def _make_function_controller(function: JointFunction, name: str) -> type[Contro
             return ControllerCommand(make_position_setpoints(self.robot, angles_rad), telemetry)
 
     FunctionController.__name__ = name
-    FunctionController.__module__ = getattr(function, "__module__", None) or FunctionController.__module__
+    FunctionController.__module__ = (
+        getattr(function, "__module__", None) or FunctionController.__module__
+    )
     return FunctionController
 
 
 def _validate_angles(returned: Any, joint_count: int, name: str) -> list[float]:
     """Convert the result of a controller function to a list of angles. Raises ControllerError if it is not valid."""
     shown = " ".join(repr(returned).split())  # NumPy prints several lines
-    message = f"{name}() returned {shown:.60}, must return {joint_count} angles in rad, tail to head"
+    message = (
+        f"{name}() returned {shown:.60}, must return {joint_count} angles in rad, tail to head"
+    )
     try:
         angles_rad = np.asarray(returned, dtype=float)
     except (TypeError, ValueError) as error:
         raise ControllerError(f"{message}: {error}") from error
     if angles_rad.shape == (joint_count,):
         return angles_rad.tolist()
-    actual = f"{len(angles_rad)}" if angles_rad.ndim == 1 else f"an array of shape {angles_rad.shape}"
+    actual = (
+        f"{len(angles_rad)}" if angles_rad.ndim == 1 else f"an array of shape {angles_rad.shape}"
+    )
     raise ControllerError(f"{message}; got {actual}")

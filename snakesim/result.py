@@ -20,7 +20,12 @@ from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.results.page.charts import ChartLine, make_line_chart
 from snakesim_operator.results.run_ending import COMPLETE
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.signals import compute_signals, find_unit, make_signal_columns, select_columns
+from snakesim_operator.results.signals import (
+    compute_signals,
+    find_unit,
+    make_signal_columns,
+    select_columns,
+)
 from snakesim_operator.results.summary import RunSummary, get_distance_m
 
 PLAYBACK_HEIGHT_PX = 580
@@ -250,5 +255,7 @@ class Result:
         drawn: list[ChartLine] = []
         for i, (column, values) in enumerate(columns.items()):
             label = column.removeprefix(f"{name}.")
-            drawn.append(ChartLine(label, self.time_s, values.astype(float), f"--joint-{i % color_count}"))
+            drawn.append(
+                ChartLine(label, self.time_s, values.astype(float), f"--joint-{i % color_count}")
+            )
         return drawn

@@ -15,7 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
-from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, StalledError, suggest_word
+from snakesim_hal.base.errors import (
+    ConfigError,
+    NotConnectedError,
+    RefusedError,
+    StalledError,
+    suggest_word,
+)
 from snakesim_hal.base.process import get_user_name
 from snakesim_hal.controller import make_position_setpoints
 from snakesim_hal.network.commanding import READABLE_KEYS, CommandingClient
@@ -83,7 +89,9 @@ class Robot:
         """
         self._link = connection
         self._exit_stack = ExitStack()
-        self._session: Session = self._exit_stack.enter_context(open_session(connection, CONNECT_TIMEOUT_S))
+        self._session: Session = self._exit_stack.enter_context(
+            open_session(connection, CONNECT_TIMEOUT_S)
+        )
 
         # Messages.
         self._reader_by_key: dict[str, SampleReader[Any]] = {}
@@ -94,7 +102,9 @@ class Robot:
         self._is_armed_by_us = False  # whether this connection armed the robot
 
         try:
-            self.description: RobotDescription = self._require_newest(keys.DESCRIPTION, RobotDescription)
+            self.description: RobotDescription = self._require_newest(
+                keys.DESCRIPTION, RobotDescription
+            )
             self._require_newest(keys.STATUS, RobotStatus)
             # In lockstep the clock publishes nothing while a controller computes, so its first message is not required.
             self._read_newest(keys.CLOCK, Clock, 0.0)
@@ -104,7 +114,10 @@ class Robot:
 
     @staticmethod
     def connect(
-        endpoint: str | None = None, *, name: str | None = None, session: str | os.PathLike[str] | None = None
+        endpoint: str | None = None,
+        *,
+        name: str | None = None,
+        session: str | os.PathLike[str] | None = None,
     ) -> "Robot":
         """Find a running robot, and connect to it.
 
@@ -136,7 +149,9 @@ class Robot:
             )
         if len(links) > 1:
             choices = [f"  endpoint={link.endpoint!r}, name={link.namespace!r}" for link in links]
-            raise RefusedError("several robots found; choose one:", *choices, code="network/several-robots")
+            raise RefusedError(
+                "several robots found; choose one:", *choices, code="network/several-robots"
+            )
         return Robot(links[0])
 
     def __enter__(self) -> Self:
@@ -279,13 +294,18 @@ class Robot:
 
         control.command_until(lambda: self.status.ready_to_arm, ARM_TIMEOUT_S, explain_not_armed)
         previous_session = self._current_clock.arm_session
-        self._request_and_wait(make_arm_request(self.description, get_user_name(), unchecked=unchecked), "armed")
+        self._request_and_wait(
+            make_arm_request(self.description, get_user_name(), unchecked=unchecked), "armed"
+        )
         control.command_until(
-            lambda: self._current_clock.arm_session > previous_session, ARM_TIMEOUT_S, explain_not_armed
+            lambda: self._current_clock.arm_session > previous_session,
+            ARM_TIMEOUT_S,
+            explain_not_armed,
         )
         if self._current_clock.lifecycle != "armed":
             raise RefusedError(
-                f"not armed any more, but {self._current_clock.lifecycle}: {self.status.reason}", code="robot/not-armed"
+                f"not armed any more, but {self._current_clock.lifecycle}: {self.status.reason}",
+                code="robot/not-armed",
             )
         self._is_armed_by_us = True
 
@@ -295,7 +315,9 @@ class Robot:
         Raises:
             RefusedError: The robot refuses, or does not confirm.
         """
-        self._request_and_wait(LifecycleRequest(action="disarm", requester=get_user_name()), "disarmed")
+        self._request_and_wait(
+            LifecycleRequest(action="disarm", requester=get_user_name()), "disarmed"
+        )
         self._is_armed_by_us = False
 
     def reset_fault(self) -> None:
@@ -357,12 +379,20 @@ class Robot:
         link = replace(self._link, max_bytes=MAX_IMAGE_BYTES)
         with ThreadPoolExecutor(1) as executor:
             recording = executor.submit(
-                record_to_file, link, Path(path), lambda: not should_stop.is_set(), lambda *_: has_started.set()
+                record_to_file,
+                link,
+                Path(path),
+                lambda: not should_stop.is_set(),
+                lambda *_: has_started.set(),
             )
             try:
                 deadline = time.monotonic() + RECORDING_START_TIMEOUT_S
                 # Ticks must continue while the recorder starts and ends, or an armed robot would lose its lease.
-                while not has_started.is_set() and not recording.done() and time.monotonic() < deadline:
+                while (
+                    not has_started.is_set()
+                    and not recording.done()
+                    and time.monotonic() < deadline
+                ):
                     self._tick_or_sleep()
                 yield Path(path)
             finally:
@@ -374,7 +404,9 @@ class Robot:
     def _get_command_client(self) -> CommandingClient:
         """Return the client that sends commands. The first call creates it, and it takes the lease."""
         if self._command_client is None:
-            self._command_client = CommandingClient(self._session, self.description, self.status.clock_mode)
+            self._command_client = CommandingClient(
+                self._session, self.description, self.status.clock_mode
+            )
         return self._command_client
 
     def _validate_joint_values(self, name: str, values: Sequence[float]) -> None:
@@ -420,11 +452,14 @@ class Robot:
         newest = self._read_newest(key, message_type, CONNECT_TIMEOUT_S)
         if newest is None:
             raise NotConnectedError(
-                f"{self._link.namespace} publishes nothing on {key}; is its HAL host running?", code="network/no-robot"
+                f"{self._link.namespace} publishes nothing on {key}; is its HAL host running?",
+                code="network/no-robot",
             )
         return newest
 
-    def _read_newest(self, key: str, message_type: type[Message], first_message_timeout_s: float) -> Any:
+    def _read_newest(
+        self, key: str, message_type: type[Message], first_message_timeout_s: float
+    ) -> Any:
         """Return the newest message of a key, or None. Wait only for the first message of a key."""
         reader = self._get_reader(key, message_type)
         timeout_s = 0.0 if key in self._newest_by_key else first_message_timeout_s

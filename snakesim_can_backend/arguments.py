@@ -29,9 +29,14 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
     add_channels(parser, CHANNEL_ABOUT)
     _add_bit_rate(parser)
     add_duration_argument(
-        parser, "seconds to listen on each bus (default: 1)", make_number_parser(0.001, 3600, "s"), 1.0
+        parser,
+        "seconds to listen on each bus (default: 1)",
+        make_number_parser(0.001, 3600, "s"),
+        1.0,
     )
-    parser.add_argument("--anyway", action="store_true", help="send requests also where others use the bus")
+    parser.add_argument(
+        "--anyway", action="store_true", help="send requests also where others use the bus"
+    )
 
 
 def add_canopen_scan(parser: argparse.ArgumentParser) -> None:
@@ -81,7 +86,12 @@ def add_load(parser: argparse.ArgumentParser) -> None:
 
 def add_replay(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that read a log of the bus of joint modules."""
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of the run, with config.json and its black box")
+    parser.add_argument(
+        "run",
+        type=Path,
+        metavar="RUN",
+        help="folder of the run, with config.json and its black box",
+    )
     parser.add_argument(
         "log",
         type=Path,
@@ -98,14 +108,19 @@ def add_dbc(parser: argparse.ArgumentParser) -> None:
 def add_module_emulation(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim drive emulate can`, which emulates joint modules on a bus."""
     add_scenario_name_argument(parser)
-    add_channel(parser, f"interface, or INTERFACE:CHANNEL of python-can, tail to head (default: {DEFAULT_CHANNEL})")
+    add_channel(
+        parser,
+        f"interface, or INTERFACE:CHANNEL of python-can, tail to head (default: {DEFAULT_CHANNEL})",
+    )
     parser.add_argument(
         "--firmware",
         action="store_true",
         help="run the reference firmware in C, each module with a simulated joint of its own, on --channel unix:PATH",
     )
     parser.add_argument(
-        "--physics-model", metavar="NAME", help="body that the motors move: mujoco, inertia, or ./file.py:Class"
+        "--physics-model",
+        metavar="NAME",
+        help="body that the motors move: mujoco, inertia, or ./file.py:Class",
     )
     add_set_argument(parser)
     parser.add_argument(
@@ -117,11 +132,17 @@ def add_module_emulation(parser: argparse.ArgumentParser) -> None:
     )
     add_control_arguments(parser)
     parser.add_argument(
-        "--stepped", action="store_true", help="advance time only from Sync to Sync, for a host in lockstep"
+        "--stepped",
+        action="store_true",
+        help="advance time only from Sync to Sync, for a host in lockstep",
     )
     add_pose(parser, f"or none, default: {DEFAULT_POSE}", DEFAULT_POSE)
     add_duration_argument(parser, "end after this many seconds")
     add_seed_argument(parser, "of noise and serial numbers, default: the scenario's")
-    parser.add_argument("--stats", action="store_true", help="print the load of every bus once a second")
-    parser.add_argument("--on-real-bus", action="store_true", help="allow interfaces that are not called vcan...")
+    parser.add_argument(
+        "--stats", action="store_true", help="print the load of every bus once a second"
+    )
+    parser.add_argument(
+        "--on-real-bus", action="store_true", help="allow interfaces that are not called vcan..."
+    )
     add_parent_argument(parser)

@@ -46,7 +46,8 @@ from snakesim_hal.run_log.host_record import BLACK_BOX
 
 OK, FAILED = 0, 1
 MODULE_BACKEND = "can"  # the backend of joint modules
-LISTEN_DURATION_S = 0.3  # for others on a bus; most devices send something five times a second or more
+# For others on a bus; most devices send something five times a second or more.
+LISTEN_DURATION_S = 0.3
 COLUMNS = (
     *("channel", "node", "serial", "firmware", "protocol", "emulated", "state", "faults", "uptime"),
     *("voltage", "motor", "board", "shaft"),
@@ -63,7 +64,10 @@ def print_load(arguments: argparse.Namespace) -> int:
     Returns:
         Exit code 0; 1 if a bus of the scenario cannot carry its load.
     """
-    overrides = [KeyOverride("backend", "can", "drive load can"), *(parse_set_option(text) for text in arguments.set)]
+    overrides = [
+        KeyOverride("backend", "can", "drive load can"),
+        *(parse_set_option(text) for text in arguments.set),
+    ]
     loaded = load_scenario(arguments.scenario, overrides)
     settings = load_can_settings(loaded)
     config = loaded.config
@@ -84,7 +88,12 @@ def _print_scenario_load(config: RunConfig, settings: CanSettings, *, as_json: b
     if as_json:
         channels = settings.channels or ["one bus"]
         buses = [
-            {"channel": channel, "joints": bus[0], "load": compute_bus_load(*bus), "fits": is_feasible(*bus)}
+            {
+                "channel": channel,
+                "joints": bus[0],
+                "load": compute_bus_load(*bus),
+                "fits": is_feasible(*bus),
+            }
             for channel, bus in zip(channels, plan_buses(config, settings), strict=True)
         ]
         print_json({"rate_hz": config.rate_hz, "buses": buses, "fits": all_fit})
@@ -95,7 +104,10 @@ def _print_scenario_load(config: RunConfig, settings: CanSettings, *, as_json: b
 
 
 def _list_loads(
-    config: RunConfig, settings: CanSettings, joints: Sequence[int], rates_hz: Sequence[float] | None
+    config: RunConfig,
+    settings: CanSettings,
+    joints: Sequence[int],
+    rates_hz: Sequence[float] | None,
 ) -> Iterator[dict[str, Any]]:
     """Yield the load of the bus with the most joints for every number of joints and every rate."""
     buses = max(len(settings.channels), 1)
@@ -124,14 +136,22 @@ def describe_bus_loads(config: RunConfig, settings: CanSettings) -> tuple[list[s
     for name, bus in zip(settings.channels or ["one bus"], buses, strict=True):
         lines += [f"{name}: {bus[0]} joints at {config.rate_hz:g} Hz", *explain_load(*bus)]
         busiest_ms = 1e3 * busiest_period_s(*bus)
-        lines.append(f"  Sync, answers, forces and setpoints of one period: {busiest_ms:.2f} of {period_ms:.2f} ms")
+        lines.append(
+            f"  Sync, answers, forces and setpoints of one period: {busiest_ms:.2f} of {period_ms:.2f} ms"
+        )
     if all(is_feasible(*bus) for bus in buses):
         return lines, True
-    return [*lines, f"Refused. {suggest_alternatives([joints for joints, _ in buses], config, settings)}"], False
+    return [
+        *lines,
+        f"Refused. {suggest_alternatives([joints for joints, _ in buses], config, settings)}",
+    ], False
 
 
 def format_load_table(
-    config: RunConfig, settings: CanSettings, joints: Sequence[int], rates_hz: Sequence[float] | None = None
+    config: RunConfig,
+    settings: CanSettings,
+    joints: Sequence[int],
+    rates_hz: Sequence[float] | None = None,
 ) -> Iterator[str]:
     """Yield the lines of a table with the load of the bus with the most joints.
 
@@ -145,7 +165,10 @@ def format_load_table(
     rates = rates_hz or [config.rate_hz]
     yield "joints" + "".join(f"{f'{rate:g} Hz':>16}" for rate in rates)
     for count in joints:
-        cells = [_format_load_cell(ceil(count / buses), plan_reports_at(rate, config, settings)) for rate in rates]
+        cells = [
+            _format_load_cell(ceil(count / buses), plan_reports_at(rate, config, settings))
+            for rate in rates
+        ]
         yield f"{count:6}" + "".join(f"{cell:>16}" for cell in cells)
     on = "one bus" if buses == 1 else f"the fullest of {buses} buses"
     of = format_bit_rate(settings.bit_rate)
@@ -230,7 +253,8 @@ def scan(wire: Wire, seconds: float) -> list[dict[str, str]]:
     reading = ModuleReports(LAST_NODE)
     all_nodes_bus = ModuleBus(wire, range(FIRST_NODE, LAST_NODE + 1))
     return [
-        _make_scan_row(identity, reading) for identity in find_modules([all_nodes_bus], seconds, reading.process_frame)
+        _make_scan_row(identity, reading)
+        for identity in find_modules([all_nodes_bus], seconds, reading.process_frame)
     ]
 
 
@@ -312,7 +336,9 @@ def replay_log(arguments: argparse.Namespace) -> int:
     replay.read(log)
     if not replay.joints:
         finding = f"{replay.frames} frames, and no Sync among them: the log of another bus"
-        print_line(f"{arguments.log}: {finding}{describe_frame_origin(replay.other_protocol_frames)}")
+        print_line(
+            f"{arguments.log}: {finding}{describe_frame_origin(replay.other_protocol_frames)}"
+        )
         return FAILED
     print_line(f"{arguments.log}: {replay.frames} frames, {len(replay.joints)} Syncs")
     for line in log.report():

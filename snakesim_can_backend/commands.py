@@ -87,7 +87,10 @@ def _load_cia402(arguments: argparse.Namespace) -> int:
 
 
 def _add_emulation(parser: argparse.ArgumentParser) -> None:
-    add_emulation(parser, f"interface, or INTERFACE:CHANNEL of python-can (default: {options.DEFAULT_CHANNEL})")
+    add_emulation(
+        parser,
+        f"interface, or INTERFACE:CHANNEL of python-can (default: {options.DEFAULT_CHANNEL})",
+    )
 
 
 COMMANDS: Commands = (
@@ -117,7 +120,10 @@ COMMANDS: Commands = (
         add=options.add_module_load,
         run=_load_modules,
         details="Exit code: 0 it fits, 1 it does not, 2 wrong input.",
-        examples=("drive load can triplet", "drive load can triplet --joints 13 30 --hz 50 100 200"),
+        examples=(
+            "drive load can triplet",
+            "drive load can triplet --joints 13 30 --hz 50 100 200",
+        ),
     ),
     Command(
         name="drive replay can",
@@ -125,7 +131,10 @@ COMMANDS: Commands = (
         add=options.add_replay,
         run=_replay_modules,
         details="Exit code: 0 all joint states are the same to the bit, 1 otherwise, 2 wrong input.",
-        examples=("drive replay can runs/demo runs/demo/bus.log", "drive replay can runs/bench bench.blf"),
+        examples=(
+            "drive replay can runs/demo runs/demo/bus.log",
+            "drive replay can runs/bench bench.blf",
+        ),
     ),
     Command(
         name="drive dbc",
@@ -139,7 +148,10 @@ COMMANDS: Commands = (
         help="Emulate the ODrive axes of a robot, as a process on CAN buses.",
         add=_add_emulation,
         run=_emulate_odrive,
-        examples=("drive emulate odrive triplet", "drive emulate odrive triplet --channel vcan0 --channel vcan1"),
+        examples=(
+            "drive emulate odrive triplet",
+            "drive emulate odrive triplet --channel vcan0 --channel vcan1",
+        ),
     ),
     Command(
         name="drive load odrive",
@@ -153,7 +165,10 @@ COMMANDS: Commands = (
         help="Emulate the moteus controllers of a robot, as a process on CAN FD buses.",
         add=_add_emulation,
         run=_emulate_moteus,
-        examples=("drive emulate moteus triplet", "drive emulate moteus triplet --channel vcan0 --channel vcan1"),
+        examples=(
+            "drive emulate moteus triplet",
+            "drive emulate moteus triplet --channel vcan0 --channel vcan1",
+        ),
     ),
     Command(
         name="drive load moteus",

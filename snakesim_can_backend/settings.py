@@ -23,17 +23,23 @@ class MountedModule(MountedDrive, frozen=True, kw_only=True):
 class CanSettings(FileStruct, frozen=True, kw_only=True):
     """Buses, modules on them, and their reports."""
 
-    channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
+    channels: Annotated[
+        list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)
+    ] = []
     """CAN buses, tail to head: SocketCAN interfaces such as can0, INTERFACE:CHANNEL of python-can, or unix:PATH of
     emulated modules. Empty: a virtual bus in this process with emulated joint modules.
     """
 
-    bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
+    bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = (
+        1_000_000
+    )
     """Bit rate of the buses, for which loads are computed and to which adapters are set. A kernel interface has that of
     `ip link`.
     """
 
-    joints_per_channel: Annotated[list[Annotated[int, Meta(ge=1, le=LAST_NODE)]], Meta(max_length=8)] = []
+    joints_per_channel: Annotated[
+        list[Annotated[int, Meta(ge=1, le=LAST_NODE)]], Meta(max_length=8)
+    ] = []
     """Number of joints of each channel, tail to head. Empty: joints are distributed evenly."""
 
     emulators: Literal["here", "process", "firmware", "none"] | None = None

@@ -63,7 +63,8 @@ class SafeSetpoints:
     mode: list[JointMode]  # of each joint
     target: list[float]  # rad, rad/s or N·m, depending on the mode
     torque_limit_nm: list[float]  # maximum torque of each joint's motor
-    isolated: frozenset[int] = frozenset()  # indices of isolated joints, which are passive here and to be switched off
+    # Indices of isolated joints, which are passive here and to be switched off.
+    isolated: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,10 @@ class Samples:
     """Sensor samples of one tick. Besides the joint state they contain only samples that were due."""
 
     joints: JointState  # in every tick
-    by_key: Mapping[str, Message] = field(default_factory=dict[str, Message])  # of the other sensors, by key
-    encoded_by_key: Mapping[str, EncodedMessage] = field(
-        default_factory=dict[str, EncodedMessage]
-    )  # encoded `by_key`, filled in by the host
+    # Of the other sensors, by key.
+    by_key: Mapping[str, Message] = field(default_factory=dict[str, Message])
+    # Encoded `by_key`, filled in by the host.
+    encoded_by_key: Mapping[str, EncodedMessage] = field(default_factory=dict[str, EncodedMessage])
 
 
 class Backend(ABC):
@@ -83,8 +84,10 @@ class Backend(ABC):
     The members above the constructor belong to the class: they are used before a run, when no backend is open.
     """
 
-    Settings: ClassVar[type[msgspec.Struct]]  # the scenario's `[backends.<name>]` section (may be an empty Struct)
-    supported_modes: ClassVar[Collection[DriveMode] | None] = None  # of every joint (None: those of the robot file)
+    # The scenario's `[backends.<name>]` section (may be an empty Struct).
+    Settings: ClassVar[type[msgspec.Struct]]
+    # Of every joint (None: those of the robot file).
+    supported_modes: ClassVar[Collection[DriveMode] | None] = None
 
     @classmethod
     def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:

@@ -42,15 +42,21 @@ class Task:
         """Return the task of a run."""
         start = compute_start_pose(config)
         x, y = start.position_w
-        return Task((x, y, config.robot.module.radius_m), quaternion_from_yaw(start.yaw_rad), config.mission.goal)
+        return Task(
+            (x, y, config.robot.module.radius_m),
+            quaternion_from_yaw(start.yaw_rad),
+            config.mission.goal,
+        )
 
 
 @dataclass(frozen=True)
 class SensorSamples:
     """Samples as the sensors published them, and the task. Only for controllers with `uses_sensors = True`."""
 
-    newest: Mapping[str, Message]  # newest sample of `sensor/pose` and `sensor/contacts`, by key (absent: none yet)
-    late: Mapping[str, str]  # key -> why its newest sample is too old to be used (fresh ones are left out)
+    # Newest sample of `sensor/pose` and `sensor/contacts`, by key (absent: none yet).
+    newest: Mapping[str, Message]
+    # Key -> why its newest sample is too old to be used (fresh ones are left out).
+    late: Mapping[str, str]
     task: Task  # where the robot started, and its goal
 
 
@@ -62,9 +68,11 @@ class Observation:
     time_s: float  # since arming (also across new parameters, which replace the controller in an arm session)
     period_s: float  # of the control cycle
     joints: JointState  # angles, velocities and torques, tail to head, always fresh
-    world: WorldModel | None  # pose, contacts and obstacles (None: there is none yet, or it is too old)
+    # Pose, contacts and obstacles (None: there is none yet, or it is too old).
+    world: WorldModel | None
     trajectory: Trajectory | None  # path and speed (None: there is none yet, or it is too old)
-    sensor_samples: SensorSamples | None = None  # None: the controller does not declare `uses_sensors`
+    # None: the controller does not declare `uses_sensors`.
+    sensor_samples: SensorSamples | None = None
 
 
 @dataclass(frozen=True)
@@ -233,7 +241,9 @@ class Controller(ABC, Generic[ParametersT]):
 
 def load_controller(name: str) -> type[Controller[Any]]:
     """Return the class of a controller by its name; a file is loaded, which runs its code. Raises ConfigError."""
-    return require_base_class(load_plugin(CONTROLLERS, name), Controller, f"controller {shorten(name)!r}")
+    return require_base_class(
+        load_plugin(CONTROLLERS, name), Controller, f"controller {shorten(name)!r}"
+    )
 
 
 def decode_parameters(
@@ -258,22 +268,31 @@ def decode_parameters(
     Raises:
         ConfigError: A value is not allowed, or `Parameters` is not a Struct.
     """
-    if not (isinstance(controller.Parameters, type) and issubclass(controller.Parameters, msgspec.Struct)):
+    if not (
+        isinstance(controller.Parameters, type)
+        and issubclass(controller.Parameters, msgspec.Struct)
+    ):
         raise ConfigError(
             f"{describe_plugin(controller)}: `Parameters` is {shorten(repr(controller.Parameters))}, must be a class "
             "that derives from snakesim.Parameters"
         )
-    return decode_table(ConfigTable(section, source, origin_by_key or {}), controller.Parameters, section_key)
+    return decode_table(
+        ConfigTable(section, source, origin_by_key or {}), controller.Parameters, section_key
+    )
 
 
 def is_motion_requested(observation: Observation) -> bool:
     """Return whether world and trajectory are known, and the requested speed is not 0. Otherwise a controller holds."""
     return (
-        observation.world is not None and observation.trajectory is not None and observation.trajectory.speed_m_s != 0.0
+        observation.world is not None
+        and observation.trajectory is not None
+        and observation.trajectory.speed_m_s != 0.0
     )
 
 
-def make_position_setpoints(robot: RobotDescription, angles_rad: Sequence[float]) -> RequestedSetpoints:
+def make_position_setpoints(
+    robot: RobotDescription, angles_rad: Sequence[float]
+) -> RequestedSetpoints:
     """Return setpoints that move every joint to an angle in position mode, with its full torque.
 
     Args:

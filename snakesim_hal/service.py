@@ -12,7 +12,13 @@ from typing import ClassVar
 
 import msgspec
 
-from snakesim_hal.base.errors import NotConnectedError, ServiceError, SnakesimError, WireError, describe_exception
+from snakesim_hal.base.errors import (
+    NotConnectedError,
+    ServiceError,
+    SnakesimError,
+    WireError,
+    describe_exception,
+)
 from snakesim_hal.faults.allowed import create_service_faults
 from snakesim_hal.model.scenario import RunConfig, ServiceSchedule
 from snakesim_hal.network.client import HostClient
@@ -24,9 +30,8 @@ from snakesim_hal.wire.messages import Clock, Message, RobotDescription
 SILENCE_S = 1.0  # a clock that is silent for longer has stopped
 MAX_SHOWN_KEYS = 16  # bound of `waits_for` in a process entry
 CONNECT_ATTEMPT_S = 2.0  # duration of one attempt to find the robot
-SERVICE_START_LIMIT_S = (
-    600.0  # until every part of a run has started: MuJoCo starts slowly in an emulated, busy machine
-)
+# Until every part of a run has started: MuJoCo starts slowly in an emulated, busy machine.
+SERVICE_START_LIMIT_S = 600.0
 
 
 class Service(ABC):
@@ -37,8 +42,10 @@ class Service(ABC):
     while a simulator is paused `pause`. An exception of any call ends the service, and its log names the call.
     """
 
-    name: ClassVar[str] = ""  # of its section in a scenario, and the first part of the keys that it writes
-    urgent: ClassVar[bool] = False  # True: the robot waits for this service in every tick, so it gets a high priority
+    # Of its section in a scenario, and the first part of the keys that it writes.
+    name: ClassVar[str] = ""
+    # True: the robot waits for this service in every tick, so it gets a high priority.
+    urgent: ClassVar[bool] = False
     too_slow: str = ""  # evidence that it is too slow for real time (empty: none)
 
     def __init__(self, client: HostClient, config: RunConfig) -> None:
@@ -116,14 +123,18 @@ class ServiceLoop:
         self._module = service_type.__module__
 
         # The service, which subscribes in its constructor, before the robot is known.
-        client = HostClient(session, name, decimation=schedule.decimation, clock_mode=config.clock_mode)
+        client = HostClient(
+            session, name, decimation=schedule.decimation, clock_mode=config.clock_mode
+        )
         self._client = client
         with self._name_service_in_errors("__init__"):
             self.service = service_type(client, config)
         robot = _wait_for_robot(client, should_retry)
         with self._name_service_in_errors("configure"):
             self.service.configure(robot)
-        self._faults = create_service_faults(name, config, session, robot, lambda: client.newest_clock)
+        self._faults = create_service_faults(
+            name, config, session, robot, lambda: client.newest_clock
+        )
         self._due_ticks = client.iterate_ticks(0.0, include_paused=True)
 
         # What other processes see of it.
@@ -241,7 +252,9 @@ class ServiceLoop:
             raise
         except (Exception, SystemExit) as error:
             traceback.print_exc()
-            raise ServiceError(f"{self._label}: {method}() {describe_exception(error, self._module)}") from error
+            raise ServiceError(
+                f"{self._label}: {method}() {describe_exception(error, self._module)}"
+            ) from error
 
 
 def _wait_for_robot(client: HostClient, should_retry: Callable[[], bool]) -> RobotDescription:

@@ -73,13 +73,24 @@ def list_compilers(target: CompileTarget | None = None) -> list[list[str]]:
         zig_target = target or get_this_target()
         # Without a target, zig would use all instructions of this computer's processor.
         commands.append(
-            [sys.executable, "-m", "ziglang", "cc", "-target", zig_target.zig_target_name, "-mcpu=baseline"]
+            [
+                sys.executable,
+                "-m",
+                "ziglang",
+                "cc",
+                "-target",
+                zig_target.zig_target_name,
+                "-mcpu=baseline",
+            ]
         )
     return commands
 
 
 def compile_library(
-    library: NativeLibrary, folder: Path, target: CompileTarget | None = None, extra_flags: tuple[str, ...] = ()
+    library: NativeLibrary,
+    folder: Path,
+    target: CompileTarget | None = None,
+    extra_flags: tuple[str, ...] = (),
 ) -> Path:
     """Compile a library into a folder, and remove older builds of it from there.
 
@@ -146,7 +157,12 @@ def _run_compiler(
                 mujoco_library = mujoco.library
                 if is_foreign:
                     mujoco_library = _make_placeholder_library(command, mujoco, Path(temporary))
-                arguments += ["-isystem", str(mujoco.include_folder), "-Wl,--no-as-needed", str(mujoco_library)]
+                arguments += [
+                    "-isystem",
+                    str(mujoco.include_folder),
+                    "-Wl,--no-as-needed",
+                    str(mujoco_library),
+                ]
             compiled = Path(temporary, file.name)
             problem = run_and_get_error([*arguments, "-lm", "-o", str(compiled)])
             if not problem:
@@ -164,7 +180,9 @@ def _make_placeholder_library(command: list[str], mujoco: MujocoFiles, folder: P
     source = folder / "empty.c"
     source.write_text("")
     file = folder / mujoco.library.name
-    problem = run_and_get_error([*command, "-shared", f"-Wl,-soname,{file.name}", str(source), "-o", str(file)])
+    problem = run_and_get_error(
+        [*command, "-shared", f"-Wl,-soname,{file.name}", str(source), "-o", str(file)]
+    )
     if problem:
         raise OSError(problem)
     return file
@@ -174,7 +192,12 @@ def run_and_get_error(arguments: list[str]) -> str:
     """Run a compiler command, and return the first error that it prints; an empty text if it succeeded."""
     try:
         completed = subprocess.run(
-            arguments, capture_output=True, text=True, errors="replace", check=False, timeout=COMPILE_TIMEOUT_S
+            arguments,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+            timeout=COMPILE_TIMEOUT_S,
         )
     except subprocess.TimeoutExpired as error:
         return str(error)
@@ -215,7 +238,9 @@ def compile_all(folder: Path) -> list[str]:
         try:
             compile_library(library, folder)
         except CannotCompileError as error:
-            warnings.append(f"without the C library `{library.name}` {library.python_cost}: {error}")
+            warnings.append(
+                f"without the C library `{library.name}` {library.python_cost}: {error}"
+            )
     return warnings
 
 

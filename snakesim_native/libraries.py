@@ -10,7 +10,16 @@ PACKAGE = Path(__file__).resolve().parent
 SHARED_SOURCE = PACKAGE / "build_key.c"  # is compiled into every library
 
 # No multiplication and addition is fused, so that every processor and compiler computes the same bits.
-FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror=vla")
+FLAGS = (
+    "-std=c11",
+    "-O2",
+    "-ffp-contract=off",
+    "-fPIC",
+    "-shared",
+    "-Wall",
+    "-Wextra",
+    "-Werror=vla",
+)
 KEY_LENGTH = 12  # characters of the hash in a file's name
 
 

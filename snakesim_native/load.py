@@ -59,14 +59,22 @@ def _load_cached(library: NativeLibrary, setting: str) -> LoadedLibrary:
     """
     if setting == SWITCH_OFF:
         return LoadedLibrary(
-            library=None, path=None, problem=f"the environment variable {SWITCH_VARIABLE} is `{SWITCH_OFF}`"
+            library=None,
+            path=None,
+            problem=f"the environment variable {SWITCH_VARIABLE} is `{SWITCH_OFF}`",
         )
     mujoco = find_mujoco()
     if library.uses_mujoco and mujoco is None:
-        return LoadedLibrary(library=None, path=None, problem="MuJoCo is not installed (install the extra [sim])")
+        return LoadedLibrary(
+            library=None, path=None, problem="MuJoCo is not installed (install the extra [sim])"
+        )
     key = compute_build_key(library, mujoco.version if mujoco else "")
     try:
-        path = Path(setting, make_file_name(library, key)) if setting else _find_compiled_file(library, key)
+        path = (
+            Path(setting, make_file_name(library, key))
+            if setting
+            else _find_compiled_file(library, key)
+        )
         if path is None:
             path = _compile_to_writable_folder(library)
         handle = ctypes.CDLL(str(path))

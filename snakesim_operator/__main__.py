@@ -10,7 +10,9 @@ def _remove_working_folder_from_search_path() -> None:
     if __name__ == "__main__" and not sys.flags.safe_path:
         del sys.path[0]  # `python -m` has put that folder there
     search_path = os.environ.get("PYTHONPATH", "")
-    if search_path and "" in search_path.split(os.pathsep):  # as in PYTHONPATH=/opt/mine:$PYTHONPATH
+    if search_path and "" in search_path.split(
+        os.pathsep
+    ):  # as in PYTHONPATH=/opt/mine:$PYTHONPATH
         try:
             folder = os.getcwd()  # noqa: PTH109 - pathlib itself could be replaced
         except FileNotFoundError:  # it has been deleted

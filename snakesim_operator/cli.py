@@ -15,7 +15,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
-from snakesim_hal.base.terminal import discard_output, print_line, print_stderr, report_error, run_tool
+from snakesim_hal.base.terminal import (
+    discard_output,
+    print_line,
+    print_stderr,
+    report_error,
+    run_tool,
+)
 from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.monitoring import watching
 from snakesim_operator.playback import arguments as playback
@@ -24,7 +30,8 @@ from snakesim_operator.run import arguments as run
 from snakesim_operator.this_computer import setup
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
-HEADINGS = ("daily work", "robot", "runs and studies", "files and computers")  # in the order of the help
+# In the order of the help.
+HEADINGS = "daily work", "robot", "runs and studies", "files and computers"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,7 +46,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return run_tool("snakesim", lambda: _run_command(words, owns_process=argv is None), as_json="--json" in words)
+        return run_tool(
+            "snakesim",
+            lambda: _run_command(words, owns_process=argv is None),
+            as_json="--json" in words,
+        )
     except ModuleNotFoundError as error:
         from snakesim_operator.base.extras import explain_missing_package
 
@@ -97,7 +108,9 @@ def _reject_empty_words(words: list[str]) -> None:
     for previous, word in zip(["", *words], words, strict=False):
         if not word or (word.startswith("--") and word.endswith("=")):
             option = word.rstrip("=") or previous or "the command"
-            raise ConfigError(f"{option}: empty; give a value, or leave it out", code="command/invalid-option")
+            raise ConfigError(
+                f"{option}: empty; give a value, or leave it out", code="command/invalid-option"
+            )
 
 
 def _reject_unknown_command(name: str, parser: "MainParser") -> None:
@@ -140,9 +153,16 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End the process with one line instead of the whole usage."""
-        plain = re.sub(r"invalid float value: (.*)", r"\1 is not a number; give it without a unit", message)
-        plain = re.sub(r"invalid int value: (.*)", r"\1 is not a whole number; give it without a unit", plain)
-        report_error(ConfigError(f"{plain}; see `{self.prog} --help`", code="command/invalid-option"), self.prog)
+        plain = re.sub(
+            r"invalid float value: (.*)", r"\1 is not a number; give it without a unit", message
+        )
+        plain = re.sub(
+            r"invalid int value: (.*)", r"\1 is not a whole number; give it without a unit", plain
+        )
+        report_error(
+            ConfigError(f"{plain}; see `{self.prog} --help`", code="command/invalid-option"),
+            self.prog,
+        )
         sys.exit(BAD_INPUT)
 
 
@@ -157,9 +177,14 @@ class MainParser(CommandParser):
             epilog="`snakesim COMMAND --help` explains a command. Begin with: snakesim run triplet --console",
         )
         self.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version")
-        self.subparsers: Any = self.add_subparsers(required=True, metavar="COMMAND", parser_class=CommandParser)
-        self._subparsers_by_noun: dict[str, Any] = {"": self.subparsers}  # the commands below each noun
-        self._actions_by_heading: dict[str, list[argparse.Action]] = {heading: [] for heading in HEADINGS}
+        self.subparsers: Any = self.add_subparsers(
+            required=True, metavar="COMMAND", parser_class=CommandParser
+        )
+        # The commands below each noun.
+        self._subparsers_by_noun: dict[str, Any] = {"": self.subparsers}
+        self._actions_by_heading: dict[str, list[argparse.Action]] = {
+            heading: [] for heading in HEADINGS
+        }
         for registered in BUILT_IN_COMMANDS:
             self._add_commands(registered)
 
@@ -185,7 +210,9 @@ class MainParser(CommandParser):
         for entry in registered:
             noun, _, word = entry.name.rpartition(" ")
             if noun not in self._subparsers_by_noun:
-                raise ConfigError(f"command {entry.name!r} cannot be added: no Noun {noun!r} is registered before it")
+                raise ConfigError(
+                    f"command {entry.name!r} cannot be added: no Noun {noun!r} is registered before it"
+                )
             siblings = self._subparsers_by_noun[noun]
             if word in siblings.choices:
                 continue
@@ -194,10 +221,14 @@ class MainParser(CommandParser):
             else:
                 _add_command(entry, siblings, word)
             if not noun:
-                self._actions_by_heading.setdefault(entry.heading, []).append(siblings._choices_actions[-1])
+                self._actions_by_heading.setdefault(entry.heading, []).append(
+                    siblings._choices_actions[-1]
+                )
 
     def _add_noun(self, noun: CommandGroup, siblings: Any, word: str) -> None:
-        parser = siblings.add_parser(word, help=_format_list_entry(noun.help), description=noun.help)
+        parser = siblings.add_parser(
+            word, help=_format_list_entry(noun.help), description=noun.help
+        )
         parser.epilog = f"`{parser.prog} COMMAND --help` explains a command."
         self._subparsers_by_noun[noun.name] = parser.add_subparsers(
             required=True, metavar="COMMAND", parser_class=CommandParser
@@ -205,7 +236,9 @@ class MainParser(CommandParser):
 
     def list_commands_by_heading(self) -> list[tuple[str, list[argparse.Action]]]:
         """Return the headings of the help, each with its nouns and commands."""
-        return [(heading, actions) for heading, actions in self._actions_by_heading.items() if actions]
+        return [
+            (heading, actions) for heading, actions in self._actions_by_heading.items() if actions
+        ]
 
     def has_command(self, words: Sequence[str]) -> bool:
         """Return whether the words begin with a command that has been added, not only with a noun."""
@@ -265,7 +298,9 @@ def _format_list_entry(sentence: str) -> str:
 def _format_epilog(command: Command) -> str:
     """Return the text below the options in the help of a command: details, and the examples, one a line."""
     lines = [command.details, ""] if command.details else []
-    return "\n".join([*lines, "examples:", *(f"  snakesim {example}" for example in command.examples)])
+    return "\n".join(
+        [*lines, "examples:", *(f"  snakesim {example}" for example in command.examples)]
+    )
 
 
 def find_subparsers(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:

@@ -70,14 +70,20 @@ COMMANDS: Commands = (
         add=_add_scan,
         run=_scan,
         details="Exit code: 0 a servo answers, 1 none does, 2 wrong input.",
-        examples=("drive scan dynamixel /dev/ttyUSB0", "drive scan dynamixel /dev/ttyUSB0 --baud 1000000 --json"),
+        examples=(
+            "drive scan dynamixel /dev/ttyUSB0",
+            "drive scan dynamixel /dev/ttyUSB0 --baud 1000000 --json",
+        ),
     ),
     Command(
         name="drive emulate dynamixel",
         help="Emulate the Dynamixel servos of a robot, as a process at the other end of pseudo terminals.",
         add=_add_emulation,
         run=_emulate,
-        examples=("drive emulate dynamixel triplet", "drive emulate dynamixel triplet --channel tail --channel head"),
+        examples=(
+            "drive emulate dynamixel triplet",
+            "drive emulate dynamixel triplet --channel tail --channel head",
+        ),
     ),
     Command(
         name="drive load dynamixel",
@@ -92,14 +98,20 @@ COMMANDS: Commands = (
         add=_add_scan,
         run=_scan_feetech,
         details="Exit code: 0 a servo answers, 1 none does, 2 wrong input.",
-        examples=("drive scan feetech /dev/ttyACM0", "drive scan feetech /dev/ttyACM0 --baud 1000000 --json"),
+        examples=(
+            "drive scan feetech /dev/ttyACM0",
+            "drive scan feetech /dev/ttyACM0 --baud 1000000 --json",
+        ),
     ),
     Command(
         name="drive emulate feetech",
         help="Emulate the Feetech servos of a robot, as a process at the other end of pseudo terminals.",
         add=_add_emulation,
         run=_emulate_feetech,
-        examples=("drive emulate feetech triplet", "drive emulate feetech triplet --channel tail --channel head"),
+        examples=(
+            "drive emulate feetech triplet",
+            "drive emulate feetech triplet --channel tail --channel head",
+        ),
     ),
     Command(
         name="drive load feetech",

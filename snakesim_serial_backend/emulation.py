@@ -48,16 +48,22 @@ def emulate_servos(arguments: argparse.Namespace, backend: type[ServoBackend[Any
         *map(parse_set_option, arguments.set),
     ]
     loaded = load_scenario(arguments.scenario, overrides)
-    config = apply_backend_modes(msgspec.structs.replace(loaded.config, clock_mode="realtime"), backend)
+    config = apply_backend_modes(
+        msgspec.structs.replace(loaded.config, clock_mode="realtime"), backend
+    )
     link_paths = [Path(channel) for channel in arguments.channel or ["servos"]]
     settings = decode_backend_settings(config, backend, loaded.table)
     settings = msgspec.structs.replace(settings, ports=[str(link) for link in link_paths])
     with contextlib.ExitStack() as exit_stack:
         ptys = exit_stack.enter_context(create_named_ptys(link_paths))
-        emulator = backend.make_robot_emulator(config, settings, ptys, DriverClock(config), arguments.pose)
+        emulator = backend.make_robot_emulator(
+            config, settings, ptys, DriverClock(config), arguments.pose
+        )
         ends = ", ".join(f"{link} ({pty.path})" for link, pty in zip(link_paths, ptys, strict=True))
         ready = f"servos ready: {len(config.robot.joint_table)} on {ends}"
-        control = EmulatorControl(arguments, emulator.inject_typed, emulator.read_true_state, exit_stack)
+        control = EmulatorControl(
+            arguments, emulator.inject_typed, emulator.read_true_state, exit_stack
+        )
         serve_until_stopped(ready, emulator, partial(select.select, ptys, [], []), control.run)
     return 0
 
@@ -99,7 +105,9 @@ def format_load_table(load: PortLoad) -> Iterator[str]:
             f"{1e3 * load.cycle_s(servos, baud):.1f} ms, {load.compute_max_rate_hz(servos, baud)} Hz"
             for baud in load.rates
         ]
-        yield f"{servos:6}{load.count_cycle_bytes(servos):8}" + "".join(f"{cell:>19}" for cell in cells)
+        yield f"{servos:6}{load.count_cycle_bytes(servos):8}" + "".join(
+            f"{cell:>19}" for cell in cells
+        )
     yield load.note
 
 
@@ -143,4 +151,6 @@ def _make_link(link: Path, target: str) -> None:
             link.unlink()
         link.symlink_to(target)
     except OSError as error:
-        raise ConfigError(f"--channel {link}: {error.strerror}; give another name", code="file/not-writable") from error
+        raise ConfigError(
+            f"--channel {link}: {error.strerror}; give another name", code="file/not-writable"
+        ) from error

@@ -15,7 +15,8 @@ class PortLoad:
     """Bytes, time and rate of a cycle on a port, by one protocol."""
 
     rates: Sequence[int]  # possible baud rates in bit/s
-    count_cycle_bytes: Callable[[int], int]  # on the wire, in both directions, from the number of servos
+    # On the wire, in both directions, from the number of servos.
+    count_cycle_bytes: Callable[[int], int]
     cycle: str  # the requests of a cycle, in words
 
     @property

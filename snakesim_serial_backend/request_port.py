@@ -16,7 +16,8 @@ from snakesim_serial_backend.wire import SerialWire
 
 CHUNK_BYTES = 64  # that an adapter passes on at once
 EXTENDED_GAP_S = 0.25  # silence that ends the wait for an answer before the control cycle runs
-SECOND_ANSWER_GAP_S = 0.02  # silence that ends the wait for a second answer: a return delay is 0.5 ms at most
+# Silence that ends the wait for a second answer: a return delay is 0.5 ms at most.
+SECOND_ANSWER_GAP_S = 0.02
 IDLE_S = 0.05  # silence after which the line is idle
 MAX_DRAIN_S = 1.0  # for a line that never becomes idle
 ATTEMPTS = 3  # to read or write registers before the control cycle runs
@@ -58,9 +59,8 @@ class RequestResponses(NamedTuple, Generic[StatusT]):
     """Everything that arrived after one request to one servo."""
 
     statuses: list[StatusT]  # of that servo: answers to this request
-    surplus_count: (
-        int  # answers of that servo to which no request belongs: two servos have its id, one answers after another
-    )
+    # Answers of that servo to which no request belongs: two servos have its id, one answers after another.
+    surplus_count: int
     garbled: bool  # bytes arrived that are no packet: two servos answer at the same time, or the line is disturbed
 
 
@@ -77,9 +77,8 @@ class RequestPort(ABC, Generic[StatusT]):
         self._response_gap_s = response_gap_s
         self._next_response_gap_s = response_gap_s
         self._received = bytearray()  # since the newest request
-        self._pending_request_times_s: dict[int, deque[float]] = defaultdict(
-            deque
-        )  # when each servo was asked, the oldest first
+        # When each servo was asked, the oldest first.
+        self._pending_request_times_s: dict[int, deque[float]] = defaultdict(deque)
 
     @abstractmethod
     def _make_decoder(self) -> StatusDecoder[StatusT]:
@@ -168,7 +167,9 @@ class RequestPort(ABC, Generic[StatusT]):
         decoder = self._make_decoder()
         statuses: list[StatusT] = []
         surplus_count = 0
-        for status in self._send_request(decoder, request, self._response_gap_s, self._next_response_gap_s):
+        for status in self._send_request(
+            decoder, request, self._response_gap_s, self._next_response_gap_s
+        ):
             is_expected = self._match_response(status.id)
             if status.id != id_:
                 continue
@@ -188,7 +189,9 @@ class RequestPort(ABC, Generic[StatusT]):
         self._record_request(ids)
         doubled_ids: set[int] = set()
         statuses: list[StatusT] = []
-        for status in self._send_request(self._make_decoder(), request, self._response_gap_s, self._response_gap_s):
+        for status in self._send_request(
+            self._make_decoder(), request, self._response_gap_s, self._response_gap_s
+        ):
             if not self._match_response(status.id):
                 doubled_ids.add(status.id)
             elif status.id in ids and len(status.data) == size:
@@ -198,7 +201,11 @@ class RequestPort(ABC, Generic[StatusT]):
         return [status for status in statuses if status.id not in doubled_ids]
 
     def _send_request(
-        self, decoder: StatusDecoder[StatusT], request: bytes, response_gap_s: float, next_response_gap_s: float
+        self,
+        decoder: StatusDecoder[StatusT],
+        request: bytes,
+        response_gap_s: float,
+        next_response_gap_s: float,
     ) -> Iterator[StatusT]:
         """Send a request, and yield the statuses that arrive until the bus is silent.
 
@@ -235,5 +242,7 @@ class RequestPort(ABC, Generic[StatusT]):
         """Forget the requests to a servo whose answers do not arrive any more."""
         pending_request_times_s = self._pending_request_times_s[id_]
         oldest_s = time.monotonic() - MAX_RESPONSE_DELAY_S
-        while pending_request_times_s and (self.wire.has_immediate_responses or pending_request_times_s[0] < oldest_s):
+        while pending_request_times_s and (
+            self.wire.has_immediate_responses or pending_request_times_s[0] < oldest_s
+        ):
             pending_request_times_s.popleft()

@@ -47,7 +47,9 @@ def scan_ports(arguments: argparse.Namespace, scan: PortScan) -> int:
         for baud in _choose_bauds(name, arguments.baud or scan.rates):
             try:
                 wire = SerialWire(name, baud)
-            except BackendError as error:  # an adapter that does not support this rate, or a port in use
+            except (
+                BackendError
+            ) as error:  # an adapter that does not support this rate, or a port in use
                 failures.append(str(error))
                 continue
             try:

@@ -12,8 +12,16 @@ from snakesim_drivers.emulation.drive_emulator import DriveEmulator
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
-from snakesim_drivers.kit.drive_settings import assign_ports, compute_response_timeout_s, make_emulated_body
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, make_bus_specs_by_port
+from snakesim_drivers.kit.drive_settings import (
+    assign_ports,
+    compute_response_timeout_s,
+    make_emulated_body,
+)
+from snakesim_drivers.kit.drive_type import (
+    DriverTypeBackend,
+    DriverTypeContext,
+    make_bus_specs_by_port,
+)
 from snakesim_drivers.kit.drives import Drives
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.model.joints import Joint
@@ -87,7 +95,12 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
 
     @classmethod
     def make_robot_emulator(
-        cls, config: RunConfig, settings: Any, ptys: list[PseudoTerminal], clock: DriverClock, pose_address: str | None
+        cls,
+        config: RunConfig,
+        settings: Any,
+        ptys: list[PseudoTerminal],
+        clock: DriverClock,
+        pose_address: str | None,
     ) -> EmulatorT:
         """Make emulated servos for a whole robot.
 
@@ -119,7 +132,10 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
         bus_by_joint = assign_ports(joints, settings.ports)
         max_servo_count = max(bus_by_joint.count(bus) for bus in set(bus_by_joint))
         cls.port_load.check(
-            max_servo_count, config.rate_hz / settings.decimation, settings.baud, f"backends.{cls.name}"
+            max_servo_count,
+            config.rate_hz / settings.decimation,
+            settings.baud,
+            f"backends.{cls.name}",
         )
 
     @classmethod
@@ -131,7 +147,9 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
         body = context.body
         log = open_log(settings.log, f"backends.{cls.name}.log")
 
-        def open_drives(port_name: str, joint_indices: Sequence[int], readings: DriveReadings) -> Drives:
+        def open_drives(
+            port_name: str, joint_indices: Sequence[int], readings: DriveReadings
+        ) -> Drives:
             """Open a port with the servos of some joints; emulated servos are on a pseudo terminal.
 
             Args:
@@ -144,7 +162,9 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
                 wire = SerialWire(port_name, settings.baud, log)
             else:
                 pty = PseudoTerminal()
-                emulator = cls.make_emulator(list(joints.values()), settings, body, [pty] * len(joints), clock)
+                emulator = cls.make_emulator(
+                    list(joints.values()), settings, body, [pty] * len(joints), clock
+                )
                 wire = SerialWire(pty.path, settings.baud, log, pty, emulator)
             gap_per_period = EMULATED_GAP_PER_PERIOD if is_emulated(wire.port) else GAP_PER_PERIOD
             opened_port = OpenedPort(

@@ -84,7 +84,8 @@ class ServoBusContext(Generic[ServoT, StatusT]):
     servos: Sequence[ServoT]  # of this port, from tail to head
     port: RequestPort[StatusT]  # sends and receives packets
     readings: DriveReadings
-    emulator: DriveEmulator[PseudoTerminal] | None  # the servos, if they are emulated in this process
+    # The servos, if they are emulated in this process.
+    emulator: DriveEmulator[PseudoTerminal] | None
     response_timeout_s: float  # time that a reading waits for answers
     clock_ns: Callable[[], int]
 
@@ -106,10 +107,12 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
         self._readings = context.readings
         self._clock_ns = context.clock_ns
         self._response_timeout_s = context.response_timeout_s
-        self._silent_servos: set[int] = set()  # read one by one, as they would silence others in a sync read
+        # Read one by one, as they would silence others in a sync read.
+        self._silent_servos: set[int] = set()
         self._cycle_count = 0
         self._read_deadline_s = 0.0
-        self._is_brought_up = False  # until bring-up has checked that these are the servos of the robot
+        # Until bring-up has checked that these are the servos of the robot.
+        self._is_brought_up = False
 
     # --- what a driver type implements ------------------------------------------------------------------------
 
@@ -178,7 +181,8 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
             servo.garbled = 0
         if responses.statuses and not responses.surplus_count:
             self._silent_servos.clear()  # perhaps others answer again, too
-            self.handle_response(i, responses.statuses[-1])  # an earlier one is a late answer to an earlier request
+            # An earlier one is a late answer to an earlier request.
+            self.handle_response(i, responses.statuses[-1])
 
     def _read_states(self, indices: Sequence[int]) -> None:
         """Read at once whether these servos have stopped by themselves; a silent one is read again later."""
@@ -190,7 +194,9 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
 
     def _read_next_health(self, indices: list[int]) -> None:
         """Read the health of one of these servos: first of those with an alert whose error is unknown, in turn."""
-        servos_with_unknown_error = [i for i in indices if self.servos[i].alert and not self.servos[i].errors]
+        servos_with_unknown_error = [
+            i for i in indices if self.servos[i].alert and not self.servos[i].errors
+        ]
         candidates = servos_with_unknown_error or indices
         if not candidates:
             return
@@ -215,7 +221,9 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
         findings: list[FaultFinding] = []
         error = self._port.wire.error()
         if error:
-            findings.append(FaultFinding("interface_down", f"{self._port.wire.port}: {error}; {BUS_CUT}"))
+            findings.append(
+                FaultFinding("interface_down", f"{self._port.wire.port}: {error}; {BUS_CUT}")
+            )
         for i, servo in enumerate(self.servos):
             for finding in (_find_response_problem(i, servo), self._find_stop_reason(i)):
                 if finding is not None:
@@ -250,5 +258,10 @@ def _find_response_problem(i: int, servo: SerialServo[Any]) -> FaultFinding | No
         # It concerns the whole robot: which of the two servos is where is unknown.
         return FaultFinding("duplicate_node", f"{servo.label} {RESPONDS_TWICE}", i)
     if servo.garbled >= MAX_BAD_RESPONSES:
-        return FaultFinding("drive_silent", f"{servo.label} sends garbled bytes: {GARBLED}", i, affects_only_joint=True)
+        return FaultFinding(
+            "drive_silent",
+            f"{servo.label} sends garbled bytes: {GARBLED}",
+            i,
+            affects_only_joint=True,
+        )
     return None

@@ -20,7 +20,8 @@ class ServoProbe(DriveProbe, Generic[PortT]):
     """Reads registers of the first servo of a robot."""
 
     has_own_line = False
-    required_registers: ClassVar[Mapping[str, tuple[int, int]]]  # by name: address and value of one byte
+    # By name: address and value of one byte.
+    required_registers: ClassVar[Mapping[str, tuple[int, int]]]
 
     def __init__(self, config: RunConfig, settings: Any, port_class: type[PortT]) -> None:
         """Open the port.

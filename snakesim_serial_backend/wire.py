@@ -25,7 +25,8 @@ REOPEN_PERIOD_S = 0.5  # between two attempts to open a port that is gone
 READ_BYTES = 4096
 WRITE_TIMEOUT_S = 1.0
 DISCONNECTED_EVENTS = select.POLLHUP | select.POLLERR | select.POLLNVAL
-IO_ERRORS = (OSError, termios.error, ValueError)  # of pyserial and of `select`, on a port that is gone
+# Of pyserial and of `select`, on a port that is gone.
+IO_ERRORS = OSError, termios.error, ValueError
 
 # Runs the drives that are emulated in this process: they handle what was sent to them, answer, and let time pass.
 RunDrives = Callable[[], None]
@@ -58,7 +59,8 @@ class PseudoTerminal:
             readable, _, _ = select.select([self._master], [], [], KERNEL_TIMEOUT_S)
             if not readable:
                 raise BackendError(
-                    f"{self.path}: the kernel has not handed on what was written to it", code="bus/io-failed"
+                    f"{self.path}: the kernel has not handed on what was written to it",
+                    code="bus/io-failed",
                 )
             data += self._read()
         return b"" if self._is_cut else data
@@ -66,7 +68,9 @@ class PseudoTerminal:
     def inject(self, kind: str, *, begins: bool) -> None:
         """Start or end the fault "cut", in which nothing passes. Raises ConfigError for other kinds."""
         if kind != "cut":
-            raise ConfigError(f"fault {kind}: a pseudo terminal knows only cut", code="injection/not-supported")
+            raise ConfigError(
+                f"fault {kind}: a pseudo terminal knows only cut", code="injection/not-supported"
+            )
         self._is_cut = begins
 
     def send(self, data: bytes) -> None:
@@ -135,9 +139,8 @@ class SerialWire:
         self._received_bytes = 0
 
         # State of the port.
-        self._last_reopen_attempt_s: float | None = (
-            None  # when a port that is gone was last tried; None: the port is open
-        )
+        # When a port that is gone was last tried; None: the port is open.
+        self._last_reopen_attempt_s: float | None = None
         self._is_cut = False  # by an injected fault
         if not Path(port).exists():
             raise ConfigError(
@@ -148,7 +151,8 @@ class SerialWire:
             self._serial = self._open()
         except IO_ERRORS as error:
             raise BackendError(
-                f"{port}: cannot be opened: {error}. Is another program using it?", code="bus/cannot-open"
+                f"{port}: cannot be opened: {error}. Is another program using it?",
+                code="bus/cannot-open",
             ) from error
         self.latency_s = latency_s(port)
 
@@ -242,9 +246,15 @@ class SerialWire:
 
     def _open(self) -> serial.Serial:
         port = serial.Serial(
-            self.port, self.baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=self._is_exclusive
+            self.port,
+            self.baud,
+            timeout=0,
+            write_timeout=WRITE_TIMEOUT_S,
+            exclusive=self._is_exclusive,
         )
-        with contextlib.suppress(*IO_ERRORS):  # pseudo terminals and some adapters do not have this mode
+        with contextlib.suppress(
+            *IO_ERRORS
+        ):  # pseudo terminals and some adapters do not have this mode
             port.set_low_latency_mode(True)
         return port
 
@@ -296,7 +306,9 @@ class SerialWire:
 
     def _write_log(self, direction: str, data: bytes) -> None:
         if self._log is not None:
-            self._log.write(f"({time.monotonic():.6f}) {self.port} {direction:<3} {data.hex(' ')}\n")
+            self._log.write(
+                f"({time.monotonic():.6f}) {self.port} {direction:<3} {data.hex(' ')}\n"
+            )
 
 
 def is_emulated(port: str) -> bool:
@@ -330,4 +342,6 @@ def open_log(path: str, setting: str) -> TextIO | None:
     try:
         return Path(path).open("w", encoding="utf-8")
     except OSError as error:
-        raise BackendError(f"`{setting}` = {path!r}: {error.strerror}", code="file/not-writable") from error
+        raise BackendError(
+            f"`{setting}` = {path!r}: {error.strerror}", code="file/not-writable"
+        ) from error

@@ -49,7 +49,9 @@ def add_motor(spec: mujoco.MjSpec, joint: Joint, module: ModuleBody, step_s: flo
     # With motor constant 1, volts are rad/s, and the torque at rest under full volts is speed limit / resistance.
     stall_torque_nm = compute_torque_roll_off(joint, module, step_s) * limits.torque_nm
     inputs = mujoco.mjtCtrlInput
-    motor = spec.add_actuator(name=f"motor_{joint.name}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    motor = spec.add_actuator(
+        name=f"motor_{joint.name}", target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+    )
     motor.set_to_dcmotor(
         motorconst=[1.0, 0.0],
         resistance=limits.speed_rad_s / stall_torque_nm,
@@ -60,9 +62,8 @@ def add_motor(spec: mujoco.MjSpec, joint: Joint, module: ModuleBody, step_s: flo
     )
     if joint.motor.latency_s > 0:
         motor.delay = joint.motor.latency_s
-        motor.nsample = (
-            math.ceil(joint.motor.latency_s / step_s) + 1
-        )  # one sample for each physics step, and the newest
+        # One sample for each physics step, and the newest.
+        motor.nsample = math.ceil(joint.motor.latency_s / step_s) + 1
 
 
 def _make_gains_by_mode(joint: Joint, scale: float) -> dict[JointMode, tuple[float, float, float]]:
@@ -76,7 +77,11 @@ def _make_gains_by_mode(joint: Joint, scale: float) -> dict[JointMode, tuple[flo
     max_volts = joint.limits.speed_rad_s
     gains = {
         JointMode.PASSIVE: (0.0, 0.0, 0.0),
-        JointMode.POSITION: (scale * motor.stiffness_nm_per_rad, scale * motor.damping_nm_s_per_rad, max_volts),
+        JointMode.POSITION: (
+            scale * motor.stiffness_nm_per_rad,
+            scale * motor.damping_nm_s_per_rad,
+            max_volts,
+        ),
         JointMode.VELOCITY: (0.0, scale * motor.velocity_gain_nm_s_per_rad, max_volts),
         JointMode.TORQUE: (0.0, 0.0, max_volts),
     }
@@ -115,14 +120,18 @@ class _InputHistory:
     def forget(self, history: Floats, inputs: Floats) -> None:
         """Let the present inputs of a motor be those of all samples, so that they count at once."""
         first = self._start + self.HEADER_NUMBERS + self._sample_count
-        samples = history[first : first + INPUTS_PER_MOTOR * self._sample_count].reshape(-1, INPUTS_PER_MOTOR)
+        samples = history[first : first + INPUTS_PER_MOTOR * self._sample_count].reshape(
+            -1, INPUTS_PER_MOTOR
+        )
         samples[:] = inputs[INPUTS_PER_MOTOR * self._motor : INPUTS_PER_MOTOR * (self._motor + 1)]
 
     def restart_at_time_0(self, history: Floats) -> None:
         """Let the samples be those of the steps before time 0, as at the start of a simulation."""
         history[self._start + 1] = self._sample_count - 1
         first = self._start + self.HEADER_NUMBERS
-        history[first : first + self._sample_count] = self._step_s * np.arange(-self._sample_count, 0)
+        history[first : first + self._sample_count] = self._step_s * np.arange(
+            -self._sample_count, 0
+        )
 
 
 class ModelMotors:
@@ -134,7 +143,12 @@ class ModelMotors:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, data: MotorData, robot: RobotFile, period_s: float, gain_scale: float = 1.0
+        self,
+        model: mujoco.MjModel,
+        data: MotorData,
+        robot: RobotFile,
+        period_s: float,
+        gain_scale: float = 1.0,
     ) -> None:
         """Take control of the motors of a compiled model, and switch them off.
 
@@ -154,7 +168,9 @@ class ModelMotors:
         ]
         self._names = [joint.name for joint in joints]
         self._gains_by_mode = [_make_gains_by_mode(joint, gain_scale) for joint in joints]
-        self._input_histories = [_InputHistory(model, i) for i, joint in enumerate(joints) if joint.motor.latency_s > 0]
+        self._input_histories = [
+            _InputHistory(model, i) for i, joint in enumerate(joints) if joint.motor.latency_s > 0
+        ]
 
         # Views of MuJoCo's arrays.
         self._gains = model.actuator_gainprm[: self.count]
@@ -196,7 +212,9 @@ class ModelMotors:
         """
         self.set_inputs(setpoints.mode, setpoints.target, setpoints.torque_limit_nm)
 
-    def set_inputs(self, modes: list[JointMode], targets: list[float], limits_nm: list[float]) -> None:
+    def set_inputs(
+        self, modes: list[JointMode], targets: list[float], limits_nm: list[float]
+    ) -> None:
         """Drive the simulated motors, as `enact` does; also before a run begins, when no limiter is there yet."""
         has_new_modes = modes != self._modes
         if has_new_modes:
@@ -274,7 +292,9 @@ class ModelMotors:
         """
         for gains, mode, name in zip(self._gains_by_mode, modes, self._names, strict=True):
             if mode not in gains:
-                raise BackendError(f"{name} got a setpoint in {mode.name.lower()} mode, which its drive does not have")
+                raise BackendError(
+                    f"{name} got a setpoint in {mode.name.lower()} mode, which its drive does not have"
+                )
         self._modes = list(modes)
         self._gains[:, [KP, KD, MAX_VOLTS]] = [
             gains[mode] for gains, mode in zip(self._gains_by_mode, modes, strict=True)
@@ -282,7 +302,9 @@ class ModelMotors:
         indices = [INPUTS_PER_MOTOR * i + INPUT_INDEX_BY_MODE[mode] for i, mode in enumerate(modes)]
         self._input_indices = np.array(indices, dtype=np.intp)
         self._passive_indices = [
-            INPUTS_PER_MOTOR * i + TORQUE_INPUT for i, mode in enumerate(modes) if mode == JointMode.PASSIVE
+            INPUTS_PER_MOTOR * i + TORQUE_INPUT
+            for i, mode in enumerate(modes)
+            if mode == JointMode.PASSIVE
         ]
         self._inputs[:] = 0.0
 

@@ -61,11 +61,17 @@ class SimBackend(Backend):
         if config.robot.sensors.power is not None:
             supported_faults.append("overheat")
         else:
-            explanation += ", and without [sensors.power] in the robot file heat would not be measured"
-        validate_faults_for_backend(config, supported_kinds=supported_faults, bus_count=0, reason=explanation)
+            explanation += (
+                ", and without [sensors.power] in the robot file heat would not be measured"
+            )
+        validate_faults_for_backend(
+            config, supported_kinds=supported_faults, bus_count=0, reason=explanation
+        )
         return ("lockstep", "realtime", "free")
 
-    def __init__(self, config: RunConfig, settings: SimSettings, *, laws: LawsVersion | None = None) -> None:
+    def __init__(
+        self, config: RunConfig, settings: SimSettings, *, laws: LawsVersion | None = None
+    ) -> None:
         """Build the scene, place the robot in it, and let it come to rest.
 
         Args:
@@ -97,8 +103,12 @@ class SimBackend(Backend):
         model = self._sim.model
         self._data = mujoco.MjData(model)
         self._physics = PhysicsStepper(self._sim, self._data)
-        self._motors = ModelMotors(model, self._data, config.robot, self._period_s, settings.motor_gain_scale)
-        place_and_settle_robot(self._sim, self._data, self._physics, config, self._motors, settings.settle_s)
+        self._motors = ModelMotors(
+            model, self._data, config.robot, self._period_s, settings.motor_gain_scale
+        )
+        place_and_settle_robot(
+            self._sim, self._data, self._physics, config, self._motors, settings.settle_s
+        )
         self._tether_rope: TetherRope | None = None
         if settings.tether is not None:
             self._tether_rope = TetherRope(model, self._data, settings.tether)
@@ -107,12 +117,18 @@ class SimBackend(Backend):
         # Heat and sensors.
         self._simulates_heat = config.robot.sensors.power is not None
         self._windings = ThermalModel(config.robot.joint_table)
-        self._sensors = SensorSuite(self._sim, self._data, config, self._motors, self._physics, self._windings)
-        self._divergence_watch = DivergenceWatch(model, self._data, self._physics, self._sim.steps_per_tick)
+        self._sensors = SensorSuite(
+            self._sim, self._data, config, self._motors, self._physics, self._windings
+        )
+        self._divergence_watch = DivergenceWatch(
+            model, self._data, self._physics, self._sim.steps_per_tick
+        )
 
         # IMUs cost time, and only their values in the last step of a tick are read.
         self._flags_with_sensors = int(model.opt.disableflags)
-        self._flags_without_sensors = self._flags_with_sensors | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        self._flags_without_sensors = self._flags_with_sensors | int(
+            mujoco.mjtDisableBit.mjDSBL_SENSOR
+        )
         self._steps_without_sensors = 0
         if model.nsensor:
             self._steps_without_sensors = self._sim.steps_per_tick - 1
@@ -162,7 +178,9 @@ class SimBackend(Backend):
 
     def _update_winding_temperatures(self) -> None:
         """Heat the windings for a control period by the torque of its last step, and derate hot joints."""
-        self._windings.advance_temperatures(self._period_s, np.square(self._motors.get_applied_torque_nm()))
+        self._windings.advance_temperatures(
+            self._period_s, np.square(self._motors.get_applied_torque_nm())
+        )
         remaining_fraction = self._windings.compute_remaining_fractions()
         if remaining_fraction is not None:
             self._motors.derate(remaining_fraction)

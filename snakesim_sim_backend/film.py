@@ -71,7 +71,9 @@ class FollowCamera:
             ConfigError: The scene cannot be built, or there is no OpenGL.
         """
         section = config.backends.get("sim", {})
-        settings = decode_plugin_settings(FollowCamera, section, f"run {config.name!r}", "backends.sim")
+        settings = decode_plugin_settings(
+            FollowCamera, section, f"run {config.name!r}", "backends.sim"
+        )
         self._sim = build_sim_model(config, settings)
         self._model = self._sim.model
         self._data = mujoco.MjData(self._model)
@@ -105,7 +107,12 @@ class FollowCamera:
         self._depth = np.zeros((height, width), np.float32)
 
     def render_picture(
-        self, position_w: Floats, wxyz: Floats, angles_rad: Floats, look_at_w: Floats, arrows_w: Sequence[Floats] = ()
+        self,
+        position_w: Floats,
+        wxyz: Floats,
+        angles_rad: Floats,
+        look_at_w: Floats,
+        arrows_w: Sequence[Floats] = (),
     ) -> Picture:
         """Render the robot at a pose, seen from above and behind.
 
@@ -129,12 +136,16 @@ class FollowCamera:
 
         self._gl.make_current()
         categories = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self.camera, categories, self._scene)
+        mujoco.mjv_updateScene(
+            self._model, self._data, self._option, None, self.camera, categories, self._scene
+        )
         self._add_sunlight(look_at_w)
         if self._is_flat:
             self._add_grid(look_at_w)
         for start_w, end_w in arrows_w:
-            self._add_connector(mujoco.mjtGeom.mjGEOM_ARROW, ARROW_WIDTH_M, start_w, end_w, ARROW_COLOR)
+            self._add_connector(
+                mujoco.mjtGeom.mjGEOM_ARROW, ARROW_WIDTH_M, start_w, end_w, ARROW_COLOR
+            )
         mujoco.mjr_render(self._frame, self._scene, self._context)
         mujoco.mjr_readPixels(self._rgb, self._depth, self._frame, self._context)
         picture = self._rgb.copy()
@@ -198,16 +209,25 @@ class FollowCamera:
                 end[across] += k * GRID_CELL_M
                 start[along] -= half_length_m
                 end[along] += half_length_m
-                self._add_connector(mujoco.mjtGeom.mjGEOM_CAPSULE, GRID_LINE_WIDTH_M, start, end, GRID_COLOR)
+                self._add_connector(
+                    mujoco.mjtGeom.mjGEOM_CAPSULE, GRID_LINE_WIDTH_M, start, end, GRID_COLOR
+                )
 
     def _add_connector(
-        self, shape: mujoco.mjtGeom, width_m: float, start_w: Floats, end_w: Floats, rgba: Sequence[float]
+        self,
+        shape: mujoco.mjtGeom,
+        width_m: float,
+        start_w: Floats,
+        end_w: Floats,
+        rgba: Sequence[float],
     ) -> None:
         """Add an arrow or a line from one point to another, unless the picture has MAX_CONNECTORS of them."""
         if self._scene.ngeom >= self._scene.maxgeom:
             return
         geom = self._scene.geoms[self._scene.ngeom]
-        mujoco.mjv_initGeom(geom, shape, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, np.float32))
+        mujoco.mjv_initGeom(
+            geom, shape, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, np.float32)
+        )
         mujoco.mjv_connector(geom, shape, width_m, start_w, end_w)
         self._scene.ngeom += 1
 

@@ -21,7 +21,11 @@ from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.sensors.imu import ImuReader
 from snakesim_sim_backend.sensors.pose import PoseReader
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
-from snakesim_sim_backend.state.divergence import MAX_ACCELERATION, DivergenceWatch, log_mujoco_warnings
+from snakesim_sim_backend.state.divergence import (
+    MAX_ACCELERATION,
+    DivergenceWatch,
+    log_mujoco_warnings,
+)
 from snakesim_sim_backend.state.loads import LinkLoadReader
 from snakesim_sim_backend.state.start import place_and_settle_robot
 
@@ -56,7 +60,9 @@ class MujocoPhysicsModel(PhysicsModel):
         self._model = self._sim.model
         self._data = mujoco.MjData(self._model)
         self.step_s: float = self._model.opt.timestep
-        self._data.qpos[:] = _compute_rest_coordinates(config, settings, yields=bool(self._sim.yielding))
+        self._data.qpos[:] = _compute_rest_coordinates(
+            config, settings, yields=bool(self._sim.yielding)
+        )
         self._physics = PhysicsStepper(self._sim, self._data)
         self._physics.reset()
         if settings.tether is not None:
@@ -68,7 +74,9 @@ class MujocoPhysicsModel(PhysicsModel):
         self._step_count = 0
         self._unchecked_steps = 0
         self._has_diverged = False
-        self._divergence_watch = DivergenceWatch(self._model, self._data, self._physics, STEPS_PER_CHECK, "step")
+        self._divergence_watch = DivergenceWatch(
+            self._model, self._data, self._physics, STEPS_PER_CHECK, "step"
+        )
 
     def _bind_mujoco_arrays(self, config: RunConfig) -> None:
         """Make the views of MuJoCo's arrays that a step reads and writes."""
@@ -118,11 +126,14 @@ class MujocoPhysicsModel(PhysicsModel):
             self._physics.step(1)
         except mujoco.FatalError as error:
             raise BackendError(
-                f"MuJoCo cannot go on at step {self._step_count}: {error}", code="simulator/diverged"
+                f"MuJoCo cannot go on at step {self._step_count}: {error}",
+                code="simulator/diverged",
             ) from error
         self._unchecked_steps += 1
         # Divergence shows here first. It is detected in the same step, because firmware would read NaN otherwise.
-        is_plausible = self._all_accelerations.dot(self._all_accelerations) < MAX_ACCELERATION_SQUARED
+        is_plausible = (
+            self._all_accelerations.dot(self._all_accelerations) < MAX_ACCELERATION_SQUARED
+        )
         if self._unchecked_steps == STEPS_PER_CHECK or not is_plausible:
             self._check_and_store_state()
 
@@ -132,7 +143,8 @@ class MujocoPhysicsModel(PhysicsModel):
         try:
             self._divergence_watch.check(self._step_count)
         except BackendError:
-            self._velocities_before_step[:] = self._all_velocities  # those of the state that the watch has restored
+            # Those of the state that the watch has restored.
+            self._velocities_before_step[:] = self._all_velocities
             raise
         self._has_diverged = False
         self._unchecked_steps = 0
@@ -162,7 +174,9 @@ class MujocoPhysicsModel(PhysicsModel):
         torque_nm = self._motor_torques + self._viscous_torques
         torque_nm -= self._armature * self._joint_accelerations
         if self._joints_with_friction:
-            torque_nm[self._joints_with_friction] += self._data.efc_force[: len(self._joints_with_friction)]
+            torque_nm[self._joints_with_friction] += self._data.efc_force[
+                : len(self._joints_with_friction)
+            ]
         return torque_nm
 
     def loads(self) -> list[LinkLoad]:
@@ -211,7 +225,9 @@ class MujocoPhysicsModel(PhysicsModel):
         return self._data
 
 
-def _compute_rest_coordinates(config: RunConfig, settings: PhysicsModelSettings, *, yields: bool) -> Floats:
+def _compute_rest_coordinates(
+    config: RunConfig, settings: PhysicsModelSettings, *, yields: bool
+) -> Floats:
     """Return the coordinates at which `SimBackend` comes to rest, (nq,): its motors hold the start angles until then.
 
     On rough ground they depend on the step by millimeters, so the step is the default one of `SimBackend`, unless

@@ -44,7 +44,9 @@ class SensorService(Service):
         self._readers = []
         for key, sensor in self._config.robot.sensors.iterate_mounted():
             if key not in published:
-                scope = SensorScope(self._config, self._sim, self._data, make_sensor_rng(key, self._config.seed))
+                scope = SensorScope(
+                    self._config, self._sim, self._data, make_sensor_rng(key, self._config.seed)
+                )
                 self._readers.append((key, make_mounted_reader(key, sensor, scope)))
 
     def outputs(self, clock: Clock) -> list[tuple[str, Message]] | None:
@@ -57,7 +59,9 @@ class SensorService(Service):
         if joints is None or pose is None:
             return None
         self._set_state(joints, pose)
-        return [(key, reader.read(clock.tick, joints.timestamp_ns)) for key, reader in self._readers]
+        return [
+            (key, reader.read(clock.tick, joints.timestamp_ns)) for key, reader in self._readers
+        ]
 
     def _set_state(self, joints: JointState, pose: Pose) -> None:
         """Put the model's robot where the real one is."""

@@ -70,4 +70,6 @@ class PhysicsModelSettings(SimSettings, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         """Reject a gain scale: the motors belong to the firmware."""
         if self.motor_gain_scale != 1.0:
-            raise ValueError("`motor_gain_scale` is of motors in the simulator; those of emulated modules are firmware")
+            raise ValueError(
+                "`motor_gain_scale` is of motors in the simulator; those of emulated modules are firmware"
+            )

@@ -9,7 +9,8 @@ import tempfile
 from snakesim_hal.base.arithmetic import pin_common_arithmetic
 
 if "SNAKESIM_UNPINNED" not in os.environ:  # set by verification/computers/test_computers.py
-    pin_common_arithmetic(one_thread=True)  # so that what is computed in this process is what `snakesim` computes
+    # So that what is computed in this process is what `snakesim` computes.
+    pin_common_arithmetic(one_thread=True)
 
 # What runs leave behind for this user (a latched stop, the list of live robots) must not meet that of other tests.
 _state = tempfile.mkdtemp(prefix="snakesim-tests-")

@@ -68,19 +68,27 @@ class StoredMessages:
         if self._updating:
             return
         hint = f"if this message is right, run `pytest {OPTION} {self._item.nodeid.partition('::')[0]}`"
-        assert number < len(self._stored), f"{FILE} does not hold message {number} of this test: {text}\n{hint}"
+        assert number < len(self._stored), (
+            f"{FILE} does not hold message {number} of this test: {text}\n{hint}"
+        )
         assert text == self._stored[number], hint
 
     def check_count(self) -> None:
         """Raise AssertionError if the file holds more messages than the test compared."""
         extra = len(self._stored) - len(self.checked)
-        assert self._updating or extra <= 0, f"{FILE} holds {extra} messages more than this test has; run with {OPTION}"
+        assert self._updating or extra <= 0, (
+            f"{FILE} holds {extra} messages more than this test has; run with {OPTION}"
+        )
 
     def _replace_varying_parts(self, text: str) -> str:
         if isinstance(self._item, pytest.Function) and "tmp_path" in self._item.funcargs:
             text = text.replace(str(self._item.funcargs["tmp_path"]), "TMP")
-        text = re.sub(r"/[^\s:'\"`]*/pytest-of-[^/\s]+/pytest-\d+/(popen-gw\d+/)?[^/\s:'\"`]*", "TMP", text)
-        text = text.replace(sys.executable, "PYTHON").replace(str(self._item.config.rootpath), "REPOSITORY")
+        text = re.sub(
+            r"/[^\s:'\"`]*/pytest-of-[^/\s]+/pytest-\d+/(popen-gw\d+/)?[^/\s:'\"`]*", "TMP", text
+        )
+        text = text.replace(sys.executable, "PYTHON").replace(
+            str(self._item.config.rootpath), "REPOSITORY"
+        )
         for pattern, name in VARYING:
             text = pattern.sub(name, text)
         return text
@@ -93,7 +101,9 @@ class MessagesPlugin:
         self._path = config.rootpath / FILE
         self._updating = bool(config.getoption(OPTION))
         self._is_worker = hasattr(config, "workerinput")  # of pytest-xdist
-        self._is_partial = bool(config.getoption("keyword")) or any("::" in argument for argument in config.args)
+        self._is_partial = bool(config.getoption("keyword")) or any(
+            "::" in argument for argument in config.args
+        )
         self._stored: dict[str, list[str]] | None = None
         self._new: dict[str, list[str]] = {}
         self.current: StoredMessages | None = None
@@ -111,7 +121,9 @@ class MessagesPlugin:
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
         """Begin with the messages of a test."""
-        if item.get_closest_marker("hypothesis") is not None:  # it runs many examples, with as many texts
+        if (
+            item.get_closest_marker("hypothesis") is not None
+        ):  # it runs many examples, with as many texts
             return
         stored = self.read_stored().get(make_key(item.nodeid), [])
         self.current = StoredMessages(item, stored, updating=self._updating)
@@ -144,10 +156,14 @@ class MessagesPlugin:
         stored = self.read_stored()
         functions = {key.partition("[")[0] for key in self._new}
         kept = {
-            key: texts for key, texts in stored.items() if self._is_partial or key.partition("[")[0] not in functions
+            key: texts
+            for key, texts in stored.items()
+            if self._is_partial or key.partition("[")[0] not in functions
         }
         merged = {key: texts for key, texts in sorted({**kept, **self._new}.items()) if texts}
-        self._path.write_text(json.dumps(merged, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        self._path.write_text(
+            json.dumps(merged, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        )
 
 
 def make_key(nodeid: str) -> str:
@@ -158,7 +174,9 @@ def make_key(nodeid: str) -> str:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option."""
-    parser.addoption(OPTION, action="store_true", help=f"write the messages of the tests that run into {FILE}")
+    parser.addoption(
+        OPTION, action="store_true", help=f"write the messages of the tests that run into {FILE}"
+    )
 
 
 _plugins: list[MessagesPlugin] = []  # of the pytest sessions of this process, the inner one last
@@ -227,7 +245,9 @@ def raises_error(
     if value is not None:
         names.append(str(value))
     for name in names:
-        assert re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text), f"{name!r} is not named in: {text}"
+        assert re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text), (
+            f"{name!r} is not named in: {text}"
+        )
     messages = find_messages()
     if stored and messages is not None:
         shown = f"{text} [{error.code}]" if isinstance(error, SnakesimError) else text

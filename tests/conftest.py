@@ -23,7 +23,9 @@ class FailuresAtOnce:
         terminal = self._config.pluginmanager.get_plugin("terminalreporter")
         if not report.failed or terminal is None:
             return
-        reasons = [line for line in report.longreprtext.splitlines() if line.startswith("E ")] or [""]
+        reasons = [line for line in report.longreprtext.splitlines() if line.startswith("E ")] or [
+            ""
+        ]
         terminal.write_line(f"\nFAILED {report.nodeid}: {reasons[0][1:].strip()}", red=True)
 
 

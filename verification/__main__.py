@@ -35,9 +35,13 @@ PARTS = {
         ("verification.mutation", "--files", "lease.py", "lifecycle.py", "stop_ramp.py"),
     ),
     "decoders": CampaignPart(
-        "100,000 damaged payloads into every decoder", 1, ("verification.fuzz", "--payloads", "100000")
+        "100,000 damaged payloads into every decoder",
+        1,
+        ("verification.fuzz", "--payloads", "100000"),
     ),
-    "sanitizers": CampaignPart("physics tests with a C library that checks itself", 6, ("verification.sanitize",)),
+    "sanitizers": CampaignPart(
+        "physics tests with a C library that checks itself", 6, ("verification.sanitize",)
+    ),
     "contracts": CampaignPart(
         "tools of the campaign, and the rules of who may import whom",
         1,
@@ -68,31 +72,51 @@ PARTS = {
         script=True,
     ),
     "documents": CampaignPart(
-        "every command that the documentation prints", 10, (*PYTEST, "verification/documents", "-m", "")
+        "every command that the documentation prints",
+        10,
+        (*PYTEST, "verification/documents", "-m", ""),
     ),
     "installation": CampaignPart(
         "wheels, extras and left-out packages", 5, (*PYTEST, "verification/installation", "-m", "")
     ),
     "computers": CampaignPart(
-        "the digests under the code of other processors", 4, (*PYTEST, "verification/computers", "-m", "")
+        "the digests under the code of other processors",
+        4,
+        (*PYTEST, "verification/computers", "-m", ""),
     ),
     "commissioning": CampaignPart(
-        "hidden faults of joints", 3, (*PYTEST, "verification/test_commissioning_trials.py", "-m", "")
+        "hidden faults of joints",
+        3,
+        (*PYTEST, "verification/test_commissioning_trials.py", "-m", ""),
     ),
-    "attack": CampaignPart("every attack of an unauthorized client, once", 5, (*PYTEST, "verification/attack")),
-    "links": CampaignPart("bad links between machines (root)", 4, (*PYTEST, "verification/links", "-m", "")),
-    "faults": CampaignPart("the fault table, two trials of each row", 6, ("verification.faults", "--trials", "2")),
+    "attack": CampaignPart(
+        "every attack of an unauthorized client, once", 5, (*PYTEST, "verification/attack")
+    ),
+    "links": CampaignPart(
+        "bad links between machines (root)", 4, (*PYTEST, "verification/links", "-m", "")
+    ),
+    "faults": CampaignPart(
+        "the fault table, two trials of each row", 6, ("verification.faults", "--trials", "2")
+    ),
     "fuzz": CampaignPart(
         "damaged payloads into a running robot",
         3,
         ("verification.fuzz", "--network", "--payloads", "200000"),
     ),
-    "kills": CampaignPart("processes killed and frozen at random", 3, ("verification.soak.kills", "--trials", "20")),
-    "soak": CampaignPart("random faults for three minutes", 4, ("verification.soak", "--minutes", "3")),
+    "kills": CampaignPart(
+        "processes killed and frozen at random", 3, ("verification.soak.kills", "--trials", "20")
+    ),
+    "soak": CampaignPart(
+        "random faults for three minutes", 4, ("verification.soak", "--minutes", "3")
+    ),
     "mutation": CampaignPart(
         "mutants of the rest of the safety core",
         12,
-        ("verification.mutation", "--files", *sorted(TRIED_BY.keys() - {"lease.py", "lifecycle.py", "stop_ramp.py"})),
+        (
+            "verification.mutation",
+            "--files",
+            *sorted(TRIED_BY.keys() - {"lease.py", "lifecycle.py", "stop_ramp.py"}),
+        ),
     ),
 }
 
@@ -106,7 +130,9 @@ def main() -> int:
     asked = parser.parse_args()
     if unknown := set(asked.parts) - PARTS.keys():
         parser.error(f"no part called {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
-    chosen = _fitting([name for name in PARTS if not asked.parts or name in asked.parts], asked.minutes)
+    chosen = _fitting(
+        [name for name in PARTS if not asked.parts or name in asked.parts], asked.minutes
+    )
     if asked.list:
         for name in chosen:
             print(f"{name:<14}{PARTS[name].minutes:>4g} min  {PARTS[name].about}")
@@ -137,8 +163,12 @@ def _run(name: str) -> bool:
     print(f"== {name}: {part.about}", flush=True)
     began_s = time.monotonic()
     words = part.command if part.script else ("-m", *part.command)
-    code = subprocess.run(make_python_command(*words), cwd=ROOT, env=make_child_environment(), check=False).returncode
-    print(f"== {name}: exit code {code} after {(time.monotonic() - began_s) / 60:.1f} min", flush=True)
+    code = subprocess.run(
+        make_python_command(*words), cwd=ROOT, env=make_child_environment(), check=False
+    ).returncode
+    print(
+        f"== {name}: exit code {code} after {(time.monotonic() - began_s) / 60:.1f} min", flush=True
+    )
     return code == 0
 
 

@@ -30,7 +30,10 @@ from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_opti
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Imu, JointMode, JointState
-from snakesim_operator.features.commissioning.identification import JointIdentification, identify_joints
+from snakesim_operator.features.commissioning.identification import (
+    JointIdentification,
+    identify_joints,
+)
 from snakesim_operator.features.commissioning.judge import JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import collect_measurements
 
@@ -66,7 +69,10 @@ class CheckTrial:
         """Whether the right property of every joint with the fault was found wrong, by the right name."""
         name, words = FAULTS[self.fault]
         rows = [self.rows[joint] for joint in self.joints]
-        return all(row.findings[name].state == "wrong" and words in row.findings[name].reason for row in rows)
+        return all(
+            row.findings[name].state == "wrong" and words in row.findings[name].reason
+            for row in rows
+        )
 
     @property
     def blamed(self) -> list[str]:
@@ -81,7 +87,9 @@ class CheckTrial:
         return [f"{row.joint}: {row.summary}" for row in rows if row.list_properties("unknown")]
 
 
-def check_trial(number: int, fault: str, *sets: str, module_count: int = 8, seconds: float = 13.0) -> CheckTrial:
+def check_trial(
+    number: int, fault: str, *sets: str, module_count: int = 8, seconds: float = 13.0
+) -> CheckTrial:
     """Check a robot with a hidden fault. sets: as `--set` of a run."""
     pick = random.Random(number)
     zeros = [pick.uniform(-LAID_RAD, LAID_RAD) for _ in range(module_count)]
@@ -103,7 +111,11 @@ def check_trial(number: int, fault: str, *sets: str, module_count: int = 8, seco
         case _:
             pass
     truth = [*faults, *(f"joint_{i + 1}.zero_rad={zero}" for i, zero in enumerate(zeros))]
-    run = [f"seed={number}", f"scene.ground.friction={pick.uniform(0.2, 0.8)}", f"robot.chain.modules={module_count}"]
+    run = [
+        f"seed={number}",
+        f"scene.ground.friction={pick.uniform(0.2, 0.8)}",
+        f"robot.chain.modules={module_count}",
+    ]
     run += [f"duration_s={seconds}", *(f"backends.can.mounted.{text}" for text in truth)]
     with_fault = {NONE: [], "order": [joint, other]}.get(fault, [joint])
     return CheckTrial(fault, with_fault, _checked("backend=can", *sets, *run))
@@ -123,7 +135,9 @@ def _checked(*sets: str) -> list[JointVerdict]:
         columns = box.layout.decode_rows(rows)
         robot = run.host.description
     ticks = columns.pop("tick").tolist()
-    return judge_joints(collect_measurements(config, robot, ticks, columns, imus), was_laid_straight=True)
+    return judge_joints(
+        collect_measurements(config, robot, ticks, columns, imus), was_laid_straight=True
+    )
 
 
 def check_table(first: int, trial_count: int, *sets: str) -> list[str]:
@@ -135,14 +149,24 @@ def check_table(first: int, trial_count: int, *sets: str) -> list[str]:
         trial = check_trial(number, fault, *sets)
         made.append(trial)
         if trial.blamed or trial.unsure or (trial.joints and not trial.found):
-            said = [f"{trial.rows[joint].joint}: {trial.rows[joint].summary}" for joint in trial.joints]
-            print(f"trial {number}, {fault}: {said}; blamed {trial.blamed}; unsure {trial.unsure}", flush=True)
-    lines = ["| hidden fault | robots | found by name | robots with a sound joint blamed | with one unknown |"]
+            said = [
+                f"{trial.rows[joint].joint}: {trial.rows[joint].summary}" for joint in trial.joints
+            ]
+            print(
+                f"trial {number}, {fault}: {said}; blamed {trial.blamed}; unsure {trial.unsure}",
+                flush=True,
+            )
+    lines = [
+        "| hidden fault | robots | found by name | robots with a sound joint blamed | with one unknown |"
+    ]
     lines.append("|---|---|---|---|---|")
     for fault in kinds:
         those = [trial for trial in made if trial.fault == fault]
         found = "-" if fault == NONE else str(sum(trial.found for trial in those))
-        blamed, unsure = sum(bool(trial.blamed) for trial in those), sum(bool(trial.unsure) for trial in those)
+        blamed, unsure = (
+            sum(bool(trial.blamed) for trial in those),
+            sum(bool(trial.unsure) for trial in those),
+        )
         lines.append(f"| {fault} | {len(those)} | {found} | {blamed} | {unsure} |")
     return lines
 
@@ -156,7 +180,13 @@ IDENTIFY_ROBOT = (
     "robot.motor.viscous_nm_s_per_rad=0.1",
     "robot.motor.torque_constant_nm_per_a=0.5",
 )
-FIELDS = ("friction_nm", "viscous_nm_s_per_rad", "armature_kg_m2", "response_time_s", "torque_constant_nm_per_a")
+FIELDS = (
+    "friction_nm",
+    "viscous_nm_s_per_rad",
+    "armature_kg_m2",
+    "response_time_s",
+    "torque_constant_nm_per_a",
+)
 DRAWN = 0.3  # to either side of the file's value
 LATENCY_S = 0.01
 IMU_RATE_HZ = 5.0  # of joint modules, one after the other
@@ -171,8 +201,10 @@ class IdentifyTrial:
     truth: Mapping[str, MountedDrive]
     found: Sequence[JointIdentification]
     written: int = field(init=False, default=0)  # values
-    covered: int = field(init=False, default=0)  # values that are written, and whose interval covers the truth
-    constants_off: int = field(init=False, default=0)  # torque constants that are written, and off by more than 10 %
+    # Values that are written, and whose interval covers the truth.
+    covered: int = field(init=False, default=0)
+    # Torque constants that are written, and off by more than 10 %.
+    constants_off: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
         """Compare what would be written with the truth."""
@@ -185,12 +217,18 @@ class IdentifyTrial:
                 truth = getattr(self.truth[one.joint], name)
                 self.written += 1
                 self.covered += value.contains(truth)
-                self.constants_off += name == "torque_constant_nm_per_a" and abs(value.value / truth - 1) > 0.1
+                self.constants_off += (
+                    name == "torque_constant_nm_per_a" and abs(value.value / truth - 1) > 0.1
+                )
 
     @property
     def named(self) -> list[int]:
         """Joints that are said to have backlash."""
-        return [joint for joint, one in enumerate(self.found) if any("backlash" in text for text in one.unknown)]
+        return [
+            joint
+            for joint, one in enumerate(self.found)
+            if any("backlash" in text for text in one.unknown)
+        ]
 
 
 def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTrial, IdentifyTrial]:
@@ -206,7 +244,9 @@ def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTr
     loose = pick.randrange(IDENTIFY_MODULES)
     backlash_rad = pick.choice(BACKLASHES_RAD)
     for joint, one in enumerate(config.robot.joint_table):
-        values = {name: getattr(one.motor, name) * pick.uniform(1 - DRAWN, 1 + DRAWN) for name in FIELDS}
+        values = {
+            name: getattr(one.motor, name) * pick.uniform(1 - DRAWN, 1 + DRAWN) for name in FIELDS
+        }
         if backlash and joint == loose:
             values["backlash_rad"] = backlash_rad
         truth[one.name] = MountedDrive(**values)
@@ -233,9 +273,15 @@ def _shaken(
     joints = config.robot.joint_table
     body = EmulatedBody(SharedPhysics(config, physics_model, truth, None), range(len(joints)))
     robot = describe_robot(
-        config.robot, backend="emulator", period_ns=config.period_ns, lease_ns=config.lease_ns, config_hash=""
+        config.robot,
+        backend="emulator",
+        period_ns=config.period_ns,
+        lease_ns=config.lease_ns,
+        config_hash="",
     )
-    controller = Identification(robot, msgspec.convert(config.controller_parameters, IdentifyParameters))
+    controller = Identification(
+        robot, msgspec.convert(config.controller_parameters, IdentifyParameters)
+    )
     noise = np.random.default_rng(config.seed).standard_normal
     sensor = config.robot.sensors.joints
     sigma = np.array([sensor.angle_noise_rad, sensor.velocity_noise_rad_s, sensor.torque_noise_nm])
@@ -249,7 +295,9 @@ def _shaken(
     imu_ticks = round(config.rate_hz / IMU_RATE_HZ)
     waiting: dict[int, list[tuple[int, float]]] = defaultdict(list)  # step -> joint and target
     ticks = round(config.duration_s * config.rate_hz)
-    rows: dict[str, list[Any]] = {name: [] for name in ("angle_rad", "velocity_rad_s", "torque_nm", "target")}
+    rows: dict[str, list[Any]] = {
+        name: [] for name in ("angle_rad", "velocity_rad_s", "torque_nm", "target")
+    }
     link_rates = np.full((ticks, len(joints) + 1, 3), np.nan)
     for tick in range(ticks):
         reporting = [i for i in range(len(joints)) if tick % imu_ticks == 7 * i % imu_ticks]
@@ -258,7 +306,13 @@ def _shaken(
             for i in reporting:
                 rate = np.array(imu.angular_velocity_rad_s[list(imu.link).index(i + 1)])
                 link_rates[tick, i + 1] = rate + GYRO_NOISE_RAD_S * noise(3)
-        state = np.stack((physics_model.angle_rad, physics_model.velocity_rad_s, body.motors.torque_nm * as_measured))
+        state = np.stack(
+            (
+                physics_model.angle_rad,
+                physics_model.velocity_rad_s,
+                body.motors.torque_nm * as_measured,
+            )
+        )
         angle, velocity, torque = (state + sigma[:, None] * noise(state.shape)).tolist()
         joint_state = JointState(
             tick=tick,
@@ -286,10 +340,15 @@ def _shaken(
 
 def identify_table(first: int, trial_count: int, *sets: str) -> list[str]:
     """Return the table of trials with backlash in one of five joints, and without, with IMUs and without."""
-    lines = ["| hidden fault | IMUs | robots | named | named falsely | values written | they cover | constants off |"]
+    lines = [
+        "| hidden fault | IMUs | robots | named | named falsely | values written | they cover | constants off |"
+    ]
     lines.append("|---|---|---|---|---|---|---|---|")
     for backlash in (True, False):
-        made = [identify_trials(number, *sets, backlash=backlash) for number in range(first, first + trial_count)]
+        made = [
+            identify_trials(number, *sets, backlash=backlash)
+            for number in range(first, first + trial_count)
+        ]
         for imus, those in zip(("yes", "no"), zip(*made, strict=True), strict=True):
             lines.append(
                 f"| {'backlash' if backlash else NONE} | {imus} | {_identified_row(those, backlash=backlash)} |"
@@ -313,9 +372,13 @@ def main() -> int:
     tables: dict[str, Callable[..., list[str]]] = {"check": check_table, "identify": identify_table}
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("table", choices=tables)
-    parser.add_argument("--first", type=int, default=1000, help="number of the first trial (default: 1000)")
+    parser.add_argument(
+        "--first", type=int, default=1000, help="number of the first trial (default: 1000)"
+    )
     parser.add_argument("--trials", type=int, default=70, help="default: 70")
-    parser.add_argument("--set", action="append", default=[], dest="sets", metavar="PATH=VALUE", help="as of a run")
+    parser.add_argument(
+        "--set", action="append", default=[], dest="sets", metavar="PATH=VALUE", help="as of a run"
+    )
     arguments = parser.parse_args()
     print("\n".join(tables[arguments.table](arguments.first, arguments.trials, *arguments.sets)))
     return 0

@@ -16,7 +16,10 @@ from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import simulate
 
 PAGE = Path(__file__).parents[1] / "docs" / "concepts" / "gaits.md"
-BEGIN, END = "<!-- from here: made by `python -m verification.gaits --write` -->\n", "<!-- to here -->\n"
+BEGIN, END = (
+    "<!-- from here: made by `python -m verification.gaits --write` -->\n",
+    "<!-- to here -->\n",
+)
 DURATION_S = 10
 HEADER = "| gait | scenario | distance in 10 s, m | speed, body lengths/s | energy, J/m |\n|---|---|---|---|---|\n"
 
@@ -46,7 +49,9 @@ ROWS = (
 def run_row(row: GaitRow, seed: int) -> RunSummary:
     """Run one trial, and return its summary."""
     sets = (f"controller={row.gait}", f"duration_s={DURATION_S}", f"seed={seed}", *row.sets)
-    return simulate(load_scenario(row.scenario, [parse_set_option(text) for text in sets]).config).summary
+    return simulate(
+        load_scenario(row.scenario, [parse_set_option(text) for text in sets]).config
+    ).summary
 
 
 def format_row(row: GaitRow, summaries: Sequence[RunSummary]) -> str:
@@ -78,10 +83,16 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="gaits to run (all)")
     parser.add_argument("--seeds", type=int, default=5, help="number of seeds, from 1 (5)")
     parser.add_argument("--workers", type=int, default=2, help="runs side by side (2)")
-    parser.add_argument("--write", action="store_true", help=f"write the table into {PAGE.name}; only with all gaits")
+    parser.add_argument(
+        "--write",
+        action="store_true",
+        help=f"write the table into {PAGE.name}; only with all gaits",
+    )
     asked = parser.parse_args()
     if unknown := set(asked.names) - {row.gait for row in ROWS}:
-        parser.error(f"no gait called {', '.join(sorted(unknown))}; there are {', '.join(row.gait for row in ROWS)}")
+        parser.error(
+            f"no gait called {', '.join(sorted(unknown))}; there are {', '.join(row.gait for row in ROWS)}"
+        )
     if asked.write and asked.names:
         parser.error("--write needs all gaits: leave the names out")
     table = HEADER

@@ -28,14 +28,19 @@ def main() -> int:
             f"{' and '.join(differing)} of this computer round otherwise than COMMON in "
             "snakesim_hal/base/arithmetic.py."
         )
-        print("If the lock has another NumPy now, change it there, and try again:", json.dumps(measured, indent=4))
+        print(
+            "If the lock has another NumPy now, change it there, and try again:",
+            json.dumps(measured, indent=4),
+        )
         return 1
     found: dict[str, str] = {}
     for name in SCENARIOS:
         found[name] = simulate(
             load_scenario(name, [parse_set_option(f"duration_s={SECONDS}")]).config
         ).summary.command_digest[:16]
-        print(f"{name:<12}{GOLDEN.get(name, 'new'):<18}{found[name]}{'' if GOLDEN.get(name) == found[name] else '  *'}")
+        print(
+            f"{name:<12}{GOLDEN.get(name, 'new'):<18}{found[name]}{'' if GOLDEN.get(name) == found[name] else '  *'}"
+        )
     FILE.write_text(json.dumps(found, indent=2) + "\n")
     return 0
 

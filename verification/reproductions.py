@@ -76,9 +76,13 @@ What is left in the last step is marked as unknown.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run all experiments, and print or write the page. Returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m verification.reproductions", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m verification.reproductions", description=__doc__
+    )
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.name} and its pictures")
-    parser.add_argument("--seeds", type=int, default=5, help="seeds where the result depends on noise (5)")
+    parser.add_argument(
+        "--seeds", type=int, default=5, help="seeds where the result depends on noise (5)"
+    )
     parser.add_argument("--workers", type=int, default=2, help="runs side by side (2)")
     asked = parser.parse_args(arguments)
     found: list[tuple[Experiment, ExperimentFindings]] = []
@@ -88,7 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{experiment.name}: done", file=sys.stderr, flush=True)
         found.append((experiment, findings))
         if asked.write:
-            write_picture(findings.picture, experiment.name, PICTURES / f"reproduce-{experiment.name}.png")
+            write_picture(
+                findings.picture, experiment.name, PICTURES / f"reproduce-{experiment.name}.png"
+            )
     page = make_page(found, asked.seeds)
     if asked.write:
         PAGE.write_text(page, encoding="utf-8")
@@ -113,7 +119,10 @@ def _conclude(comparisons: Sequence[PublishedComparison]) -> str:
     """Return how many values agree, and what differs most."""
     numbers = [comparison for comparison in comparisons if comparison.difference is not None]
     texts = [comparison for comparison in comparisons if comparison.difference is None]
-    largest = max(abs(comparison.difference or 0.0) / abs(float(comparison.published)) for comparison in numbers)
+    largest = max(
+        abs(comparison.difference or 0.0) / abs(float(comparison.published))
+        for comparison in numbers
+    )
     same = sum(comparison.agrees is True for comparison in texts)
     sentence = (
         f"All {len(numbers)} numbers agree within {math.ceil(100 * largest)} %, and {same} of {len(texts)} results "

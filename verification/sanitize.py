@@ -18,7 +18,12 @@ from snakesim_native.load import SWITCH_VARIABLE
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "build" / "sanitized"
 # MuJoCo's headers would replace functions by others that only a MuJoCo with sanitizers has, if they saw this macro.
-SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-U__SANITIZE_ADDRESS__")
+SANITIZERS = (
+    "-fsanitize=address,undefined",
+    "-fno-sanitize-recover=all",
+    "-g",
+    "-U__SANITIZE_ADDRESS__",
+)
 TESTS = (
     "tests/unit/sim_backend",
     "tests/unit/gnc/test_native_growth.py",
@@ -44,7 +49,17 @@ def main() -> int:
         "LD_PRELOAD": " ".join(find_sanitizers()),
         "ASAN_OPTIONS": "detect_leaks=0",  # Python frees little at its end
     }
-    command = [sys.executable, "-m", "pytest", "-q", "--timeout", "1200", "-p", "no:cacheprovider", *arguments.tests]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "--timeout",
+        "1200",
+        "-p",
+        "no:cacheprovider",
+        *arguments.tests,
+    ]
     return subprocess.call(command, cwd=ROOT, env=make_child_environment(environment))
 
 

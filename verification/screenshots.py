@@ -28,10 +28,14 @@ PHONE = 400, 800
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run", help="folder of a recorded run, or what follows `snakesim run`")
     parser.add_argument("out", type=Path, help="the picture, a PNG")
-    parser.add_argument("--at", type=float, default=0.0, metavar="S", help="seconds into the recording")
+    parser.add_argument(
+        "--at", type=float, default=0.0, metavar="S", help="seconds into the recording"
+    )
     parser.add_argument(
         "--after",
         type=float,
@@ -39,9 +43,19 @@ def main() -> None:
         metavar="S",
         help="seconds for the page to draw, without a graphics card (8)",
     )
-    parser.add_argument("--click", action="append", default=[], metavar="LABEL", help="in this order (may be repeated)")
-    parser.add_argument("--signals", default="", metavar="NAMES", help="in the tab Signals: plots are parted by ;")
-    parser.add_argument("--commission", metavar="FILE", help="of a host: RUN is what follows `snakesim start host`")
+    parser.add_argument(
+        "--click",
+        action="append",
+        default=[],
+        metavar="LABEL",
+        help="in this order (may be repeated)",
+    )
+    parser.add_argument(
+        "--signals", default="", metavar="NAMES", help="in the tab Signals: plots are parted by ;"
+    )
+    parser.add_argument(
+        "--commission", metavar="FILE", help="of a host: RUN is what follows `snakesim start host`"
+    )
     parser.add_argument("--scroll", type=int, default=0, metavar="DOTS", help="the panel, at last")
     parser.add_argument("--dark", action="store_true")
     parser.add_argument("--phone", action="store_true")
@@ -57,19 +71,27 @@ def main() -> None:
             tab.size(width, height, scale=2.0, mobile=True)
         tab.wait_for("RECORDING" if recorded else "DISARMED" if given.commission else "armed by")
         time.sleep(given.after)
-        tab.value("document.querySelectorAll('[class*=Notification-closeButton]').forEach(e => e.click())")
+        tab.value(
+            "document.querySelectorAll('[class*=Notification-closeButton]').forEach(e => e.click())"
+        )
         if given.dark:
             tab.click("Dark page")
         for label in [*given.click, *(["Signals"] if given.signals else [])]:
             tab.click(label)
             time.sleep(1.0)
         if given.signals:
-            tab.value(f"document.querySelector('iframe').src = 'signals?within&with#{given.signals}'")
-        tab.value(f"document.querySelectorAll('[class*=viewport]').forEach(e => {{ e.scrollTop += {given.scroll}; }})")
+            tab.value(
+                f"document.querySelector('iframe').src = 'signals?within&with#{given.signals}'"
+            )
+        tab.value(
+            f"document.querySelectorAll('[class*=viewport]').forEach(e => {{ e.scrollTop += {given.scroll}; }})"
+        )
         time.sleep(given.after if recorded or given.scroll else 0.0)
         taken = tab.picture()
     with Image.open(io.BytesIO(taken)) as picture:
-        few = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few = picture.convert("RGB").quantize(
+            256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
         few.save(given.out, optimize=True)  # a quarter of the bytes
 
 
@@ -92,13 +114,20 @@ def commissioning(arguments: str, file: str) -> Iterator[str]:
     endpoint, snakesim = find_free_endpoint(), [sys.executable, "-m", "snakesim_operator"]
     with tempfile.TemporaryDirectory() as state:
         own = {**os.environ, "XDG_STATE_HOME": state}
-        host = subprocess.Popen([*snakesim, "host", *shlex.split(arguments), "--endpoint", endpoint], env=own)
+        host = subprocess.Popen(
+            [*snakesim, "host", *shlex.split(arguments), "--endpoint", endpoint], env=own
+        )
         words = ["console", "--endpoint", endpoint, "--commission", file]
         try:
             wait_until(
-                lambda: subprocess.run([*snakesim, "status", "--endpoint", endpoint]).returncode == 0, "the host"
+                lambda: (
+                    subprocess.run([*snakesim, "status", "--endpoint", endpoint]).returncode == 0
+                ),
+                "the host",
             )
-            with subprocess.Popen([*snakesim, *words], env=own, stdout=subprocess.PIPE, text=True) as console:
+            with subprocess.Popen(
+                [*snakesim, *words], env=own, stdout=subprocess.PIPE, text=True
+            ) as console:
                 assert console.stdout is not None
                 yield console.stdout.readline().split()[1]
                 console.terminate()
@@ -111,7 +140,10 @@ def commissioning(arguments: str, file: str) -> Iterator[str]:
 def live(arguments: str) -> Iterator[str]:
     """A run with its console, and the address."""
     words = [*shlex.split(arguments), "--clock-mode", "realtime", "--console"]
-    with tempfile.TemporaryDirectory() as folder, running_snakesim(Path(folder) / "run", *words) as run:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        running_snakesim(Path(folder) / "run", *words) as run,
+    ):
         yield run.console()
         run.process.terminate()
         run.end()

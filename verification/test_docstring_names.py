@@ -23,7 +23,9 @@ def members_by_class(trees: dict[str, ast.Module]) -> dict[str, set[str]]:
         for node in ast.walk(tree):
             if not isinstance(node, ast.ClassDef):
                 continue
-            bases[node.name] |= {ast.unparse(base).split("[")[0].split(".")[-1] for base in node.bases}
+            bases[node.name] |= {
+                ast.unparse(base).split("[")[0].split(".")[-1] for base in node.bases
+            }
             for inner in ast.walk(node):
                 match inner:
                     case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.Name(id=name):

@@ -41,21 +41,29 @@ WRONG = [  # (folder, import, contract that it breaks)
 ]
 
 
-@pytest.mark.skipif(not LINTER.is_file(), reason="import-linter is not installed in this environment")
+@pytest.mark.skipif(
+    not LINTER.is_file(), reason="import-linter is not installed in this environment"
+)
 def test_a_wrong_import_is_found_at_every_level(tmp_path: Path) -> None:
     shutil.copy(REPOSITORY / "pyproject.toml", tmp_path)
     for package in REPOSITORY.glob("snakesim*/"):
-        shutil.copytree(package, tmp_path / package.name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            package, tmp_path / package.name, ignore=shutil.ignore_patterns("__pycache__")
+        )
     for folder, _, _ in WRONG:
         wrong = sorted({module for place, module, _ in WRONG if place == folder})
         lines = "".join(f"import {module}\n" for module in wrong)
         (tmp_path / folder / "planted.py").write_text(f'"""Breaks rules."""\n\n{lines}')
     (tmp_path / "snakesim_hal" / "in_no_room.py").write_text('"""Where does this belong?"""\n')
     command = [str(LINTER), "--config", "pyproject.toml", "--no-cache"]
-    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False).stdout
+    said = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    ).stdout
     for folder, module, contract in WRONG:
         broken = next(row for row in said.splitlines() if row.startswith(contract))
         assert broken.endswith("BROKEN"), broken
         planted = f"{folder.replace('/', '.')}.planted"
-        assert re.search(rf"{re.escape(planted)} -> {re.escape(module)}\b|{re.escape(planted)}.*{module}", said), said
+        assert re.search(
+            rf"{re.escape(planted)} -> {re.escape(module)}\b|{re.escape(planted)}.*{module}", said
+        ), said
     assert "in_no_room" in said

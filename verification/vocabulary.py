@@ -42,7 +42,9 @@ REPLACEMENTS: dict[str, str] = {
 def count(pattern: str, *paths: str) -> int:
     """Return how often a word stands in tracked files, as a whole word or as a part of an identifier."""
     word = rf"(?<![A-Za-z])({pattern})(?![A-Za-z])"
-    listed = subprocess.run(["git", "ls-files", *paths], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    listed = subprocess.run(
+        ["git", "ls-files", *paths], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
     total = 0
     for name in listed.stdout.splitlines():
         is_ours = "/vendor/" not in name and name not in ("CHANGELOG.md", REJECTED_WORDS)

@@ -51,7 +51,9 @@ EXPLAINED = (
 Percentiles = tuple[float, float]  # p50, p99 in microseconds
 
 
-def ours(way: ConnectionWay, seconds: float, folder: Path, scenario: Sequence[str] = (str(LOOP),)) -> Percentiles:
+def ours(
+    way: ConnectionWay, seconds: float, folder: Path, scenario: Sequence[str] = (str(LOOP),)
+) -> Percentiles:
     """One run of host and controller."""
     with ExitStack() as stack:
         routers(way, stack, folder)
@@ -73,14 +75,21 @@ def ours(way: ConnectionWay, seconds: float, folder: Path, scenario: Sequence[st
                 str(its.fileno()),
             ]
             host = way.robot.start_module(
-                "snakesim_hal.programs.host_program", *flags, *way.host, *out, log=log, inherits=[its.fileno()]
+                "snakesim_hal.programs.host_program",
+                *flags,
+                *way.host,
+                *out,
+                log=log,
+                inherits=[its.fileno()],
             )
         stack.callback(_end, host)
         arm(StarterEnd(mine), host, seconds)
         record = msgspec.json.decode((folder / "host.json").read_bytes(), type=HostRecord)
     p50, p99 = (record.state_to_command_us[name] for name in ("p50", "p99"))
     if record.ended != "complete" or p50 is None or p99 is None:
-        raise RuntimeError(f"stopped after {record.armed_ticks * PERIOD_S:.1f} s: {record.ended_why}")
+        raise RuntimeError(
+            f"stopped after {record.armed_ticks * PERIOD_S:.1f} s: {record.ended_why}"
+        )
     return p50, p99
 
 
@@ -99,12 +108,21 @@ def arm(channel: StarterEnd, host: subprocess.Popen[bytes], seconds: float) -> N
     channel.close()
 
 
-def raw(way: ConnectionWay, seconds: float, folder: Path, state: bytes, command: bytes) -> Percentiles:
+def raw(
+    way: ConnectionWay, seconds: float, folder: Path, state: bytes, command: bytes
+) -> Percentiles:
     """The same with bare Zenoh."""
     with ExitStack() as stack:
         routers(way, stack, folder)
         log, out = folder / "raw.log", folder / "times.json"
-        sizes = ("--bytes", str(len(state)), "--rounds", str(round(seconds / PERIOD_S)), "--out", str(out))
+        sizes = (
+            "--bytes",
+            str(len(state)),
+            "--rounds",
+            str(round(seconds / PERIOD_S)),
+            "--out",
+            str(out),
+        )
         ask = way.robot.start_module(_RAW, "ask", str(way.robot_file), *sizes, log=log)
         stack.callback(_end, ask)
         time.sleep(0.5)  # direct: it listens
@@ -163,7 +181,10 @@ def main() -> None:
         lab = CabledMachines(folder, stack)
         for way in () if arguments.only_slow else lab.ways():
             pairs = [
-                (ours(way, arguments.seconds, folder), raw(way, arguments.seconds, folder, state, command))
+                (
+                    ours(way, arguments.seconds, folder),
+                    raw(way, arguments.seconds, folder, state, command),
+                )
                 for _ in range(arguments.repeats)
             ]
             lines.append(row(way.name, pairs))
@@ -178,16 +199,28 @@ def main() -> None:
             "|---|---|---|---|---|---|---|",
         ]
         print("\n".join(slow), flush=True)
-        lines += [*slow, *slow_link(lab, arguments.seconds, arguments.repeats, folder, state, command), "", *EXPLAINED]
+        lines += [
+            *slow,
+            *slow_link(lab, arguments.seconds, arguments.repeats, folder, state, command),
+            "",
+            *EXPLAINED,
+        ]
     if arguments.write:
         RESULTS.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def slow_link(
-    lab: CabledMachines, seconds: float, repeat_count: int, folder: Path, state: bytes, command: bytes
+    lab: CabledMachines,
+    seconds: float,
+    repeat_count: int,
+    folder: Path,
+    state: bytes,
+    command: bytes,
 ) -> list[str]:
     """The loop over a slow link while a client behind it watches the camera, against quiet: lines of a table."""
-    lab.robot.run(*f"tc qdisc add dev robot root handle 1: tbf rate {RATE_MBIT:g}mbit burst 16kb latency 50ms".split())
+    lab.robot.run(
+        *f"tc qdisc add dev robot root handle 1: tbf rate {RATE_MBIT:g}mbit burst 16kb latency 50ms".split()
+    )
     rows: list[str] = []
     way = lab.one_router()
     for queue in ("bfifo limit 64kb", "pfifo_fast"):
@@ -205,11 +238,16 @@ def slow_link(
             pairs.append((busy, quiet))
             shares.append(share)
         if pairs:
-            rows.append(row(f"`{queue}`", pairs, AIM_SATURATED) + f" {statistics.median(shares):.1f} |")
+            rows.append(
+                row(f"`{queue}`", pairs, AIM_SATURATED) + f" {statistics.median(shares):.1f} |"
+            )
         rows += [f"| `{queue}` | {why} | | | | **missed** | |" for why in stopped]
         print("\n".join(rows[-len(stopped) - bool(pairs) :]), flush=True)
     bare = [
-        (beside_images(way, seconds, folder, state, command), raw(way, seconds, folder, state, command))
+        (
+            beside_images(way, seconds, folder, state, command),
+            raw(way, seconds, folder, state, command),
+        )
         for _ in range(repeat_count)
     ]
     rows.append(row(f"`{queue}`, raw Zenoh", bare, AIM_SATURATED) + " |")
@@ -222,14 +260,18 @@ def watched(way: ConnectionWay, seconds: float, folder: Path) -> tuple[Percentil
     seen = folder / "seen.json"
     with ExitStack() as stack:
         reading = ("--key", IMAGE_MESSAGE_TYPES, "--out", str(seen))
-        viewer = way.workstation.start_module(_RAW, "read", str(way.workstation_file), *reading, log=Path("/dev/null"))
+        viewer = way.workstation.start_module(
+            _RAW, "read", str(way.workstation_file), *reading, log=Path("/dev/null")
+        )
         stack.callback(_end, viewer)
         busy = ours(way, seconds, folder, CAMERA)
         _, size = json.loads(seen.read_text())
     return busy, size * 8e-6 / seconds
 
 
-def beside_images(way: ConnectionWay, seconds: float, folder: Path, state: bytes, command: bytes) -> Percentiles:
+def beside_images(
+    way: ConnectionWay, seconds: float, folder: Path, state: bytes, command: bytes
+) -> Percentiles:
     """Raw Zenoh while a client reads the images of a robot that runs on the same way."""
     with ThreadPoolExecutor(1) as other:
         images = other.submit(watched, way, seconds + 2 * IMAGES_FIRST_S, folder)
@@ -241,7 +283,10 @@ def beside_images(way: ConnectionWay, seconds: float, folder: Path, state: bytes
 
 def row(name: str, pairs: Sequence[tuple[Percentiles, Percentiles]], aim: float = AIM) -> str:
     """A line of the table."""
-    mine, bare = ([statistics.median(one[i] for one in side) for i in (0, 1)] for side in zip(*pairs, strict=True))
+    mine, bare = (
+        [statistics.median(one[i] for one in side) for i in (0, 1)]
+        for side in zip(*pairs, strict=True)
+    )
     ratios = [statistics.median(one[i] / other[i] for one, other in pairs) for i in (0, 1)]
     met = "met" if max(ratios) <= aim else "**missed**"
     return (

@@ -36,7 +36,9 @@ def main() -> None:
         if arguments.part == "answer":
             answer_requests(session, bytes(arguments.bytes), DROP)
         elif arguments.part == "ask":
-            arguments.out.write_text(json.dumps(_ask(session, bytes(arguments.bytes), arguments.rounds)))
+            arguments.out.write_text(
+                json.dumps(_ask(session, bytes(arguments.bytes), arguments.rounds))
+            )
         elif arguments.part == "read":
             _read(session, arguments.key, arguments.out)
         else:

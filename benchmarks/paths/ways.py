@@ -32,7 +32,9 @@ class CabledMachines:
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder = folder
-        self.robot, self.first, self.second, self.workstation = (NamespaceMachine(stack) for _ in range(4))
+        self.robot, self.first, self.second, self.workstation = (
+            NamespaceMachine(stack) for _ in range(4)
+        )
         connect_by_cable(self.first, self.robot, "robot", "10.78.1")
         connect_by_cable(self.first, self.workstation, "desk", "10.78.2")
         connect_by_cable(self.first, self.second, "trunk", "10.78.3")
@@ -43,13 +45,31 @@ class CabledMachines:
         """All of them."""
         two = [
             (self.first, self._file("first", "router", listen=["tcp/0.0.0.0:7447"])),
-            (self.second, self._file("second", "router", listen=["tcp/0.0.0.0:7447"], connect=["tcp/10.78.3.1:7447"])),
+            (
+                self.second,
+                self._file(
+                    "second", "router", listen=["tcp/0.0.0.0:7447"], connect=["tcp/10.78.3.1:7447"]
+                ),
+            ),
         ]
-        tls = [(self.first, self._file("tls-router", "router", listen=["tls/0.0.0.0:7447"], tls=self._certificates()))]
+        tls = [
+            (
+                self.first,
+                self._file(
+                    "tls-router", "router", listen=["tls/0.0.0.0:7447"], tls=self._certificates()
+                ),
+            )
+        ]
         return [
             self._direct(),
             self._by("one router", two[:1], "tcp/10.78.1.1:7447", "tcp/10.78.2.1:7447"),
-            self._by("one router, mTLS", tls, "tls/10.78.1.1:7447", "tls/10.78.2.1:7447", self._certificates()),
+            self._by(
+                "one router, mTLS",
+                tls,
+                "tls/10.78.1.1:7447",
+                "tls/10.78.2.1:7447",
+                self._certificates(),
+            ),
             self._by("two routers", two, "tcp/10.78.1.1:7447", "tcp/10.78.4.1:7447"),
         ]
 
@@ -62,7 +82,9 @@ class CabledMachines:
         own = self._file("direct-robot", "router", listen=[endpoint])
         other = self._file("direct-desk", "client", connect=[endpoint])
         host = ["--endpoint", endpoint, "--insecure"]
-        return ConnectionWay("direct", self.robot, self.workstation, host, ["--endpoint", endpoint], own, other)
+        return ConnectionWay(
+            "direct", self.robot, self.workstation, host, ["--endpoint", endpoint], own, other
+        )
 
     def _by(
         self,
@@ -78,7 +100,9 @@ class CabledMachines:
         host, service = ["--session", str(own)], ["--session", str(other)]
         return ConnectionWay(name, self.robot, self.workstation, host, service, own, other, routers)
 
-    def _file(self, stem: str, mode: str, *, tls: dict[str, Any] | None = None, **ends: list[str]) -> Path:
+    def _file(
+        self, stem: str, mode: str, *, tls: dict[str, Any] | None = None, **ends: list[str]
+    ) -> Path:
         path = self.folder / f"{stem}.json5"
         settings: dict[str, Any] = {"mode": mode, "scouting": QUIET}
         settings |= {verb: {"endpoints": endpoints} for verb, endpoints in ends.items()}
@@ -94,11 +118,44 @@ class CabledMachines:
         authority, key, leaf = (self.folder / name for name in ("ca.pem", "key.pem", "leaf.pem"))
         if not leaf.is_file():
             names = "subjectAltName=IP:10.78.1.1,IP:10.78.2.1"
-            made = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"]
-            own = ["-x509", "-subj", "/CN=lab", "-keyout", self.folder / "ca.key", "-out", authority]
+            made = [
+                "-newkey",
+                "ec",
+                "-pkeyopt",
+                "ec_paramgen_curve:prime256v1",
+                "-nodes",
+                "-days",
+                "2",
+            ]
+            own = [
+                "-x509",
+                "-subj",
+                "/CN=lab",
+                "-keyout",
+                self.folder / "ca.key",
+                "-out",
+                authority,
+            ]
             subprocess.run(["openssl", "req", *made, *own], check=True, capture_output=True)
-            signed = ["-x509", "-CA", authority, "-CAkey", self.folder / "ca.key", "-subj", "/CN=all", "-addext", names]
-            signed += ["-addext", "basicConstraints=critical,CA:FALSE", "-keyout", key, "-out", leaf]
+            signed = [
+                "-x509",
+                "-CA",
+                authority,
+                "-CAkey",
+                self.folder / "ca.key",
+                "-subj",
+                "/CN=all",
+                "-addext",
+                names,
+            ]
+            signed += [
+                "-addext",
+                "basicConstraints=critical,CA:FALSE",
+                "-keyout",
+                key,
+                "-out",
+                leaf,
+            ]
             subprocess.run(["openssl", "req", *made, *signed], check=True, capture_output=True)
         return {
             "root_ca_certificate": str(authority),

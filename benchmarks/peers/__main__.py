@@ -55,7 +55,9 @@ def main() -> int:
     if arguments.inside:
         return _measure(write=arguments.write)
     _install()
-    again = make_python_command("-m", "benchmarks.peers", "--inside", *(["--write"] if arguments.write else []))
+    again = make_python_command(
+        "-m", "benchmarks.peers", "--inside", *(["--write"] if arguments.write else [])
+    )
     user = () if os.geteuid() == 0 else ("--map-root-user",)
     shell = ["sh", "-c", 'ip link set lo up && exec "$@"', "sh"]
     return subprocess.call([*ISOLATED, *user, *shell, *again], env=make_child_environment())
@@ -63,22 +65,40 @@ def main() -> int:
 
 def _install() -> None:
     if not (DORA / "bin/dora").exists():
-        subprocess.run(make_python_command("-m", "venv", str(DORA)), env=make_child_environment(), check=True)
+        subprocess.run(
+            make_python_command("-m", "venv", str(DORA)), env=make_child_environment(), check=True
+        )
         packages = ("dora-rs", "dora-rs-cli", "pyarrow", "numpy")
-        subprocess.run([DORA / "bin/python", "-m", "pip", "install", "--quiet", *packages], check=True)
+        subprocess.run(
+            [DORA / "bin/python", "-m", "pip", "install", "--quiet", *packages], check=True
+        )
     if not _has_rospy():
-        install = ["apt-get", "install", "--yes", "--quiet", "--no-install-recommends", *ROS_PACKAGES]
+        install = [
+            "apt-get",
+            "install",
+            "--yes",
+            "--quiet",
+            "--no-install-recommends",
+            *ROS_PACKAGES,
+        ]
         if os.geteuid() != 0 or subprocess.call(install, stdout=subprocess.DEVNULL) != 0:
             print(f"rospy is left out; to have it: sudo {' '.join(install)}", file=sys.stderr)
 
 
 def _has_rospy() -> bool:
-    return subprocess.call([ROS_PYTHON, "-c", "import rospy, rosmaster, sensor_msgs"], stderr=subprocess.DEVNULL) == 0
+    return (
+        subprocess.call(
+            [ROS_PYTHON, "-c", "import rospy, rosmaster, sensor_msgs"], stderr=subprocess.DEVNULL
+        )
+        == 0
+    )
 
 
 def _measure(*, write: bool) -> int:
     state, command = encode_tick(load_config())
-    prefix = PRIORITY if subprocess.call([*PRIORITY, "true"], stderr=subprocess.DEVNULL) == 0 else ()
+    prefix = (
+        PRIORITY if subprocess.call([*PRIORITY, "true"], stderr=subprocess.DEVNULL) == 0 else ()
+    )
     loop = f"{len(state)} {len(command)} {ROUNDS} {1 / RATE_HZ}"
     candidates: dict[str, Callable[[], list[float]]] = {
         "raw zenoh-python, bytes only": lambda: _zenoh(state, command, prefix),
@@ -103,7 +123,10 @@ def _measure(*, write: bool) -> int:
 
 
 def _table(
-    ours: list[Percentiles], theirs: dict[str, list[Percentiles]], state_bytes: int, command_bytes: int
+    ours: list[Percentiles],
+    theirs: dict[str, list[Percentiles]],
+    state_bytes: int,
+    command_bytes: int,
 ) -> list[str]:
     def row(name: str, found: list[Percentiles]) -> str:
         p50, p99 = (statistics.median(values) for values in zip(*found, strict=True))
@@ -127,7 +150,14 @@ def _table(
 
 def _ours(scenario: str) -> Percentiles:
     """A run in real time: publishing to arrival of the command, and then its check and the decision."""
-    options = ("--clock-mode", "realtime", "--duration", str(ROUNDS / RATE_HZ), "--controller", "hold")
+    options = (
+        "--clock-mode",
+        "realtime",
+        "--duration",
+        str(ROUNDS / RATE_HZ),
+        "--controller",
+        "hold",
+    )
     summary = run(*options, scenario=scenario)
     p50, p99 = (summary.state_to_command_us[name] or 0.0 for name in ("p50", "p99"))
     decided_us = _deciding_us()
@@ -180,16 +210,25 @@ def _dora(loop: str, prefix: tuple[str, ...]) -> list[float]:
     with tempfile.TemporaryDirectory() as folder:
         flow = Path(folder, "dataflow.yml")
         robot = part("robot", "state", "command: controller/command")
-        flow.write_text(f"nodes:\n{robot}{part('controller', 'command', 'state: robot/state')}", encoding="ascii")
+        flow.write_text(
+            f"nodes:\n{robot}{part('controller', 'command', 'state: robot/state')}",
+            encoding="ascii",
+        )
         return _timed([str(DORA.absolute() / "bin/dora"), "run", str(flow)], Path(folder), loop)
 
 
 def _rospy(loop: str, prefix: tuple[str, ...]) -> list[float]:
     with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"ROS_MASTER_URI": "http://127.0.0.1:11311", "ROS_IP": "127.0.0.1", "HOME": folder}
+        environment = os.environ | {
+            "ROS_MASTER_URI": "http://127.0.0.1:11311",
+            "ROS_IP": "127.0.0.1",
+            "HOME": folder,
+        }
         quiet = subprocess.DEVNULL
         environment |= {"PEER_LOOP": loop}
-        master = subprocess.Popen(["rosmaster", "--core"], env=environment, stdout=quiet, stderr=quiet)
+        master = subprocess.Popen(
+            ["rosmaster", "--core"], env=environment, stdout=quiet, stderr=quiet
+        )
         node = [*prefix, ROS_PYTHON, str(HERE / "rospy_node.py")]
         controller = subprocess.Popen([*node, "controller"], env=environment)
         try:
@@ -200,15 +239,21 @@ def _rospy(loop: str, prefix: tuple[str, ...]) -> list[float]:
                 process.wait()
 
 
-def _timed(command: list[str], folder: Path, loop: str, environment: dict[str, str] | None = None) -> list[float]:
+def _timed(
+    command: list[str], folder: Path, loop: str, environment: dict[str, str] | None = None
+) -> list[float]:
     """Run the node that measures, and read what it has written."""
     out = folder / "times"
     env = (environment or dict(os.environ)) | {"PEER_LOOP": loop, "PEER_OUT": str(out)}
-    subprocess.run(command, env=env, cwd=folder, check=True, stdout=subprocess.DEVNULL, timeout=START_LIMIT_S)
+    subprocess.run(
+        command, env=env, cwd=folder, check=True, stdout=subprocess.DEVNULL, timeout=START_LIMIT_S
+    )
     return [float(line) for line in out.read_text(encoding="ascii").splitlines()]
 
 
 if __name__ == "__main__":
     if shutil.which("unshare") is None:
-        raise SystemExit("bench-peers: needs `unshare` (Debian: util-linux), so that nothing leaves loopback")
+        raise SystemExit(
+            "bench-peers: needs `unshare` (Debian: util-linux), so that nothing leaves loopback"
+        )
     raise SystemExit(main())

@@ -26,7 +26,9 @@ def message():
 
 if role == "controller":
     command = rospy.Publisher("command", JointState, queue_size=1, tcp_nodelay=True)
-    rospy.Subscriber("state", JointState, lambda _state: command.publish(message()), tcp_nodelay=True)
+    rospy.Subscriber(
+        "state", JointState, lambda _state: command.publish(message()), tcp_nodelay=True
+    )
     rospy.spin()
 else:
     came = threading.Event()

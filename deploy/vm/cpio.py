@@ -23,7 +23,21 @@ def end() -> bytes:
 def _entry(path: str, mode: int, content: bytes) -> bytes:
     name = path.encode() + b"\0"
     inode = uid = gid = mtime = device = checksum = 0
-    fields = (inode, mode, uid, gid, 1, mtime, len(content), device, device, device, device, len(name), checksum)
+    fields = (
+        inode,
+        mode,
+        uid,
+        gid,
+        1,
+        mtime,
+        len(content),
+        device,
+        device,
+        device,
+        device,
+        len(name),
+        checksum,
+    )
     assert len(fields) == HEADER_FIELDS
     header = b"070701" + b"".join(b"%08X" % field for field in fields)
     return _aligned(_aligned(header + name) + content)

@@ -21,7 +21,8 @@ from deploy.vm.packages import PreparationError, kernel_packages, kernel_version
 
 # What init.sh itself needs, then what a caller can request. Their dependencies stand in the module files.
 BOOT_MODULES = ("9p", "9pnet_virtio", "virtio_pci", "virtio_console", "overlay")
-CAN_MODULES = ("can", "can_raw", "can_bcm", "vcan", "sch_tbf")  # the last one makes a vcan slow, in tests
+# The last one makes a vcan slow, in tests.
+CAN_MODULES = "can", "can_raw", "can_bcm", "vcan", "sch_tbf"
 INPUT_MODULES = ("uinput", "evdev")  # a virtual joystick, in tests
 CONTROLLER_MODULES = ("kvaser_pci",)
 NETWORK_MODULES = ("virtio_net",)
@@ -70,7 +71,11 @@ def load_order(names: Iterable[str], kernel: Kernel) -> list[str]:
             continue
         if name not in kernel.depends:
             raise PreparationError(f"kernel {kernel.version} has no module {name}")
-        order += [needed for needed in (*load_order(kernel.depends[name], kernel), name) if needed not in order]
+        order += [
+            needed
+            for needed in (*load_order(kernel.depends[name], kernel), name)
+            if needed not in order
+        ]
     return order
 
 
@@ -99,7 +104,9 @@ def plain_kernel(image: bytes) -> bytes | None:
         return None
     # Four bytes at the end tell the unpacked size.
     kernel = decompressed(payload if payload.startswith(XZ) else payload[:-4])
-    note = re.compile(struct.pack("<I", 4) + b"[\x04\x08]\0\0\0" + struct.pack("<I", PVH_ENTRY_NOTE) + b"Xen\0")
+    note = re.compile(
+        struct.pack("<I", 4) + b"[\x04\x08]\0\0\0" + struct.pack("<I", PVH_ENTRY_NOTE) + b"Xen\0"
+    )
     return kernel if note.search(kernel) else None
 
 
@@ -108,7 +115,9 @@ def decompressed(content: bytes) -> bytes:
     if content.startswith(XZ):
         return lzma.LZMADecompressor().decompress(content)
     if content.startswith(ZSTD):
-        return subprocess.run([need_tool("zstd"), "-dcq"], input=content, capture_output=True, check=True).stdout
+        return subprocess.run(
+            [need_tool("zstd"), "-dcq"], input=content, capture_output=True, check=True
+        ).stdout
     return content
 
 
@@ -131,8 +140,15 @@ def _fetch(folder: Path) -> Path:
         plain = plain_kernel(image)
         (made / ("vmlinux" if plain else "vmlinuz")).write_bytes(plain or image)
         modules = _collect({module_name(path.name): path for path in files.glob("**/*.ko*")})
-        built_in = {module_name(line) for path in files.glob("**/modules.builtin") for line in path.read_text().split()}
-        listed = {"depends": {n: dependencies(m) for n, m in modules.items()}, "built_in": sorted(built_in)}
+        built_in = {
+            module_name(line)
+            for path in files.glob("**/modules.builtin")
+            for line in path.read_text().split()
+        }
+        listed = {
+            "depends": {n: dependencies(m) for n, m in modules.items()},
+            "built_in": sorted(built_in),
+        }
         (made / "modules.json").write_text(json.dumps(listed))
         (made / "initramfs").write_bytes(_first_files(busybox, modules))
         made.rename(folder / version)

@@ -48,7 +48,14 @@ EMULATION = ("-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max")
 VIRTUALIZATION = ("-accel", "kvm", "-cpu", "host")
 
 # These name places of the host that the guest does not have.
-NOT_FOR_THE_GUEST = {"XDG_RUNTIME_DIR", "DBUS_SESSION_BUS_ADDRESS", "DISPLAY", "WAYLAND_DISPLAY", "SSH_AUTH_SOCK", "_"}
+NOT_FOR_THE_GUEST = {
+    "XDG_RUNTIME_DIR",
+    "DBUS_SESSION_BUS_ADDRESS",
+    "DISPLAY",
+    "WAYLAND_DISPLAY",
+    "SSH_AUTH_SOCK",
+    "_",
+}
 KILL_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 
 
@@ -107,21 +114,29 @@ def first_files(request: Request, environment: Mapping[str, str]) -> bytes:
             cpio.file("init", (SCRIPTS / "init.sh").read_bytes(), 0o755),
             cpio.file("run.d/session.sh", (SCRIPTS / "session.sh").read_bytes()),
             cpio.file("run.d/interfaces.sh", interface_script(request).encode()),
-            cpio.file("run.d/command.sh", command_script(request, environment).encode("utf-8", "surrogateescape")),
+            cpio.file(
+                "run.d/command.sh",
+                command_script(request, environment).encode("utf-8", "surrogateescape"),
+            ),
             cpio.file("run.d/shares", shares.encode("utf-8", "surrogateescape")),
             cpio.end(),
         )
     )
 
 
-def qemu_arguments(request: Request, kernel: Kernel, kvm: bool, initramfs: str, ports: Mapping[str, int]) -> list[str]:
+def qemu_arguments(
+    request: Request, kernel: Kernel, kvm: bool, initramfs: str, ports: Mapping[str, int]
+) -> list[str]:
     """QEMU's command line. `ports`: the number of an open socket for each of PORTS."""
     modules = [*BOOT_MODULES, *CAN_MODULES, *INPUT_MODULES]
     shares = ["-fsdev", "local,id=root,path=/,security_model=none,readonly=on,multidevs=remap"]
     shares += ["-device", "virtio-9p-pci,fsdev=root,mount_tag=root"]
     for number, path in enumerate(request.writable):
         escaped = str(path).replace(",", ",,")
-        shares += ["-fsdev", f"local,id=share{number},path={escaped},security_model=none,multidevs=remap"]
+        shares += [
+            "-fsdev",
+            f"local,id=share{number},path={escaped},security_model=none,multidevs=remap",
+        ]
         shares += ["-device", f"virtio-9p-pci,fsdev=share{number},mount_tag=share{number}"]
     talk = ["-device", "virtio-serial-pci"]
     for name, number in ports.items():
@@ -134,12 +149,23 @@ def qemu_arguments(request: Request, kernel: Kernel, kvm: bool, initramfs: str, 
     network = []
     if request.forward:
         modules += NETWORK_MODULES
-        rules = "".join(f",hostfwd=tcp:127.0.0.1:{outer}-:{inner}" for outer, inner in request.forward)
-        network = ["-netdev", f"user,id=net,restrict=on{rules}", "-device", "virtio-net-pci,netdev=net,romfile="]
+        rules = "".join(
+            f",hostfwd=tcp:127.0.0.1:{outer}-:{inner}" for outer, inner in request.forward
+        )
+        network = [
+            "-netdev",
+            f"user,id=net,restrict=on{rules}",
+            "-device",
+            "virtio-net-pci,netdev=net,romfile=",
+        ]
     controllers = []
     if request.controllers:
         modules += CONTROLLER_MODULES
-        controllers = ["-object", "can-bus,id=canbus0", *("-device", "kvaser_pci,canbus=canbus0") * len(CONTROLLERS)]
+        controllers = [
+            "-object",
+            "can-bus,id=canbus0",
+            *("-device", "kvaser_pci,canbus=canbus0") * len(CONTROLLERS),
+        ]
     options = f"{KERNEL_OPTIONS} snakesim_modules={','.join(load_order(modules, kernel))}"
     return [
         need_tool("qemu-system-x86_64"),
@@ -204,7 +230,9 @@ class Guest:
         deadline = time.monotonic() + limit_s
         while not self._ready:
             if time.monotonic() > deadline:
-                raise GuestError(f"the guest did not boot within {limit_s:.0f} s{self._last_words()}")
+                raise GuestError(
+                    f"the guest did not boot within {limit_s:.0f} s{self._last_words()}"
+                )
             self._pass_on(timeout_s=0.5)
 
     def run(self) -> int:
@@ -215,7 +243,10 @@ class Guest:
             self._pass_on(timeout_s=None)
         code, promised = self._ended
         deadline = time.monotonic() + DRAIN_LIMIT_S
-        while any(self._passed[name] < promised[name] for name in promised) and time.monotonic() < deadline:
+        while (
+            any(self._passed[name] < promised[name] for name in promised)
+            and time.monotonic() < deadline
+        ):
             self._pass_on(timeout_s=0.5)
         return code
 
@@ -227,7 +258,10 @@ class Guest:
 
     def _pass_on(self, timeout_s: float | None) -> None:
         """Handle what has arrived from the guest."""
-        handlers: dict[str, Callable[[bytes], None]] = {"control": self._obey, "console": self._note}
+        handlers: dict[str, Callable[[bytes], None]] = {
+            "control": self._obey,
+            "console": self._note,
+        }
         for key, _ in self._selector.select(timeout_s):
             port = key.fileobj
             assert isinstance(port, socket.socket)

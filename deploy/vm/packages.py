@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 TOOLS = {"qemu-system-x86_64": "qemu-system-x86", "ip": "iproute2"}
-KERNEL_PACKAGES = ("linux-image-amd64", "linux-image-generic")  # Debian's and Ubuntu's; the cloud images have no CAN
+# Debian's and Ubuntu's; the cloud images have no CAN.
+KERNEL_PACKAGES = "linux-image-amd64", "linux-image-generic"
 APT_LIMIT_S = 900
 
 
@@ -27,7 +28,9 @@ def need_tool(name: str) -> str:
         return found
     install = ["apt-get", "install", "--yes", "--no-install-recommends", TOOLS.get(name, name)]
     if os.geteuid() != 0:
-        raise PreparationError(f"{name} is missing. Run: sudo apt-get update && sudo {' '.join(install)}")
+        raise PreparationError(
+            f"{name} is missing. Run: sudo apt-get update && sudo {' '.join(install)}"
+        )
     print(f"with_vcan: installing {install[-1]}", file=sys.stderr)
     if _apt(install).returncode:
         update_lists()
@@ -53,7 +56,9 @@ def kernel_version() -> str:
             listed = _apt(["apt-cache", "depends", package]).stdout
             if found := re.search(r"Depends: linux-image-(\d\S*)", listed):
                 return found[1]
-    raise PreparationError(f"apt knows none of {', '.join(KERNEL_PACKAGES)}: only Debian and Ubuntu on x86-64 will do")
+    raise PreparationError(
+        f"apt knows none of {', '.join(KERNEL_PACKAGES)}: only Debian and Ubuntu on x86-64 will do"
+    )
 
 
 def kernel_packages(version: str) -> list[str]:

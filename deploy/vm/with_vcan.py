@@ -70,10 +70,13 @@ def native_prefix(channels: list[str]) -> list[str] | None:
     enter = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--map-root-user"]
     ip = shlex.quote(find_tool("ip") or "ip")
     bring_up = " && ".join(
-        f"{ip} link add {name} type vcan && {ip} link set {name} up" for name in map(shlex.quote, channels)
+        f"{ip} link add {name} type vcan && {ip} link set {name} up"
+        for name in map(shlex.quote, channels)
     )
     prefix = [*enter, "sh", "-c", f'{ip} link set lo up && {bring_up} && exec "$@"', "sh"]
-    tried = subprocess.run([*prefix, "true"], stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    tried = subprocess.run(
+        [*prefix, "true"], stdin=subprocess.DEVNULL, capture_output=True, check=False
+    )
     return prefix if tried.returncode == 0 else None
 
 
@@ -132,14 +135,34 @@ def kvm_works(kernel: Kernel) -> bool:
 
 
 def _parsed() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--channels", type=names, default=["vcan0"], help="default: vcan0; or vcan0,vcan1,...")
-    parser.add_argument("--guest", action="store_true", help="use a guest even if this kernel has CAN")
-    parser.add_argument("--verbose", action="store_true", help="show the messages of the guest's kernel")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--channels", type=names, default=["vcan0"], help="default: vcan0; or vcan0,vcan1,..."
+    )
+    parser.add_argument(
+        "--guest", action="store_true", help="use a guest even if this kernel has CAN"
+    )
+    parser.add_argument(
+        "--verbose", action="store_true", help="show the messages of the guest's kernel"
+    )
     guest = parser.add_argument_group("in the guest only")
-    guest.add_argument("--controllers", action="store_true", help="two emulated controllers, can0 and can1, on one bus")
-    guest.add_argument("--forward", type=ports, action="append", default=[], metavar="HOSTPORT:GUESTPORT")
-    guest.add_argument("--rwdir", type=Path, action="append", default=[], help="one more folder that may be written")
+    guest.add_argument(
+        "--controllers",
+        action="store_true",
+        help="two emulated controllers, can0 and can1, on one bus",
+    )
+    guest.add_argument(
+        "--forward", type=ports, action="append", default=[], metavar="HOSTPORT:GUESTPORT"
+    )
+    guest.add_argument(
+        "--rwdir",
+        type=Path,
+        action="append",
+        default=[],
+        help="one more folder that may be written",
+    )
     guest.add_argument("--cpus", type=int, default=2, help="default: 2")
     guest.add_argument("--memory", default="2G", help="default: 2G")
     parser.usage = "with_vcan.py [options] -- COMMAND ..."
@@ -166,7 +189,9 @@ def names(text: str) -> list[str]:
 def ports(text: str) -> tuple[int, int]:
     """The host's and the guest's port, as in `17447:7447`."""
     outer, _, inner = text.partition(":")
-    if not (outer.isdigit() and inner.isdigit() and 0 < int(outer) < 65536 and 0 < int(inner) < 65536):
+    if not (
+        outer.isdigit() and inner.isdigit() and 0 < int(outer) < 65536 and 0 < int(inner) < 65536
+    ):
         raise argparse.ArgumentTypeError(f"{text!r}: two ports of 1 to 65535, as in 17447:7447")
     return int(outer), int(inner)
 

@@ -162,7 +162,14 @@ PAGES = (
         "print(f\"{result.metrics['advance_m']:.2f} m, digest {result.digest[:16]}\")\n"
         'print(result["angle_rad.joint_7"].max(), result.units["angle_rad"])\n',
         {
-            "snakesim": ("run", "load", "Result", "Robot", "compute_body_points_w", "use_common_arithmetic"),
+            "snakesim": (
+                "run",
+                "load",
+                "Result",
+                "Robot",
+                "compute_body_points_w",
+                "use_common_arithmetic",
+            ),
             "snakesim.chart": ("Chart",),
             "snakesim_operator.robot_commands.parameters": ("RobotParameter",),
         },
@@ -216,7 +223,13 @@ PAGES = (
             ),
             "snakesim_hal.controller": ("SensorSamples", "Task"),
             "snakesim_hal.wire.setpoints": ("RequestedSetpoints",),
-            "snakesim_hal.wire.messages": ("JointMode", "JointState", "WorldModel", "WorldContact", "Trajectory"),
+            "snakesim_hal.wire.messages": (
+                "JointMode",
+                "JointState",
+                "WorldModel",
+                "WorldContact",
+                "Trajectory",
+            ),
         },
     ),
     Page(
@@ -267,7 +280,11 @@ PAGES = (
         DRIVER_EXAMPLE,
         {
             "snakesim_drivers.kit.drives": ("Drives", "BusCommand"),
-            "snakesim_drivers.kit.drive_type": ("DriverTypeBackend", "DriverTypeContext", "make_bus_specs_by_port"),
+            "snakesim_drivers.kit.drive_type": (
+                "DriverTypeBackend",
+                "DriverTypeContext",
+                "make_bus_specs_by_port",
+            ),
             "snakesim_drivers.kit.drive_settings": ("DriveSettings",),
             "snakesim_drivers.kit.start_up": ("StartUp", "StartUpStep", "StepFailedError"),
             "snakesim_drivers.kit.holding_brakes": ("HoldingBrakes", "BrakePlan"),

@@ -15,7 +15,15 @@ from typing import Any
 import msgspec
 
 from docs.site.api_contents import COMPLETE_MODULES, INTERNAL, PAGES, Page
-from docs.site.python_source import Attribute, Class, Docstring, Function, Parameter, read_class, read_function
+from docs.site.python_source import (
+    Attribute,
+    Class,
+    Docstring,
+    Function,
+    Parameter,
+    read_class,
+    read_function,
+)
 from snakesim_hal.model.field_docs import document_fields
 
 FOLDER = Path(__file__).parents[2] / "docs" / "reference" / "api"
@@ -87,7 +95,9 @@ def _describe_class(name: str, documented: type) -> Iterator[str]:
         yield from _describe_struct(documented)
     elif source.attributes:
         yield from _describe_attributes(source)
-    if source.constructor is not None and (source.constructor.parameters or source.constructor.docstring.text):
+    if source.constructor is not None and (
+        source.constructor.parameters or source.constructor.docstring.text
+    ):
         source.constructor.returns = ""
         yield from ("", f"### {name} constructor", "", "```python")
         yield from (format_signature(source.constructor, name), "```", "")
@@ -96,7 +106,15 @@ def _describe_class(name: str, documented: type) -> Iterator[str]:
         if method.is_property:
             yield from ("", f"### {name}.{method.name}", "", f"*Property*, `{method.returns}`.", "")
         else:
-            yield from ("", f"### {name}.{method.name}", "", "```python", format_signature(method), "```", "")
+            yield from (
+                "",
+                f"### {name}.{method.name}",
+                "",
+                "```python",
+                format_signature(method),
+                "```",
+                "",
+            )
         yield from _describe_function(method)
 
 
@@ -104,7 +122,13 @@ def _describe_struct(struct: type[msgspec.Struct]) -> Iterator[str]:
     docs = document_fields(struct)
     if not docs:
         return
-    yield from ("", "Its fields:", "", "| Field | Type | Unit | Default | Meaning |", "|---|---|---|---|---|")
+    yield from (
+        "",
+        "Its fields:",
+        "",
+        "| Field | Type | Unit | Default | Meaning |",
+        "|---|---|---|---|---|",
+    )
     for doc in docs:
         default = "*required*" if doc.default is None else f"`{doc.default}`"
         cells = (f"`{doc.name}`", doc.type_words, doc.unit, default, doc.description)
@@ -118,7 +142,13 @@ def _describe_attributes(source: Class) -> Iterator[str]:
             yield from ("", f"**{attribute.name}**: `{attribute.annotation}`{default}", "")
             yield format_text(attribute.meaning)
         return
-    yield from ("", "Its attributes:", "", "| Attribute | Type | Default | Meaning |", "|---|---|---|---|")
+    yield from (
+        "",
+        "Its attributes:",
+        "",
+        "| Attribute | Type | Default | Meaning |",
+        "|---|---|---|---|",
+    )
     for attribute in source.attributes:
         default = f"`{attribute.default}`" if attribute.default else "*required*"
         if attribute.default.startswith("field("):
@@ -160,7 +190,9 @@ def format_signature(function: Function, name: str = "") -> str:
             parts.append("*")
         annotation = f": {parameter.annotation}" if parameter.annotation else ""
         equals = " = " if annotation else "="
-        parts.append(f"{parameter.name}{annotation}{equals + parameter.default if parameter.default else ''}")
+        parts.append(
+            f"{parameter.name}{annotation}{equals + parameter.default if parameter.default else ''}"
+        )
     returns = f" -> {function.returns}" if function.returns else ""
     one_line = f"{name or function.name}({', '.join(parts)}){returns}"
     if len(one_line) <= 88:
@@ -249,12 +281,19 @@ def find_undocumented() -> list[str]:
 
 def _find_unlisted() -> Iterator[str]:
     """Yield the public names of complete modules that are on no page and not internal."""
-    listed = {id(find(module, name)) for page in PAGES for module, names in page.names.items() for name in names}
+    listed = {
+        id(find(module, name))
+        for page in PAGES
+        for module, names in page.names.items()
+        for name in names
+    }
     for module_name in COMPLETE_MODULES:
         module = importlib.import_module(module_name)
         names = getattr(module, "__all__", None)
         if names is None:
-            names = [name for name, value in vars(module).items() if _is_defined_in(value, module_name)]
+            names = [
+                name for name, value in vars(module).items() if _is_defined_in(value, module_name)
+            ]
         for name in names:
             is_public = not name.startswith("_") and name not in INTERNAL.get(module_name, ())
             if is_public and id(getattr(module, name)) not in listed:
@@ -274,9 +313,15 @@ def _find_gaps(name: str, documented: Any) -> Iterator[str]:
     if not source.docstring.text:
         yield f"{name}: no docstring"
     if issubclass(documented, msgspec.Struct):
-        yield from (f"{name}.{doc.name}: no meaning" for doc in document_fields(documented) if not doc.description)
+        yield from (
+            f"{name}.{doc.name}: no meaning"
+            for doc in document_fields(documented)
+            if not doc.description
+        )
     else:
-        yield from (f"{name}.{part.name}: no meaning" for part in source.attributes if not part.meaning)
+        yield from (
+            f"{name}.{part.name}: no meaning" for part in source.attributes if not part.meaning
+        )
     for method in source.methods:
         yield from _find_function_gaps(f"{name}.{method.name}", method)
     if source.constructor is not None:
@@ -291,7 +336,11 @@ def _find_function_gaps(name: str, function: Function, *, needs_text: bool = Tru
         if not parameter.meaning and len(function.parameters) > 1:
             yield f"{name}: parameter {parameter.name} has no meaning"
     known = {parameter.name.lstrip("*") for parameter in function.parameters}
-    yield from (f"{name}: no parameter {argument}" for argument in docstring.arguments if argument not in known)
+    yield from (
+        f"{name}: no parameter {argument}"
+        for argument in docstring.arguments
+        if argument not in known
+    )
 
 
 if __name__ == "__main__":

@@ -31,7 +31,8 @@ SHOWN = (
     "snakesim_gnc/guidance",
     "snakesim_hal/host/control_cycle.py",
 )
-FENCE = re.compile(r"^(```\w+) +(\S.*)$", re.MULTILINE)  # a block, and a file's name or where it is typed
+# A block, and a file's name or where it is typed.
+FENCE = re.compile(r"^(```\w+) +(\S.*)$", re.MULTILINE)
 TITLES = {"background": "in a terminal of its own", "of root": "as root", "by hand": ""}
 
 
@@ -42,7 +43,9 @@ def main() -> None:
         (PAGES / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / file, PAGES / file)
         if file.suffix == ".md":
-            (PAGES / file).write_text(FENCE.sub(titled, (ROOT / file).read_text(encoding="utf-8")), encoding="utf-8")
+            (PAGES / file).write_text(
+                FENCE.sub(titled, (ROOT / file).read_text(encoding="utf-8")), encoding="utf-8"
+            )
     (PAGES / "assets").mkdir()
     for asset in ("iframe-worker.js", "site.css"):
         shutil.copy(ROOT / "docs" / "site" / asset, PAGES / "assets")
@@ -60,7 +63,9 @@ def titled(fence: re.Match[str]) -> str:
 def shown_files() -> Iterator[Path]:
     """Every tracked or new file of the folders that pages link to."""
     command = ("git", "ls-files", "--cached", "--others", "--exclude-standard", "--", *SHOWN)
-    for name in subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines():
+    for name in subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.splitlines():
         if (ROOT / name).is_file() and not name.startswith(("docs/site/", "docs/style/")):
             yield Path(name)
 
@@ -68,7 +73,9 @@ def shown_files() -> Iterator[Path]:
 def run(module: str, *arguments: str, **variables: str) -> None:
     """Run a module of this environment's Python, and end with it if it fails."""
     ended = subprocess.run(
-        make_python_command("-m", module, *arguments), cwd=ROOT, env=make_child_environment(variables)
+        make_python_command("-m", module, *arguments),
+        cwd=ROOT,
+        env=make_child_environment(variables),
     )
     if ended.returncode:
         sys.exit(f"docs: {module} {' '.join(arguments)} exited with {ended.returncode}")

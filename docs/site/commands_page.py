@@ -30,7 +30,9 @@ def make_page() -> str:
     lines: list[str] = []
     for heading, actions in parser.list_commands_by_heading():
         for action in actions:
-            lines.append(f"| [`snakesim {action.dest}`](#snakesim-{action.dest}) | {heading} | {about[action.dest]} |")
+            lines.append(
+                f"| [`snakesim {action.dest}`](#snakesim-{action.dest}) | {heading} | {about[action.dest]} |"
+            )
     for name in about:
         lines += describe_all(find_subparsers(parser)[name])
     return HEAD + "\n".join(lines) + "\n"

@@ -54,7 +54,11 @@ FILES: dict[str, tuple[type[msgspec.Struct], str]] = {
     "Lab file": (LabFile, "A lab is described in [a lab](../how-to/lab.md)."),
 }
 PLUGINS = {
-    CONTROLLERS: ("Controllers", "controllers", "The parameters of a controller, in a scenario file."),
+    CONTROLLERS: (
+        "Controllers",
+        "controllers",
+        "The parameters of a controller, in a scenario file.",
+    ),
     BACKENDS: ("Backends", "backends", "The settings of a backend, in a scenario file."),
     PHYSICS_MODELS: (
         "Physics models",
@@ -120,7 +124,11 @@ def _structs_at(info: inspect.Type, path: str) -> Iterator[tuple[str, type[msgsp
     """Yield the Structs that a field holds, each with its heading, such as `[limits]`, `[[box]]` or `[joints.NAME]`."""
     for option in list_union_members(info):
         if isinstance(option, inspect.StructType):
-            kind = f" with `{option.tag_field} = {format_value(option.tag)}`" if option.tag_field else ""
+            kind = (
+                f" with `{option.tag_field} = {format_value(option.tag)}`"
+                if option.tag_field
+                else ""
+            )
             yield f"`[{path}]`{kind}", option.cls
         elif isinstance(option, inspect.ListType | inspect.DictType):
             (*_, entry_type) = list_item_types(option)
@@ -142,7 +150,9 @@ def _table(struct: type[msgspec.Struct]) -> list[str]:
     if issubclass(struct, FileStruct) and struct.exceptions_to:
         sections = ", ".join(f"`[{section.__name__.lower()}]`" for section in struct.exceptions_to)
         note = ["", EXCEPTIONS.format(sections=sections)]
-        of_sections = {name for section in struct.exceptions_to for name in section.__struct_fields__}
+        of_sections = {
+            name for section in struct.exceptions_to for name in section.__struct_fields__
+        }
         docs = [doc for doc in docs if doc.name not in of_sections]
     if not docs:
         return ["It has no keys."]
@@ -151,7 +161,14 @@ def _table(struct: type[msgspec.Struct]) -> list[str]:
 
 
 def _row(doc: FieldDoc) -> str:
-    cells = [f"`{doc.name}`", doc.type_words, doc.unit, _default(doc), doc.range_words, doc.description]
+    cells = [
+        f"`{doc.name}`",
+        doc.type_words,
+        doc.unit,
+        _default(doc),
+        doc.range_words,
+        doc.description,
+    ]
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 

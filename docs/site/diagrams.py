@@ -88,7 +88,9 @@ WIRINGS = {
 def draw_wiring(wiring: Wiring) -> Drawing:
     """Return a computer, its adapter, the drives on their bus, and the power with its switch."""
     drawing = Drawing(920, 330, wiring.title)
-    drawing.box(20, 40, 170, 80, f"robot's computer\nsnakesim start host\n{wiring.ports}", "computer")
+    drawing.box(
+        20, 40, 170, 80, f"robot's computer\nsnakesim start host\n{wiring.ports}", "computer"
+    )
     drawing.box(230, 45, 150, 70, wiring.adapter)
     drawing.line((190, 80), (230, 80))
     drawing.text(210, 72, "USB", anchor="middle")
@@ -108,7 +110,11 @@ def draw_wiring(wiring: Wiring) -> Drawing:
     for x in fed:
         drawing.line((x, 265), (x, 186), kind="power")
     drawing.box(
-        20, 230, 130, 70, "motor supply\n" + ("in the bus cable" if wiring.chained_power else "one for all drives")
+        20,
+        230,
+        130,
+        70,
+        "motor supply\n" + ("in the bus cable" if wiring.chained_power else "one for all drives"),
     )
     drawing.line((150, 265), (175, 265), kind="power")
     drawing.box(175, 235, 155, 60, "emergency switch\nwithin reach", "stop")
@@ -118,14 +124,21 @@ def draw_wiring(wiring: Wiring) -> Drawing:
 
 def draw_overview() -> Drawing:
     """Return the same controller in front of a simulator, of emulated drives and of real drives."""
-    drawing = Drawing(920, 300, "One controller in front of a simulator, emulated drives or real drives")
+    drawing = Drawing(
+        920, 300, "One controller in front of a simulator, emulated drives or real drives"
+    )
     drawing.box(20, 105, 170, 80, "your controller\nguidance, navigation\nand control", "yours")
     drawing.box(270, 105, 170, 80, "HAL host\nlease, lifecycle,\ncommand limiter", "computer")
     drawing.line((190, 145), (270, 145), arrow=True)
     drawing.text(230, 137, "Zenoh", anchor="middle")
     rows = (
         (20, "--backend sim", "MuJoCo simulator", "plain"),
-        (118, "--backend odrive", "driver and emulated drives\nthe real protocol, no motor", "drive"),
+        (
+            118,
+            "--backend odrive",
+            "driver and emulated drives\nthe real protocol, no motor",
+            "drive",
+        ),
         (216, 'with channels = ["can0"]', "driver and real drives\nmotors move", "stop"),
     )
     for y, option, text, kind in rows:
@@ -137,7 +150,11 @@ def draw_overview() -> Drawing:
 
 def draw_qualification() -> Drawing:
     """Return what takes part in the first hour with a drive: a host, a second program, the drive and the record."""
-    drawing = Drawing(920, 250, "Qualification of one drive: the command, the host, a second program and the record")
+    drawing = Drawing(
+        920,
+        250,
+        "Qualification of one drive: the command, the host, a second program and the record",
+    )
     drawing.box(20, 70, 190, 80, "snakesim drive qualify\ninstructs and measures", "yours")
     drawing.box(300, 20, 190, 70, "HAL host\nlease, command limiter", "computer")
     drawing.box(300, 130, 190, 70, "second program\npolls the drive", "plain")
@@ -156,7 +173,11 @@ def draw_qualification() -> Drawing:
 
 def draw_mixed() -> Drawing:
     """Return a robot with drives of two types, on three buses."""
-    drawing = Drawing(920, 300, "One robot with ODrive axes on two CAN buses and Dynamixel servos on a serial port")
+    drawing = Drawing(
+        920,
+        300,
+        "One robot with ODrive axes on two CAN buses and Dynamixel servos on a serial port",
+    )
     drawing.box(20, 110, 150, 80, "HAL host\nbackend mixed", "computer")
     rows = (
         (20, "can0", "ODrive", "joint_1 to joint_6", "100 Hz, thread of its own"),
@@ -175,7 +196,9 @@ def draw_mixed() -> Drawing:
 def draw_cable() -> Drawing:
     """Return the travel of a joint: its limits, and how far its cable may be wound."""
     drawing = Drawing(
-        920, 200, "Travel of a joint without end stops: its limits, and cable_turns to either side of zero"
+        920,
+        200,
+        "Travel of a joint without end stops: its limits, and cable_turns to either side of zero",
     )
     drawing.fill(120, 70, 680, 40, "far")
     drawing.fill(250, 70, 420, 40, "zone")
@@ -236,7 +259,11 @@ def draw_driver() -> Drawing:
 
 def draw_backend() -> Drawing:
     """Return the calls of a backend over the life of a run."""
-    drawing = Drawing(920, 250, "The calls of a backend: check, the constructor, then four calls a cycle, and close")
+    drawing = Drawing(
+        920,
+        250,
+        "The calls of a backend: check, the constructor, then four calls a cycle, and close",
+    )
     drawing.box(20, 90, 130, 70, "check\nbefore the run,\nopens nothing", "yours")
     drawing.box(180, 90, 130, 70, "__init__\nopens the robot", "yours")
     drawing.box(770, 90, 130, 70, "close\nmotors off", "yours")
@@ -262,7 +289,9 @@ def draw_backend() -> Drawing:
 def draw_contract() -> Drawing:
     """Return one suite of tests in front of many backends."""
     drawing = Drawing(920, 260, "One contract suite tests every backend")
-    drawing.box(20, 90, 220, 80, "contract suite\none set of tests,\none set of tolerances", "computer")
+    drawing.box(
+        20, 90, 220, 80, "contract suite\none set of tests,\none set of tolerances", "computer"
+    )
     backends = (
         ("sim", "plain"),
         ("can", "drive"),
@@ -280,7 +309,11 @@ def draw_contract() -> Drawing:
 
 def draw_lab() -> Drawing:
     """Return two robots, a router, and three people with different rights."""
-    drawing = Drawing(920, 330, "Two robots, a router that checks certificates, and three people with different rights")
+    drawing = Drawing(
+        920,
+        330,
+        "Two robots, a router that checks certificates, and three people with different rights",
+    )
     drawing.box(380, 20, 160, 290, "router\n\nchecks the\ncertificate of\neach process", "computer")
     robots = ((30, "anna"), (190, "bert"))
     for y, name in robots:
@@ -304,7 +337,9 @@ def draw_lab() -> Drawing:
 
 def draw_tour() -> Drawing:
     """Return the lessons of the tour in their order."""
-    drawing = Drawing(920, 200, "The six lessons of the tour, from the first run to a controller that pushes")
+    drawing = Drawing(
+        920, 200, "The six lessons of the tour, from the first run to a controller that pushes"
+    )
     lessons = (
         "first run",
         "explore\nand compare",
@@ -314,7 +349,9 @@ def draw_tour() -> Drawing:
         "a controller\nthat pushes",
     )
     kinds = ("plain", "plain", "computer", "stop", "yours", "yours")
-    for number, (x, lesson, kind) in enumerate(zip(spread(10, 775, 6), lessons, kinds, strict=True)):
+    for number, (x, lesson, kind) in enumerate(
+        zip(spread(10, 775, 6), lessons, kinds, strict=True)
+    ):
         drawing.box(x, 60, 130, 70, f"{number + 1}\n{lesson}", kind)
         if number:
             drawing.line((x - 23, 95), (x, 95), arrow=True)

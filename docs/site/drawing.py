@@ -35,7 +35,9 @@ class Drawing:
         self._title = title
         self._parts: list[str] = []
 
-    def box(self, x: float, y: float, width: float, height: float, text: str, kind: str = "plain") -> None:
+    def box(
+        self, x: float, y: float, width: float, height: float, text: str, kind: str = "plain"
+    ) -> None:
         """Draw a box with centered text: the first line is bold, and the others are small.
 
         Args:
@@ -46,7 +48,9 @@ class Drawing:
             text: Lines of text.
             kind: "plain", "computer", "drive", "yours" or "stop".
         """
-        self._parts.append(f'<rect class="{kind}" x="{x}" y="{y}" width="{width}" height="{height}" rx="8"/>')
+        self._parts.append(
+            f'<rect class="{kind}" x="{x}" y="{y}" width="{width}" height="{height}" rx="8"/>'
+        )
         lines = text.split("\n")
         top = y + height / 2 - LINE_PX * (len(lines) - 1) / 2 + 5
         for number, line in enumerate(lines):
@@ -55,7 +59,9 @@ class Drawing:
 
     def fill(self, x: float, y: float, width: float, height: float, kind: str) -> None:
         """Draw an area without a border, of the kind "zone" or "far"."""
-        self._parts.append(f'<rect class="{kind}" x="{x}" y="{y}" width="{width}" height="{height}"/>')
+        self._parts.append(
+            f'<rect class="{kind}" x="{x}" y="{y}" width="{width}" height="{height}"/>'
+        )
 
     def line(self, *points: Point, kind: str = "a", arrow: bool = False) -> None:
         """Draw a line of the kind "a", "bus", "power" or "no" along some points."""

@@ -5,7 +5,11 @@ import math
 import numpy as np
 
 from docs.site.drawing import Drawing
-from snakesim_gnc.control.gaits.backbones import BackboneSidewindingParameters, compute_arc, compute_helix
+from snakesim_gnc.control.gaits.backbones import (
+    BackboneSidewindingParameters,
+    compute_arc,
+    compute_helix,
+)
 from snakesim_gnc.control.gaits.concertina import ConcertinaParameters, compute_fold_fractions
 from snakesim_gnc.control.gaits.rectilinear import RectilinearParameters
 from snakesim_gnc.control.gaits.serpenoid import SerpenoidParameters, compute_serpenoid_headings
@@ -20,7 +24,9 @@ MIDDLES_FROM_HEAD = 1.0 - 0.5 * (PLACES[1:] + PLACES[:-1])
 
 def draw_gait_curves() -> Drawing:
     """Return six curves, of each the body at three phases, with its head to the right."""
-    drawing = Drawing(920, 520, "Body curves of six gaits at three phases each, the head to the right")
+    drawing = Drawing(
+        920, 520, "Body curves of six gaits at three phases each, the head to the right"
+    )
     panels = (
         ("serpenoid, cpg", "from above", _list_serpenoid()),
         ("concertina", "from above: transfer, draw, extend", _list_concertina()),
@@ -39,7 +45,8 @@ def draw_gait_curves() -> Drawing:
             x, y = curve
             y = y - 0.5 * (y.max() + y.min())
             points = [
-                (round(left + LENGTH_PX * a, 1), round(middle - LENGTH_PX * b, 1)) for a, b in zip(x, y, strict=True)
+                (round(left + LENGTH_PX * a, 1), round(middle - LENGTH_PX * b, 1))
+                for a, b in zip(x, y, strict=True)
             ]
             drawing.line(*points, kind="bus")
             head_x, head_y = points[-1]
@@ -59,7 +66,9 @@ def _list_serpenoid():
     p = SerpenoidParameters()
     phases = (0.0, math.tau / 3, 2 * math.tau / 3)
     return [
-        _integrate(compute_serpenoid_headings(MIDDLES_FROM_HEAD, phase, p.winding_angle_rad, p.wavelength))
+        _integrate(
+            compute_serpenoid_headings(MIDDLES_FROM_HEAD, phase, p.winding_angle_rad, p.wavelength)
+        )
         for phase in phases
     ]
 
@@ -78,7 +87,10 @@ def _list_concertina():
 def _list_rectilinear():
     p = RectilinearParameters()
     phases = (0.0, math.tau / 3, 2 * math.tau / 3)
-    return [_integrate(p.slope_rad * np.cos(phase + math.tau * MIDDLES_FROM_HEAD / p.wavelength)) for phase in phases]
+    return [
+        _integrate(p.slope_rad * np.cos(phase + math.tau * MIDDLES_FROM_HEAD / p.wavelength))
+        for phase in phases
+    ]
 
 
 def _list_lifts():

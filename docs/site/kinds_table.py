@@ -40,7 +40,11 @@ def table() -> str:
     """A row a kind."""
     rows = ["| target | kind | effect | amount | carried out by |", "|---|---|---|---|---|"]
     for sort, kinds in FAULT_KINDS.items():
-        target = f"{sort}: {TARGETS[sort]}" if sort in ("process", "key", "joint", "bus") else TARGETS[sort]
+        target = (
+            f"{sort}: {TARGETS[sort]}"
+            if sort in ("process", "key", "joint", "bus")
+            else TARGETS[sort]
+        )
         for name, kind in kinds.items():
             amount = "" if kind.amount is None else _amount(kind.amount)
             doers = ", else ".join(EXECUTOR_DESCRIPTIONS[doer] for doer in kind.executors)
@@ -53,13 +57,18 @@ def drive_table() -> str:
     """Return the table of faults that emulated drives and their buses have, with a row for each drive type."""
     rows = ["| `--backend` | in an emulated drive | on its bus | in samples |", "|---|---|---|---|"]
     in_samples = [
-        name for name, kind in FAULT_KINDS["joint"].items() if "samples" in kind.executors and name not in FAULTS
+        name
+        for name, kind in FAULT_KINDS["joint"].items()
+        if "samples" in kind.executors and name not in FAULTS
     ]
     for name in DRIVE_TYPES:
         backend = load_backend_class(name)
         assert issubclass(backend, DriverTypeBackend)
         on_bus = {*backend.list_bus_faults(backend.Settings()), "slow"}
-        cells = [" ".join(f"`{kind}`" for kind in kinds) for kinds in (FAULTS, sorted(on_bus), in_samples)]
+        cells = [
+            " ".join(f"`{kind}`" for kind in kinds)
+            for kinds in (FAULTS, sorted(on_bus), in_samples)
+        ]
         rows.append(f"| `{name}` | {' | '.join(cells)} |")
     return "\n".join(rows) + "\n"
 

@@ -1,7 +1,7 @@
 """Reads classes and functions from their source, as the pages of the Python API show them.
 
 The source keeps what a running program does not have: annotations and defaults as they are written, and the meaning of
-an attribute, which is the text after it or the comment on its line.
+an attribute, which is the text after it, the comment on its line, or the comment above it.
 """
 
 import ast
@@ -45,7 +45,8 @@ class Function:
     parameters: list[Parameter]
     returns: str  # the annotation
     docstring: Docstring
-    keyword_only: int | None = None  # index of the first parameter that needs its name; None: there is none
+    # Index of the first parameter that needs its name; None: there is none.
+    keyword_only: int | None = None
     is_property: bool = False
 
 
@@ -93,7 +94,9 @@ def read_class(plugin: type) -> Class:
         elif isinstance(part, ast.FunctionDef):
             function = _make_function(part)
             if not function.docstring.text:
-                function.docstring = parse_docstring(inspect.getdoc(getattr(plugin, part.name, None)) or "")
+                function.docstring = parse_docstring(
+                    inspect.getdoc(getattr(plugin, part.name, None)) or ""
+                )
             if part.name == "__init__":
                 constructor = function
             elif not part.name.startswith("_") or part.name == "__getitem__":
@@ -105,6 +108,16 @@ def _parse(thing: Any) -> ast.Module:
     return ast.parse(textwrap.dedent(inspect.getsource(thing)))
 
 
+def _read_comment_above(lines: list[str], line_number: int) -> str:
+    """Return the comment that ends on the line before the given one, without its marks."""
+    comment: list[str] = []
+    for line in reversed(lines[: line_number - 1]):
+        if not line.lstrip().startswith("#"):
+            break
+        comment.insert(0, line.strip().lstrip("# "))
+    return " ".join(comment).removesuffix(".")
+
+
 def _make_attribute(node: ast.AnnAssign, following: ast.stmt | None, lines: list[str]) -> Attribute:
     assert isinstance(node.target, ast.Name)
     meaning = ""
@@ -114,6 +127,8 @@ def _make_attribute(node: ast.AnnAssign, following: ast.stmt | None, lines: list
         last_line = lines[(node.end_lineno or node.lineno) - 1]
         code_length = len(last_line.encode()[: node.end_col_offset].decode())
         meaning = last_line[code_length:].partition("#")[2].strip()
+        if not meaning:
+            meaning = _read_comment_above(lines, node.lineno)
     default = "" if node.value is None else _shorten(ast.unparse(node.value))
     return Attribute(node.target.id, _shorten(ast.unparse(node.annotation)), default, meaning)
 
@@ -121,7 +136,9 @@ def _make_attribute(node: ast.AnnAssign, following: ast.stmt | None, lines: list
 def _make_function(node: ast.FunctionDef) -> Function:
     decorators = {ast.unparse(decorator).rpartition(".")[2] for decorator in node.decorator_list}
     docstring = parse_docstring(ast.get_docstring(node) or "")
-    parameters = [parameter for parameter in _list_parameters(node) if parameter.name not in ("self", "cls")]
+    parameters = [
+        parameter for parameter in _list_parameters(node) if parameter.name not in ("self", "cls")
+    ]
     for parameter in parameters:
         parameter.meaning = docstring.arguments.get(parameter.name.lstrip("*"), "")
     returns = "" if node.returns is None else ast.unparse(node.returns).strip("'\"")
@@ -133,8 +150,13 @@ def _make_function(node: ast.FunctionDef) -> Function:
 def _list_parameters(node: ast.FunctionDef) -> list[Parameter]:
     arguments = node.args
     positional = [*arguments.posonlyargs, *arguments.args]
-    defaults: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults)) + list(arguments.defaults)
-    found = [_make_parameter(argument, default) for argument, default in zip(positional, defaults, strict=True)]
+    defaults: list[ast.expr | None] = [None] * (len(positional) - len(arguments.defaults)) + list(
+        arguments.defaults
+    )
+    found = [
+        _make_parameter(argument, default)
+        for argument, default in zip(positional, defaults, strict=True)
+    ]
     if arguments.vararg:
         found.append(_make_parameter(arguments.vararg, None, "*"))
     for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True):
@@ -145,8 +167,12 @@ def _list_parameters(node: ast.FunctionDef) -> list[Parameter]:
 
 
 def _make_parameter(argument: ast.arg, default: ast.expr | None, stars: str = "") -> Parameter:
-    annotation = "" if argument.annotation is None else ast.unparse(argument.annotation).strip("'\"")
-    return Parameter(stars + argument.arg, annotation, "" if default is None else ast.unparse(default))
+    annotation = (
+        "" if argument.annotation is None else ast.unparse(argument.annotation).strip("'\"")
+    )
+    return Parameter(
+        stars + argument.arg, annotation, "" if default is None else ast.unparse(default)
+    )
 
 
 def _shorten(code: str) -> str:

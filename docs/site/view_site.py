@@ -85,10 +85,16 @@ CHECK = r"""
 
 def main() -> int:
     """Check the pages and make the sheets."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("under", nargs="*", default=[""], help="only pages whose path begins like this")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "under", nargs="*", default=[""], help="only pages whose path begins like this"
+    )
     parser.add_argument("--every", action="store_true", help="both color schemes at both widths")
-    parser.add_argument("--whole", action="store_true", help="continue a long page in further tiles of its sheet")
+    parser.add_argument(
+        "--whole", action="store_true", help="continue a long page in further tiles of its sheet"
+    )
     arguments = parser.parse_args()
     shutil.rmtree(COPY, ignore_errors=True)
     shutil.copytree(SITE, COPY)
@@ -122,17 +128,23 @@ def check(pages: list[Path], arguments: argparse.Namespace) -> Iterator[str]:
 
 def list_pages() -> list[Path]:
     """Return the pages of the site, relative to it; the links of 404.html begin at the address of a published site."""
-    return sorted(page.relative_to(COPY) for page in COPY.rglob("*.html") if page.name != "404.html")
+    return sorted(
+        page.relative_to(COPY) for page in COPY.rglob("*.html") if page.name != "404.html"
+    )
 
 
 def find_broken_links(page: Path) -> Iterator[str]:
     """Yield every link of a page to a file or an anchor that the site does not have."""
     text = (COPY / page).read_text(encoding="utf-8")
-    for link in dict.fromkeys(re.findall(r"""<(?:a|img|link|script)\b[^>]*?\b(?:href|src)=["']?([^"'\s>]+)""", text)):
+    for link in dict.fromkeys(
+        re.findall(r"""<(?:a|img|link|script)\b[^>]*?\b(?:href|src)=["']?([^"'\s>]+)""", text)
+    ):
         address = urlparse(link)
         if address.scheme or address.netloc:
             continue
-        target = (COPY / page.parent / unquote(address.path)).resolve() if address.path else COPY / page
+        target = (
+            (COPY / page.parent / unquote(address.path)).resolve() if address.path else COPY / page
+        )
         if not target.exists():
             yield f"broken link: {link}"
         elif address.fragment and target.suffix == ".html":
@@ -141,7 +153,9 @@ def find_broken_links(page: Path) -> Iterator[str]:
                 yield f"broken anchor: {link}"
 
 
-def view(tab: BrowserTab, page: Path, sheets: dict[tuple[int, str], "Sheets"], max_tiles: int) -> Iterator[str]:
+def view(
+    tab: BrowserTab, page: Path, sheets: dict[tuple[int, str], "Sheets"], max_tiles: int
+) -> Iterator[str]:
     """Yield the problems of a page in every view, and put its pictures on the sheets."""
     open_page(tab, page)
     for (width, scheme), sheet in sheets.items():
@@ -162,7 +176,8 @@ def show(tab: BrowserTab, width: int, scheme: str, tiles: int = 1) -> None:
     """Give the window a width and the height of some tiles, and the page a color scheme."""
     tab.size(width, tiles * WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
     attribute = json.dumps("slate" if scheme == "dark" else "default")
-    tab.value(f"document.body.setAttribute('data-md-color-scheme', {attribute})")  # as the theme's own button does
+    # As the theme's own button does.
+    tab.value(f"document.body.setAttribute('data-md-color-scheme', {attribute})")
     time.sleep(0.2)  # until it is laid out
 
 
@@ -171,11 +186,16 @@ def open_page(tab: BrowserTab, page: Path) -> None:
     tab.send("Page.navigate", url=f"file://{COPY / page}")
     deadline = time.monotonic() + LOAD_LIMIT_S
     name = json.dumps(page.name)
-    while tab.value(f"document.readyState === 'complete' && location.pathname.endsWith({name})") is not True:
+    while (
+        tab.value(f"document.readyState === 'complete' && location.pathname.endsWith({name})")
+        is not True
+    ):
         if time.monotonic() > deadline:
             raise TimeoutError(f"{page} does not load")
         time.sleep(0.02)
-    tab.value("document.head.insertAdjacentHTML('beforeend', '<style>* { transition: none !important }</style>')")
+    tab.value(
+        "document.head.insertAdjacentHTML('beforeend', '<style>* { transition: none !important }</style>')"
+    )
     time.sleep(0.15)  # the theme wraps tables and colors code
 
 
@@ -197,7 +217,9 @@ class Sheets:
         for number in range(tiles):
             top = number * self._tile_height
             title = str(page) if number == 0 else f"{page.stem}, part {number + 1}"
-            self._tiles.append((title, whole.crop((0, top, self._tile_width, top + self._tile_height))))
+            self._tiles.append(
+                (title, whole.crop((0, top, self._tile_width, top + self._tile_height)))
+            )
             if len(self._tiles) == TILES_PER_SHEET:
                 self.save()
 
@@ -207,7 +229,9 @@ class Sheets:
             return
         columns = COLUMNS[self._width]
         rows = TILES_PER_SHEET // columns
-        sheet = Image.new("RGB", (columns * (self._tile_width + 8), rows * (self._tile_height + 24)), "gray")
+        sheet = Image.new(
+            "RGB", (columns * (self._tile_width + 8), rows * (self._tile_height + 24)), "gray"
+        )
         draw = ImageDraw.Draw(sheet)
         for number, (title, tile) in enumerate(self._tiles):
             left = number % columns * (self._tile_width + 8)

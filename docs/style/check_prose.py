@@ -28,7 +28,8 @@ IGNORED_CHECKS = ("typography", "misc", "lexical_illusions", "psychology", "date
 PRODUCT_CODE = ("snakesim", "snakesim_*", "examples")
 GENERATED_MARK = "<!-- generated"  # the first line of a page that a program writes
 
-MAX_PAGE_WORDS = 1200  # of a page that is read from top to bottom; reference pages are looked up instead
+# Of a page that is read from top to bottom; reference pages are looked up instead.
+MAX_PAGE_WORDS = 1200
 MAX_SENTENCE_WORDS = 45
 MAX_SEMICOLONS_PER_1000_WORDS = 3.0
 
@@ -75,8 +76,12 @@ class PageFigures:
 
 def main() -> int:
     """Check everything, or print the figures. Returns the exit code."""
-    parser = argparse.ArgumentParser(description="Check the English of documentation, docstrings and messages.")
-    parser.add_argument("--figures", action="store_true", help="print the measurements of every page instead")
+    parser = argparse.ArgumentParser(
+        description="Check the English of documentation, docstrings and messages."
+    )
+    parser.add_argument(
+        "--figures", action="store_true", help="print the measurements of every page instead"
+    )
     arguments = parser.parse_args()
     pages = list_pages()
     if arguments.figures:
@@ -89,7 +94,10 @@ def main() -> int:
     for problem in problems:
         print(problem)
     if problems:
-        print(f"{len(problems)} problems; docs/style/reject.toml lists what to write instead", file=sys.stderr)
+        print(
+            f"{len(problems)} problems; docs/style/reject.toml lists what to write instead",
+            file=sys.stderr,
+        )
     return 1 if problems else 0
 
 
@@ -109,7 +117,11 @@ def read_reject_list() -> list[Rejected]:
 def list_pages() -> list[Path]:
     """Return the Markdown pages that people write: tracked files, without the changelog and the development notes."""
     pages = _list_tracked("*.md")
-    return [page for page in pages if page.name != "CHANGELOG.md" and "docs/development/" not in page.as_posix()]
+    return [
+        page
+        for page in pages
+        if page.name != "CHANGELOG.md" and "docs/development/" not in page.as_posix()
+    ]
 
 
 def list_code_files() -> list[Path]:
@@ -134,14 +146,22 @@ def check_page(page: Path, rejected: list[Rejected]) -> Iterator[Problem]:
     for number in find_tables_without_header(prose):
         yield Problem(file, number, "a table has an empty header cell; name the column")
     for number, words in find_long_sentences(prose):
-        yield Problem(file, number, f"a sentence of {words} words; at most {MAX_SENTENCE_WORDS}, better 20")
+        yield Problem(
+            file, number, f"a sentence of {words} words; at most {MAX_SENTENCE_WORDS}, better 20"
+        )
     if lines and lines[0].startswith(GENERATED_MARK):
         return
     figures = measure_page(page)
     if figures.words > MAX_PAGE_WORDS and not _is_looked_up(file):
-        yield Problem(file, 1, f"{figures.words} words; at most {MAX_PAGE_WORDS} a page: split it by topic")
+        yield Problem(
+            file, 1, f"{figures.words} words; at most {MAX_PAGE_WORDS} a page: split it by topic"
+        )
     if figures.words > 200 and figures.semicolons_per_1000_words > MAX_SEMICOLONS_PER_1000_WORDS:
-        yield Problem(file, 1, f"{figures.semicolons} semicolons in {figures.words} words; write two sentences")
+        yield Problem(
+            file,
+            1,
+            f"{figures.semicolons} semicolons in {figures.words} words; write two sentences",
+        )
 
 
 def _is_looked_up(file: str) -> bool:
@@ -232,7 +252,9 @@ def measure_page(page: Path) -> PageFigures:
     prose = remove_code(lines)
     paragraphs = [text for _, text in _list_paragraphs(prose)]
     text = " ".join(paragraphs)
-    headers = [n for n in range(len(prose) - 1) if re.fullmatch(r"\s*\|[\s:|-]+\|\s*", prose[n + 1])]
+    headers = [
+        n for n in range(len(prose) - 1) if re.fullmatch(r"\s*\|[\s:|-]+\|\s*", prose[n + 1])
+    ]
     return PageFigures(
         file=page.relative_to(ROOT).as_posix(),
         words=len(text.split()),
@@ -247,7 +269,9 @@ def measure_page(page: Path) -> PageFigures:
 
 def print_figures(figures: list[PageFigures]) -> None:
     """Print one line a page, and the totals."""
-    print(f"{'page':52} {'words':>6} {'; /1000':>8} {'you /1000':>9} {'pictures':>8} {'tables':>6} {'no header':>9}")
+    print(
+        f"{'page':52} {'words':>6} {'; /1000':>8} {'you /1000':>9} {'pictures':>8} {'tables':>6} {'no header':>9}"
+    )
     for page in figures:
         _print_row(page.file, [page])
     _print_row(f"all {len(figures)} pages", figures)
@@ -260,7 +284,9 @@ def _print_row(name: str, pages: list[PageFigures]) -> None:
     pictures = sum(page.pictures for page in pages)
     tables = sum(page.tables for page in pages)
     without_header = sum(page.tables_without_header for page in pages)
-    print(f"{name:52} {words:6} {semicolons:8.1f} {second_person:9.1f} {pictures:8} {tables:6} {without_header:9}")
+    print(
+        f"{name:52} {words:6} {semicolons:8.1f} {second_person:9.1f} {pictures:8} {tables:6} {without_header:9}"
+    )
 
 
 def run_proselint(pages: list[Path]) -> list[Problem]:
@@ -269,7 +295,10 @@ def run_proselint(pages: list[Path]) -> list[Problem]:
         copies = {}
         for number, page in enumerate(pages):
             copy = Path(folder, f"{number}.md")
-            copy.write_text("\n".join(remove_code(page.read_text(encoding="utf-8").splitlines())), encoding="utf-8")
+            copy.write_text(
+                "\n".join(remove_code(page.read_text(encoding="utf-8").splitlines())),
+                encoding="utf-8",
+            )
             copies[copy.as_posix()] = page.relative_to(ROOT).as_posix()
         command = [Path(sys.executable).with_name("proselint"), "check", *copies]
         finished = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -27,9 +27,17 @@ from snakesim.environments.environment import SnakeEnv  # noqa: E402
 from snakesim.environments.vector import SnakeVectorEnv  # noqa: E402
 
 __all__ = ["SCENARIOS", "SnakeEnv", "SnakeVectorEnv"]
-SCENARIOS = {"Clutter": "surveyed_clutter", "PegRow": "peg_row", "Flat": "mamba_flat", "Hills": "mamba_hills"}
+SCENARIOS = {
+    "Clutter": "surveyed_clutter",
+    "PegRow": "peg_row",
+    "Flat": "mamba_flat",
+    "Hills": "mamba_hills",
+}
 """By environment; `SnakeSIM/Scenario-v0` takes any."""
-ENTRY, MANY = "snakesim.environments.environment:SnakeEnv", "snakesim.environments.vector:SnakeVectorEnv"
+ENTRY, MANY = (
+    "snakesim.environments.environment:SnakeEnv",
+    "snakesim.environments.vector:SnakeVectorEnv",
+)
 for name, scenario in SCENARIOS.items():
     register(f"SnakeSIM/{name}-v0", ENTRY, kwargs={"scenario": scenario}, vector_entry_point=MANY)
 register("SnakeSIM/Scenario-v0", ENTRY, vector_entry_point=MANY)

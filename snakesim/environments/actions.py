@@ -42,7 +42,9 @@ class ActionTargets:
         names = [joint.name for joint in joints]
         if kind.startswith(RESIDUAL_PREFIX):
             high = [residual_rad] * len(joints)
-            return ActionTargets(kind, JointMode.POSITION, "rad", names, [-value for value in high], high)
+            return ActionTargets(
+                kind, JointMode.POSITION, "rad", names, [-value for value in high], high
+            )
         mode, unit = MODE_AND_UNIT_BY_KIND[kind]
         match mode:
             case JointMode.POSITION:
@@ -68,7 +70,9 @@ class ActionTargets:
         Raises:
             ValueError: The action has another shape, or holds a number that is not finite.
         """
-        values = _convert_to_array("action", action, (len(self.names),), f"must be {self._describe_expected()}")
+        values = _convert_to_array(
+            "action", action, (len(self.names),), f"must be {self._describe_expected()}"
+        )
         self._check_finite(values, "action")
         return values
 
@@ -104,7 +108,9 @@ class ActionTargets:
     def _describe_expected(self) -> str:
         count = len(self.names)
         what = "a correction" if self.kind.startswith(RESIDUAL_PREFIX) else f"a {self.kind}"
-        return f"({count},): {what} in {self.unit} for each joint, {self.names[0]} to {self.names[-1]}"
+        return (
+            f"({count},): {what} in {self.unit} for each joint, {self.names[0]} to {self.names[-1]}"
+        )
 
 
 def _convert_to_array(name: str, argument: Any, shape: tuple[int, ...], expected: str) -> Floats:

@@ -35,8 +35,10 @@ from snakesim_sim_backend.batch.robots import SimulatedRobots
 
 Mask = NDArray[np.bool_]  # (robots,)
 ArrayT = TypeVar("ArrayT", bound=NDArray[Any])
-SURE_JUMP_FRACTION = 0.99  # of the largest plausible jump of an angle: a smaller jump is surely plausible
-MAX_FINITE_CHANGE = 1e300  # of a velocity or torque from one tick to the next; only NaN and infinity exceed it
+# Of the largest plausible jump of an angle: a smaller jump is surely plausible.
+SURE_JUMP_FRACTION = 0.99
+# Of a velocity or torque from one tick to the next; only NaN and infinity exceed it.
+MAX_FINITE_CHANGE = 1e300
 MIN_POWER_RATE_HZ = 0.5  # the limiter ignores temperatures that are older than 3 s
 
 
@@ -74,7 +76,13 @@ class ArmedRobots:
     """
 
     def __init__(
-        self, robot_count: int, config: RunConfig, description: RobotDescription, *, safe: bool, thread_count: int
+        self,
+        robot_count: int,
+        config: RunConfig,
+        description: RobotDescription,
+        *,
+        safe: bool,
+        thread_count: int,
     ) -> None:
         """Allocate the arrays for a number of robots. `start` adds each robot.
 
@@ -103,9 +111,8 @@ class ArmedRobots:
 
         # Limits.
         self._limits = LimitArrays.allocate(robot_count, joints, config.period_ns * 1e-9)
-        self._max_plausible_change = np.full(
-            (robot_count, 3 * joints), MAX_FINITE_CHANGE
-        )  # of angle, velocity and torque in a tick
+        # Of angle, velocity and torque in a tick.
+        self._max_plausible_change = np.full((robot_count, 3 * joints), MAX_FINITE_CHANGE)
         self._is_temperature_measured = np.ones((robot_count, joints), dtype=np.bool_)
         self._stop_at_c = np.ones((robot_count, joints))
         self._torque_fraction = np.ones((robot_count, joints))
@@ -121,14 +128,15 @@ class ArmedRobots:
         # Commands, newest last. A limiter uses them some ticks later.
         schedule = config.services.get(CONTROL, ServiceSchedule())
         self._schedule = schedule
-        self._commands: deque[Floats] = deque(maxlen=max(schedule.latency_ticks, 1) + schedule.decimation)
+        self._commands: deque[Floats] = deque(
+            maxlen=max(schedule.latency_ticks, 1) + schedule.decimation
+        )
 
         # Each robot is limited either as a row of arrays, or by a client with a limiter of its own.
         self._limiter_client_by_robot: dict[int, LimiterClient] = {}
         self._is_vectorized: Mask = np.zeros(robot_count, dtype=np.bool_)
-        self._is_excluded: Mask = np.zeros(
-            robot_count, dtype=np.bool_
-        )  # from the array limiter, until the next `start`
+        # From the array limiter, until the next `start`.
+        self._is_excluded: Mask = np.zeros(robot_count, dtype=np.bool_)
         self._descriptions = [description] * robot_count
         self._all_robots = self.simulation.all_robots
 
@@ -169,10 +177,14 @@ class ArmedRobots:
         self._descriptions[robot_index] = description
         self._load_limits(robot_index)
         self.ticks = _copy_with_row(self.ticks, robot_index, 0)
-        self.joints = _copy_with_row(self.joints, robot_index, self.simulation.sensors.joints[robot_index])
+        self.joints = _copy_with_row(
+            self.joints, robot_index, self.simulation.sensors.joints[robot_index]
+        )
         self._modes = _copy_with_row(self._modes, robot_index, int(JointMode.PASSIVE))
         self._target = _copy_with_row(self._target, robot_index, 0.0)
-        self._torque_limit_nm = _copy_with_row(self._torque_limit_nm, robot_index, self._limits.torque_nm[robot_index])
+        self._torque_limit_nm = _copy_with_row(
+            self._torque_limit_nm, robot_index, self._limits.torque_nm[robot_index]
+        )
         self._torque_fraction = _copy_with_row(self._torque_fraction, robot_index, 1.0)
         self.is_limited = _copy_with_row(self.is_limited, robot_index, False)
         self._active_limits[robot_index] = NO_LIMIT
@@ -208,15 +220,21 @@ class ArmedRobots:
             active: Which robots take part, (robots,). They must be armed. The array must not change afterwards, either.
         """
         # The masks are cached: all arrays are replaced, not changed, so that their identity tells whether they are new.
-        if active is not self._active_at_last_call or self._is_vectorized is not self._vectorized_at_last_call:
+        if (
+            active is not self._active_at_last_call
+            or self._is_vectorized is not self._vectorized_at_last_call
+        ):
             self._update_active_masks(active)
         active_robots = self._active
         vectorized = self._active_vectorized
-        self._commands.append(target)  # not a copy: a limiter with latency reads it some ticks later
+        # Not a copy: a limiter with latency reads it some ticks later.
+        self._commands.append(target)
         self._limit_vectorized(mode, vectorized)
         for robot in self._select_individually_limited(active_robots):
             self._limit_individually(robot, mode, target[robot].tolist())
-        self._command_digests.add(active_robots, self.ticks, self._modes, self._target, self._torque_limit_nm)
+        self._command_digests.add(
+            active_robots, self.ticks, self._modes, self._target, self._torque_limit_nm
+        )
         self.simulation.enact(mode, self._target, self._torque_limit_nm, vectorized)
         stepped_robots = self._advance(active_robots)
         self._observe(mode, stepped_robots)
@@ -264,7 +282,9 @@ class ArmedRobots:
         if self._safe:
             requested = self._select_due_commands()
             torque_limit_nm = self._limit_torque_limits()
-            target = limit_targets(mode, requested, self._target, torque_limit_nm, measured, self._limits)
+            target = limit_targets(
+                mode, requested, self._target, torque_limit_nm, measured, self._limits
+            )
             is_limited = target != requested
             if self._is_derated:
                 full_nm = self._limits.torque_nm
@@ -296,7 +316,8 @@ class ArmedRobots:
         due_ticks = np.maximum(self.ticks + 1 - schedule.latency_ticks, 0)
         ages = self.ticks - (due_ticks - due_ticks % schedule.decimation)
         newest_first = np.stack(list(self._commands)[::-1])
-        ages = np.clip(ages, 0, len(newest_first) - 1)  # outside of the bounds only for robots with their own limiter
+        # Outside of the bounds only for robots with their own limiter.
+        ages = np.clip(ages, 0, len(newest_first) - 1)
         return newest_first[ages, np.arange(len(ages))]
 
     def _limit_torque_limits(self) -> Floats:
@@ -304,7 +325,9 @@ class ArmedRobots:
         full_nm = self._limits.torque_nm
         if self._has_full_torque and not self._is_derated:
             return full_nm
-        torque_limit_nm = limit_torque_limits(self._torque_limit_nm, self._torque_fraction, self._limits)
+        torque_limit_nm = limit_torque_limits(
+            self._torque_limit_nm, self._torque_fraction, self._limits
+        )
         self._has_full_torque = np.array_equal(torque_limit_nm, full_nm)
         return torque_limit_nm
 
@@ -360,7 +383,9 @@ class ArmedRobots:
         if client is None:
             self.reasons[robot_index] = cause
         else:
-            fault = Fault(tick=int(self.ticks[robot_index]), what="backend_failed", cause=cause, reach="robot")
+            fault = Fault(
+                tick=int(self.ticks[robot_index]), what="backend_failed", cause=cause, reach="robot"
+            )
             client.core.latch_fault(fault)
             self.reasons[robot_index] = client.reason
         self.is_armed = _copy_with_row(self.is_armed, robot_index, False)
@@ -388,7 +413,11 @@ class ArmedRobots:
             self._is_excluded[robot] |= (
                 not is_plausible[robot] or self._limiter_client_by_robot[robot].has_isolated_joints
             )
-            if is_ordinary[robot] and not self._is_excluded[robot] and self._follows_mode(robot, mode):
+            if (
+                is_ordinary[robot]
+                and not self._is_excluded[robot]
+                and self._follows_mode(robot, mode)
+            ):
                 self._move_to_array_limiter(robot)
         if is_ordinary is not self._all_robots:
             unusual = self._active_vectorized & moved & ~is_ordinary
@@ -430,7 +459,9 @@ class ArmedRobots:
         windings = self.simulation.sensors.windings
         if windings is None or windings.is_new is windings.no_robots:
             return
-        fractions = np.where(self._is_temperature_measured, self.simulation.remaining_fractions(), 1.0)
+        fractions = np.where(
+            self._is_temperature_measured, self.simulation.remaining_fractions(), 1.0
+        )
         self._torque_fraction = np.where(windings.is_new[:, None], fractions, self._torque_fraction)
         self._is_derated = bool((self._torque_fraction < 1.0).any())
 
@@ -452,7 +483,11 @@ class ArmedRobots:
     def _follows_mode(self, robot_index: int, mode: JointMode) -> bool:
         """Return whether all joints of a robot follow commands in this mode now, and will do so in the next tick."""
         has_commands = self.ticks[robot_index] + 1 >= self._schedule.latency_ticks
-        return bool(self.is_armed[robot_index] and has_commands and (self._modes[robot_index] == int(mode)).all())
+        return bool(
+            self.is_armed[robot_index]
+            and has_commands
+            and (self._modes[robot_index] == int(mode)).all()
+        )
 
     def _move_to_array_limiter(self, robot_index: int) -> None:
         """Move a robot from its own limiter to the array limiter, if it is armed."""
@@ -475,7 +510,10 @@ class ArmedRobots:
         self._limiter_client_by_robot[robot_index] = client
         self._is_vectorized = _copy_with_row(self._is_vectorized, robot_index, False)
         newest_first = list(self._commands)[::-1][:tick]  # only those of this episode
-        commands = [(tick - 1 - age, target[robot_index].tolist()) for age, target in enumerate(newest_first)]
+        commands = [
+            (tick - 1 - age, target[robot_index].tolist())
+            for age, target in enumerate(newest_first)
+        ]
         windings = self.simulation.sensors.windings
         power = None
         if windings is not None and not windings.is_new[robot_index]:
@@ -501,8 +539,12 @@ class ArmedRobots:
         self._limits.set_robot(robot_index, description)
         speed_rad_s = np.array([joint.speed_limit_rad_s for joint in description.joints])
         max_turn_rad = SPEED_MARGIN * speed_rad_s * description.period_ns * 1e-9
-        self._max_plausible_change[robot_index, :joints] = ANGLE_NOISE_MARGIN_RAD + SURE_JUMP_FRACTION * max_turn_rad
-        self._is_temperature_measured[robot_index] = ["temperature" in joint.measures for joint in description.joints]
+        self._max_plausible_change[robot_index, :joints] = (
+            ANGLE_NOISE_MARGIN_RAD + SURE_JUMP_FRACTION * max_turn_rad
+        )
+        self._is_temperature_measured[robot_index] = [
+            "temperature" in joint.measures for joint in description.joints
+        ]
         self._stop_at_c[robot_index] = [joint.stop_at_c for joint in description.joints]
 
     def _update_active_limits(self) -> None:
@@ -530,7 +572,11 @@ def _copy_with_row(array: ArrayT, robot_index: int, value: object) -> ArrayT:
     return copy
 
 
-def _read_setpoints(setpoints: tuple[NDArray[np.int8], Floats, Floats], robot_index: int) -> AppliedSetpoints:
+def _read_setpoints(
+    setpoints: tuple[NDArray[np.int8], Floats, Floats], robot_index: int
+) -> AppliedSetpoints:
     """Return the setpoints of one robot from the arrays of modes, targets and torque limits of all robots."""
     modes, target, torque_limit_nm = setpoints
-    return AppliedSetpoints(modes[robot_index].astype(np.int64), target[robot_index], torque_limit_nm[robot_index])
+    return AppliedSetpoints(
+        modes[robot_index].astype(np.int64), target[robot_index], torque_limit_nm[robot_index]
+    )

@@ -17,8 +17,20 @@ from snakesim_hal.wire.messages import JointMode, RobotDescription
 
 Masks = NDArray[np.bool_]  # (robots, joints)
 # Names of limits, as `limit_names.find_active_limits` gives them. An array of limits holds indices of this list.
-LIMIT_NAMES = ("", "angle", "angle_rate", "speed", "acceleration", "torque", "torque_rate", "thermal", "isolated")
-NO_LIMIT, ANGLE, ANGLE_RATE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, THERMAL, _ = range(len(LIMIT_NAMES))
+LIMIT_NAMES = (
+    "",
+    "angle",
+    "angle_rate",
+    "speed",
+    "acceleration",
+    "torque",
+    "torque_rate",
+    "thermal",
+    "isolated",
+)
+NO_LIMIT, ANGLE, ANGLE_RATE, SPEED, ACCELERATION, TORQUE, TORQUE_RATE, THERMAL, _ = range(
+    len(LIMIT_NAMES)
+)
 
 
 @dataclass(frozen=True)
@@ -65,7 +77,9 @@ class MeasuredArrays(NamedTuple):
     velocity_rad_s: Floats
 
 
-def limit_torque_limits(last_limit_nm: Floats, torque_fraction: Floats, limits: LimitArrays) -> Floats:
+def limit_torque_limits(
+    last_limit_nm: Floats, torque_fraction: Floats, limits: LimitArrays
+) -> Floats:
     """Return the torque limits that apply in this period, for commands that request full torque.
 
     A torque limit rises by no more than the torque rate allows, and never exceeds the derated torque.
@@ -104,8 +118,12 @@ def limit_targets(
     """
     match mode:
         case JointMode.POSITION:
-            low = _clamp(measured.angle_rad - limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
-            high = _clamp(measured.angle_rad + limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad)
+            low = _clamp(
+                measured.angle_rad - limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad
+            )
+            high = _clamp(
+                measured.angle_rad + limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad
+            )
             max_change = limits.angle_rate_rad
         case JointMode.VELOCITY:
             low, high = _compute_velocity_bounds(measured, limits)
@@ -163,10 +181,16 @@ def find_active_limit_indices(
         limit_indices = np.where(is_above_end_bound | is_below_end_bound, ANGLE, limit_indices)
     limit_indices = np.where(target != requested, limit_indices, NO_LIMIT)
     is_derated = limits.torque_nm > limits.torque_nm * torque_fraction
-    return np.where(is_derated & ((limit_indices == NO_LIMIT) | (limit_indices == TORQUE)), THERMAL, limit_indices)
+    return np.where(
+        is_derated & ((limit_indices == NO_LIMIT) | (limit_indices == TORQUE)),
+        THERMAL,
+        limit_indices,
+    )
 
 
-def _compute_velocity_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
+def _compute_velocity_bounds(
+    measured: MeasuredArrays, limits: LimitArrays
+) -> tuple[Floats, Floats]:
     """Return the minimum and maximum velocities from which joints can stop before their ends."""
     to_lower_end, to_upper_end = _compute_stoppable_speeds(measured, limits)
     return -to_lower_end, to_upper_end
@@ -187,7 +211,9 @@ def _compute_torque_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tup
     )
 
 
-def _compute_stoppable_speeds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
+def _compute_stoppable_speeds(
+    measured: MeasuredArrays, limits: LimitArrays
+) -> tuple[Floats, Floats]:
     """Return the maximum speeds from which joints can stop before their lower and upper ends."""
     to_lower_end = _compute_stoppable_speed(measured.angle_rad - limits.angle_min_rad, limits)
     to_upper_end = _compute_stoppable_speed(limits.angle_max_rad - measured.angle_rad, limits)

@@ -51,15 +51,19 @@ class AssistedRobot:
         Raises:
             SnakesimError: The run cannot begin, or the robot is not ready to arm in time.
         """
-        self._correction_rad: list[float] = [0.0] * config.robot.chain.modules  # the controller reads it in every tick
+        # The controller reads it in every tick.
+        self._correction_rad: list[float] = [0.0] * config.robot.chain.modules
         # The part after the colon is the configuration section, which both controllers share.
         corrected_name = f"residual:{config.controller.rpartition(':')[2]}"
-        corrected_class = _make_correcting_class(load_controller(config.controller), self._correction_rad)
+        corrected_class = _make_correcting_class(
+            load_controller(config.controller), self._correction_rad
+        )
         run_config = msgspec.structs.replace(
             config, controller=corrected_name, duration_s=config.duration_s + EXTRA_DURATION_S
         )
 
-        self._service_output = io.StringIO()  # not shown: the reason of a failure is in `failed` of the run
+        # Not shown: the reason of a failure is in `failed` of the run.
+        self._service_output = io.StringIO()
         with (
             register_plugin_temporarily(CONTROLLERS, corrected_name, corrected_class),
             contextlib.ExitStack() as opening,
@@ -69,9 +73,13 @@ class AssistedRobot:
             self._tick_iterator = self._run.iterate_ticks(before_services=True)
             opening.callback(self._tick_iterator.close)
             self.description: RobotDescription = self._run.host.description
-            self._joint_index_by_name = {joint.name: i for i, joint in enumerate(self.description.joints)}
-            self.newest_samples: dict[str, Message] = {}  # the newest sample of every sensor besides the joints, by key
-            self.limit_by_joint: dict[int, str] = {}  # joint index -> which limit changed its target in the last tick
+            self._joint_index_by_name = {
+                joint.name: i for i, joint in enumerate(self.description.joints)
+            }
+            # The newest sample of every sensor besides the joints, by key.
+            self.newest_samples: dict[str, Message] = {}
+            # Joint index -> which limit changed its target in the last tick.
+            self.limit_by_joint: dict[int, str] = {}
             self._step_until_armed()
             self._exit_stack = opening.pop_all()  # from now on `close` closes everything
 
@@ -82,7 +90,8 @@ class AssistedRobot:
         self._joint_reader = session.declare_reader(keys.JOINTS, JointState)
         self._applied_reader = session.declare_reader(keys.APPLIED, AppliedCommand)
         self._sensor_readers = {
-            key: session.declare_reader(key, message) for key, message in SENSOR_MESSAGE_TYPES.items()
+            key: session.declare_reader(key, message)
+            for key, message in SENSOR_MESSAGE_TYPES.items()
         }
 
     @property
@@ -117,7 +126,9 @@ class AssistedRobot:
         if applied is None:
             self.limit_by_joint = {}
         else:
-            self.limit_by_joint = {self._joint_index_by_name[name]: reason for name, reason in applied.limited.items()}
+            self.limit_by_joint = {
+                self._joint_index_by_name[name]: reason for name, reason in applied.limited.items()
+            }
 
     def close(self) -> None:
         """End the run."""
@@ -145,7 +156,9 @@ class AssistedRobot:
             finally:
                 del errors  # it refers to a traceback with this frame, and would be part of a reference cycle
         if is_over and self.lifecycle == "armed":
-            raise BackendError(f"the run ended early: {self._run.host.ending_reason or self._run.host.ending_status}")
+            raise BackendError(
+                f"the run ended early: {self._run.host.ending_reason or self._run.host.ending_status}"
+            )
         joints = self._joint_reader.pop_newest(lambda _: True)
         if joints is not None:
             self.joints = joints
@@ -182,7 +195,9 @@ def _make_correcting_class(
                 # A correction of 0 is not added, so that the target stays the same to the bit.
                 if correction_rad and setpoints.mode[i] is JointMode.POSITION:
                     target[i] = setpoints.target[i] + correction_rad
-            corrected_setpoints = RequestedSetpoints(setpoints.mode, target, setpoints.torque_limit_nm)
+            corrected_setpoints = RequestedSetpoints(
+                setpoints.mode, target, setpoints.torque_limit_nm
+            )
             return ControllerCommand(corrected_setpoints, command.telemetry)
 
     return CorrectedController

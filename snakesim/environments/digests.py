@@ -73,13 +73,16 @@ class CommandDigests:
         """Add the collected ticks to the digests, and drop the ticks."""
         if not self._pending_ticks:
             return
-        packed_ticks = np.empty((len(self._hashes), len(self._pending_ticks)), dtype=self._tick_dtype)
+        packed_ticks = np.empty(
+            (len(self._hashes), len(self._pending_ticks)), dtype=self._tick_dtype
+        )
         for i, tick in enumerate(self._pending_ticks):
             packed_ticks["tick"][:, i] = tick.ticks
             packed_ticks["mode"][:, i] = tick.modes
             packed_ticks["target"][:, i] = tick.target
             packed_ticks["torque_limit_nm"][:, i] = tick.torque_limit_nm
-        got_setpoints = np.stack([tick.robots for tick in self._pending_ticks], axis=1)  # (robots, ticks)
+        # (robots, ticks).
+        got_setpoints = np.stack([tick.robots for tick in self._pending_ticks], axis=1)
         self._pending_ticks = []
         for robot_hash, rows, mask in zip(self._hashes, packed_ticks, got_setpoints, strict=True):
             robot_hash.update(rows[mask].tobytes())

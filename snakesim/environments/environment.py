@@ -70,7 +70,9 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         Raises:
             ConfigError: An argument is wrong. The message is that of the command `snakesim run`.
         """
-        self._arguments = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        self._arguments = {
+            name: value for name, value in locals().items() if name not in ("self", "__class__")
+        }
         setup = EnvironmentSetup(**self._arguments)
         self.setup = setup  # the same for all environments with these arguments
         self._episodes = EpisodeBatch(setup, 1, thread_count=1)
@@ -140,7 +142,9 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
         self._require_robot()
         target = self.setup.commands.convert_action(action)
         if self._episodes.is_over[ONLY_ROW]:
-            raise gymnasium.error.ResetNeeded("the episode is over, or its last step did not finish; call reset()")
+            raise gymnasium.error.ResetNeeded(
+                "the episode is over, or its last step did not finish; call reset()"
+            )
         result = self._episodes.step(target[None], ONLY_ENVIRONMENT_MASK)
         return (
             self.setup.split(result.observations[ONLY_ROW]),
@@ -179,7 +183,9 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
             "advance_m": float(self._episodes.advance_m[ONLY_ROW]),
             "lifecycle": lifecycle,
         }
-        joints_with_limits = zip(self.action_names, robots.read_limit_names()[ONLY_ROW].tolist(), strict=True)
+        joints_with_limits = zip(
+            self.action_names, robots.read_limit_names()[ONLY_ROW].tolist(), strict=True
+        )
         limited = {joint: name for joint, name in joints_with_limits if name is not None}
         if limited:
             info["limited"] = limited
@@ -190,14 +196,20 @@ class SnakeEnv(gymnasium.Env[Any, Any]):
     def _make_step_info(self, result: BatchStepResult) -> dict[str, Any]:
         """Return the info dict of a step."""
         terms = {name: float(term[ONLY_ROW]) for name, term in result.terms.items()}
-        info = {**self._make_robot_info(), "energy_j": float(result.energy_j[ONLY_ROW]), "reward_terms": terms}
+        info = {
+            **self._make_robot_info(),
+            "energy_j": float(result.energy_j[ONLY_ROW]),
+            "reward_terms": terms,
+        }
         if ONLY_ROW in result.endings:
             info["ended"] = result.endings[ONLY_ROW]
             info["digest"] = self._episodes.robots.read_digest(ONLY_ROW)
         return info
 
 
-def _rebuild_environment(env_class: type[SnakeEnv], arguments: dict[str, Any], spec: Any) -> SnakeEnv:
+def _rebuild_environment(
+    env_class: type[SnakeEnv], arguments: dict[str, Any], spec: Any
+) -> SnakeEnv:
     """Return a new environment like the one that was pickled."""
     env = env_class(**arguments)
     env.spec = spec

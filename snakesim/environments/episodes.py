@@ -28,7 +28,8 @@ from snakesim_hal.controller import Task
 from snakesim_hal.model.plugins import FILMS, load_plugin
 from snakesim_hal.model.scenario import RunConfig
 
-MAX_FIELD_ATTEMPTS = 20  # a reset gives up after so many random fields without room for their obstacles
+# A reset gives up after so many random fields without room for their obstacles.
+MAX_FIELD_ATTEMPTS = 20
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,11 @@ class EpisodeBatch:
         self._count = count
         joint_count = len(setup.action_names)
         self.robots = EnvironmentRobots(
-            count, joint_count, assisted=setup.is_assisted, safe=setup.is_safe, thread_count=thread_count
+            count,
+            joint_count,
+            assisted=setup.is_assisted,
+            safe=setup.is_safe,
+            thread_count=thread_count,
         )
         self._observer = BatchObserver(count, setup.description, setup.parts)
         self.configs: list[RunConfig] = [setup.config] * count
@@ -160,8 +165,12 @@ class EpisodeBatch:
         self._remaining_ticks = self._remaining_ticks - step_ticks
 
         observations = self.observe(environments)
-        energy_j, limited_count = self._sum_energy_and_limited_joints(tick_count, is_everyone_active)
-        is_goal_reached = np.array([progress.is_goal_reached for progress in self._observer.progress])
+        energy_j, limited_count = self._sum_energy_and_limited_joints(
+            tick_count, is_everyone_active
+        )
+        is_goal_reached = np.array(
+            [progress.is_goal_reached for progress in self._observer.progress]
+        )
         is_stopped = ~self.robots.is_armed
         term_values = {
             "advance": self.advance_m - start_advance_m,
@@ -177,15 +186,20 @@ class EpisodeBatch:
         endings: dict[int, str] = {}
         for environment in np.flatnonzero(terminated | truncated).tolist():
             endings[environment] = _describe_ending(
-                is_stopped=bool(is_stopped[environment]), is_goal_reached=bool(is_goal_reached[environment])
+                is_stopped=bool(is_stopped[environment]),
+                is_goal_reached=bool(is_goal_reached[environment]),
             )
-        return BatchStepResult(observations, sum_terms(terms), terminated, truncated, energy_j, terms, endings)
+        return BatchStepResult(
+            observations, sum_terms(terms), terminated, truncated, energy_j, terms, endings
+        )
 
     def render(self, environment: int) -> NDArray[np.uint8]:
         """Return a picture of a robot in its scene, (height, width, 3), drawn as by `snakesim recording video`."""
         if environment not in self._renderers:
             make_renderer = load_plugin(FILMS, "mujoco")
-            self._renderers[environment] = make_renderer(self.configs[environment], *self._setup.picture_size)
+            self._renderers[environment] = make_renderer(
+                self.configs[environment], *self._setup.picture_size
+            )
         progress = self._observer.progress[environment]
         position_w, wxyz = (np.array(part) for part in progress.pose)
         look_at_w = np.array([*progress.center_w, progress.mean_height_m])
@@ -246,7 +260,9 @@ class EpisodeBatch:
         joint_count = len(self._setup.action_names)
         samples = self._joints_by_tick[:tick_count]
         # A cumulative sum adds in order. `sum` would round differently for another number of environments.
-        joint_power_w = np.abs(samples[:, :, 2 * joint_count :] * samples[:, :, joint_count : 2 * joint_count])
+        joint_power_w = np.abs(
+            samples[:, :, 2 * joint_count :] * samples[:, :, joint_count : 2 * joint_count]
+        )
         energy_j = joint_power_w.cumsum(axis=2)[:, :, -1] * self._period_ns * 1e-9
         is_limited = self._is_limited_by_tick[:tick_count]
         if not is_everyone_active:

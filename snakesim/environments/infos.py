@@ -14,11 +14,14 @@ class InfoArrays:
 
     def __init__(self, count: int) -> None:
         self._count = count
-        self._values: dict[str, tuple[Any, Mask]] = {}  # an array or InfoArrays, and which environments have it
+        # An array or InfoArrays, and which environments have it.
+        self._values: dict[str, tuple[Any, Mask]] = {}
 
     def add(self, key: str, values: NDArray[Any], environments: Mask) -> None:
         """Add a key with a value for some environments. `values` has a row for every environment."""
-        merged: NDArray[Any] = np.full(self._count, None) if values.dtype == object else np.zeros_like(values)
+        merged: NDArray[Any] = (
+            np.full(self._count, None) if values.dtype == object else np.zeros_like(values)
+        )
         np.copyto(merged, values, where=environments)
         self._values[key] = merged, environments
 

@@ -82,11 +82,19 @@ class LimiterClient:
         """
         if self._authority is None:
             return
-        self._authority.handle_lease_request(LeaseRequest(action="acquire", holder=CONTROL, priority=LEASE_PRIORITY), 0)
-        self._send_command(
-            self._authority, 0, 0, [JointMode.POSITION] * len(self._max_torque_nm), list(joints.angle_rad)
+        self._authority.handle_lease_request(
+            LeaseRequest(action="acquire", holder=CONTROL, priority=LEASE_PRIORITY), 0
         )
-        answer = self._authority.handle_lifecycle_request(make_arm_request(self._description, REQUESTER), 0)
+        self._send_command(
+            self._authority,
+            0,
+            0,
+            [JointMode.POSITION] * len(self._max_torque_nm),
+            list(joints.angle_rad),
+        )
+        answer = self._authority.handle_lifecycle_request(
+            make_arm_request(self._description, REQUESTER), 0
+        )
         if not answer.ok:
             raise RefusedError(f"not ready to arm: {answer.reason}", code="robot/not-ready")
 
@@ -134,7 +142,12 @@ class LimiterClient:
             self._send_command(authority, tick, joints.timestamp_ns, [mode] * len(target), target)
 
     def _send_command(
-        self, authority: CommandAuthority, tick: int, now_ns: int, modes: list[JointMode], target: list[float]
+        self,
+        authority: CommandAuthority,
+        tick: int,
+        now_ns: int,
+        modes: list[JointMode],
+        target: list[float],
     ) -> None:
         """Send a command that answers the samples of a tick."""
         self._sequence += 1
@@ -183,7 +196,9 @@ class _ResumedAuthority(CommandAuthority):
         self.arm_session = 1
         self._is_stop_sent = True
         expires_ns = joints.timestamp_ns + description.lease_ns
-        self.lease = CommandLease(holder=CONTROL, epoch=1, priority=LEASE_PRIORITY, expires_ns=expires_ns)
+        self.lease = CommandLease(
+            holder=CONTROL, epoch=1, priority=LEASE_PRIORITY, expires_ns=expires_ns
+        )
         # `joints` were measured under the last setpoints but one, and the state that follows under the last ones.
         previous_setpoints, last_setpoints = applied
         self._last_setpoints = previous_setpoints

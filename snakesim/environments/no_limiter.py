@@ -2,7 +2,14 @@
 
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.safety.authority import TickOutput
-from snakesim_hal.wire.messages import Fault, JointMode, JointState, LifecycleState, Power, RobotDescription
+from snakesim_hal.wire.messages import (
+    Fault,
+    JointMode,
+    JointState,
+    LifecycleState,
+    Power,
+    RobotDescription,
+)
 
 
 class NoLimiter:

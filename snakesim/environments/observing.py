@@ -37,7 +37,9 @@ class BatchObserver:
         progress: Advance of each robot towards its goal.
     """
 
-    def __init__(self, robot_count: int, description: RobotDescription, parts: Mapping[str, ObservationPart]) -> None:
+    def __init__(
+        self, robot_count: int, description: RobotDescription, parts: Mapping[str, ObservationPart]
+    ) -> None:
         """Allocate the arrays for a number of robots, without tasks. `restart` sets the task of each robot.
 
         Args:
@@ -60,7 +62,9 @@ class BatchObserver:
         """Start an episode of a robot with a new task. The advance counts from the first observation on."""
         self._descriptions[robot_index] = description
         first_description = self._descriptions[0]
-        self._has_equal_links = all(_has_equal_links(first_description, other) for other in self._descriptions)
+        self._has_equal_links = all(
+            _has_equal_links(first_description, other) for other in self._descriptions
+        )
         self._locator = BodyLocator(first_description)
         self._start_poses[robot_index] = [*task.start_position_w, *task.start_wxyz]
         self.progress[robot_index] = GoalProgress(description, task)
@@ -91,7 +95,11 @@ class BatchObserver:
         if self._has_equal_links and indices:
             groups = [indices]
         for group in groups:
-            locator = self._locator if self._has_equal_links else BodyLocator(self._descriptions[group[0]])
+            locator = (
+                self._locator
+                if self._has_equal_links
+                else BodyLocator(self._descriptions[group[0]])
+            )
             nodes_w, centers_w = locator.compute_body_positions(poses[group], angles_rad[group])
             for i, robot in enumerate(group):
                 progress = self.progress[robot]
@@ -103,7 +111,9 @@ def _has_equal_links(first: RobotDescription, second: RobotDescription) -> bool:
     """Return whether two robots have the same links and axes, so that their bodies are located together."""
     if first is second:
         return True
-    return first.links == second.links and [j.axis for j in first.joints] == [j.axis for j in second.joints]
+    return first.links == second.links and [j.axis for j in first.joints] == [
+        j.axis for j in second.joints
+    ]
 
 
 def _make_joint_reader(quantity_index: int) -> Callable[[BatchState], Floats]:
@@ -117,7 +127,9 @@ def _make_joint_reader(quantity_index: int) -> Callable[[BatchState], Floats]:
 
 
 def _read_bearings(state: BatchState) -> Floats:
-    return np.array([(math.cos(p.goal_bearing_rad), math.sin(p.goal_bearing_rad)) for p in state.progress])
+    return np.array(
+        [(math.cos(p.goal_bearing_rad), math.sin(p.goal_bearing_rad)) for p in state.progress]
+    )
 
 
 def _read_distances_left(state: BatchState) -> Floats:

@@ -16,10 +16,14 @@ class RewardTerm:
 
 
 REWARD_TERMS = {
-    "advance": RewardTerm(1.0, "m", "of the center of mass towards the goal; without a goal along the first heading"),
+    "advance": RewardTerm(
+        1.0, "m", "of the center of mass towards the goal; without a goal along the first heading"
+    ),
     "energy": RewardTerm(-0.005, "J", "sum over joints of |torque x velocity| over time"),
     "limited": RewardTerm(
-        -0.001, "1", "fraction of joints whose targets the limiter changed, mean over the ticks of the step"
+        -0.001,
+        "1",
+        "fraction of joints whose targets the limiter changed, mean over the ticks of the step",
     ),
     "goal": RewardTerm(1.0, "1", "1 in the step that reaches the goal"),
     "stopped": RewardTerm(-1.0, "1", "1 in the step in which the robot is stopped by a fault"),

@@ -33,7 +33,9 @@ class EnvironmentRobots:
             tick.
     """
 
-    def __init__(self, robot_count: int, joint_count: int, *, assisted: bool, safe: bool, thread_count: int) -> None:
+    def __init__(
+        self, robot_count: int, joint_count: int, *, assisted: bool, safe: bool, thread_count: int
+    ) -> None:
         """Allocate the arrays for a number of robots. `start` puts a robot into a row at the start of its episode.
 
         Args:
@@ -51,7 +53,8 @@ class EnvironmentRobots:
         # Robots that are stepped together; None until the first of them starts. All others are stepped on their own.
         self._batch: ArmedRobots | None = None
         self._single_robot_by_row: dict[int, SteppedRobot | AssistedRobot] = {}
-        self.joints: Floats = np.zeros((robot_count, 3 * joint_count))  # angles, velocities, torques
+        # Angles, velocities, torques.
+        self.joints: Floats = np.zeros((robot_count, 3 * joint_count))
         self.is_armed: Mask = np.zeros(robot_count, dtype=np.bool_)
         self.is_limited: Masks = np.zeros((robot_count, joint_count), dtype=np.bool_)
 
@@ -133,7 +136,9 @@ class EnvironmentRobots:
         if self._batch is not None and np.count_nonzero(self.is_limited):
             names = NAMES_OR_NONE[self._batch.read_active_limits()]
         for robot, single_robot in self._single_robot_by_row.items():
-            names[robot] = [single_robot.limit_by_joint.get(joint) for joint in range(self._joint_count)]
+            names[robot] = [
+                single_robot.limit_by_joint.get(joint) for joint in range(self._joint_count)
+            ]
         return names
 
     # --- what the sensors besides the joints measure -----------------------------------------------------------
@@ -183,13 +188,19 @@ class EnvironmentRobots:
 
     # --- rows ------------------------------------------------------------------------------------------------
 
-    def _start_in_batch(self, robot_index: int, config: RunConfig, description: RobotDescription) -> bool:
+    def _start_in_batch(
+        self, robot_index: int, config: RunConfig, description: RobotDescription
+    ) -> bool:
         """Start a robot among those that are stepped together. Return False if it cannot be stepped with them."""
         if not can_arm(config):
             return False
         if self._batch is None:
             self._batch = ArmedRobots(
-                self._robot_count, config, description, safe=self._uses_limiter, thread_count=self._threads
+                self._robot_count,
+                config,
+                description,
+                safe=self._uses_limiter,
+                thread_count=self._threads,
             )
         return self._batch.can_start(config) and self._batch.start(robot_index, config, description)
 
@@ -208,4 +219,6 @@ class EnvironmentRobots:
             joints = single_robot.joints
             self.joints[robot] = [*joints.angle_rad, *joints.velocity_rad_s, *joints.torque_nm]
             self.is_armed[robot] = single_robot.lifecycle == "armed"
-            self.is_limited[robot] = [joint in single_robot.limit_by_joint for joint in range(self._joint_count)]
+            self.is_limited[robot] = [
+                joint in single_robot.limit_by_joint for joint in range(self._joint_count)
+            ]

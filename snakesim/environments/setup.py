@@ -59,7 +59,8 @@ class EnvironmentSetup:
                 code="python/invalid-argument",
             )
         _validate_step_arguments(frame_skip, render_mode, residual_rad)
-        controller = parse_corrected_controller(action)  # whose targets the actions correct; None: actions are targets
+        # Whose targets the actions correct; None: actions are targets.
+        controller = parse_corrected_controller(action)
         overrides = make_overrides(set, duration_s=duration)
         if controller is not None:
             if not safe:
@@ -115,7 +116,8 @@ class EnvironmentSetup:
             slice_by_part[part_name] = slice(start, len(self.observation_names))
             space_by_part[part_name] = _make_box(part.low, part.high)
         self.observation_space: spaces.Space[Any]
-        self.slices: dict[str, slice] | None = None  # of each part in an observation; None for a flat space
+        # Of each part in an observation; None for a flat space.
+        self.slices: dict[str, slice] | None = None
         if flat:
             observer = ObservationBuilder(self.description, self.parts)
             self.observation_space = spaces.Box(observer.low, observer.high)
@@ -142,7 +144,10 @@ class EnvironmentSetup:
 
         The hash of the configuration in it may be that of another seed. Nothing reads this hash here.
         """
-        has_equal_times = (config.period_ns, config.lease_ns) == (self.config.period_ns, self.config.lease_ns)
+        has_equal_times = (config.period_ns, config.lease_ns) == (
+            self.config.period_ns,
+            self.config.lease_ns,
+        )
         if config.robot is self.config.robot and has_equal_times:
             return self.description
         return describe_run_robot(config)
@@ -157,7 +162,9 @@ class EnvironmentSetup:
         """Return the configuration of the scenario with another seed, also of its random fields."""
         if not self.new_fields:
             return msgspec.structs.replace(self.config, seed=seed)
-        fields = [msgspec.structs.replace(field, seed=seed) for field in self.config.scene.random_field]
+        fields = [
+            msgspec.structs.replace(field, seed=seed) for field in self.config.scene.random_field
+        ]
         scene = msgspec.structs.replace(self.config.scene, random_field=fields)
         return msgspec.structs.replace(self.config, seed=seed, scene=scene)
 
@@ -196,11 +203,13 @@ def _validate_step_arguments(frame_skip: int, render_mode: str | None, residual_
         )
     if render_mode not in (None, *RENDER_MODES):
         raise ConfigError(
-            f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out", code="python/invalid-argument"
+            f"render_mode={render_mode!r:.60}: give 'rgb_array', or leave it out",
+            code="python/invalid-argument",
         )
     if not residual_rad > 0:
         raise ConfigError(
-            f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad", code="python/invalid-argument"
+            f"residual_rad={residual_rad!r:.60}: give a number > 0, in rad",
+            code="python/invalid-argument",
         )
 
 

@@ -19,9 +19,17 @@ from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.programs.preflight import decode_backend_settings, load_backend_class
 from snakesim_hal.run_log.black_box import BlackBox
 from snakesim_hal.safety.authority import MAX_REASON_LENGTH
-from snakesim_hal.wire.messages import Fault, JointMode, JointState, LifecycleState, Message, RobotDescription
+from snakesim_hal.wire.messages import (
+    Fault,
+    JointMode,
+    JointState,
+    LifecycleState,
+    Message,
+    RobotDescription,
+)
 
-SUPPORTED_FAULT_TARGETS = ("joint", "bus", "simulator")  # faults of these need neither services nor processes
+# Faults of these need neither services nor processes.
+SUPPORTED_FAULT_TARGETS = "joint", "bus", "simulator"
 
 
 class SteppedRobot:
@@ -55,8 +63,10 @@ class SteppedRobot:
         self._control_schedule = config.services.get(CONTROL, ServiceSchedule())
         self._black_box = BlackBox(self.description, memory_bytes=0)
         self._tick = 0
-        self.newest_samples: dict[str, Message] = {}  # the newest sample of every sensor besides the joints, by key
-        self.limit_by_joint: dict[int, str] = {}  # joint index -> which limit changed its target in the last tick
+        # The newest sample of every sensor besides the joints, by key.
+        self.newest_samples: dict[str, Message] = {}
+        # Joint index -> which limit changed its target in the last tick.
+        self.limit_by_joint: dict[int, str] = {}
         self._samples = self._read_samples()
         try:
             self._client.arm(self.joints)
@@ -107,7 +117,12 @@ class SteppedRobot:
             self._tick += 1
             self._samples = self._read_samples()
         except BackendError as error:
-            fault = Fault(tick=self._tick, what="backend_failed", cause=str(error)[:MAX_REASON_LENGTH], reach="robot")
+            fault = Fault(
+                tick=self._tick,
+                what="backend_failed",
+                cause=str(error)[:MAX_REASON_LENGTH],
+                reach="robot",
+            )
             self._cycle.safety.latch_fault(fault)
 
     def close(self) -> None:
@@ -155,4 +170,6 @@ def _remove_cameras_and_lidars(config: RunConfig) -> RunConfig:
     The noise of each sensor has a random stream of its own, so the noise of all other sensors stays the same.
     """
     sensors = msgspec.structs.replace(config.robot.sensors, depth=[], range=[])
-    return msgspec.structs.replace(config, robot=msgspec.structs.replace(config.robot, sensors=sensors))
+    return msgspec.structs.replace(
+        config, robot=msgspec.structs.replace(config.robot, sensors=sensors)
+    )

@@ -54,7 +54,8 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             is_count = type(number) is int and number >= 1
             if not is_count and (name != "thread_count" or number is not None):
                 raise ConfigError(
-                    f"{name}={number!r:.60}: give a whole number, 1 or more", code="python/invalid-argument"
+                    f"{name}={number!r:.60}: give a whole number, 1 or more",
+                    code="python/invalid-argument",
                 )
         try:
             self._autoreset_mode = AutoresetMode(autoreset_mode)
@@ -93,7 +94,10 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         return _rebuild_vector, (type(self), self._arguments, self.spec)
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Reset all environments, or some of them.
 
@@ -120,7 +124,9 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         self._has_unfinished_step = not self._episodes.has_robot.all()
         return self._setup.split(observations), self._make_reset_infos(mask).read()
 
-    def step(self, actions: Any) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+    def step(
+        self, actions: Any
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Step every environment.
 
         Args:
@@ -143,7 +149,9 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         was_episode_over = self._episodes.is_over.copy()
         if self._autoreset_mode is AutoresetMode.DISABLED and was_episode_over.any():
             over = np.flatnonzero(was_episode_over).tolist()
-            raise error.ResetNeeded(f"the episodes of environments {over} are over; reset them with `reset_mask`")
+            raise error.ResetNeeded(
+                f"the episodes of environments {over} are over; reset them with `reset_mask`"
+            )
         self._has_unfinished_step = True
         for environment in np.flatnonzero(was_episode_over).tolist():
             self._reset_environment(environment, None)
@@ -188,7 +196,9 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             self._rngs[environment] = np_random(seed)[0]
         self._episodes.reset(environment, seed, self._rngs[environment])
 
-    def _update_observations(self, environments: Mask, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _update_observations(
+        self, environments: Mask, observations: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
         """Return observations in which those of some environments are new."""
         return np.where(environments[:, None], self._episodes.observe(environments), observations)
 
@@ -212,7 +222,9 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
     def _make_reset_infos(self, environments: Mask) -> InfoArrays:
         """Return the merged info dicts of environments that have just been reset."""
         infos = InfoArrays(self.num_envs)
-        infos.add("seed", np.array([config.seed for config in self._episodes.configs]), environments)
+        infos.add(
+            "seed", np.array([config.seed for config in self._episodes.configs]), environments
+        )
         self._add_robot_infos(infos, environments)
         return infos
 
@@ -229,7 +241,8 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
             robots = self._episodes.robots
             infos.add_objects("ended", result.endings)
             infos.add_objects(
-                "digest", {environment: robots.read_digest(environment) for environment in result.endings}
+                "digest",
+                {environment: robots.read_digest(environment) for environment in result.endings},
             )
         return infos
 
@@ -249,7 +262,8 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
         infos.add("time_s", self._episodes.time_s, environments)
         infos.add("advance_m", self._episodes.advance_m, environments)
         infos.add_objects("lifecycle", lifecycle_by_row)
-        limit_names = robots.read_limit_names()  # (num_envs, joints), None where no limit changed the target
+        # (num_envs, joints), None where no limit changed the target.
+        limit_names = robots.read_limit_names()
         has_limited_joint = (limit_names != None).any(axis=1) & environments  # noqa: E711 - element by element
         if has_limited_joint.any():
             limit_infos = InfoArrays(self.num_envs)
@@ -259,13 +273,17 @@ class SnakeVectorEnv(VectorEnv[Any, Any, Any]):
                     limit_infos.add(joint_name, limit_names[:, joint_index], is_limited)
             infos.add_group("limited", limit_infos, has_limited_joint)
         reason_by_row = {
-            row: robots.read_reason(row) for row, lifecycle in lifecycle_by_row.items() if lifecycle != "armed"
+            row: robots.read_reason(row)
+            for row, lifecycle in lifecycle_by_row.items()
+            if lifecycle != "armed"
         }
         if reason_by_row:
             infos.add_objects("reason", reason_by_row)
 
 
-def _rebuild_vector(env_class: type[SnakeVectorEnv], arguments: dict[str, Any], spec: Any) -> SnakeVectorEnv:
+def _rebuild_vector(
+    env_class: type[SnakeVectorEnv], arguments: dict[str, Any], spec: Any
+) -> SnakeVectorEnv:
     """Return a new vector environment like the one that was pickled."""
     env = env_class(**arguments)
     env.spec = spec
@@ -277,7 +295,12 @@ def _read_mask(options: dict[str, Any] | None, count: int) -> Mask:
     mask = None if options is None else options.get("reset_mask")
     if mask is None:
         return np.ones(count, dtype=np.bool_)
-    if not isinstance(mask, np.ndarray) or mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
+    if (
+        not isinstance(mask, np.ndarray)
+        or mask.shape != (count,)
+        or mask.dtype != np.bool_
+        or not mask.any()
+    ):
         raise ValueError(
             f"options['reset_mask'] is {mask!r:.60}, must be an array of {count} booleans, at least one of them True"
         )

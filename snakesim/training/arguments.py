@@ -22,15 +22,23 @@ def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim policy train`."""
     add_scenario_name_argument(parser)
     parser.add_argument(
-        "--form", choices=("feeling", "wave"), default="feeling", help="what is learned (default: feeling)"
+        "--form",
+        choices=("feeling", "wave"),
+        default="feeling",
+        help="what is learned (default: feeling)",
     )
     _add_count_option(parser, "--generations", 1, 20, "generations of the search")
     _add_count_option(parser, "--population", 4, 12, "policies in a generation")
     add_fields_argument(parser, "for each policy, anew in each generation (default: 4)", 4)
-    _add_count_option(parser, "--check-fields", 1, 8, "fields on which the mean of the search is checked")
+    _add_count_option(
+        parser, "--check-fields", 1, 8, "fields on which the mean of the search is checked"
+    )
     add_seed_argument(parser, "of the search (default: 1)", 1)
     parser.add_argument(
-        "--init", dest="begin", metavar="POLICY", help="begin at its numbers: a shipped policy, or policy.onnx"
+        "--init",
+        dest="begin",
+        metavar="POLICY",
+        help="begin at its numbers: a shipped policy, or policy.onnx",
     )
     parser.add_argument(
         "--spread",
@@ -40,10 +48,16 @@ def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
         help="times how far the first generation looks (default: 1)",
     )
     add_duration_argument(
-        parser, "seconds of an episode (default: the scenario's)", make_number_parser(0.1, 3600.0, "s")
+        parser,
+        "seconds of an episode (default: the scenario's)",
+        make_number_parser(0.1, 3600.0, "s"),
     )
     parser.add_argument(
-        "--reward", action="append", default=[], metavar="TERM=WEIGHT", help="as energy=-0.002 (may be repeated)"
+        "--reward",
+        action="append",
+        default=[],
+        metavar="TERM=WEIGHT",
+        help="as energy=-0.002 (may be repeated)",
     )
     add_set_argument(parser)
     parser.add_argument(
@@ -58,7 +72,9 @@ def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
     add_resume_argument(parser)
 
 
-def _add_count_option(parser: argparse.ArgumentParser, option: str, minimum: int, default: int, about: str) -> None:
+def _add_count_option(
+    parser: argparse.ArgumentParser, option: str, minimum: int, default: int, about: str
+) -> None:
     parser.add_argument(
         option,
         type=make_number_parser(minimum, 100_000),
@@ -70,7 +86,9 @@ def _add_count_option(parser: argparse.ArgumentParser, option: str, minimum: int
 
 def _add_info_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim policy info`."""
-    parser.add_argument("policy", metavar="POLICY", help="path of an ONNX file, or name of a shipped policy")
+    parser.add_argument(
+        "policy", metavar="POLICY", help="path of an ONNX file, or name of a shipped policy"
+    )
     add_json_argument(parser)
 
 
@@ -97,12 +115,16 @@ def _run_train(arguments: argparse.Namespace) -> int:
     environment = {
         "scenario": arguments.scenario,
         "duration": arguments.duration,
-        "reward": {override.key: override.value for override in map(parse_set_option, arguments.reward)},
+        "reward": {
+            override.key: override.value for override in map(parse_set_option, arguments.reward)
+        },
         "set": {override.key: override.value for override in map(parse_set_option, arguments.set)},
         "randomize": dict(map(parse_randomize_option, arguments.randomize)),
     }
     # Every field of Effort is the `dest` of an option.
-    effort = SearchEffort(**{field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchEffort)})
+    effort = SearchEffort(
+        **{field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchEffort)}
+    )
     return train_policy(
         environment,
         arguments.form,
@@ -136,7 +158,9 @@ def _list_search_options(arguments: argparse.Namespace) -> list[str]:
 
 COMMANDS: Commands = (
     CommandGroup(
-        name="policy", heading="runs and studies", help="Train policies, and show what a policy file describes."
+        name="policy",
+        heading="runs and studies",
+        help="Train policies, and show what a policy file describes.",
     ),
     Command(
         name="policy train",

@@ -53,7 +53,13 @@ def _draw_curve(path: Path, generations: Sequence[SearchGeneration]) -> None:
     axes = figure.subplots()
     axes.plot(episodes, best_rewards, ":", color="0.5", label="best of a generation")
     axes.plot(episodes, mean_rewards, color="0.5", label="mean of a generation")
-    axes.plot(checked_episodes, check_rewards, "o-", color="tab:blue", label="mean policy, on other fields")
+    axes.plot(
+        checked_episodes,
+        check_rewards,
+        "o-",
+        color="tab:blue",
+        label="mean policy, on other fields",
+    )
     axes.set(xlabel="episodes", ylabel="reward of an episode")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=8)

@@ -56,7 +56,9 @@ class EpisodeRunner:
     The same policies and fields give the same numbers with any number of processes.
     """
 
-    def __init__(self, arguments: Arguments, worker_count: int | None = None, cluster: str | None = None) -> None:
+    def __init__(
+        self, arguments: Arguments, worker_count: int | None = None, cluster: str | None = None
+    ) -> None:
         """Load the scenario in this process. The `with` block starts the workers.
 
         Args:
@@ -107,7 +109,9 @@ class EpisodeRunner:
         episodes_by_policy: list[list[EpisodeResult]] = []
         for start in range(0, len(all_episodes), len(fields)):
             policy_episodes = all_episodes[start : start + len(fields)]
-            episodes_by_policy.append([episode for episode in policy_episodes if episode is not None])
+            episodes_by_policy.append(
+                [episode for episode in policy_episodes if episode is not None]
+            )
         return episodes_by_policy
 
     def _start_workers(self) -> MapFunction:
@@ -118,7 +122,8 @@ class EpisodeRunner:
 
     def _connect_to_cluster(self, address: str) -> MapFunction:
         """Connect to a Dask scheduler. Raises ConfigError, NotConnectedError."""
-        from snakesim_operator.base.dask_cluster import connect_to_cluster  # Dask is of another extra
+        # Dask is of another extra.
+        from snakesim_operator.base.dask_cluster import connect_to_cluster
 
         client = self._exit_stack.enter_context(connect_to_cluster(address))
         threads: Any = client.nthreads()  # of each worker
@@ -137,7 +142,9 @@ def _get_cached_environments(arguments: Arguments) -> tuple[EnvironmentSetup, En
     if not _ENVIRONMENT_CACHE or _ENVIRONMENT_CACHE[-1].arguments != arguments:
         setup = _make_setup(arguments)
         _ENVIRONMENT_CACHE[:] = [
-            _CachedEnvironments(arguments, setup, Environments(setup, MAX_BATCH_SIZE, thread_count=1))
+            _CachedEnvironments(
+                arguments, setup, Environments(setup, MAX_BATCH_SIZE, thread_count=1)
+            )
         ]
     return _ENVIRONMENT_CACHE[-1].setup, _ENVIRONMENT_CACHE[-1].environments
 
@@ -184,7 +191,13 @@ def _run_batch(arguments: Arguments, jobs: Sequence[Job]) -> list[EpisodeResult 
             continue
         is_goal_reached = ending_by_row[row] == "goal"
         episodes.append(
-            EpisodeResult(float(total_reward[row]), advance_m[row], float(energy_j[row]), time_s[row], is_goal_reached)
+            EpisodeResult(
+                float(total_reward[row]),
+                advance_m[row],
+                float(energy_j[row]),
+                time_s[row],
+                is_goal_reached,
+            )
         )
     for row in range(row_count):
         environments.close(row)

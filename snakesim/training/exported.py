@@ -10,7 +10,13 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from snakesim.training.form import MAX_REACTION_RAD, OBSERVE, RAMP_PER_S, PolicyArrays
-from snakesim_gnc.control.policy import ACTION_KEY, FRAME_SKIP_KEY, JOINTS_KEY, OBSERVATIONS_KEY, load_model
+from snakesim_gnc.control.policy import (
+    ACTION_KEY,
+    FRAME_SKIP_KEY,
+    JOINTS_KEY,
+    OBSERVATIONS_KEY,
+    load_model,
+)
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import export_atomically
 
@@ -57,7 +63,11 @@ def read_learned_parameters(policy: str) -> dict[str, float]:
 
 
 def write_onnx_file(
-    path: Path, policy: PolicyArrays, values: Mapping[str, float], frame_skip: int, again: Sequence[str]
+    path: Path,
+    policy: PolicyArrays,
+    values: Mapping[str, float],
+    frame_skip: int,
+    again: Sequence[str],
 ) -> None:
     """Write a policy into an ONNX file.
 
@@ -80,14 +90,18 @@ def write_onnx_file(
         [helper.make_tensor_value_info("target_rad", TensorProto.FLOAT, [1, joint_count])],
         [numpy_helper.from_array(array, name) for name, array in arrays.items()],
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET_VERSION)], ir_version=IR_VERSION)
+    model = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", OPSET_VERSION)], ir_version=IR_VERSION
+    )
     metadata = {
         OBSERVATIONS_KEY: ",".join(OBSERVE),
         ACTION_KEY: "position",
         JOINTS_KEY: str(joint_count),
         FRAME_SKIP_KEY: str(frame_skip),
         "snakesim.trained_by": " ".join(again),
-        LEARNED_PARAMETERS_KEY: json.dumps({name: round(value, 6) for name, value in values.items()}),
+        LEARNED_PARAMETERS_KEY: json.dumps(
+            {name: round(value, 6) for name, value in values.items()}
+        ),
     }
     helper.set_model_props(model, metadata)
     onnx.checker.check_model(model)

@@ -18,7 +18,8 @@ RAMP_PER_S = 1.0  # the wave grows to its full amplitude in 1 s
 INPUT_SCALES = {"angle_rad": 0.5, "velocity_rad_s": 2.0, "torque_nm": 5.0, "contact_n": 50.0}
 """Values of an observation that count as 1 for a gain."""
 REACTION_PARTS = ("angle_rad", "velocity_rad_s", "torque_nm")
-NEIGHBOR_STEPS = {"behind": -1, "itself": 0, "ahead": 1}  # steps along the joints that bend sideways
+# Steps along the joints that bend sideways.
+NEIGHBOR_STEPS = {"behind": -1, "itself": 0, "ahead": 1}
 Array = NDArray[np.float32]
 
 
@@ -36,7 +37,9 @@ WAVE = {
     "growth": LearnedParameter(0.0, 0.1, "rad, of the amplitude at the tail"),
     "omega": LearnedParameter(3.5, 0.7, "rad/s"),
     "lag": LearnedParameter(0.9, 0.1, "rad, of a joint behind the one ahead of it"),
-    "steering": LearnedParameter(0.06, 0.03, "rad of every joint, times the sine of the goal's bearing"),
+    "steering": LearnedParameter(
+        0.06, 0.03, "rad of every joint, times the sine of the goal's bearing"
+    ),
     "head_steering": LearnedParameter(0.0, 0.05, "the same, growing towards the head"),
 }
 FEELING = {
@@ -44,8 +47,12 @@ FEELING = {
     for part in REACTION_PARTS
     for where in NEIGHBOR_STEPS
 } | {
-    "contact_behind": LearnedParameter(0.0, 0.05, "rad of amplitude for each 50 N on the link behind"),
-    "contact_ahead": LearnedParameter(0.0, 0.05, "rad of amplitude for each 50 N on the link ahead"),
+    "contact_behind": LearnedParameter(
+        0.0, 0.05, "rad of amplitude for each 50 N on the link behind"
+    ),
+    "contact_ahead": LearnedParameter(
+        0.0, 0.05, "rad of amplitude for each 50 N on the link ahead"
+    ),
 }
 FORMS = {"wave": WAVE, "feeling": WAVE | FEELING}
 
@@ -76,8 +83,10 @@ class PolicyArrays:
         joint_count = len(axes)
         parameters = {**dict.fromkeys(FEELING, 0.0), **values}
         is_yaw = np.array([axis == "yaw" for axis in axes], dtype=np.float64)  # 1.0 or 0.0
-        yaw_joints_ahead = np.cumsum(is_yaw[::-1])[::-1] - 1  # number of yaw joints between a joint and the head
-        tail_fraction = np.clip(yaw_joints_ahead / max(is_yaw.sum() - 1, 1), 0, 1)  # 0 at the head, 1 at the tail
+        # Number of yaw joints between a joint and the head.
+        yaw_joints_ahead = np.cumsum(is_yaw[::-1])[::-1] - 1
+        # 0 at the head, 1 at the tail.
+        tail_fraction = np.clip(yaw_joints_ahead / max(is_yaw.sum() - 1, 1), 0, 1)
 
         observation_size = 0
         first_row_by_part: dict[str, int] = {}  # of each part of the observation
@@ -92,7 +101,9 @@ class PolicyArrays:
         time[first_row_by_part["time_s"]] = 1.0
         # The part has the cosine and the sine of the bearing.
         bearing_sine_row = first_row_by_part["goal_bearing"] + 1
-        steering[bearing_sine_row] = parameters["steering"] + parameters["head_steering"] * (1 - tail_fraction)
+        steering[bearing_sine_row] = parameters["steering"] + parameters["head_steering"] * (
+            1 - tail_fraction
+        )
         yaw_joints = np.flatnonzero(is_yaw)
         for position, joint in enumerate(yaw_joints):
             for neighbor_name, step in NEIGHBOR_STEPS.items():
@@ -104,8 +115,12 @@ class PolicyArrays:
                     feeling[first_row_by_part[part] + neighbor, joint] = gain / INPUT_SCALES[part]
             # Joint i is between link i behind it and link i + 1 ahead of it.
             contact_row_behind = first_row_by_part["contact_n"] + joint
-            yielding[contact_row_behind, joint] = parameters["contact_behind"] / INPUT_SCALES["contact_n"]
-            yielding[contact_row_behind + 1, joint] = parameters["contact_ahead"] / INPUT_SCALES["contact_n"]
+            yielding[contact_row_behind, joint] = (
+                parameters["contact_behind"] / INPUT_SCALES["contact_n"]
+            )
+            yielding[contact_row_behind + 1, joint] = (
+                parameters["contact_ahead"] / INPUT_SCALES["contact_n"]
+            )
 
         omega = np.full(joint_count, parameters["omega"])
         lag = parameters["lag"] * yaw_joints_ahead

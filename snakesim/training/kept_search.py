@@ -79,7 +79,9 @@ def open_search_file(folder: Path, command: Sequence[str], *, resume: bool) -> I
         generations = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, b"".join(msgspec.json.encode(line) + b"\n" for line in (header, *generations)))
+        write_atomically(
+            path, b"".join(msgspec.json.encode(line) + b"\n" for line in (header, *generations))
+        )
         handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
     except OSError as error:
         raise ConfigError(
@@ -105,7 +107,8 @@ def _read_generations(path: Path, expected: _SearchHeader) -> list[KeptGeneratio
         content = path.read_bytes()
     except OSError as error:
         raise ConfigError(
-            f"--resume: {path}: {error.strerror}; leave --resume out to begin a search there", code="file/not-writable"
+            f"--resume: {path}: {error.strerror}; leave --resume out to begin a search there",
+            code="file/not-writable",
         ) from None
     try:
         header_line, *lines = content.split(b"\n")[:-1]
@@ -113,7 +116,8 @@ def _read_generations(path: Path, expected: _SearchHeader) -> list[KeptGeneratio
         generations = [msgspec.json.decode(line, type=KeptGeneration) for line in lines]
     except (ValueError, msgspec.MsgspecError) as error:
         raise ConfigError(
-            f"--resume: {path} is no search: {error}; choose another --out", code="evaluation/other-search"
+            f"--resume: {path} is no search: {error}; choose another --out",
+            code="evaluation/other-search",
         ) from None
     if header != expected:
         raise ConfigError(

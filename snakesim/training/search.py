@@ -11,9 +11,11 @@ from snakesim.training.form import FORMS
 from snakesim.training.kept_search import KeptGeneration, SearchCheck
 
 CHECK_INTERVAL = 5  # generations
-FIRST_TRAINING_SEED = 1_000_001  # seed of the first field that is searched on; evaluations use fields from 1 on
+# Seed of the first field that is searched on; evaluations use fields from 1 on.
+FIRST_TRAINING_SEED = 1_000_001
 FIRST_CHECK_SEED = 2_000_001  # seed of the first field that policies are checked on
-RETRY_SEED_STEP = 10_000_000  # step to other seeds when no field of a generation has room for its obstacles
+# Step to other seeds when no field of a generation has room for its obstacles.
+RETRY_SEED_STEP = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,8 @@ class SearchGeneration:
     episodes: int  # so far, checks not counted
     mean_reward: float  # of the population, on this generation's fields
     best_reward: float
-    check_reward: float | None  # of the distribution's mean, on fields that it is not searched on; None: not checked
+    # Of the distribution's mean, on fields that it is not searched on; None: not checked.
+    check_reward: float | None
     check_advance_m: float | None
     check_goals: float | None  # share that reached it
 
@@ -69,9 +72,13 @@ def run_search(
             policies are proposed again by the optimizer, but not run.
     """
     parameters = FORMS[form]
-    start = np.array([start_values.get(name, parameter.start) for name, parameter in parameters.items()])
+    start = np.array(
+        [start_values.get(name, parameter.start) for name, parameter in parameters.items()]
+    )
     sigmas = effort.spread * np.array([parameter.sigma for parameter in parameters.values()])
-    optimizer = cmaes.CMA(np.zeros(len(start)), 1.0, seed=effort.seed, population_size=effort.population)
+    optimizer = cmaes.CMA(
+        np.zeros(len(start)), 1.0, seed=effort.seed, population_size=effort.population
+    )
     best_policy: dict[str, float] = {}
     best_reward = -np.inf
 
@@ -79,7 +86,9 @@ def run_search(
         """Return the parameters, by name, for a point of the search space, whose unit is one sigma."""
         return dict(zip(parameters, (start + sigmas * point).tolist(), strict=True))
 
-    for number in range(effort.generations + 1):  # in the last round, the mean policy is only checked
+    for number in range(
+        effort.generations + 1
+    ):  # in the last round, the mean policy is only checked
         is_last = number == effort.generations
         mean_policy = make_parameters(optimizer.mean)
         points = [] if is_last else [optimizer.ask() for _ in range(effort.population)]
@@ -101,7 +110,9 @@ def run_search(
         yield SearchStep(_make_curve_row(number, result, effort), result, best_policy, best_reward)
 
 
-def _run_check(episodes: EpisodeRunner, policy: Mapping[str, float], effort: SearchEffort) -> SearchCheck:
+def _run_check(
+    episodes: EpisodeRunner, policy: Mapping[str, float], effort: SearchEffort
+) -> SearchCheck:
     """Run a policy on the check fields, which the search does not use, and return the means over these episodes."""
     fields = range(FIRST_CHECK_SEED, FIRST_CHECK_SEED + effort.check_fields)
     check_episodes = episodes.run([policy], fields)[0]
@@ -113,7 +124,10 @@ def _run_check(episodes: EpisodeRunner, policy: Mapping[str, float], effort: Sea
 
 
 def _run_generation(
-    episodes: EpisodeRunner, policies: Sequence[Mapping[str, float]], number: int, effort: SearchEffort
+    episodes: EpisodeRunner,
+    policies: Sequence[Mapping[str, float]],
+    number: int,
+    effort: SearchEffort,
 ) -> list[float]:
     """Run the policies of a generation on the fields of the generation, and return the mean reward of each policy."""
     if not policies:

@@ -60,17 +60,23 @@ def train_policy(
     with raise_on_stop_signals():
         try:
             with (
-                EpisodeRunner({**arguments, "frame_skip": FRAME_SKIP}, worker_count, cluster) as episodes,
+                EpisodeRunner(
+                    {**arguments, "frame_skip": FRAME_SKIP}, worker_count, cluster
+                ) as episodes,
                 kept_search.open_search_file(folder, again, resume=resume) as kept,
             ):
                 known_count = len(kept.generations)
                 if resume:
-                    print_line(f"{known_count} of {effort.generations + 1} generations are done already")
+                    print_line(
+                        f"{known_count} of {effort.generations + 1} generations are done already"
+                    )
                 for step in run_search(episodes, form, effort, start_values, kept.generations):
                     curve.append(step.row)
                     if len(curve) > known_count:
                         print_line(_format_generation(step.row))
-                        policy = PolicyArrays.make_from_parameters(step.best, episodes.axes, episodes.sizes)
+                        policy = PolicyArrays.make_from_parameters(
+                            step.best, episodes.axes, episodes.sizes
+                        )
                         write_onnx_file(folder / POLICY_FILE, policy, step.best, FRAME_SKIP, again)
                         write_curve(folder, curve)
                         kept.add(step.kept)

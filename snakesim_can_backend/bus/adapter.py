@@ -18,7 +18,14 @@ from typing import Any
 
 import can
 
-from snakesim_can_backend.bus.bus import IO_ERRORS, MAX_AT_ONCE, SocketCanWire, Wire, to_python_can, validate_interface
+from snakesim_can_backend.bus.bus import (
+    IO_ERRORS,
+    MAX_AT_ONCE,
+    SocketCanWire,
+    Wire,
+    to_python_can,
+    validate_interface,
+)
 from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.load import BIT_RATE
 from snakesim_can_backend.bus.loopback_wire import INTERFACE as LOOPBACK
@@ -28,15 +35,12 @@ from snakesim_can_backend.protocol.definitions import NODE_BITS, CanFrame, Opcod
 from snakesim_hal.base.errors import BackendError, ConfigError, suggest_word
 
 OWN_INTERFACES = (UNIX, LOOPBACK)  # implemented here, not by python-can
-INTERFACES_WITHOUT_ADAPTER = ("udp_multicast", "virtual", *OWN_INTERFACES)  # they have no bit rate, either
-FD_INTERFACES = (
-    "socketcan",
-    "kvaser",
-    "udp_multicast",
-    "virtual",
-    LOOPBACK,
-)  # interfaces through which this driver supports CAN FD
-ARE_MULTICAST_GROUPS_SEPARATE = sys.platform == "linux"  # only Linux keeps multicast groups on one UDP port apart
+# They have no bit rate, either.
+INTERFACES_WITHOUT_ADAPTER = "udp_multicast", "virtual", *OWN_INTERFACES
+# Interfaces through which this driver supports CAN FD.
+FD_INTERFACES = "socketcan", "kvaser", "udp_multicast", "virtual", LOOPBACK
+# Only Linux keeps multicast groups on one UDP port apart.
+ARE_MULTICAST_GROUPS_SEPARATE = sys.platform == "linux"
 IP_MULTICAST_ALL = 49  # linux/in.h
 IPV6_MULTICAST_ALL = 29  # linux/in6.h
 ERROR_FRAME_BYTES = 8  # of a whole error frame of the kernel
@@ -73,7 +77,10 @@ POLL_PERIOD_S = 0.0005  # pause between two looks at an adapter that has no file
 
 
 def open_wire(
-    channel: str, only: Iterable[Opcode] | None = None, bit_rate: int = BIT_RATE, data_bit_rate: int | None = None
+    channel: str,
+    only: Iterable[Opcode] | None = None,
+    bit_rate: int = BIT_RATE,
+    data_bit_rate: int | None = None,
 ) -> Wire:
     """Open one end of a bus: a SocketCAN interface of the kernel, or an adapter of python-can.
 
@@ -111,7 +118,8 @@ def split_channel(channel: str) -> tuple[str, str]:
         )
     if not name:
         raise ConfigError(
-            f"channel {channel!r}: give INTERFACE:CHANNEL, such as slcan:/dev/ttyACM0", code="bus/invalid-channel"
+            f"channel {channel!r}: give INTERFACE:CHANNEL, such as slcan:/dev/ttyACM0",
+            code="bus/invalid-channel",
         )
     return interface, name
 
@@ -194,7 +202,9 @@ def open_bus(channel: str, bit_rate: int, data_bit_rate: int | None = None) -> c
         )
         is_library_missing = isinstance(error, NameError | AttributeError)
         reason = "its library is missing" if is_library_missing else str(error)
-        raise BackendError(f"{channel}: cannot be opened: {reason}{needs}", code="bus/cannot-open") from error
+        raise BackendError(
+            f"{channel}: cannot be opened: {reason}{needs}", code="bus/cannot-open"
+        ) from error
     if interface == "udp_multicast":
         restrict_to_own_multicast_group(bus)
     return bus
@@ -237,7 +247,11 @@ class AdapterWire:
     """One end of a bus, through python-can. On classic CAN it drops all frames but data frames with 11-bit ids."""
 
     def __init__(
-        self, channel: str, only: Iterable[Opcode] | None, bit_rate: int, data_bit_rate: int | None = None
+        self,
+        channel: str,
+        only: Iterable[Opcode] | None,
+        bit_rate: int,
+        data_bit_rate: int | None = None,
     ) -> None:
         """Open the adapter. `open_wire` explains the arguments. Raises ConfigError and BackendError."""
         self.channel = channel
@@ -246,7 +260,9 @@ class AdapterWire:
         self._bus = open_bus(channel, bit_rate, data_bit_rate)
         self._descriptor = self._find_file_descriptor()
         # UDP multicast returns the frames that this end sends: how many of each are still to come back.
-        self._pending_echo_counts: Counter[CanFrame] | None = Counter() if _is_multicast(channel) else None
+        self._pending_echo_counts: Counter[CanFrame] | None = (
+            Counter() if _is_multicast(channel) else None
+        )
         self._errors: list[BusError] = []
 
     def send(self, frame: CanFrame) -> bool:
@@ -257,7 +273,9 @@ class AdapterWire:
             self._errors.append(BusError("not_sent", self.channel, str(error)))
             return False
         except (OSError, ValueError) as error:
-            raise BackendError(f"{self.channel}: cannot send: {error}", code="bus/io-failed") from error
+            raise BackendError(
+                f"{self.channel}: cannot send: {error}", code="bus/io-failed"
+            ) from error
         if self._pending_echo_counts is not None:
             self._pending_echo_counts[frame] += 1
         return True
@@ -277,7 +295,9 @@ class AdapterWire:
                 if self._should_receive(message, frame):
                     frames.append(frame)
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot receive: {error}", code="bus/io-failed") from error
+            raise BackendError(
+                f"{self.channel}: cannot receive: {error}", code="bus/io-failed"
+            ) from error
         return frames
 
     def errors(self) -> list[BusError]:
@@ -306,7 +326,9 @@ class AdapterWire:
         try:
             self._bus.shutdown()
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot be closed: {error}", code="bus/io-failed") from error
+            raise BackendError(
+                f"{self.channel}: cannot be closed: {error}", code="bus/io-failed"
+            ) from error
 
     def _decode_errors(self, message: can.Message) -> list[BusError]:
         interface, _ = split_channel(self.channel)
@@ -326,7 +348,10 @@ class AdapterWire:
         ):  # UDP does not report which end sent a datagram
             self._pending_echo_counts[frame] -= 1
             return False
-        return self._received_opcodes is None or message.arbitration_id >> NODE_BITS in self._received_opcodes
+        return (
+            self._received_opcodes is None
+            or message.arbitration_id >> NODE_BITS in self._received_opcodes
+        )
 
     def _find_file_descriptor(self) -> int | None:
         try:

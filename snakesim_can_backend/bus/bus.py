@@ -117,14 +117,17 @@ class SocketCanWire:
             self._set_filters()
             self._socket.setblocking(False)
         except IO_ERRORS as error:
-            raise BackendError(f"{channel}: cannot be opened: {error}", code="bus/cannot-open") from error
+            raise BackendError(
+                f"{channel}: cannot be opened: {error}", code="bus/cannot-open"
+            ) from error
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._buffer = bytearray(RAW_FRAME_FORMAT.size)
         self._errors: list[BusError] = []
         self._is_down = False  # whether the interface is down
         self._is_unplugged = False  # whether the adapter of the interface was unplugged
-        self._reported_drop_count = 0  # received frames that the kernel had dropped at the last call of `errors`
+        # Received frames that the kernel had dropped at the last call of `errors`.
+        self._reported_drop_count = 0
 
     def send(self, frame: CanFrame) -> bool:
         """Send a frame; return False if the queue is full or the interface is down."""
@@ -176,7 +179,9 @@ class SocketCanWire:
         try:
             self._bus.shutdown()
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot be closed: {error}", code="bus/io-failed") from error
+            raise BackendError(
+                f"{self.channel}: cannot be closed: {error}", code="bus/io-failed"
+            ) from error
 
     def _set_filters(self) -> None:
         """Let the kernel drop all messages that this end does not need."""
@@ -184,7 +189,9 @@ class SocketCanWire:
         if self._received_opcodes is not None:
             opcode_mask = LAST_STANDARD_ID & ~NODE_MASK
             filters = [(opcode << NODE_BITS, opcode_mask) for opcode in self._received_opcodes]
-        data = b"".join(struct.pack("=II", identifier, mask | EXTENDED | REMOTE) for identifier, mask in filters)
+        data = b"".join(
+            struct.pack("=II", identifier, mask | EXTENDED | REMOTE) for identifier, mask in filters
+        )
         self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, data)
 
     def _record_error_frame(self, identifier: int, data: bytes) -> None:
@@ -193,24 +200,34 @@ class SocketCanWire:
     def _record_os_error(self, error: OSError) -> None:
         """Report a full queue or an interface that went down. Raises BackendError for any other error."""
         match error.errno:
-            case errno.ENOBUFS | errno.EAGAIN:  # the interface's queue, or this socket's share of it
-                self._errors.append(BusError("queue_full", self.channel, "the transmit queue is full"))
+            case (
+                errno.ENOBUFS | errno.EAGAIN
+            ):  # the interface's queue, or this socket's share of it
+                self._errors.append(
+                    BusError("queue_full", self.channel, "the transmit queue is full")
+                )
             case errno.ENETDOWN:
                 self._record_interface_down()
             case errno.ENODEV | errno.ENXIO:
                 self._is_unplugged = True
                 self._record_interface_down()
             case _:
-                raise BackendError(f"{self.channel}: {error.strerror}", code="bus/io-failed") from error
+                raise BackendError(
+                    f"{self.channel}: {error.strerror}", code="bus/io-failed"
+                ) from error
 
     def _record_interface_down(self) -> None:
         if not self._is_down:
             state = "gone" if self._is_unplugged else "down"
-            self._errors.append(BusError("interface_down", self.channel, f"the interface is {state}"))
+            self._errors.append(
+                BusError("interface_down", self.channel, f"the interface is {state}")
+            )
         self._is_down = True
 
     def _record_interface_up(self) -> None:
-        if self._is_unplugged:  # an adapter that was plugged in again is another interface of the same name
+        if (
+            self._is_unplugged
+        ):  # an adapter that was plugged in again is another interface of the same name
             try:
                 self._socket.bind((self.channel,))
                 self._set_filters()  # the kernel dropped them with the interface
@@ -291,7 +308,9 @@ class VirtualWire(FaultableWire):
         try:
             self._bus.send(to_python_can(frame, fd=self._uses_fd))
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot send: {error}", code="bus/io-failed") from error
+            raise BackendError(
+                f"{self.channel}: cannot send: {error}", code="bus/io-failed"
+            ) from error
         return True
 
     def _receive_frames(self) -> list[CanFrame]:
@@ -300,7 +319,9 @@ class VirtualWire(FaultableWire):
             while (message := self._bus.recv(0)) is not None:
                 frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot receive: {error}", code="bus/io-failed") from error
+            raise BackendError(
+                f"{self.channel}: cannot receive: {error}", code="bus/io-failed"
+            ) from error
         return frames
 
     def fileno(self) -> int | None:
@@ -319,11 +340,16 @@ class VirtualWire(FaultableWire):
         try:
             self._bus.shutdown()
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot be closed: {error}", code="bus/io-failed") from error
+            raise BackendError(
+                f"{self.channel}: cannot be closed: {error}", code="bus/io-failed"
+            ) from error
 
 
 def drain_socket(
-    source: socket.socket, buffer: bytearray, frames: list[CanFrame], on_error: Callable[[int, bytes], None]
+    source: socket.socket,
+    buffer: bytearray,
+    frames: list[CanFrame],
+    on_error: Callable[[int, bytes], None],
 ) -> None:
     """Read frames from a non-blocking raw CAN socket until it is empty, at most MAX_AT_ONCE.
 
@@ -375,13 +401,17 @@ def wait(wires: Sequence[Wire], timeout_s: float) -> bool:
             select.select(file_descriptors, [], [], wait_s)
         except IO_ERRORS as error:
             channels = ", ".join(wire.channel for wire in wires)
-            raise BackendError(f"{channels}: cannot be waited for: {error}", code="bus/io-failed") from error
+            raise BackendError(
+                f"{channels}: cannot be waited for: {error}", code="bus/io-failed"
+            ) from error
     elif wait_s > 0:
         time.sleep(wait_s)
     return True
 
 
-def receive_frames(wires: Sequence[Wire], timeout_s: float = MAX_WAIT_S) -> Iterator[tuple[Wire, CanFrame]]:
+def receive_frames(
+    wires: Sequence[Wire], timeout_s: float = MAX_WAIT_S
+) -> Iterator[tuple[Wire, CanFrame]]:
     """Wait for at most MAX_WAIT_S and yield what has arrived. For the time before control cycles begin."""
     if not wait(wires, min(timeout_s, MAX_WAIT_S)):
         time.sleep(PAUSE_S)
@@ -403,7 +433,8 @@ def inject_into(wires: Sequence[Wire], injection: FaultInjection, *, begins: boo
         return False
     if injection.target_index >= len(wires):
         raise ConfigError(
-            f"there is no {injection.target}; this robot has bus_1 to bus_{len(wires)}", code="injection/unknown-target"
+            f"there is no {injection.target}; this robot has bus_1 to bus_{len(wires)}",
+            code="injection/unknown-target",
         )
     wires[injection.target_index].inject(injection.kind, begins=begins)
     return True
@@ -430,7 +461,8 @@ def validate_interface(channel: str) -> None:
         )
     if not is_up(channel):
         raise ConfigError(
-            f"channel {channel!r}: the interface is down; `{bring_up} {channel}` brings it up", code="bus/not-available"
+            f"channel {channel!r}: the interface is down; `{bring_up} {channel}` brings it up",
+            code="bus/not-available",
         )
 
 
@@ -438,7 +470,10 @@ def is_up(channel: str) -> bool:
     """Return whether an interface exists and is administratively up."""
     try:
         flags = int(Path("/sys/class/net", channel, "flags").read_text(encoding="ascii"), 16)
-    except (OSError, ValueError):  # the latter: the file of an interface that is going away is empty
+    except (
+        OSError,
+        ValueError,
+    ):  # the latter: the file of an interface that is going away is empty
         return False
     return bool(flags & INTERFACE_UP)
 

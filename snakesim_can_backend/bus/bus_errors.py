@@ -18,7 +18,11 @@ Kind = Literal[
 ]
 
 # Bits of an error frame's id, and of its second byte: linux/can/error.h.
-ERROR_CLASSES: tuple[tuple[int, Kind], ...] = ((0x40, "bus_off"), (0x20, "not_acknowledged"), (0x100, "restarted"))
+ERROR_CLASSES: tuple[tuple[int, Kind], ...] = (
+    (0x40, "bus_off"),
+    (0x20, "not_acknowledged"),
+    (0x100, "restarted"),
+)
 CONTROLLER_CLASS = 0x04  # the second byte has the controller's state
 CONTROLLER_STATES: tuple[tuple[int, Kind], ...] = (
     (0x30, "error_passive"),

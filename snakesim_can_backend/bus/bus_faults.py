@@ -43,7 +43,10 @@ REPORTED_ERRORS: dict[tuple[str, bool], tuple[Kind, str]] = {
     ("cut", False): ("interface_up", "the interface is up again"),
     ("bus_off", True): ("bus_off", f"transmit errors {MAX_ERRORS}, receive errors 0"),
     ("bus_off", False): ("restarted", "transmit errors 0, receive errors 0"),
-    ("error_passive", True): ("error_passive", f"transmit errors {PASSIVE_ERRORS}, receive errors 0"),
+    ("error_passive", True): (
+        "error_passive",
+        f"transmit errors {PASSIVE_ERRORS}, receive errors 0",
+    ),
 }
 
 
@@ -81,7 +84,9 @@ class VirtualFaults:
         """Return what becomes of a frame that is sent now."""
         if "cut" in self.active:
             return SendOutcome.REJECTED
-        if "bus_off" in self.active:  # its queue is gone with the carrier: the kernel accepts frames and drops them
+        if (
+            "bus_off" in self.active
+        ):  # its queue is gone with the carrier: the kernel accepts frames and drops them
             return SendOutcome.LOST
         if "full" in self.active:
             self._errors.append(BusError("queue_full", self._channel, "the transmit queue is full"))
@@ -125,7 +130,9 @@ def _set_link(channel: str, state: str) -> None:
     command = ["ip", "link", "set", channel, state]
     problem = ""
     try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=IP_TIMEOUT_S, check=False)
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=IP_TIMEOUT_S, check=False
+        )
         if result.returncode:
             problem = result.stderr.strip()
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -137,7 +144,9 @@ def _set_link(channel: str, state: str) -> None:
         )
 
 
-def _send_error_frame(channel: str, error_class: int, controller_state: int, transmit_errors: int) -> None:
+def _send_error_frame(
+    channel: str, error_class: int, controller_state: int, transmit_errors: int
+) -> None:
     """Send an error frame as the driver of a controller does. Only virtual interfaces carry one from a program."""
     if not channel.startswith(VIRTUAL):
         raise ConfigError(
@@ -146,11 +155,14 @@ def _send_error_frame(channel: str, error_class: int, controller_state: int, tra
         )
     data = bytes([0, controller_state, 0, 0, 0, 0, transmit_errors, 0])
     frame = struct.pack("=IB3x8s", ERROR_FRAME | error_class, len(data), data)
-    with contextlib.closing(socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)) as sender:
+    with contextlib.closing(
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    ) as sender:
         try:
             sender.bind((channel,))
             sender.send(frame)
         except OSError as error:
             raise ConfigError(
-                f"{channel}: cannot send an error frame: {error.strerror}", code="injection/not-supported"
+                f"{channel}: cannot send an error frame: {error.strerror}",
+                code="injection/not-supported",
             ) from error

@@ -10,7 +10,12 @@ from dataclasses import dataclass, replace
 from math import ceil
 
 from snakesim_can_backend.protocol.codec import load_layouts
-from snakesim_can_backend.protocol.definitions import HEALTH_PERIOD_S, HEARTBEAT_PERIOD_S, LAST_NODE, Opcode
+from snakesim_can_backend.protocol.definitions import (
+    HEALTH_PERIOD_S,
+    HEARTBEAT_PERIOD_S,
+    LAST_NODE,
+    Opcode,
+)
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig
@@ -38,7 +43,9 @@ def compute_max_frame_bits(length: int) -> int:
     return FRAME_BITS + 8 * length + (STUFFABLE_BITS + 8 * length - 1) // 4
 
 
-def compute_max_frame_duration_s(length: int, bit_rate: int, data_bit_rate: int | None = None) -> float:
+def compute_max_frame_duration_s(
+    length: int, bit_rate: int, data_bit_rate: int | None = None
+) -> float:
     """Return the time that a frame occupies the bus with the maximum number of stuff bits.
 
     On CAN FD, identifier and end are sent at the first bit rate; length, data and CRC at the second. The CRC has 17
@@ -114,14 +121,26 @@ def list_streams(joint_count: int, reports: ReportSchedule) -> list[FrameStream]
 
 def compute_bus_load(joint_count: int, reports: ReportSchedule) -> float:
     """Return the worst-case load of a bus, as a fraction of its time."""
-    return sum(stream.bits_per_s for stream in list_streams(joint_count, reports)) / reports.bit_rate
+    return (
+        sum(stream.bits_per_s for stream in list_streams(joint_count, reports)) / reports.bit_rate
+    )
 
 
 def busiest_period_s(joint_count: int, reports: ReportSchedule) -> float:
     """Return the bus time of a period with force reports: Sync, all answers and all setpoints, at worst."""
     one_period = ReportSchedule(1.0, min(reports.contact_every, 1), 0, reports.tail)
-    in_each_period = (Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.CONTACT, Opcode.TAIL_CONTACT)
-    streams = [stream for stream in list_streams(joint_count, one_period) if stream.opcode in in_each_period]
+    in_each_period = (
+        Opcode.SYNC,
+        Opcode.SET_POINT,
+        Opcode.JOINT_STATE,
+        Opcode.CONTACT,
+        Opcode.TAIL_CONTACT,
+    )
+    streams = [
+        stream
+        for stream in list_streams(joint_count, one_period)
+        if stream.opcode in in_each_period
+    ]
     return sum(stream.bits_per_s for stream in streams) / reports.bit_rate
 
 
@@ -182,7 +201,8 @@ def count_joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
     buses = max(len(settings.channels), 1)
     if len(set(settings.channels)) < len(settings.channels):
         raise ConfigError(
-            f"`backends.can.channels` = {settings.channels} names a channel twice", code="bus/invalid-channel"
+            f"`backends.can.channels` = {settings.channels} names a channel twice",
+            code="bus/invalid-channel",
         )
     if joints > LAST_NODE:
         raise ConfigError(
@@ -198,7 +218,8 @@ def count_joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
         )
     if buses > joints:
         raise ConfigError(
-            f"`backends.can.channels` names {buses} channels for {joints} joints", code="bus/invalid-channel"
+            f"`backends.can.channels` names {buses} channels for {joints} joints",
+            code="bus/invalid-channel",
         )
     if joint_counts:
         return list(joint_counts)
@@ -277,7 +298,9 @@ def explain_load(joint_count: int, reports: ReportSchedule) -> list[str]:
         )
     total_percent = 100 * compute_bus_load(joint_count, reports)
     bit_rate = format_bit_rate(reports.bit_rate)
-    lines.append(f"  together {total_percent:.1f} % of {bit_rate} at worst-case stuffing; at most {MAX_LOAD:.0%}")
+    lines.append(
+        f"  together {total_percent:.1f} % of {bit_rate} at worst-case stuffing; at most {MAX_LOAD:.0%}"
+    )
     return lines
 
 
@@ -310,7 +333,9 @@ def suggest_alternatives(joints: Sequence[int], config: RunConfig, settings: Can
         if not 0 < contact_every <= MAX_SYNCS_PER_REPORT:
             continue
         if is_feasible(fullest_bus, replace(reports, contact_every=contact_every)):
-            alternatives.append(f"backends.can.contact_rate_hz = {config.rate_hz / contact_every:g}")
+            alternatives.append(
+                f"backends.can.contact_rate_hz = {config.rate_hz / contact_every:g}"
+            )
             break
 
     text = "; or ".join(alternatives) or "nothing on classic CAN"

@@ -35,7 +35,8 @@ def open_log(path: Path, backend: str = "can") -> TextIO:
         return path.open("w", encoding="utf-8", errors="backslashreplace", buffering=FLUSH_BYTES)
     except OSError as error:
         raise ConfigError(
-            f"`backends.{backend}.log` = {str(path)!r}: {error.strerror}; choose another file", code="file/not-writable"
+            f"`backends.{backend}.log` = {str(path)!r}: {error.strerror}; choose another file",
+            code="file/not-writable",
         ) from error
 
 
@@ -80,8 +81,12 @@ class LoggedWire:
         prefix = f"({time.time():.6f}) {self.channel}"
         try:
             for frame in frames:
-                identifier = f"{frame.id:03X}" if frame.id <= LAST_STANDARD_ID else f"{frame.id:08X}"
-                self._log.write(f"{prefix} {identifier}{self._mark}{frame.data.hex().upper()} {direction}\n")
+                identifier = (
+                    f"{frame.id:03X}" if frame.id <= LAST_STANDARD_ID else f"{frame.id:08X}"
+                )
+                self._log.write(
+                    f"{prefix} {identifier}{self._mark}{frame.data.hex().upper()} {direction}\n"
+                )
         except OSError as error:  # a full disk ends the log, and nothing else
             self._is_full = True
             _log.warning("the bus log ends here: %s", error.strerror)

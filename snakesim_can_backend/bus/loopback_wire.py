@@ -55,7 +55,9 @@ class LoopbackWire(FaultableWire):
             self._marker.touch()
         except OSError as error:
             self._socket.close()
-            raise BackendError(f"{channel}: cannot be opened: {error}", code="bus/cannot-open") from error
+            raise BackendError(
+                f"{channel}: cannot be opened: {error}", code="bus/cannot-open"
+            ) from error
         self._other_ports: list[int] = []
         self._next_list_s = 0.0
 
@@ -63,7 +65,9 @@ class LoopbackWire(FaultableWire):
         """Send a frame to all other ends. Each accepts it, or loses it if its buffer is full."""
         datagram = _ID.pack(frame.id) + frame.data
         for port in self._list_other_ports():
-            with contextlib.suppress(OSError):  # a full buffer loses the frame, as that of a kernel interface does
+            with contextlib.suppress(
+                OSError
+            ):  # a full buffer loses the frame, as that of a kernel interface does
                 self._socket.sendto(datagram, (LOCALHOST, port))
         return True
 
@@ -75,7 +79,10 @@ class LoopbackWire(FaultableWire):
                 if len(datagram) < _ID.size:
                     continue
                 (identifier,) = _ID.unpack_from(datagram)
-                if self._received_opcodes is None or identifier >> NODE_BITS in self._received_opcodes:
+                if (
+                    self._received_opcodes is None
+                    or identifier >> NODE_BITS in self._received_opcodes
+                ):
                     frames.append(CanFrame(identifier, datagram[_ID.size :]))
         return frames
 
@@ -102,7 +109,10 @@ class LoopbackWire(FaultableWire):
         with contextlib.suppress(OSError):  # the folder is gone
             for name in os.listdir(self._folder):  # noqa: PTH208 - names alone, several times a second
                 process_text, _, port_text = name.partition("-")
-                if not (process_text.isdecimal() and port_text.isdecimal()) or int(port_text) == self._port:
+                if (
+                    not (process_text.isdecimal() and port_text.isdecimal())
+                    or int(port_text) == self._port
+                ):
                     continue
                 if Path("/proc", process_text).exists():
                     ports.append(int(port_text))

@@ -36,9 +36,11 @@ COMPACT_LINE_PATTERN = re.compile(  # (1700000000.000000) can0 105#00112233 R
     r"#(?:(?P<remote>R\d?)|(?P<flags>#[0-9A-Fa-f])?(?P<data>(?:[0-9A-Fa-f]{2})*)(?:_[0-9A-F])?)"
     r"(?:\s+(?P<direction>[RT]))?\s*"
 )
-PRINTED_LINE_PATTERN = re.compile(  # can0  105   [8]  00 11 22 33 44 55 66 77; of CAN FD the length has two digits
-    r"\s*(?:\((?P<time>[^)]+)\)\s+)?(?P<channel>\S+)\s+(?:(?P<direction>[RT])X\s+\S+\s+\S+\s+)?"
-    r"(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[(?P<length>\d{1,2})\](?P<rest>.*)"
+PRINTED_LINE_PATTERN = (
+    re.compile(  # can0  105   [8]  00 11 22 33 44 55 66 77; of CAN FD the length has two digits
+        r"\s*(?:\((?P<time>[^)]+)\)\s+)?(?P<channel>\S+)\s+(?:(?P<direction>[RT])X\s+\S+\s+\S+\s+)?"
+        r"(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[(?P<length>\d{1,2})\](?P<rest>.*)"
+    )
 )
 HEX_BYTE_PATTERN = re.compile(r"\s+([0-9A-Fa-f]{2})(?=\s|$)")
 

@@ -12,7 +12,10 @@ ResponseT = TypeVar("ResponseT")
 
 
 def request_response(
-    wire: Wire, request: CanFrame | None, decode: Callable[[CanFrame], ResponseT | None], timeout_s: float
+    wire: Wire,
+    request: CanFrame | None,
+    decode: Callable[[CanFrame], ResponseT | None],
+    timeout_s: float,
 ) -> ResponseT | None:
     """Send a request, and return the first answer to it.
 

@@ -55,7 +55,9 @@ class UnixWire(FaultableWire):
             self._socket.setblocking(False)
         except OSError as error:
             self._socket.close()
-            raise BackendError(f"{self.channel}: cannot be opened: {error}", code="bus/cannot-open") from error
+            raise BackendError(
+                f"{self.channel}: cannot be opened: {error}", code="bus/cannot-open"
+            ) from error
         self._received = b""  # the beginning of a frame that has not arrived completely
         self._errors: list[BusError] = []
         self._is_down = False  # whether the modules' process has ended
@@ -65,7 +67,9 @@ class UnixWire(FaultableWire):
         record = RAW_FRAME_FORMAT.pack(frame.id, len(frame.data), frame.data)
         try:
             sent_bytes = self._socket.send(record)
-            while sent_bytes < len(record):  # the rest of a frame must follow, or all later ones are shifted
+            while sent_bytes < len(
+                record
+            ):  # the rest of a frame must follow, or all later ones are shifted
                 self._socket.setblocking(True)
                 sent_bytes += self._socket.send(record[sent_bytes:])
                 self._socket.setblocking(False)
@@ -106,7 +110,9 @@ class UnixWire(FaultableWire):
         try:
             self._socket.close()
         except IO_ERRORS as error:
-            raise BackendError(f"{self.channel}: cannot be closed: {error}", code="bus/io-failed") from error
+            raise BackendError(
+                f"{self.channel}: cannot be closed: {error}", code="bus/io-failed"
+            ) from error
 
     def _read_all(self) -> bytes:
         chunks: list[bytes] = []
@@ -124,5 +130,7 @@ class UnixWire(FaultableWire):
 
     def _record_end(self) -> None:
         if not self._is_down:
-            self._errors.append(BusError("interface_down", self.channel, "the process with the modules has ended"))
+            self._errors.append(
+                BusError("interface_down", self.channel, "the process with the modules has ended")
+            )
         self._is_down = True

@@ -80,11 +80,17 @@ def listen_for_unknown_frames(bus: can.BusABC, duration_s: float) -> list[Unknow
             frame_count_by_key[key] += 1
             newest_message_by_key[key] = message
     except (OSError, ValueError, can.CanError) as error:
-        raise BackendError(f"{bus.channel_info}: cannot be listened to: {error}", code="bus/io-failed") from error
+        raise BackendError(
+            f"{bus.channel_info}: cannot be listened to: {error}", code="bus/io-failed"
+        ) from error
     unknown: list[UnknownFrames] = []
     for (identifier, extended), count in sorted(frame_count_by_key.items()):
         message = newest_message_by_key[identifier, extended]
-        unknown.append(UnknownFrames(identifier, extended, len(message.data), count, guess_frame_origin(message)))
+        unknown.append(
+            UnknownFrames(
+                identifier, extended, len(message.data), count, guess_frame_origin(message)
+            )
+        )
     return unknown
 
 

@@ -22,7 +22,11 @@ from snakesim_drivers.kit.drive_settings import (
     make_emulated_body,
     make_joint_label,
 )
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, make_bus_specs_by_port
+from snakesim_drivers.kit.drive_type import (
+    DriverTypeBackend,
+    DriverTypeContext,
+    make_bus_specs_by_port,
+)
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import FAULT_KINDS
@@ -33,12 +37,16 @@ from snakesim_hal.model.scenario import RunConfig
 class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
     """Settings that every driver type on CAN has."""
 
-    channels: Annotated[list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)] = []
+    channels: Annotated[
+        list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)
+    ] = []
     """CAN buses: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can. Empty: emulated drives in this
     process.
     """
 
-    bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = 1_000_000
+    bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = (
+        1_000_000
+    )
     """Bit rate of the buses, for which loads are computed and to which adapters are set."""
 
     log: str = ""
@@ -64,7 +72,8 @@ class CanDriveBackend(DriverTypeBackend):
     last_id: ClassVar[int]
     reserved_ids: ClassVar[str]  # what the ids beyond these are, for a message
     traffic: ClassVar[CycleTraffic]
-    report_period_s: ClassVar[float | None] = None  # of a drive's state; None: a drive reports it when requested
+    # Of a drive's state; None: a drive reports it when requested.
+    report_period_s: ClassVar[float | None] = None
 
     @classmethod
     def validate_joint(cls, config: RunConfig, settings: Any, joint: Joint) -> None:
@@ -113,7 +122,9 @@ class CanDriveBackend(DriverTypeBackend):
                 )
             cls.validate_joint(config, settings, joint)
         rate_hz = config.rate_hz / settings.decimation
-        cls.compute_load(rate_hz, settings, joints).check(cls.name, rate_hz, cls.describe_bit_rates(settings))
+        cls.compute_load(rate_hz, settings, joints).check(
+            cls.name, rate_hz, cls.describe_bit_rates(settings)
+        )
 
     @staticmethod
     def has_real_bus(settings: Any) -> bool:
@@ -133,7 +144,9 @@ class CanDriveBackend(DriverTypeBackend):
         def compute_frame_duration_s(length: int) -> float:
             return compute_max_frame_duration_s(length, settings.bit_rate, settings.fd_rate)
 
-        return compute_load(cls.traffic, assign_ports(joints, settings.channels), rate_hz, compute_frame_duration_s)
+        return compute_load(
+            cls.traffic, assign_ports(joints, settings.channels), rate_hz, compute_frame_duration_s
+        )
 
     @staticmethod
     def describe_bit_rates(settings: Any) -> str:
@@ -145,7 +158,12 @@ class CanDriveBackend(DriverTypeBackend):
 
     @classmethod
     def make_emulator(
-        cls, config: RunConfig, settings: Any, wires: Sequence[Wire], clock: DriverClock, pose_address: str | None
+        cls,
+        config: RunConfig,
+        settings: Any,
+        wires: Sequence[Wire],
+        clock: DriverClock,
+        pose_address: str | None,
     ) -> CanEmulator:
         """Create the emulated drives of a whole robot, on buses that are already open.
 
@@ -159,7 +177,9 @@ class CanDriveBackend(DriverTypeBackend):
         body = make_emulated_body(config, settings, cls.name, pose_address)
         joints = config.robot.joint_table
         wire_by_joint = [wires[bus] for bus in assign_ports(joints, settings.channels)]
-        return cls.emulator_class(CanEmulatorContext(joints, settings, body, wire_by_joint, clock.now_ns))
+        return cls.emulator_class(
+            CanEmulatorContext(joints, settings, body, wire_by_joint, clock.now_ns)
+        )
 
     @classmethod
     def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
@@ -193,7 +213,9 @@ class CanDriveBackend(DriverTypeBackend):
             if body is not None:
                 emulator_wire = VirtualWire(channel, fd=uses_fd)
                 wires = [emulator_wire] * len(all_joints)
-                emulator = cls.emulator_class(CanEmulatorContext(all_joints, settings, body, wires, clock.now_ns))
+                emulator = cls.emulator_class(
+                    CanEmulatorContext(all_joints, settings, body, wires, clock.now_ns)
+                )
                 wire: Wire = VirtualWire(channel, emulator, fd=uses_fd)
             else:
                 wire = open_wire(channel, None, settings.bit_rate, settings.fd_rate)

@@ -46,12 +46,19 @@ def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> in
             )
     validate_channels(settings.channels, fd=settings.fd_rate is not None)
     config = msgspec.structs.replace(config, clock_mode="realtime")
-    wires = [open_wire(channel, None, settings.bit_rate, settings.fd_rate) for channel in settings.channels]
+    wires = [
+        open_wire(channel, None, settings.bit_rate, settings.fd_rate)
+        for channel in settings.channels
+    ]
     emulator = backend.make_emulator(config, settings, wires, DriverClock(config), arguments.pose)
-    ready_text = f"{backend.plural_noun} ready: {len(emulator.wires)} on {', '.join(settings.channels)}"
+    ready_text = (
+        f"{backend.plural_noun} ready: {len(emulator.wires)} on {', '.join(settings.channels)}"
+    )
     with contextlib.ExitStack() as exit_stack:
         exit_stack.enter_context(contextlib.closing(emulator))
-        control = EmulatorControl(arguments, emulator.inject_typed, emulator.read_true_state, exit_stack)
+        control = EmulatorControl(
+            arguments, emulator.inject_typed, emulator.read_true_state, exit_stack
+        )
         serve_until_stopped(ready_text, emulator, partial(wait, wires), control.run)
     return 0
 

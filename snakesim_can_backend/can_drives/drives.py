@@ -26,7 +26,8 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 REQUEST_PERIOD_S = 0.1  # from one request to the next one to the same drive in bring-up
-DUPLICATE_WAIT_S = 0.06  # after the last drive has responded: a second drive with its id may respond later
+# After the last drive has responded: a second drive with its id may respond later.
+DUPLICATE_WAIT_S = 0.06
 MIN_UNKNOWN_NODE_FRAMES = 3  # a single frame of an unknown node may be left in a queue from before
 HOST = -1  # the sender of a frame that only a host sends
 
@@ -80,10 +81,13 @@ class CanDrives(Drives):
         self.wire = context.wire
         self.node_ids = [joint.id for joint in context.joints]
         self._index_by_node_id = {node: i for i, node in enumerate(self.node_ids)}
-        self._is_brought_up = False  # whether every drive was found and no other program uses the bus
+        # Whether every drive was found and no other program uses the bus.
+        self._is_brought_up = False
         # What drives report.
         self.readings = context.readings
-        labels = [f"{joint.name} (node {joint.id} on {context.wire.channel})" for joint in context.joints]
+        labels = [
+            f"{joint.name} (node {joint.id} on {context.wire.channel})" for joint in context.joints
+        ]
         self.states = DriveStates(labels, context.report_period_ns, context.clock_ns)
         self.firmware: list[tuple[int, ...]] = [()] * len(self.node_ids)  # (): not reported yet
         # Serial numbers that respond with the id of each joint. Two of them are two drives with one id.
@@ -203,14 +207,21 @@ class CanDrives(Drives):
         self._request_until_done(self.is_identified, self.request_identity)
         self._wait_for_duplicates()
         problems = [
-            f"  {self.states.drives[i].label} {problem}" for i in drives for problem in self._find_identity_problems(i)
+            f"  {self.states.drives[i].label} {problem}"
+            for i in drives
+            for problem in self._find_identity_problems(i)
         ]
         if self._other_controller_seen:
             raise BackendError(
-                "another program commands drives on this bus; end it first. Nothing was sent", code="bus/second-host"
+                "another program commands drives on this bus; end it first. Nothing was sent",
+                code="bus/second-host",
             )
         if problems:
-            raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
+            raise BackendError(
+                "the robot is not complete; nothing was enabled:",
+                *problems,
+                code="drive/not-complete",
+            )
         self._is_brought_up = True
         for i in drives:
             self.send_command(i, "idle")
@@ -218,13 +229,24 @@ class CanDrives(Drives):
             self.write_settings(i)
         self._request_until_done(self._is_start_up_decided, self.request_motion)
         start_problems = {i: self.find_start_up_problem(i) for i in drives}
-        problems = [f"  {self.states.drives[i].label} {problem}" for i, problem in start_problems.items() if problem]
+        problems = [
+            f"  {self.states.drives[i].label} {problem}"
+            for i, problem in start_problems.items()
+            if problem
+        ]
         if problems:
-            raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
-        silent_drives = [self.states.drives[i].label for i in drives if not self.readings.has_reported(i)]
+            raise BackendError(
+                "the robot is not complete; nothing was enabled:",
+                *problems,
+                code="drive/not-complete",
+            )
+        silent_drives = [
+            self.states.drives[i].label for i in drives if not self.readings.has_reported(i)
+        ]
         if silent_drives:
             raise BackendError(
-                f"{', '.join(silent_drives)}: no motion and torque; nothing was enabled", code="drive/silent"
+                f"{', '.join(silent_drives)}: no motion and torque; nothing was enabled",
+                code="drive/silent",
             )
         for i in drives:
             self.request_health(i)
@@ -240,7 +262,8 @@ class CanDrives(Drives):
     def reset_faults(self, joints: frozenset[int]) -> None:
         """Clear errors of these drives, and write the settings that a restart may have lost."""
         self.states.reset_errors(joints)
-        self._serials = [serials[:1] for serials in self._serials]  # a second drive that is still there answers again
+        # A second drive that is still there answers again.
+        self._serials = [serials[:1] for serials in self._serials]
         for i in sorted(joints):
             self.clear_errors(i)
             self.write_settings(i)
@@ -282,8 +305,12 @@ class CanDrives(Drives):
         if not command.may_enable:
             enabled_drives &= self.states.get_enabled_drives()
         for i in sorted(enabled_drives):
-            self.send_setpoint(i, command.modes[i], float(command.targets[i]), float(command.limits_nm[i]))
-        for i, drive_command in self.states.update_commands(enabled_drives, emergency=command.emergency):
+            self.send_setpoint(
+                i, command.modes[i], float(command.targets[i]), float(command.limits_nm[i])
+            )
+        for i, drive_command in self.states.update_commands(
+            enabled_drives, emergency=command.emergency
+        ):
             self.send_command(i, drive_command)
 
     def poll(self) -> None:
@@ -340,13 +367,18 @@ class CanDrives(Drives):
         findings: list[FaultFinding] = []
         if self._other_controller_seen:
             findings.append(
-                FaultFinding("second_host", "another program commands drives on this bus; end one of the two")
+                FaultFinding(
+                    "second_host", "another program commands drives on this bus; end one of the two"
+                )
             )
             self._other_controller_seen = False
         for node, frame_count in self._frame_count_by_unknown_node.items():
             if frame_count >= MIN_UNKNOWN_NODE_FRAMES:
                 findings.append(
-                    FaultFinding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot")
+                    FaultFinding(
+                        "unknown_node",
+                        f"node {node} is on the bus, but is not a joint of this robot",
+                    )
                 )
         return findings
 
@@ -401,7 +433,9 @@ class CanDrives(Drives):
             self._receive()
         self._receive()
 
-    def _request_until_done(self, is_done: Callable[[int], bool], request: Callable[[int], object]) -> None:
+    def _request_until_done(
+        self, is_done: Callable[[int], bool], request: Callable[[int], object]
+    ) -> None:
         """Repeat requests to all drives until all are done or the time for bring-up is over.
 
         Args:

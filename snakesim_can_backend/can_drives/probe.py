@@ -33,7 +33,10 @@ class CanDriveProbe(DriveProbe):
         self._wire = open_wire(settings.channels[0], None, settings.bit_rate, settings.fd_rate)
 
     def request(
-        self, request: CanFrame | None, decode: Callable[[CanFrame], ResponseT | None], timeout_s: float
+        self,
+        request: CanFrame | None,
+        decode: Callable[[CanFrame], ResponseT | None],
+        timeout_s: float,
     ) -> ResponseT | None:
         """Send a request, and return the first answer to it; None without an answer in time.
 

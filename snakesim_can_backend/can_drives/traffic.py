@@ -47,7 +47,10 @@ class BusLoad:
 
 
 def compute_load(
-    traffic: CycleTraffic, bus_indices: Sequence[int], rate_hz: float, compute_frame_duration_s: Callable[[int], float]
+    traffic: CycleTraffic,
+    bus_indices: Sequence[int],
+    rate_hz: float,
+    compute_frame_duration_s: Callable[[int], float],
 ) -> BusLoad:
     """Return the load of the bus with the most drives, and the highest control rate that it allows.
 
@@ -63,6 +66,8 @@ def compute_load(
     cycle_s = drive_count * each_drive_s + one_drive_s
     heartbeat_fraction = 0.0  # heartbeats have a rate of their own, whatever the control rate is
     if traffic.heartbeats_hz:
-        heartbeat_fraction = drive_count * traffic.heartbeats_hz * compute_frame_duration_s(HEARTBEAT_BYTES)
+        heartbeat_fraction = (
+            drive_count * traffic.heartbeats_hz * compute_frame_duration_s(HEARTBEAT_BYTES)
+        )
     max_rate_hz = int((MAX_LOAD - heartbeat_fraction) / cycle_s)
     return BusLoad(cycle_s * rate_hz + heartbeat_fraction, max_rate_hz, drive_count)

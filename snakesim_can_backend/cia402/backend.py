@@ -27,9 +27,14 @@ class Cia402Backend(CanDriveBackend):
     first_id = FIRST_NODE
     last_id = LAST_NODE - 1
     reserved_ids = "0 means all nodes, and 127 is the host's as shipped"
-    report_period_s = 0.1  # a drive reports with every SYNC, but its way to Operation enabled takes a while
+    # A drive reports with every SYNC, but its way to Operation enabled takes a while.
+    report_period_s = 0.1
     traffic = CycleTraffic(
-        bytes_per_drive=(8, 8, 7),  # a setpoint and two answers to SYNC; a change of the mode is rare
+        bytes_per_drive=(
+            8,
+            8,
+            7,
+        ),  # a setpoint and two answers to SYNC; a change of the mode is rare
         bytes_per_cycle=(
             0,
             1,
@@ -66,7 +71,9 @@ class Cia402Backend(CanDriveBackend):
             )
 
     @classmethod
-    def check_drives(cls, config: RunConfig, settings: Cia402Settings, joints: Sequence[Joint]) -> None:
+    def check_drives(
+        cls, config: RunConfig, settings: Cia402Settings, joints: Sequence[Joint]
+    ) -> None:
         """Check also the EDS files that the settings name."""
         read_all_eds(settings.eds)
         super().check_drives(config, settings, joints)

@@ -51,7 +51,16 @@ MAX_CYCLE_VALUE = 255
 
 REQUIRED_ENTRIES = (DEVICE_TYPE, VENDOR_ID, STATUSWORD, SUPPORTED_MODES, MAX_TORQUE)
 OPTIONAL_ENTRIES = (
-    *(PRODUCT_CODE, REVISION, SERIAL, ERROR_CODE, ABORT_CONNECTION_OPTION_CODE, RATED_CURRENT, RATED_TORQUE, MAX_SPEED),
+    *(
+        PRODUCT_CODE,
+        REVISION,
+        SERIAL,
+        ERROR_CODE,
+        ABORT_CONNECTION_OPTION_CODE,
+        RATED_CURRENT,
+        RATED_TORQUE,
+        MAX_SPEED,
+    ),
     *(MIN_POSITION, MAX_POSITION, ENCODER_INCREMENTS, ENCODER_REVOLUTIONS),
 )
 
@@ -91,10 +100,14 @@ def list_configuration_steps(node_id: int, settings: Cia402Settings, period_s: f
     steps += _write_and_check(CONSUMER_HEARTBEAT, encode_consumer_heartbeat(settings))
     steps += _write_and_check(PRODUCER_HEARTBEAT, round(settings.heartbeat_s * 1000))
     steps += _write_and_check(ERROR_BEHAVIOR, NO_NMT_STATE_CHANGE, optional=True)
-    steps += _write_and_check(ABORT_CONNECTION_OPTION_CODE, FAULT_ON_ABORT, optional=settings.allow_unverified_watchdog)
+    steps += _write_and_check(
+        ABORT_CONNECTION_OPTION_CODE, FAULT_ON_ABORT, optional=settings.allow_unverified_watchdog
+    )
     # Many drives have one reaction only, so a refusal is no failure.
     steps.append(WriteStep(FAULT_REACTION, TORQUE_OFF_ON_FAULT, optional=True))
-    steps.append(WriteStep(QUICK_STOP_OPTION, QUICK_STOP_OPTION_CODES[settings.quick_stop], optional=True))
+    steps.append(
+        WriteStep(QUICK_STOP_OPTION, QUICK_STOP_OPTION_CODES[settings.quick_stop], optional=True)
+    )
     value, exponent = encode_cycle_period(period_s)
     steps.append(WriteStep(CYCLE_VALUE, value, optional=True))
     steps.append(WriteStep(CYCLE_INDEX, exponent, optional=True))

@@ -58,7 +58,12 @@ from snakesim_can_backend.cia402.objects import (
 )
 from snakesim_can_backend.cia402.sdo import ReadStep, SdoQueue, SdoStepResult
 from snakesim_can_backend.cia402.servo import Cia402Drive, Phase, make_health_objects
-from snakesim_can_backend.cia402.state_machine import FAULT_STATES, ControlwordCommand, PowerState, decode_statusword
+from snakesim_can_backend.cia402.state_machine import (
+    FAULT_STATES,
+    ControlwordCommand,
+    PowerState,
+    decode_statusword,
+)
 from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_states import DriveCommand
 from snakesim_drivers.kit.drives import BusCommand
@@ -67,9 +72,12 @@ from snakesim_hal.wire.messages import JointMode
 
 MAX_MISSED_HEARTBEATS = 5  # of a drive that still answers SYNC
 MIN_PRE_OPERATIONAL_HEARTBEATS = 2  # one may be from before the start of the drive
-NEEDS_COMMUNICATION_RESET = (HEARTBEAT_LOST, 0x8120)  # errors that some drives keep until their communication restarts
-MAX_START_NS = 1_000_000_000  # after which a drive that does not complete its start counts as silent
-MAX_BOOT_NS = 1_000_000_000  # after which a drive is configured whose boot-up message has not arrived
+# Errors that some drives keep until their communication restarts.
+NEEDS_COMMUNICATION_RESET = HEARTBEAT_LOST, 0x8120
+# After which a drive that does not complete its start counts as silent.
+MAX_START_NS = 1_000_000_000
+# After which a drive is configured whose boot-up message has not arrived.
+MAX_BOOT_NS = 1_000_000_000
 
 _log = logging.getLogger("snakesim.drivers")
 
@@ -78,7 +86,8 @@ class Cia402Drives(CanDrives):
     """All CiA 402 drives of a bus."""
 
     missing_identity_text = (
-        "does not answer SDO requests: it is off, has another node id or bit rate, or is no CANopen device"
+        "does not answer SDO requests: it is off, has another node id or bit rate, or "
+        "is no CANopen device"
     )
 
     def __init__(self, context: CanDrivesContext) -> None:
@@ -100,7 +109,8 @@ class Cia402Drives(CanDrives):
         self._eds = read_all_eds(paths)
         self._health = make_health_objects(self._settings, uses_bundled_eds=uses_bundled_eds)
         self._watchdog_ns = round(self._settings.watchdog_s * 1e9)
-        self._should_send_heartbeats = False  # from the first enabling on, because drives then watch the host
+        # From the first enabling on, because drives then watch the host.
+        self._should_send_heartbeats = False
         self._was_sync_accepted = False
         self.servos = [self._make_servo(i) for i in range(len(context.joints))]
 
@@ -186,7 +196,9 @@ class Cia402Drives(CanDrives):
             servo.was_enabled = True
         if state not in FAULT_STATES:
             servo.emergency = None
-        self.states.record_report(i, enabled=state == PowerState.ENABLED, state=f"in the state {state.value!r}")
+        self.states.record_report(
+            i, enabled=state == PowerState.ENABLED, state=f"in the state {state.value!r}"
+        )
         self.states.drives[i].errors = servo.describe_errors()
         self._disable_after_quick_stop(i)
 
@@ -209,7 +221,12 @@ class Cia402Drives(CanDrives):
         else:
             servo.emergency = emergency
             label = self.states.drives[i].label
-            _log.warning("%s: %s; %s", label, describe_error(emergency.code), describe_register(emergency.register))
+            _log.warning(
+                "%s: %s; %s",
+                label,
+                describe_error(emergency.code),
+                describe_register(emergency.register),
+            )
         self.states.drives[i].errors = servo.describe_errors()
 
     def _handle_heartbeat(self, i: int, nmt_state: int) -> None:
@@ -249,7 +266,9 @@ class Cia402Drives(CanDrives):
         self._enter_phase(servo, "ready")
         servo.last_heartbeat_ns = self._now_ns()
         servo.pre_operational_heartbeats = 0
-        is_last_of_bring_up = all(other.phase == "ready" for other in self.servos) and not self.readings.has_reported(i)
+        is_last_of_bring_up = all(
+            other.phase == "ready" for other in self.servos
+        ) and not self.readings.has_reported(i)
         if is_last_of_bring_up:
             self._send_sync()  # so that bring-up need not wait for its next requests
 
@@ -263,7 +282,9 @@ class Cia402Drives(CanDrives):
         """Store vendor, product and serial number of a drive; a serial number of 0 means that the drive has none."""
         values = self.servos[i].values
         if serial and VENDOR_ID in values:
-            self.record_serial(i, f"{values[VENDOR_ID]:08X}-{values.get(PRODUCT_CODE, 0):08X}-{serial:08X}")
+            self.record_serial(
+                i, f"{values[VENDOR_ID]:08X}-{values.get(PRODUCT_CODE, 0):08X}-{serial:08X}"
+            )
 
     def _store_result(self, i: int, result: SdoStepResult) -> None:
         servo = self.servos[i]
@@ -346,7 +367,10 @@ class Cia402Drives(CanDrives):
             return scaling
         servo.scaling = scaling
         problems = list(find_incompatibilities(servo.values, scaling, self._settings, joint))
-        if ABORT_CONNECTION_OPTION_CODE not in servo.values and not self._settings.allow_unverified_watchdog:
+        if (
+            ABORT_CONNECTION_OPTION_CODE not in servo.values
+            and not self._settings.allow_unverified_watchdog
+        ):
             problems.append(
                 f"has no {ABORT_CONNECTION_OPTION_CODE.name} ({ABORT_CONNECTION_OPTION_CODE.address}), so it cannot "
                 "be verified that it stops when the host is silent: test it, and set "
@@ -364,7 +388,9 @@ class Cia402Drives(CanDrives):
         servo = self.servos[i]
         state = decode_statusword(servo.values[STATUSWORD])
         if state == PowerState.FAULT and servo.values.get(ERROR_CODE) == HEARTBEAT_LOST:
-            _log.warning("%s: clearing an expired watchdog of an earlier run", self.states.drives[i].label)
+            _log.warning(
+                "%s: clearing an expired watchdog of an earlier run", self.states.drives[i].label
+            )
             self._restart_communication(i)
 
     def write_settings(self, i: int) -> None:
@@ -403,7 +429,9 @@ class Cia402Drives(CanDrives):
         servo.is_enabling = False
         self._enter_phase(servo, "configuring")
         servo.queue.clear()
-        servo.queue.add(list_fault_reset_steps() if servo.should_reset_fault else list_switch_off_steps())
+        servo.queue.add(
+            list_fault_reset_steps() if servo.should_reset_fault else list_switch_off_steps()
+        )
         servo.queue.add(list_configuration_steps(self.node_ids[i], self._settings, self._period_s))
         servo.should_reset_fault = False
 
@@ -429,7 +457,10 @@ class Cia402Drives(CanDrives):
 
     def is_awaiting_responses(self) -> bool:
         """Return whether a drive is being configured: it takes many answers."""
-        return any(self._is_configuring(servo) and servo.queue.is_awaiting_response for servo in self.servos)
+        return any(
+            self._is_configuring(servo) and servo.queue.is_awaiting_response
+            for servo in self.servos
+        )
 
     def request_health(self, i: int) -> None:
         """Read voltage, current and temperatures; and the serial number, to notice a second drive with this id."""
@@ -495,13 +526,13 @@ class Cia402Drives(CanDrives):
         timeout_ns = MAX_MISSED_HEARTBEATS * self._settings.heartbeat_s * 1e9
         for i, servo in enumerate(self.servos):
             if servo.phase != "ready" or self.readings.count_unanswered_requests(i):
-                servo.last_heartbeat_ns = (
-                    self._now_ns()
-                )  # a silent drive has a finding of its own; count from its next response on
+                # A silent drive has a finding of its own; count from its next response on.
+                servo.last_heartbeat_ns = self._now_ns()
             age_ns = self._now_ns() - servo.last_heartbeat_ns
             if age_ns > timeout_ns:
                 cause = (
-                    f"{self.states.drives[i].label} answers SYNC, but has sent no heartbeat for {age_ns * 1e-6:.0f} ms"
+                    f"{self.states.drives[i].label} answers SYNC, but has sent no heartbeat for "
+                    f"{age_ns * 1e-6:.0f} ms"
                 )
                 findings.append(FaultFinding("drive_silent", cause, i, affects_only_joint=True))
         return findings

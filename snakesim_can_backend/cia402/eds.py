@@ -26,12 +26,21 @@ from snakesim_hal.model.textfiles import read_text
 
 BUNDLED = Path(__file__).with_name("snakesim-cia402.eds")
 NODE_ID = "$NODEID"
-SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 1, 6: 2, 7: 4}  # bytes of the types of whole numbers, by their number
+# Bytes of the types of whole numbers, by their number.
+SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 1, 6: 2, 7: 4}
 WRITABLE = ("rw", "rww", "rwr", "wo")
 READABLE = ("ro", "rw", "rww", "rwr", "const")
 CONTAINER_OBJECT_TYPES = (0x8, 0x9)  # object types: array, record
 SUGGESTION = "take the EDS file that the vendor publishes with the drive's firmware"
-REQUIRED_ENTRIES = (DEVICE_TYPE, VENDOR_ID, CONSUMER_HEARTBEAT, PRODUCER_HEARTBEAT, MODE, MAX_TORQUE, SUPPORTED_MODES)
+REQUIRED_ENTRIES = (
+    DEVICE_TYPE,
+    VENDOR_ID,
+    CONSUMER_HEARTBEAT,
+    PRODUCER_HEARTBEAT,
+    MODE,
+    MAX_TORQUE,
+    SUPPORTED_MODES,
+)
 
 
 @dataclass(frozen=True)
@@ -125,19 +134,25 @@ def read_eds(path: str | Path) -> EdsFile:
         text = read_text(Path(path))
     except ConfigError as error:
         raise ConfigError(f"{context}: {error}; {SUGGESTION}", code="file/not-readable") from None
-    parser = RawConfigParser(strict=False, comment_prefixes=(";", "#"), inline_comment_prefixes=None)
+    parser = RawConfigParser(
+        strict=False, comment_prefixes=(";", "#"), inline_comment_prefixes=None
+    )
     try:
         parser.read_string(text)
     except ParserError as error:
         reason = str(error).splitlines()[0]
-        raise ConfigError(f"{context}: {path}: {reason}; {SUGGESTION}", code="file/not-readable") from None
+        raise ConfigError(
+            f"{context}: {path}: {reason}; {SUGGESTION}", code="file/not-readable"
+        ) from None
     objects: dict[tuple[int, int], EdsObject] = {}
     for section in parser.sections():
         address = _parse_address(section)
         if address is not None:
             objects |= _read_object_entries(str(path), parser[section], *address)
     if not objects:
-        raise ConfigError(f"{context}: {path}: describes no object; {SUGGESTION}", code="file/not-readable")
+        raise ConfigError(
+            f"{context}: {path}: describes no object; {SUGGESTION}", code="file/not-readable"
+        )
     vendor = 0
     product = 0
     if parser.has_section("DeviceInfo"):
@@ -166,7 +181,9 @@ def _parse_address(section: str) -> tuple[int, int] | None:
         return None
 
 
-def _read_object_entries(path: str, section: SectionProxy, index: int, sub: int) -> dict[tuple[int, int], EdsObject]:
+def _read_object_entries(
+    path: str, section: SectionProxy, index: int, sub: int
+) -> dict[tuple[int, int], EdsObject]:
     """Return the object dictionary entries that a section of an EDS file describes.
 
     Args:
@@ -194,7 +211,9 @@ def _read_object_entries(path: str, section: SectionProxy, index: int, sub: int)
     if not compact_count:
         return {(index, sub): entry}
     entries = {(index, number): entry for number in range(1, compact_count + 1)}
-    entries[index, 0] = EdsObject("number of entries", 1, "ro", mappable=False, default=str(compact_count))
+    entries[index, 0] = EdsObject(
+        "number of entries", 1, "ro", mappable=False, default=str(compact_count)
+    )
     return entries
 
 

@@ -24,7 +24,12 @@ from snakesim_can_backend.cia402.frames import (
     encode_read_response,
     split_id,
 )
-from snakesim_can_backend.cia402.limits import REVOLUTION_RAD, THOUSANDTHS, UnitScaling, compute_shaft_range_rad
+from snakesim_can_backend.cia402.limits import (
+    REVOLUTION_RAD,
+    THOUSANDTHS,
+    UnitScaling,
+    compute_shaft_range_rad,
+)
 from snakesim_can_backend.cia402.node import Address, Cia402Node
 from snakesim_can_backend.cia402.objects import (
     ABORT_CONNECTION_OPTION_CODE,
@@ -79,7 +84,8 @@ EMULATED_CONSTANT_NM_PER_A = 1.0  # torque constant of drives whose robot file n
 POSITION_MARGIN = 0.02  # of a joint's range: how far the position limits of a drive are beyond it
 EMULATED_REVISION = 0x0001_0000
 FIRST_SERIAL = 0x4020_0001
-DUPLICATE_SERIAL_BITS = 0x0100_0000  # in which the serial number of a second drive with the same id differs
+# In which the serial number of a second drive with the same id differs.
+DUPLICATE_SERIAL_BITS = 0x0100_0000
 OVER_TEMPERATURE = EmergencyMessage(0x4210, 0x09)  # generic and temperature
 NO_HEARTBEAT = EmergencyMessage(HEARTBEAT_LOST, 0x11)  # generic and communication
 STAYS_IN_QUICK_STOP = 5  # from this option code on
@@ -104,8 +110,10 @@ class EmulatedCia402Drive:
     error: EmergencyMessage | None = None  # that led to the fault
     is_booting: bool = True
     last_heartbeat_us: float = -math.inf  # when it sent one last
-    last_host_heartbeat_us: float | None = None  # when it received one last; None: none since the start
-    saved_values: dict[ObjectEntry, int] = field(default_factory=dict[ObjectEntry, int])  # in its nonvolatile memory
+    # When it received one last; None: none since the start.
+    last_host_heartbeat_us: float | None = None
+    # In its nonvolatile memory.
+    saved_values: dict[ObjectEntry, int] = field(default_factory=dict[ObjectEntry, int])
 
 
 class EmulatedCia402(CanEmulator):
@@ -138,10 +146,15 @@ class EmulatedCia402(CanEmulator):
         if function != FunctionCode.SDO_RESPONSE:
             return frame
         response = decode_sdo(frame.data)
-        if response.kind != UPLOAD_RESPONSE or (response.index, response.sub) != (SERIAL.index, SERIAL.sub):
+        if response.kind != UPLOAD_RESPONSE or (response.index, response.sub) != (
+            SERIAL.index,
+            SERIAL.sub,
+        ):
             return frame
         serial = SERIAL.decode(response.data) ^ DUPLICATE_SERIAL_BITS
-        return CanFrame(frame.id, encode_read_response(response.index, response.sub, SERIAL.encode(serial)))
+        return CanFrame(
+            frame.id, encode_read_response(response.index, response.sub, SERIAL.encode(serial))
+        )
 
     def restart(self, i: int) -> None:
         """Restart a drive: it loses all settings that it has not saved, and sends its boot-up message later."""
@@ -218,8 +231,12 @@ class EmulatedCia402(CanEmulator):
         if self._settings.rated_torque_nm is not None:
             rated_torque_mnm = max(round(self._settings.rated_torque_nm * 1000), 1)
         counts = round(self._settings.counts_per_turn or COUNTS_PER_TURN)
-        scaling = UnitScaling(counts, self._settings.velocity_units_per_turn_s or counts, rated_torque_mnm / 1000)
-        saved_values = make_saved_values(joint, mounted, scaling, self._settings.max_speed_units_per_turn_s)
+        scaling = UnitScaling(
+            counts, self._settings.velocity_units_per_turn_s or counts, rated_torque_mnm / 1000
+        )
+        saved_values = make_saved_values(
+            joint, mounted, scaling, self._settings.max_speed_units_per_turn_s
+        )
         saved_values |= {
             VENDOR_ID: self._eds.vendor,
             PRODUCT_CODE: self._eds.product,
@@ -277,7 +294,10 @@ class EmulatedCia402(CanEmulator):
         drive.last_host_heartbeat_us = None
         if not drive.objects.get(_get_address(ERROR_BEHAVIOR)):
             drive.objects.nmt_state = NmtState.PRE_OPERATIONAL
-        if drive.objects.get(_get_address(ABORT_CONNECTION_OPTION_CODE)) and drive.state not in FAULT_STATES:
+        if (
+            drive.objects.get(_get_address(ABORT_CONNECTION_OPTION_CODE))
+            and drive.state not in FAULT_STATES
+        ):
             self._fail(i, NO_HEARTBEAT)
 
     def _get_consumer_heartbeat(self, drive: EmulatedCia402Drive) -> tuple[int, int]:
@@ -406,7 +426,9 @@ def make_saved_values(
         max_speed_units_per_turn_s: Units of the drive's speed limit for one turn/s.
     """
     gear = joint.drive.gear
-    rated_current_a = scaling.rated_torque_nm / (joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A)
+    rated_current_a = scaling.rated_torque_nm / (
+        joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
+    )
     max_torque_nm = mounted.max_torque_nm or joint.limits.torque_nm / gear
     max_speed_rad_s = mounted.max_speed_rad_s or joint.limits.speed_rad_s * gear
     lower_rad, upper_rad = compute_shaft_range_rad(joint)

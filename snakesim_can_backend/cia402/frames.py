@@ -99,7 +99,8 @@ ABORTS = {
     0x0800_0021: "local control does not allow it",
     0x0800_0022: "the state of the device does not allow it",
 }
-MISSING_OBJECT_ABORT_CODES = (0x0602_0000, 0x0609_0011)  # codes of objects that a device does not have
+# Codes of objects that a device does not have.
+MISSING_OBJECT_ABORT_CODES = 0x0602_0000, 0x0609_0011
 ERROR_CLASSES = (  # by the high byte of an error code; the first one that fits
     (0xFF, 0x81, "communication"),
     (0xFF, 0x82, "protocol"),
@@ -125,7 +126,16 @@ ERROR_NAMES = {
     0x8220: "PDO too long",
 }
 REGISTER_BITS = (
-    *("generic", "current", "voltage", "temperature", "communication", "device profile", "reserved", "manufacturer"),
+    *(
+        "generic",
+        "current",
+        "voltage",
+        "temperature",
+        "communication",
+        "device profile",
+        "reserved",
+        "manufacturer",
+    ),
 )
 
 
@@ -165,7 +175,10 @@ def encode_heartbeat(node_id: int, state: NmtState) -> CanFrame:
 
 def encode_emergency(node_id: int, emergency: EmergencyMessage) -> CanFrame:
     """Return an emergency message."""
-    return CanFrame(FunctionCode.EMERGENCY | node_id, EMERGENCY_LAYOUT.pack(emergency.code, emergency.register, b""))
+    return CanFrame(
+        FunctionCode.EMERGENCY | node_id,
+        EMERGENCY_LAYOUT.pack(emergency.code, emergency.register, b""),
+    )
 
 
 def decode_emergency(data: bytes) -> EmergencyMessage:

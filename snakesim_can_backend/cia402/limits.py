@@ -41,7 +41,8 @@ MODE_NAMES = {
     OperationMode.CYCLIC_TORQUE: "cyclic synchronous torque (CST)",
 }
 
-EntryValues = Mapping[ObjectEntry, int]  # that a drive has reported; entries that it does not have are missing
+# That a drive has reported; entries that it does not have are missing.
+EntryValues = Mapping[ObjectEntry, int]
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,9 @@ class UnitScaling:
         return thousandths / THOUSANDTHS * self.rated_torque_nm
 
 
-def determine_scaling(values: EntryValues, settings: Cia402Settings, joint: Joint) -> UnitScaling | str:
+def determine_scaling(
+    values: EntryValues, settings: Cia402Settings, joint: Joint
+) -> UnitScaling | str:
     """Determine the units of a drive from its reported values and the settings.
 
     Args:
@@ -146,7 +149,9 @@ def compute_shaft_range_rad(joint: Joint) -> tuple[float, float]:
     """Return the lowest and the highest angle of a drive's shaft within the limits of its joint."""
     drive = joint.drive
     ratio = drive.sign * drive.gear
-    ends = [drive.zero_rad + ratio * angle for angle in (joint.limits.lower_rad, joint.limits.upper_rad)]
+    ends = [
+        drive.zero_rad + ratio * angle for angle in (joint.limits.lower_rad, joint.limits.upper_rad)
+    ]
     return min(ends), max(ends)
 
 
@@ -161,11 +166,17 @@ def _find_mode_problems(values: EntryValues, joint: Joint) -> Iterator[str]:
             yield f"does not support mode {mode:d}, {MODE_NAMES[mode]} ({SUPPORTED_MODES.address})"
 
 
-def _find_unit_problems(values: EntryValues, settings: Cia402Settings, joint: Joint) -> Iterator[str]:
+def _find_unit_problems(
+    values: EntryValues, settings: Cia402Settings, joint: Joint
+) -> Iterator[str]:
     """Yield units in the settings that differ from those that the drive reports."""
     counts = _read_counts(values)
     configured_counts = settings.counts_per_turn
-    if counts and configured_counts and abs(counts - configured_counts) > RELATIVE_TOLERANCE * configured_counts:
+    if (
+        counts
+        and configured_counts
+        and abs(counts - configured_counts) > RELATIVE_TOLERANCE * configured_counts
+    ):
         yield (
             f"has an encoder resolution ({ENCODER_INCREMENTS.address}) of {counts:g} a turn, and "
             f"`backends.cia402.counts_per_turn` = {configured_counts:g}: correct the one that is wrong"
@@ -184,7 +195,9 @@ def _find_unit_problems(values: EntryValues, settings: Cia402Settings, joint: Jo
         )
 
 
-def _find_position_limit_problems(values: EntryValues, scaling: UnitScaling, joint: Joint) -> Iterator[str]:
+def _find_position_limit_problems(
+    values: EntryValues, scaling: UnitScaling, joint: Joint
+) -> Iterator[str]:
     """Yield position limits that stop the drive within the range of its joint. Equal ones mean that there are none."""
     if MIN_POSITION not in values or MAX_POSITION not in values:
         return

@@ -38,7 +38,8 @@ COB_ID_SUB = 1
 TRANSMISSION_TYPE_SUB = 2
 
 # Indices in the object dictionary.
-COMMUNICATION_OBJECTS = range(0x1000, 0x2000)  # that a reset of the communication sets to their defaults
+# That a reset of the communication sets to their defaults.
+COMMUNICATION_OBJECTS = range(0x1000, 0x2000)
 RECEIVE_COMMUNICATION = range(0x1400, 0x1600)
 RECEIVE_MAPPING = range(0x1600, 0x1800)
 TRANSMIT_COMMUNICATION = range(0x1800, 0x1A00)
@@ -63,9 +64,8 @@ class Cia402Node:
     eds: EdsFile
     node: int
     on_write: Callable[[Address, int], None]  # gets every value that a host has written
-    compute_live_value: Callable[
-        [Address], int | None
-    ]  # returns a value that changes by itself; None: the stored one counts
+    # Returns a value that changes by itself; None: the stored one counts.
+    compute_live_value: Callable[[Address], int | None]
     nmt_state: NmtState = NmtState.PRE_OPERATIONAL
     values: dict[Address, int] = field(default_factory=dict[Address, int])
 
@@ -182,7 +182,9 @@ class Cia402Node:
 
     def _list_pdos(self, indices: range) -> list[int]:
         """Return the indices of the communication parameters of all PDOs of one direction that the node has."""
-        return sorted(index for index, sub in self.eds.objects if index in indices and sub == COB_ID_SUB)
+        return sorted(
+            index for index, sub in self.eds.objects if index in indices and sub == COB_ID_SUB
+        )
 
     def _list_mapped(self, mapping_index: int) -> Iterator[tuple[Address, int]]:
         """Yield the objects in a PDO, in the order of its data, and their lengths in bytes.
@@ -205,7 +207,8 @@ class Cia402Node:
     def _pack(self, mapping_index: int) -> bytes:
         """Return the data of a PDO: the current values of its objects, one after another, little-endian."""
         return b"".join(
-            self.get(address).to_bytes(size, "little") for address, size in self._list_mapped(mapping_index)
+            self.get(address).to_bytes(size, "little")
+            for address, size in self._list_mapped(mapping_index)
         )
 
     def _validate_mapping_write(self, address: Address, value: int) -> None:

@@ -42,7 +42,8 @@ class ObjectEntry:
 
 
 # Communication, CiA 301.
-DEVICE_TYPE = ObjectEntry(0x1000, 0, "I", "device type")  # its low 16 bits are the number of the profile
+# Its low 16 bits are the number of the profile.
+DEVICE_TYPE = ObjectEntry(0x1000, 0, "I", "device type")
 VENDOR_ID = ObjectEntry(0x1018, 1, "I", "vendor")
 PRODUCT_CODE = ObjectEntry(0x1018, 2, "I", "product code")
 REVISION = ObjectEntry(0x1018, 3, "I", "revision")  # major and minor number, 16 bits each
@@ -53,11 +54,13 @@ ERROR_BEHAVIOR = ObjectEntry(0x1029, 1, "B", "error behavior")  # 1: no change o
 ERROR_REGISTER = ObjectEntry(0x1001, 0, "B", "error register")
 
 # The state machine, CiA 402.
-ABORT_CONNECTION_OPTION_CODE = ObjectEntry(0x6007, 0, "h", "abort connection option code")  # 1: fault
+# 1: fault.
+ABORT_CONNECTION_OPTION_CODE = ObjectEntry(0x6007, 0, "h", "abort connection option code")
 ERROR_CODE = ObjectEntry(0x603F, 0, "H", "error code")
 CONTROLWORD = ObjectEntry(0x6040, 0, "H", "controlword")
 STATUSWORD = ObjectEntry(0x6041, 0, "H", "statusword")
-QUICK_STOP_OPTION = ObjectEntry(0x605A, 0, "h", "quick stop option code")  # 0: off, 2: quick stop ramp, then off
+# 0: off, 2: quick stop ramp, then off.
+QUICK_STOP_OPTION = ObjectEntry(0x605A, 0, "h", "quick stop option code")
 FAULT_REACTION = ObjectEntry(0x605E, 0, "h", "fault reaction option code")  # 0: off
 MODE = ObjectEntry(0x6060, 0, "b", "modes of operation")
 MODE_DISPLAY = ObjectEntry(0x6061, 0, "b", "modes of operation display")
@@ -87,7 +90,8 @@ DS402 = 402  # the number of the profile in `DEVICE_TYPE`
 SYNCHRONOUS = 1  # transmission type: with every SYNC
 EVENT_DRIVEN = 255  # transmission type: a receive PDO takes effect at once
 PDO_OFF = 0x8000_0000  # bit of a COB-ID: the PDO is not used
-COB_ID_MASK = PDO_OFF | 0x7FF  # bits of a COB-ID that are compared: bit 30 forbids remote requests only
+# Bits of a COB-ID that are compared: bit 30 forbids remote requests only.
+COB_ID_MASK = PDO_OFF | 0x7FF
 PDO_BASES = {"receive": (0x200, 0x300, 0x400, 0x500), "transmit": (0x180, 0x280, 0x380, 0x480)}
 
 
@@ -119,18 +123,25 @@ class Pdo:
 
     def cob_id_entry(self) -> ObjectEntry:
         """Return the entry with the id of its frames."""
-        return ObjectEntry(self._communication_index, 1, "I", f"COB-ID of the {self.direction} PDO {self.number}")
+        return ObjectEntry(
+            self._communication_index, 1, "I", f"COB-ID of the {self.direction} PDO {self.number}"
+        )
 
     def transmission_entry(self) -> ObjectEntry:
         """Return the entry with its transmission type."""
         return ObjectEntry(
-            self._communication_index, 2, "B", f"transmission type of the {self.direction} PDO {self.number}"
+            self._communication_index,
+            2,
+            "B",
+            f"transmission type of the {self.direction} PDO {self.number}",
         )
 
     def mapping_entry(self, sub: int) -> ObjectEntry:
         """Return an entry of its mapping. sub: 0 for the number of entries, and from 1 on the entries."""
         format_ = "I" if sub else "B"
-        return ObjectEntry(self._mapping_index, sub, format_, f"mapping of the {self.direction} PDO {self.number}")
+        return ObjectEntry(
+            self._mapping_index, sub, format_, f"mapping of the {self.direction} PDO {self.number}"
+        )
 
     @property
     def _communication_index(self) -> int:

@@ -2,7 +2,13 @@
 
 from snakesim_can_backend.can_drives.probe import CanDriveProbe
 from snakesim_can_backend.cia402.configuration import list_configuration_steps
-from snakesim_can_backend.cia402.frames import UPLOAD_RESPONSE, FunctionCode, decode_sdo, encode_read, split_id
+from snakesim_can_backend.cia402.frames import (
+    UPLOAD_RESPONSE,
+    FunctionCode,
+    decode_sdo,
+    encode_read,
+    split_id,
+)
 from snakesim_can_backend.cia402.objects import STATUSWORD, ObjectEntry
 from snakesim_can_backend.cia402.sdo import ReadStep
 from snakesim_can_backend.cia402.state_machine import PowerState, decode_statusword
@@ -42,8 +48,13 @@ class NodeProbe(CanDriveProbe):
             if split_id(frame) != (FunctionCode.SDO_RESPONSE, self.node_id):
                 return None
             response = decode_sdo(frame.data)
-            if response.kind != UPLOAD_RESPONSE or (response.index, response.sub) != (entry.index, entry.sub):
+            if response.kind != UPLOAD_RESPONSE or (response.index, response.sub) != (
+                entry.index,
+                entry.sub,
+            ):
                 return None
             return entry.decode(response.data)
 
-        return self.request(CanFrame(FunctionCode.SDO_REQUEST | self.node_id, encode_read(entry)), decode, timeout_s)
+        return self.request(
+            CanFrame(FunctionCode.SDO_REQUEST | self.node_id, encode_read(entry)), decode, timeout_s
+        )

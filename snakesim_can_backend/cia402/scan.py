@@ -34,8 +34,28 @@ from snakesim_hal.base.terminal import align_columns, print_json, print_line
 
 OK, FAILED = 0, 1
 RESPONSE_TIMEOUT_S = 0.1  # for all answers to one round of requests
-SCANNED_ENTRIES = (DEVICE_TYPE, VENDOR_ID, PRODUCT_CODE, REVISION, SERIAL, SUPPORTED_MODES, STATUSWORD, ERROR_CODE)
-COLUMNS = ("channel", "node", "profile", "vendor", "product", "revision", "serial", "modes", "state", "error")
+SCANNED_ENTRIES = (
+    DEVICE_TYPE,
+    VENDOR_ID,
+    PRODUCT_CODE,
+    REVISION,
+    SERIAL,
+    SUPPORTED_MODES,
+    STATUSWORD,
+    ERROR_CODE,
+)
+COLUMNS = (
+    "channel",
+    "node",
+    "profile",
+    "vendor",
+    "product",
+    "revision",
+    "serial",
+    "modes",
+    "state",
+    "error",
+)
 UNKNOWN = "-"
 MODE_LABELS = {
     OperationMode.CYCLIC_POSITION: "CSP",
@@ -43,7 +63,8 @@ MODE_LABELS = {
     OperationMode.CYCLIC_TORQUE: "CST",
 }
 
-Values = dict[ObjectEntry, set[int]]  # several values of one entry come from several nodes with one id
+# Several values of one entry come from several nodes with one id.
+Values = dict[ObjectEntry, set[int]]
 
 
 def scan_channels(arguments: argparse.Namespace) -> int:
@@ -67,7 +88,9 @@ def scan_channels(arguments: argparse.Namespace) -> int:
             values_by_node = read_nodes(wire)
         finally:
             wire.close()
-        rows += [make_scan_row(channel, node, values) for node, values in sorted(values_by_node.items())]
+        rows += [
+            make_scan_row(channel, node, values) for node, values in sorted(values_by_node.items())
+        ]
     if arguments.json:
         print_json({"drives": rows})
         return OK if rows else FAILED
@@ -91,7 +114,8 @@ def read_nodes(wire: Wire) -> dict[int, Values]:
         for node in nodes:
             wire.send(CanFrame(FunctionCode.SDO_REQUEST | node, encode_read(entry)))
         _receive_values(wire, entry, values_by_node)
-        nodes = list(values_by_node)  # only those that have the first entry are asked for the others
+        # Only those that have the first entry are asked for the others.
+        nodes = list(values_by_node)
     return values_by_node
 
 
@@ -139,7 +163,12 @@ def _receive_values(wire: Wire, entry: ObjectEntry, values_by_node: dict[int, Va
                 continue
             try:
                 response = decode_sdo(frame.data)
-                if response.kind == UPLOAD_RESPONSE and (response.index, response.sub) == (entry.index, entry.sub):
-                    values_by_node.setdefault(node, {}).setdefault(entry, set()).add(entry.decode(response.data))
+                if response.kind == UPLOAD_RESPONSE and (response.index, response.sub) == (
+                    entry.index,
+                    entry.sub,
+                ):
+                    values_by_node.setdefault(node, {}).setdefault(entry, set()).add(
+                        entry.decode(response.data)
+                    )
             except (ValueError, struct.error):
                 continue

@@ -114,7 +114,10 @@ class SdoQueue:
     @property
     def is_awaiting_response(self) -> bool:
         """Whether a request is without an answer, but not late."""
-        return self._current_step is not None and self._now_ns() - self._last_sent_ns < REPEAT_PERIOD_NS
+        return (
+            self._current_step is not None
+            and self._now_ns() - self._last_sent_ns < REPEAT_PERIOD_NS
+        )
 
     def add(self, steps: Iterable[Step]) -> None:
         """Add steps, and start the first one if no other step is in progress."""
@@ -128,7 +131,10 @@ class SdoQueue:
 
     def repeat_late_request(self) -> None:
         """Send the request in progress again if its answer is late."""
-        if self._current_step is not None and self._now_ns() - self._last_sent_ns >= REPEAT_PERIOD_NS:
+        if (
+            self._current_step is not None
+            and self._now_ns() - self._last_sent_ns >= REPEAT_PERIOD_NS
+        ):
             self._send(self._current_step)
 
     def handle_response(self, response: SdoFrame) -> None:

@@ -35,13 +35,15 @@ class Cia402Drive:
     failure: str = ""  # why it cannot be identified or configured
     # What the drive reports in bring-up.
     values: dict[ObjectEntry, int] = field(default_factory=dict[ObjectEntry, int])
-    unread_entries: set[ObjectEntry] = field(default_factory=set[ObjectEntry])  # entries that bring-up still waits for
+    # Entries that bring-up still waits for.
+    unread_entries: set[ObjectEntry] = field(default_factory=set[ObjectEntry])
     scaling: UnitScaling | None = None
     # What it reports later.
     state: PowerState = PowerState.UNKNOWN
     mode: int = 0  # of operation
     error_code: int = 0
-    emergency: EmergencyMessage | None = None  # the last one, until the drive reports that the error is gone
+    # The last one, until the drive reports that the error is gone.
+    emergency: EmergencyMessage | None = None
     last_heartbeat_ns: int = 0  # when the last one arrived
     pre_operational_heartbeats: int = 0  # in a row
     position: int | None = None  # since the last SYNC
@@ -49,7 +51,8 @@ class Cia402Drive:
     health: dict[ObjectEntry, int] = field(default_factory=dict[ObjectEntry, int])
     # What the driver does with it.
     is_enabling: bool = False  # towards Operation enabled
-    was_enabled: bool = False  # there, since it was switched off last: from then on it gets no further steps
+    # There, since it was switched off last: from then on it gets no further steps.
+    was_enabled: bool = False
     should_reset_fault: bool = False  # with the next configuration
     quick_stop_start_ns: int | None = None  # when it first reported the present quick stop
 
@@ -108,14 +111,21 @@ class HealthObjects:
     def convert(self, servo: Cia402Drive) -> DriveHealth | None:
         """Return the health that a drive has reported; None if something of it is unknown."""
         health = servo.health
-        if self.motor is None or self.motor not in health or VOLTAGE not in health or CURRENT not in health:
+        if (
+            self.motor is None
+            or self.motor not in health
+            or VOLTAGE not in health
+            or CURRENT not in health
+        ):
             return None
         rated_current_a = servo.values.get(RATED_CURRENT, 0) / 1000
         motor_c = health[self.motor] * self.unit_c
         board_c = motor_c
         if self.board is not None and self.board in health:
             board_c = health[self.board] * self.unit_c
-        return DriveHealth(health[VOLTAGE] / 1000, health[CURRENT] / 1000 * rated_current_a, motor_c, board_c)
+        return DriveHealth(
+            health[VOLTAGE] / 1000, health[CURRENT] / 1000 * rated_current_a, motor_c, board_c
+        )
 
 
 def make_health_objects(settings: Cia402Settings, *, uses_bundled_eds: bool) -> HealthObjects:

@@ -21,7 +21,9 @@ class MountedCia402(MountedDrive, frozen=True, kw_only=True):
     max_torque_nm: RatedTorque | None = None
     """Torque limit (6072h) of the emulated drive at its shaft; none: what the robot file needs."""
 
-    max_speed_rad_s: Annotated[float, Meta(gt=0, le=1e5, extra_json_schema={"unit": "rad/s"})] | None = None
+    max_speed_rad_s: (
+        Annotated[float, Meta(gt=0, le=1e5, extra_json_schema={"unit": "rad/s"})] | None
+    ) = None
     """Speed limit (6080h) of the emulated drive at its shaft; none: what the robot file needs."""
 
     min_position: Counts | None = None
@@ -37,7 +39,9 @@ class Cia402Settings(CanDriveSettings, frozen=True, kw_only=True):
     host_id: Annotated[int, Meta(ge=1, le=127)] = 127
     """Node id of the host, with which it sends heartbeats. No drive may have it."""
 
-    eds: Annotated[list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)] = []
+    eds: Annotated[
+        list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)
+    ] = []
     """EDS files of the drives, one for each type on the bus, by which objects are checked before anything is written.
 
     Emulated drives have the objects of the first file. Empty: real drives are not checked, and emulated drives have the
@@ -81,7 +85,9 @@ class Cia402Settings(CanDriveSettings, frozen=True, kw_only=True):
     board_temperature: Temperature | None = None
     """Vendor's object with the temperature of the electronics, as INDEX:SUBINDEX; none: that of `motor_temperature`."""
 
-    temperature_unit_c: Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "°C"})] = 0.1
+    temperature_unit_c: Annotated[float, Meta(gt=0, le=1000, extra_json_schema={"unit": "°C"})] = (
+        0.1
+    )
     """Unit of both temperatures, which are whole numbers of 16 bits with a sign."""
 
     mounted: Mapping[str, MountedCia402] = {}

@@ -3,8 +3,15 @@
 from snakesim_can_backend.bus.adapter import validate_channels
 from snakesim_can_backend.bus.load import plan_reports, validate_bus_load
 from snakesim_can_backend.driver.modules import JointModules
-from snakesim_can_backend.driver.own_emulators import validate_emulator_settings, validate_fault_plan
-from snakesim_can_backend.driver.parameters import validate_joint_drives, validate_ratings, validate_watchdog
+from snakesim_can_backend.driver.own_emulators import (
+    validate_emulator_settings,
+    validate_fault_plan,
+)
+from snakesim_can_backend.driver.parameters import (
+    validate_joint_drives,
+    validate_ratings,
+    validate_watchdog,
+)
 from snakesim_can_backend.driver.probe import ModuleProbe
 from snakesim_can_backend.driver.sensors import SampleBuilder, describe_sensors
 from snakesim_can_backend.settings import CanSettings
@@ -52,7 +59,9 @@ class CanBackend(DriveBackend):
         validate_bus_load(config, settings)
         validate_position_gains(config.robot)
         validate_joint_drives(config.robot, settings)
-        validate_mounting_overrides(config.robot, config.backend_section, settings.mounted, are_emulated=has_emulators)
+        validate_mounting_overrides(
+            config.robot, config.backend_section, settings.mounted, are_emulated=has_emulators
+        )
         validate_ratings(config.robot)
         validate_watchdog(config, settings)
         validate_pose_settings(config, settings.pose_listen)
@@ -76,16 +85,22 @@ class CanBackend(DriveBackend):
         """
         self.check(config, settings)
         clock = DriverClock(config)
-        sends_pose = settings.emulators_run in ("here", "process")  # the reference firmware has no world to see
+        # The reference firmware has no world to see.
+        sends_pose = settings.emulators_run in ("here", "process")
         mocap = make_receiver(
-            config, settings.pose_listen, are_emulated=sends_pose, clock=lambda _timestamp_ns: clock.now_ns()
+            config,
+            settings.pose_listen,
+            are_emulated=sends_pose,
+            clock=lambda _timestamp_ns: clock.now_ns(),
         )
         self._reports = plan_reports(config, settings)
 
         def open_modules(readings: DriveReadings) -> JointModules:
             pose_address = mocap.address if mocap is not None else None
             self.modules = JointModules(config, settings, clock, pose_address, readings)
-            self._sample_builder = SampleBuilder(config, self._reports, self.modules.module_reports, mocap)
+            self._sample_builder = SampleBuilder(
+                config, self._reports, self.modules.module_reports, mocap
+            )
             return self.modules
 
         parts = DriveBackendParts(
@@ -107,5 +122,7 @@ class CanBackend(DriveBackend):
     def _find_silent_drives(self) -> list[FaultFinding]:
         return []  # the monitor finds silent modules, by their answers to Syncs
 
-    def _describe_sensors(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
+    def _describe_sensors(
+        self, config: RunConfig, pose_delay_s: float | None
+    ) -> list[SensorDescription]:
         return describe_sensors(config, self._reports, pose_delay_s=pose_delay_s)

@@ -66,7 +66,8 @@ def find_modules(
     Returns:
         Every identity that was received, sorted by node. Two modules may have the same id.
     """
-    identities: dict[tuple[str, int, int], ModuleIdentity] = {}  # by channel, node and serial number
+    # By channel, node and serial number.
+    identities: dict[tuple[str, int, int], ModuleIdentity] = {}
     missing = {(bus.wire.channel, node) for bus in buses for node in bus.nodes}
     wires = [bus.wire for bus in buses]
     deadline_s = time.monotonic() + timeout_s
@@ -87,11 +88,12 @@ def find_modules(
                 on_frame(frame)
         if not is_complete and not missing:
             is_complete = True
-            deadline_s = min(
-                deadline_s, time.monotonic() + DUPLICATE_WAIT_S
-            )  # a second module with the same id may still answer
+            # A second module with the same id may still answer.
+            deadline_s = min(deadline_s, time.monotonic() + DUPLICATE_WAIT_S)
         now_s = time.monotonic()
-    return sorted(identities.values(), key=lambda identity: (identity.node, identity.channel, identity.serial))
+    return sorted(
+        identities.values(), key=lambda identity: (identity.node, identity.channel, identity.serial)
+    )
 
 
 def _parse_identity(channel: str, frame: CanFrame) -> ModuleIdentity | None:
@@ -115,7 +117,11 @@ def _make_identity(channel: str, node_id: int, values: Mapping[str, float]) -> M
 
 
 def find_discovery_errors(
-    buses: Sequence[ModuleBus], identities: Sequence[ModuleIdentity], joints: Sequence[str], *, lockstep: bool
+    buses: Sequence[ModuleBus],
+    identities: Sequence[ModuleIdentity],
+    joints: Sequence[str],
+    *,
+    lockstep: bool,
 ) -> list[str]:
     """Compare the modules that responded with the joints of the robot.
 
@@ -164,7 +170,8 @@ def _find_node_errors(
         hint = ""
         if identities_on_other_channels:
             hint = (
-                f"; a node {identities_on_other_channels[0].node} answers on {identities_on_other_channels[0].channel}"
+                f"; a node {identities_on_other_channels[0].node} answers on "
+                f"{identities_on_other_channels[0].channel}"
             )
         return [f"{subject} does not answer{hint}"]
     errors: list[str] = []
@@ -185,11 +192,15 @@ def _find_identity_errors(subject: str, identity: ModuleIdentity, *, lockstep: b
     """Return errors of a module whose protocol or clock does not match this driver's."""
     errors: list[str] = []
     if identity.protocol != PROTOCOL_VERSION:
-        errors.append(f"{subject} has protocol version {identity.protocol}, this driver {PROTOCOL_VERSION}: update one")
+        errors.append(
+            f"{subject} has protocol version {identity.protocol}, this driver {PROTOCOL_VERSION}: update one"
+        )
     if lockstep and not identity.stepped:
         errors.append(f"{subject} does not support lockstep: use --clock-mode realtime")
     if identity.stepped and not lockstep:
-        errors.append(f"{subject} is an emulator whose time is paused between Syncs: start it without --stepped")
+        errors.append(
+            f"{subject} is an emulator whose time is paused between Syncs: start it without --stepped"
+        )
     return errors
 
 
@@ -221,8 +232,10 @@ def configure_modules(
     wire_by_node = {node: bus.wire for bus in buses for node in bus.nodes}
     wires = [bus.wire for bus in buses]
     response_layout = load_layouts()[Opcode.PARAMETER_ANSWER]
-    remaining_parameters_by_node = {node: list(ModuleParameter) for node in new_values}  # not answered yet
-    request_time_by_node_s: dict[int, float] = {}  # when the request that a node has not answered was sent
+    # Not answered yet.
+    remaining_parameters_by_node = {node: list(ModuleParameter) for node in new_values}
+    # When the request that a node has not answered was sent.
+    request_time_by_node_s: dict[int, float] = {}
     current_values: dict[int, dict[ModuleParameter, float]] = {node: {} for node in new_values}
     deadline_s = time.monotonic() + timeout_s
     while remaining_parameters_by_node:
@@ -242,7 +255,8 @@ def configure_modules(
         for _, frame in receive_frames(wires):
             node = parse_node(frame.id)
             is_response = (
-                parse_opcode(frame.id) == Opcode.PARAMETER_ANSWER and len(frame.data) == response_layout.length
+                parse_opcode(frame.id) == Opcode.PARAMETER_ANSWER
+                and len(frame.data) == response_layout.length
             )
             if not is_response or not remaining_parameters_by_node.get(node):
                 if on_frame is not None:
@@ -254,10 +268,14 @@ def configure_modules(
                 continue
             remaining_parameters_by_node[node].pop(0)
             request_time_by_node_s.pop(node, None)
-            _raise_if_refused(node, parameter, new_values[node].get(parameter), int(response["result"]))
+            _raise_if_refused(
+                node, parameter, new_values[node].get(parameter), int(response["result"])
+            )
             current_values[node][parameter] = response["value"]
         remaining_parameters_by_node = {
-            node: parameters for node, parameters in remaining_parameters_by_node.items() if parameters
+            node: parameters
+            for node, parameters in remaining_parameters_by_node.items()
+            if parameters
         }
     return current_values
 
@@ -270,7 +288,9 @@ def _make_request(node_id: int, parameter: ModuleParameter, value: float | None)
     return layout.encode(node_id, index=parameter, operation=ParameterOperation.WRITE, value=value)
 
 
-def _raise_if_refused(node_id: int, parameter: ModuleParameter, value: float | None, result: int) -> None:
+def _raise_if_refused(
+    node_id: int, parameter: ModuleParameter, value: float | None, result: int
+) -> None:
     """Raise BackendError if a module refused a request."""
     if result == ParameterResult.DONE:
         return

@@ -34,7 +34,13 @@ class FirmwareProcess(EmulatorProcess):
         return f"unix:{self._folder.name}/{SOCKET_NAME}"
 
     def _start(
-        self, config: RunConfig, settings: CanSettings, pose_address: str | None, output_path: Path, *, stepped: bool
+        self,
+        config: RunConfig,
+        settings: CanSettings,
+        pose_address: str | None,
+        output_path: Path,
+        *,
+        stepped: bool,
     ) -> EmulatorChild:
         from snakesim_can_backend.emulator.reference_firmware import (
             build_program,
@@ -45,7 +51,9 @@ class FirmwareProcess(EmulatorProcess):
         folder = Path(self._folder.name)
         modules_path = folder / MODULES_NAME
         modules_path.write_text(describe_modules(config, settings), encoding="utf-8")
-        arguments = make_program_arguments(str(folder / SOCKET_NAME), str(modules_path), stepped=stepped)
+        arguments = make_program_arguments(
+            str(folder / SOCKET_NAME), str(modules_path), stepped=stepped
+        )
         with output_path.open("wb") as output:
             process = subprocess.Popen(
                 [str(build_program()), *arguments, "--until-input-ends"],

@@ -13,7 +13,8 @@ from snakesim_drivers.kit.findings import FaultFinding, ReportedFindings
 from snakesim_hal.wire.messages import LifecycleState
 
 MIN_UNANSWERED_SYNCS = 3  # Syncs without an answer
-MIN_CONSECUTIVE_ERRORS = 3  # bad frames of one kind, or periods with a full bus, that make a fault instead of a glitch
+# Bad frames of one kind, or periods with a full bus, that make a fault instead of a glitch.
+MIN_CONSECUTIVE_ERRORS = 3
 CLEAR_GRACE_SYNCS = 5  # Syncs that a module may take to follow a Clear
 ARM_GRACE_SYNCS = 5  # Syncs that a module may take to follow an Arm
 MIN_UNKNOWN_NODE_FRAMES = 3  # of an unexpected node, in consecutive cycles
@@ -37,7 +38,9 @@ Report = Callable[[str, str], None]  # gets the kind of a finding and its cause
 class ModuleMonitor:
     """Finds what is wrong with modules and buses, and remembers which findings it has reported."""
 
-    def __init__(self, joints: Sequence[str], channel_by_joint: Sequence[str], period_s: float) -> None:
+    def __init__(
+        self, joints: Sequence[str], channel_by_joint: Sequence[str], period_s: float
+    ) -> None:
         """Create the monitor of a robot's modules, before the first Sync.
 
         Args:
@@ -52,10 +55,10 @@ class ModuleMonitor:
 
         # By joint.
         self._restart_counts = [0] * len(joints)  # uptime decreases that were seen before
-        self._unarmed_sync_counts = [0] * len(
-            joints
-        )  # consecutive Syncs in which a module did not follow the robot's arming
-        self._restart_sync_by_joint: dict[int, int] = {}  # Sync at which a module's uptime decreased
+        # Consecutive Syncs in which a module did not follow the robot's arming.
+        self._unarmed_sync_counts = [0] * len(joints)
+        # Sync at which a module's uptime decreased.
+        self._restart_sync_by_joint: dict[int, int] = {}
         self._restarted_joints: set[int] = set()  # modules that restarted since the last reset
         self._changed_joints: set[int] = set()  # modules whose parameters may have changed
         self._armed_joints: set[int] = set()  # modules that have been armed in this arm session
@@ -65,10 +68,13 @@ class ModuleMonitor:
         self._arm_session_start_sync: int | None = None  # first Sync of this arm session
 
         # By bus.
-        self._rejecting_cycle_count_by_channel: dict[str, int] = {}  # consecutive cycles in which a bus rejected frames
-        self._last_rejected_sync_by_channel: dict[str, int] = {}  # newest Sync at which a bus rejected frames
+        # Consecutive cycles in which a bus rejected frames.
+        self._rejecting_cycle_count_by_channel: dict[str, int] = {}
+        # Newest Sync at which a bus rejected frames.
+        self._last_rejected_sync_by_channel: dict[str, int] = {}
         self._down_channels: set[str] = set()  # buses whose interface is down
-        self._unknown_node_frames: dict[int, int] = {}  # by node: frames in consecutive cycles, each with some
+        # By node: frames in consecutive cycles, each with some.
+        self._unknown_node_frames: dict[int, int] = {}
         self.minor_error_counts: dict[str, int] = {}  # bus errors that are not faults, by kind
 
     def reset(self, sync: int) -> None:
@@ -115,10 +121,20 @@ class ModuleMonitor:
         module_reports.reset_sender_counts()
         for joint, module in enumerate(module_reports.modules):
             findings += self._find_frame_faults(joint, module, module_reports)
-            findings += self._find_state_faults(joint, module, module_reports, lifecycle, isolated=joint in isolated)
+            findings += self._find_state_faults(
+                joint, module, module_reports, lifecycle, isolated=joint in isolated
+            )
         if lifecycle == "armed":
-            findings += [self._make_unconfigured_finding(joint) for joint in unconfigured if joint not in isolated]
-        relevant = [finding for finding in findings if not (finding.affects_only_joint and finding.joint in isolated)]
+            findings += [
+                self._make_unconfigured_finding(joint)
+                for joint in unconfigured
+                if joint not in isolated
+            ]
+        relevant = [
+            finding
+            for finding in findings
+            if not (finding.affects_only_joint and finding.joint in isolated)
+        ]
         return self._reported_findings.filter_new(relevant)
 
     def pop_changed_joints(self) -> set[int]:
@@ -138,12 +154,19 @@ class ModuleMonitor:
     # --- one module -------------------------------------------------------------------------------------------
 
     def _make_finding(
-        self, joint_index: int, module: ModuleStatus, what: str, cause: str, also: Sequence[str] = ()
+        self,
+        joint_index: int,
+        module: ModuleStatus,
+        what: str,
+        cause: str,
+        also: Sequence[str] = (),
     ) -> FaultFinding:
         """Return a finding about a module; `also` names further kinds that apply."""
         subject = f"{self._joint_names[joint_index]} (node {module.node} on {self._channels[joint_index]})"
         concerns_only_this_joint = ROBOT_FAULT_KINDS.isdisjoint((what, *also))
-        return FaultFinding(what, f"{subject} {cause}", joint_index, affects_only_joint=concerns_only_this_joint)
+        return FaultFinding(
+            what, f"{subject} {cause}", joint_index, affects_only_joint=concerns_only_this_joint
+        )
 
     def _find_frame_faults(
         self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports
@@ -173,29 +196,46 @@ class ModuleMonitor:
                 f"has restarted, its uptime is {uptime_s:.2f} s: a reset writes its parameters again",
             )
 
-    def _report_wrong_frames(self, module: ModuleStatus, module_reports: ModuleReports, report: Report) -> None:
+    def _report_wrong_frames(
+        self, module: ModuleStatus, module_reports: ModuleReports, report: Report
+    ) -> None:
         """Report wrong counters and checksums, a second module with the same id, and too many frames."""
         if module.repeated_state_count >= MIN_CONSECUTIVE_ERRORS:
-            report("module_frozen", f"is frozen: it repeats its answer number {module.last_count} to every Sync")
+            report(
+                "module_frozen",
+                f"is frozen: it repeats its answer number {module.last_count} to every Sync",
+            )
         elif module.wrong_counter_count >= MIN_CONSECUTIVE_ERRORS:
             report(
                 "wrong_counter",
                 f"answers Syncs that were not sent: {module.wrong_counter_count} wrong counters in a row",
             )
         if module.corrupt_state_count >= MIN_CONSECUTIVE_ERRORS:
-            report("bad_checksum", f"sends corrupt states: {module.corrupt_state_count} wrong checksums in a row")
+            report(
+                "bad_checksum",
+                f"sends corrupt states: {module.corrupt_state_count} wrong checksums in a row",
+            )
         if module.count_double_answers(module_reports.sync) >= MIN_CONSECUTIVE_ERRORS:
-            report("duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id")
+            report(
+                "duplicate_node",
+                "is duplicated: every Sync is answered twice; give each module its own node id",
+            )
         if module.frame_count > MAX_FRAMES_PER_CYCLE:
-            report("module_babbling", f"floods the bus: {module.frame_count} frames within one period")
+            report(
+                "module_babbling", f"floods the bus: {module.frame_count} frames within one period"
+            )
 
     def _report_silence(
         self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports, report: Report
     ) -> None:
-        wrong_answers = module.corrupt_state_count + max(module.repeated_state_count, module.wrong_counter_count)
+        wrong_answers = module.corrupt_state_count + max(
+            module.repeated_state_count, module.wrong_counter_count
+        )
         without_answer = module_reports.sync - module.sync - wrong_answers
         # A Sync that the bus rejected did not reach the module.
-        since_unsent = module_reports.sync - self._last_rejected_sync_by_channel.get(self._channels[joint_index], -1)
+        since_unsent = module_reports.sync - self._last_rejected_sync_by_channel.get(
+            self._channels[joint_index], -1
+        )
         unanswered = min(without_answer, since_unsent)
         if unanswered >= MIN_UNANSWERED_SYNCS:
             silence_ms = unanswered * self._period_s * 1000
@@ -215,7 +255,9 @@ class ModuleMonitor:
     ) -> list[FaultFinding]:
         """Return a finding if the module reports a fault, or does not follow the robot's arming."""
         # An emergency stop is no reason to report a module that had no fault before it.
-        stopped_on_command = lifecycle == "estop" and module.state == ModuleState.EMERGENCY and not module.faults
+        stopped_on_command = (
+            lifecycle == "estop" and module.state == ModuleState.EMERGENCY and not module.faults
+        )
         may_report = module_reports.sync >= self._grace_end_sync
         if module.is_clear_required and not stopped_on_command and may_report:
             return [self._make_fault_finding(joint_index, module)]
@@ -224,7 +266,9 @@ class ModuleMonitor:
         state = module.state.name.lower()
         if joint_index in self._armed_joints:
             return [
-                self._make_finding(joint_index, module, "module_not_armed", f"is not armed any more: it is {state}")
+                self._make_finding(
+                    joint_index, module, "module_not_armed", f"is not armed any more: it is {state}"
+                )
             ]
         cause = f"does not arm: it is {state}"
         return [self._make_finding(joint_index, module, "module_not_armed", cause, [NEVER_ARMED])]
@@ -238,7 +282,9 @@ class ModuleMonitor:
         cause = f"reports {reported}; it stopped because of {module.last_stop.name.lower()}"
         return self._make_finding(joint_index, module, kinds[0], cause, kinds)
 
-    def _has_restarted(self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports) -> bool:
+    def _has_restarted(
+        self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports
+    ) -> bool:
         """Return whether a module has restarted, once for every restart.
 
         A second module with the same id also makes the uptime decrease, but then every Sync is answered twice. So the
@@ -256,7 +302,9 @@ class ModuleMonitor:
         del self._restart_sync_by_joint[joint_index]
         return True
 
-    def _has_failed_to_arm(self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports) -> bool:
+    def _has_failed_to_arm(
+        self, joint_index: int, module: ModuleStatus, module_reports: ModuleReports
+    ) -> bool:
         """Return whether a module is not armed although the robot has been for long enough."""
         if self._arm_session_start_sync is None:
             return False
@@ -264,7 +312,9 @@ class ModuleMonitor:
             self._armed_joints.add(joint_index)
         was_armed = joint_index in self._armed_joints
         had_time = module_reports.sync - self._arm_session_start_sync > ARM_GRACE_SYNCS or was_armed
-        answered = module_reports.sync == module.sync and not module.count_double_answers(module_reports.sync)
+        answered = module_reports.sync == module.sync and not module.count_double_answers(
+            module_reports.sync
+        )
         if had_time and answered and module.state != ModuleState.ARMED:
             self._unarmed_sync_counts[joint_index] += 1
         else:
@@ -276,7 +326,9 @@ class ModuleMonitor:
 
     def _make_unconfigured_finding(self, joint_index: int) -> FaultFinding:
         name = self._joint_names[joint_index]
-        cause = f"{name} has not accepted its parameters, and is not armed; reset, or power-cycle it"
+        cause = (
+            f"{name} has not accepted its parameters, and is not armed; reset, or power-cycle it"
+        )
         return FaultFinding("module_not_configured", cause, joint_index)
 
     # --- the buses --------------------------------------------------------------------------------------------
@@ -299,7 +351,9 @@ class ModuleMonitor:
             if suggestion is None:
                 self.minor_error_counts[error.kind] = self.minor_error_counts.get(error.kind, 0) + 1
             else:
-                findings.append(FaultFinding(error.kind, f"{error.channel}: {error.detail}; {suggestion}"))
+                findings.append(
+                    FaultFinding(error.kind, f"{error.channel}: {error.detail}; {suggestion}")
+                )
         # Consecutive cycles are counted: a bus that sent everything in this cycle begins at 0 again. So does one whose
         # interface is down, which is a finding of its own.
         self._rejecting_cycle_count_by_channel = {
@@ -331,13 +385,17 @@ class ModuleMonitor:
         frame_count_by_node: dict[int, int] = {}
         for node, new_frames in module_reports.unknown_node_frame_counts.items():
             frame_count_by_node[node] = self._unknown_node_frames.get(node, 0) + new_frames
-        self._unknown_node_frames = frame_count_by_node  # without the nodes that sent no frame in this cycle
+        # Without the nodes that sent no frame in this cycle.
+        self._unknown_node_frames = frame_count_by_node
 
         findings: list[FaultFinding] = []
         for node, frames in frame_count_by_node.items():
             if frames >= MIN_UNKNOWN_NODE_FRAMES:
                 findings.append(
-                    FaultFinding("unknown_node", f"node {node} is on the bus, but is not a joint of this robot")
+                    FaultFinding(
+                        "unknown_node",
+                        f"node {node} is on the bus, but is not a joint of this robot",
+                    )
                 )
         return findings
 

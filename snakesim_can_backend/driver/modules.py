@@ -11,13 +11,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from snakesim_can_backend.bus.adapter import open_wire
-from snakesim_can_backend.bus.bus import VirtualPeer, VirtualWire, Wire, inject_into, make_virtual_channel, wait
+from snakesim_can_backend.bus.bus import (
+    VirtualPeer,
+    VirtualWire,
+    Wire,
+    inject_into,
+    make_virtual_channel,
+    wait,
+)
 from snakesim_can_backend.bus.load import compute_max_frame_bits, count_joints_per_bus, plan_reports
 from snakesim_can_backend.bus.log import LoggedWire, open_log
-from snakesim_can_backend.driver.bring_up import ModuleBus, configure_modules, find_discovery_errors, find_modules
+from snakesim_can_backend.driver.bring_up import (
+    ModuleBus,
+    configure_modules,
+    find_discovery_errors,
+    find_modules,
+)
 from snakesim_can_backend.driver.firmware_process import FirmwareProcess
 from snakesim_can_backend.driver.module_monitor import ARM_GRACE_SYNCS, ModuleMonitor
-from snakesim_can_backend.driver.own_emulators import EmulatorProcess, start_in_process_emulators, supports_fault
+from snakesim_can_backend.driver.own_emulators import (
+    EmulatorProcess,
+    start_in_process_emulators,
+    supports_fault,
+)
 from snakesim_can_backend.driver.parameters import plan_parameters, validate_ratings
 from snakesim_can_backend.driver.reports import ModuleReports, ModuleStatus
 from snakesim_can_backend.driver.sensors import are_contacts_due
@@ -36,11 +52,13 @@ from snakesim_hal.wire.messages import LifecycleState
 RESPONSE_TIME_FACTOR = 1.25  # on the bus time that all answers take
 RESPONSE_LATENCY_S = 0.002  # latency of the adapter and of this process
 MAX_RESPONSE_PERIOD_FRACTION = 0.75  # the rest of a period is for the controller
-CONFIGURE_TIMEOUT_S = 1.0  # while the robot is up; an emergency stop waits no longer than that, with motors off
+# While the robot is up; an emergency stop waits no longer than that, with motors off.
+CONFIGURE_TIMEOUT_S = 1.0
 LOCKSTEP_RESPONSE_TIMEOUT_S = 2.0  # to wait for slow emulators; dead ones are not waited for again
 FIRST_STATE_SYNCS = 20  # within which every module must send its first state
 FIRST_STATE_PAUSE_S = 0.02
-FAULTS_OF_KILLED_DRIVER = {"watchdog", "stream"}  # of a module whose driver ended without disarming it
+# Of a module whose driver ended without disarming it.
+FAULTS_OF_KILLED_DRIVER = {"watchdog", "stream"}
 FRAME_BYTES = 8  # of the longest frame on classic CAN
 
 _log = logging.getLogger("snakesim.can")
@@ -90,25 +108,28 @@ class JointModules(Drives):
         # Modules.
         self.module_reports = ModuleReports(len(self._joint_names))
         self._setpoints = commands.SetpointWriter(len(self._joint_names))
-        self._unconfigured_joints = set(
-            range(len(self._joint_names))
-        )  # joints whose parameters may differ from the robot file
+        # Joints whose parameters may differ from the robot file.
+        self._unconfigured_joints = set(range(len(self._joint_names)))
         # Whether no other host uses the modules: before that is known, nothing that disturbs them is sent.
         self._is_only_host = False
 
         # Lifecycle.
         self._lifecycle: LifecycleState = "disarmed"
-        self._isolated_joints: frozenset[int] = frozenset()  # isolated joints: motors off, and no setpoints
+        # Isolated joints: motors off, and no setpoints.
+        self._isolated_joints: frozenset[int] = frozenset()
         self._arm_session = ArmSession()
         self._is_arm_due = False  # whether the lifecycle became armed in this cycle
-        self._was_clear_broadcast = False  # whether the lifecycle left a latched state in this cycle
+        # Whether the lifecycle left a latched state in this cycle.
+        self._was_clear_broadcast = False
 
         # Buses.
         self.wires: list[Wire] = []
         self.local_emulators: VirtualPeer | None = None
         self._emulator_process: EmulatorProcess | None = None
         self._rejecting_channels: list[str] = []  # channels that rejected a frame in this cycle
-        self._response_timeout_s = LOCKSTEP_RESPONSE_TIMEOUT_S if self._lockstep else FIRST_STATE_PAUSE_S
+        self._response_timeout_s = (
+            LOCKSTEP_RESPONSE_TIMEOUT_S if self._lockstep else FIRST_STATE_PAUSE_S
+        )
         try:
             self._buses = self._open_buses(count_joints_per_bus(config, settings), pose_address)
         except BaseException:
@@ -135,7 +156,9 @@ class JointModules(Drives):
                 "another program commands the modules on this bus; end it first. Nothing was sent",
                 code="bus/second-host",
             )
-        errors = find_discovery_errors(self._buses, identities, self._joint_names, lockstep=self._lockstep)
+        errors = find_discovery_errors(
+            self._buses, identities, self._joint_names, lockstep=self._lockstep
+        )
         if errors:
             raise BackendError(
                 "the robot is not complete; nothing was enabled:",
@@ -146,7 +169,9 @@ class JointModules(Drives):
         self.emulated = all(identity.emulated for identity in identities)
         for identity in identities:
             joint = identity.node - 1
-            self._readings.set_identity(joint, serial=f"{identity.serial:08X}", firmware=identity.firmware)
+            self._readings.set_identity(
+                joint, serial=f"{identity.serial:08X}", firmware=identity.firmware
+            )
         self._broadcast(commands.make_command(CommandAction.DISARM))
         self._configure_modules(timeout_s)
         self._wait_for_first_states()
@@ -164,12 +189,16 @@ class JointModules(Drives):
         self._receive()
         sync = module_reports.sync + 1
         contacts = are_contacts_due(self._reports, sync)
-        module_reports.start_sync(sync, contacts=contacts, tail=self._reports.tail, questions=len(queries))
+        module_reports.start_sync(
+            sync, contacts=contacts, tail=self._reports.tail, questions=len(queries)
+        )
         frame = commands.make_sync(sync, time_us)
         self._rejecting_channels = [wire.channel for wire in self.wires if not wire.send(frame)]
         for wire, query in queries:
             wire.send(query)
-        if module_reports.is_complete:  # no response is expected; but emulators in this process run only in `wait`
+        if (
+            module_reports.is_complete
+        ):  # no response is expected; but emulators in this process run only in `wait`
             wait(self.wires, 0.0)
         is_every_bus_queried = len(queries) == len(self.wires)
         deadline_s = time.monotonic() + self._response_timeout_s
@@ -220,7 +249,9 @@ class JointModules(Drives):
             joints: Indices of the joints whose faults the operator has reset.
         """
         self.monitor.reset(self.module_reports.sync)
-        if not self._was_clear_broadcast:  # otherwise `send_lifecycle_commands` has sent a Clear to all modules
+        if (
+            not self._was_clear_broadcast
+        ):  # otherwise `send_lifecycle_commands` has sent a Clear to all modules
             for joint in sorted(joints):
                 self._send_command(CommandAction.CLEAR, joint)
         if self._unconfigured_joints:
@@ -244,7 +275,9 @@ class JointModules(Drives):
         self._is_arm_due = False
         if self._lifecycle != "armed":
             return
-        for joint, frame in enumerate(self._setpoints.encode(command.modes, command.targets, command.limits_nm)):
+        for joint, frame in enumerate(
+            self._setpoints.encode(command.modes, command.targets, command.limits_nm)
+        ):
             if joint not in command.enabled_drives:
                 continue
             wire = self._wire_by_joint[joint]
@@ -320,7 +353,9 @@ class JointModules(Drives):
         settings = self._settings
         channels = settings.channels
         if settings.emulators_run == "process":
-            self._emulator_process = EmulatorProcess(self._config, settings, pose_address, stepped=self._lockstep)
+            self._emulator_process = EmulatorProcess(
+                self._config, settings, pose_address, stepped=self._lockstep
+            )
         if settings.emulators_run == "firmware":
             firmware_process = FirmwareProcess(self._config, settings, stepped=self._lockstep)
             self._emulator_process = firmware_process
@@ -362,7 +397,9 @@ class JointModules(Drives):
         parameters_by_node = plan_parameters(self._config.robot, self._settings, self._reports)
         due = {joint + 1: parameters_by_node[joint + 1] for joint in self._unconfigured_joints}
         try:
-            current_values = configure_modules(self._buses, due, timeout_s, self.module_reports.process_frame)
+            current_values = configure_modules(
+                self._buses, due, timeout_s, self.module_reports.process_frame
+            )
             validate_ratings(self._config.robot, current_values)
         finally:
             self.module_reports.reset_frame_counts()  # the frames arrived over more than one period
@@ -378,13 +415,17 @@ class JointModules(Drives):
         modules = zip(self._joint_names, self.module_reports.modules, strict=True)
         silent = [name for name, module in modules if module.sync < 0]
         raise BackendError(
-            f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled", code="drive/silent"
+            f"{', '.join(silent)} did not answer {FIRST_STATE_SYNCS} Syncs; nothing was enabled",
+            code="drive/silent",
         )
 
     def _clear_faults_of_killed_driver(self) -> None:
         """Clear the faults that a killed driver has left; but not heat, leaks and emergencies."""
         for _ in range(FIRST_STATE_SYNCS):  # the reason of a fault comes in a later heartbeat
-            if all(module.faults or module.state != ModuleState.FAULT for module in self.module_reports.modules):
+            if all(
+                module.faults or module.state != ModuleState.FAULT
+                for module in self.module_reports.modules
+            ):
                 break
             time.sleep(FIRST_STATE_PAUSE_S)
             self.read()
@@ -392,7 +433,9 @@ class JointModules(Drives):
             faults = module.fault_names()
             has_only_such_faults = bool(faults) and set(faults) <= FAULTS_OF_KILLED_DRIVER
             if module.state == ModuleState.FAULT and has_only_such_faults:
-                _log.warning("node %d: clearing an earlier fault: %s", module.node, ", ".join(faults))
+                _log.warning(
+                    "node %d: clearing an earlier fault: %s", module.node, ", ".join(faults)
+                )
                 self._send_command(CommandAction.CLEAR, joint)
 
     # --- receiving --------------------------------------------------------------------------------------------
@@ -468,7 +511,9 @@ class JointModules(Drives):
         if in_time and not unconfigured_joints and joint_index not in session.armed_joints:
             self._repeat_command("armed", joint_index, module)
 
-    def _repeat_command(self, lifecycle: LifecycleState, joint_index: int, module: ModuleStatus) -> None:
+    def _repeat_command(
+        self, lifecycle: LifecycleState, joint_index: int, module: ModuleStatus
+    ) -> None:
         frame = commands.make_repeated_command(lifecycle, module.state, module.node)
         if frame is not None:
             self._wire_by_joint[joint_index].send(frame)
@@ -486,4 +531,7 @@ def compute_response_timeout_s(config: RunConfig, settings: CanSettings) -> floa
     frames_per_joint = 1 + (reports.contact_every > 0)
     frames = max(count_joints_per_bus(config, settings)) * frames_per_joint + reports.tail
     bus_time_s = frames * compute_max_frame_bits(FRAME_BYTES) / reports.bit_rate
-    return min(RESPONSE_TIME_FACTOR * bus_time_s + RESPONSE_LATENCY_S, MAX_RESPONSE_PERIOD_FRACTION / reports.rate_hz)
+    return min(
+        RESPONSE_TIME_FACTOR * bus_time_s + RESPONSE_LATENCY_S,
+        MAX_RESPONSE_PERIOD_FRACTION / reports.rate_hz,
+    )

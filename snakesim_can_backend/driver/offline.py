@@ -31,7 +31,9 @@ QUANTITIES = ("angle_rad", "velocity_rad_s", "torque_nm")
 class LogReplay:
     """Reads a log frame by frame as the driver reads a bus, and collects the joint states of every Sync."""
 
-    def __init__(self, mounting: DriveMounting, schedule: ReportSchedule, answer_limit_s: float) -> None:
+    def __init__(
+        self, mounting: DriveMounting, schedule: ReportSchedule, answer_limit_s: float
+    ) -> None:
         """Prepare to read the log of a bus as the driver would have read the bus.
 
         Args:
@@ -59,7 +61,9 @@ class LogReplay:
         It may end in the middle of a tick. Then the missing answers to the last Sync are unknown, and no sample is
         taken.
         """
-        for (time_s, _), messages in groupby(log, key=lambda message: (message.timestamp, message.channel)):
+        for (time_s, _), messages in groupby(
+            log, key=lambda message: (message.timestamp, message.channel)
+        ):
             if self._response_deadline_s is not None and time_s > self._response_deadline_s:
                 self._take_sample()
             for message in messages:
@@ -77,7 +81,9 @@ class LogReplay:
         self.frames += 1
         if not is_joint_module_frame(message):
             self.other_protocol_frames[guess_frame_origin(message)] += 1
-        is_standard_data_frame = not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
+        is_standard_data_frame = not (
+            message.is_error_frame or message.is_remote_frame or message.is_extended_id
+        )
         if not is_standard_data_frame:
             return
         frame = CanFrame(message.arbitration_id, bytes(message.data))
@@ -100,7 +106,9 @@ class LogReplay:
         if self._response_deadline_s is not None:
             self._take_sample()
         sync = self.reports.sync + 1
-        self.reports.start_sync(sync, contacts=are_contacts_due(self._schedule, sync), tail=self._schedule.tail)
+        self.reports.start_sync(
+            sync, contacts=are_contacts_due(self._schedule, sync), tail=self._schedule.tail
+        )
         self._response_deadline_s = time_s + self._response_timeout_s
 
     def _take_sample(self) -> None:
@@ -120,7 +128,9 @@ class ReplayComparison:
     first_wrong: str  # the first difference, as text; empty: all values are equal to the bit
 
 
-def compare_with_run_log(replay: LogReplay, layout: RowLayout, rows: dict[str, Floats]) -> ReplayComparison:
+def compare_with_run_log(
+    replay: LogReplay, layout: RowLayout, rows: dict[str, Floats]
+) -> ReplayComparison:
     """Compare the joint states that were replayed from a bus log with those of every tick in the run log.
 
     Args:
@@ -168,7 +178,9 @@ def _find_first_tick(replayed: Floats, recorded: Floats, ticks: np.ndarray) -> t
     best_syncs = 0
     for bring_up_syncs in range(min(MAX_BRING_UP_SYNCS, len(replayed))):
         is_in_log = ticks + bring_up_syncs < len(replayed)
-        is_equal = np.all(replayed[ticks[is_in_log] + bring_up_syncs] == recorded[is_in_log], axis=(1, 2))
+        is_equal = np.all(
+            replayed[ticks[is_in_log] + bring_up_syncs] == recorded[is_in_log], axis=(1, 2)
+        )
         equal_ticks = int(is_equal.sum())
         if equal_ticks > max_equal_ticks:
             max_equal_ticks = equal_ticks

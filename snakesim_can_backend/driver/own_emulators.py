@@ -93,7 +93,12 @@ def supports_fault(injection: FaultInjection, joint_count: int) -> bool:
 
 
 def start_in_process_emulators(
-    config: RunConfig, settings: CanSettings, channel: str, pose_address: str | None, *, stepped: bool
+    config: RunConfig,
+    settings: CanSettings,
+    channel: str,
+    pose_address: str | None,
+    *,
+    stepped: bool,
 ) -> VirtualPeer:
     """Start emulators of all joint modules at the other end of a virtual bus, in this process.
 
@@ -115,7 +120,9 @@ def start_in_process_emulators(
 class EmulatorProcess:
     """`snakesim drive emulate can` as a child that dies with this process."""
 
-    def __init__(self, config: RunConfig, settings: CanSettings, pose_address: str | None, *, stepped: bool) -> None:
+    def __init__(
+        self, config: RunConfig, settings: CanSettings, pose_address: str | None, *, stepped: bool
+    ) -> None:
         """Start `snakesim drive emulate can` as a child process, and wait until its modules are on the bus.
 
         Args:
@@ -128,21 +135,31 @@ class EmulatorProcess:
             BackendError: The child cannot be started, ended at once, or was not ready in time.
         """
         try:
-            self._folder = tempfile.TemporaryDirectory(prefix="snakesim-emulators-", ignore_cleanup_errors=True)
+            self._folder = tempfile.TemporaryDirectory(
+                prefix="snakesim-emulators-", ignore_cleanup_errors=True
+            )
             output_path = Path(self._folder.name, "modules.log")
             self._child = self._start(config, settings, pose_address, output_path, stepped=stepped)
         except OSError as error:
             raise BackendError(
-                f"the emulated joint modules cannot be started: {error}", code="emulator/not-started"
+                f"the emulated joint modules cannot be started: {error}",
+                code="emulator/not-started",
             ) from error
         if not self._child.wait_until_ready(READY_TEXT):
             self.stop()
             raise BackendError(
-                "the emulated joint modules did not start; see their output above", code="emulator/not-started"
+                "the emulated joint modules did not start; see their output above",
+                code="emulator/not-started",
             )
 
     def _start(
-        self, config: RunConfig, settings: CanSettings, pose_address: str | None, output_path: Path, *, stepped: bool
+        self,
+        config: RunConfig,
+        settings: CanSettings,
+        pose_address: str | None,
+        output_path: Path,
+        *,
+        stepped: bool,
     ) -> EmulatorChild:
         """Write the configuration for the child, and start it. Raises OSError."""
         backends = {**config.backends, "can": msgspec.to_builtins(settings)}
@@ -154,7 +171,9 @@ class EmulatorProcess:
         if stepped:
             arguments.append("--stepped")
         module = "snakesim_can_backend.emulator.command"
-        return start_python_emulator(["-m", module, str(config_path), *arguments, "--interactive"], output_path)
+        return start_python_emulator(
+            ["-m", module, str(config_path), *arguments, "--interactive"], output_path
+        )
 
     def describe_exit(self) -> str | None:
         """Return a sentence about the exit of the child; None while it runs."""
@@ -171,7 +190,8 @@ class EmulatorProcess:
             self._child.write_line(format_typed_fault(fault, begins=begins))
         except (OSError, ValueError) as error:  # the latter when it was stopped
             raise BackendError(
-                f"the emulated joint modules do not accept {fault}: {error}", code="injection/not-supported"
+                f"the emulated joint modules do not accept {fault}: {error}",
+                code="injection/not-supported",
             ) from error
 
     def stop(self) -> None:

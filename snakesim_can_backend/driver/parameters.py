@@ -11,8 +11,10 @@ from snakesim_hal.model.joints import Joint, JointDrive
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
-MIN_WATCHDOG_PERIODS = 2.2  # in a watchdog's time: one setpoint may be lost, and the next be a little late
-SPEED_RANGE_FACTOR = 1.2  # a load may turn a joint faster than its motor, and the bus must still represent that
+# In a watchdog's time: one setpoint may be lost, and the next be a little late.
+MIN_WATCHDOG_PERIODS = 2.2
+# A load may turn a joint faster than its motor, and the bus must still represent that.
+SPEED_RANGE_FACTOR = 1.2
 RATING_TOLERANCE = 0.999  # a rating has single precision on the bus
 
 
@@ -41,7 +43,9 @@ def plan_parameters(
             ModuleParameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad / gear**2,
             ModuleParameter.TORQUE_LIMIT: joint.limits.torque_nm / gear,
             ModuleParameter.SPEED_LIMIT: joint.limits.speed_rad_s * gear,
-            ModuleParameter.ANGLE_LIMIT: _max_shaft_angle_rad(joint),  # the limiter keeps to the nearer side
+            ModuleParameter.ANGLE_LIMIT: _max_shaft_angle_rad(
+                joint
+            ),  # the limiter keeps to the nearer side
             ModuleParameter.WATCHDOG: settings.watchdog_s,
             ModuleParameter.STOP_MODE: float(stop_mode),
             ModuleParameter.CONTACT_EVERY: float(reports.contact_every),
@@ -55,7 +59,9 @@ def _max_shaft_angle_rad(joint: Joint) -> float:
     """Return the largest angle of the module's shaft from its own zero, to either side."""
     drive = joint.drive
     joint_limits_rad = (joint.limits.lower_rad, joint.limits.upper_rad)
-    return max(abs(drive.zero_rad + drive.sign * drive.gear * limit_rad) for limit_rad in joint_limits_rad)
+    return max(
+        abs(drive.zero_rad + drive.sign * drive.gear * limit_rad) for limit_rad in joint_limits_rad
+    )
 
 
 def validate_joint_drives(robot: RobotFile, settings: CanSettings) -> None:
@@ -137,7 +143,12 @@ def _list_limits_at_shaft(joint: Joint) -> Iterator[tuple[str, float, float, str
     limits = joint.limits
     gear = joint.drive.gear
     yield "limits.angle_rad", _max_shaft_angle_rad(joint), state["angle"].high, "rad"
-    yield "limits.speed_rad_s", limits.speed_rad_s * gear, state["velocity"].high / SPEED_RANGE_FACTOR, "rad/s"
+    yield (
+        "limits.speed_rad_s",
+        limits.speed_rad_s * gear,
+        state["velocity"].high / SPEED_RANGE_FACTOR,
+        "rad/s",
+    )
     yield "limits.torque_nm", limits.torque_nm / gear, state["torque"].high, "N·m"
     yield "limits.stop_at_c", limits.stop_at_c, max_winding_c, "°C"
 
@@ -155,7 +166,9 @@ def _validate_contact_range(robot: RobotFile) -> None:
         )
 
 
-def _validate_module_ratings(robot: RobotFile, node_id: int, values: Mapping[ModuleParameter, float]) -> None:
+def _validate_module_ratings(
+    robot: RobotFile, node_id: int, values: Mapping[ModuleParameter, float]
+) -> None:
     """Raise BackendError if the robot file needs more torque or speed than a module is rated for."""
     joint = robot.joint_table[node_id - 1]
     gear = joint.drive.gear
@@ -163,7 +176,8 @@ def _validate_module_ratings(robot: RobotFile, node_id: int, values: Mapping[Mod
         (ModuleParameter.RATED_TORQUE, joint.limits.torque_nm / gear, "N·m"),
         (ModuleParameter.RATED_SPEED, joint.limits.speed_rad_s * gear, "rad/s"),
     ):
-        is_sufficient = values[parameter] >= required_value * RATING_TOLERANCE  # False for NaN, which the bus can carry
+        # False for NaN, which the bus can carry.
+        is_sufficient = values[parameter] >= required_value * RATING_TOLERANCE
         if not is_sufficient:
             raise BackendError(
                 f"joint_{node_id} is rated for {values[parameter]:.3g} {unit}, robot {robot.name!r} needs "

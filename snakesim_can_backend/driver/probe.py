@@ -51,7 +51,10 @@ class ModuleProbe(DriveProbe):
             values = layout.decode(frame.data)
             state = ModuleState(int(values["state"]))
             last_stop = LastStop(int(values["last_stop"]))
-            return DriveStatus(state in DRIVING_STATES, f"{state.name.lower()}, last stop: {last_stop.name.lower()}")
+            return DriveStatus(
+                state in DRIVING_STATES,
+                f"{state.name.lower()}, last stop: {last_stop.name.lower()}",
+            )
 
         return request_response(self._wire, make_command(CommandAction.IDENTIFY), decode, timeout_s)
 
@@ -65,7 +68,13 @@ class ModuleProbe(DriveProbe):
             (ModuleParameter.SPEED_LIMIT, "rad/s", limits.speed_rad_s * gear),
         )
         return [
-            ReadBack(parameter.name.lower(), unit, value, self._read_parameter(parameter, timeout_s), TOLERANCE)
+            ReadBack(
+                parameter.name.lower(),
+                unit,
+                value,
+                self._read_parameter(parameter, timeout_s),
+                TOLERANCE,
+            )
             for parameter, unit, value in required
         ]
 
@@ -77,10 +86,15 @@ class ModuleProbe(DriveProbe):
         layout = load_layouts()[Opcode.PARAMETER_ANSWER]
 
         def decode(frame: CanFrame) -> float | None:
-            if (parse_opcode(frame.id), parse_node(frame.id)) != (Opcode.PARAMETER_ANSWER, FIRST_NODE):
+            if (parse_opcode(frame.id), parse_node(frame.id)) != (
+                Opcode.PARAMETER_ANSWER,
+                FIRST_NODE,
+            ):
                 return None
             values = layout.decode(frame.data)
-            is_answer = int(values["index"]) == parameter and int(values["result"]) == ParameterResult.DONE
+            is_answer = (
+                int(values["index"]) == parameter and int(values["result"]) == ParameterResult.DONE
+            )
             return float(values["value"]) if is_answer else None
 
         return request_response(self._wire, _make_request(parameter), decode, timeout_s)

@@ -30,8 +30,10 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_hal.base.arrays import Floats
 
 MAX_REPORT_DELAY_SYNCS = 3  # from a module's fault to the heartbeat that gives its reason
-MAX_HEARTBEAT_GAP_MS = 350  # heartbeats whose uptimes differ by less are of one module; it sends one every 100 ms
-MAX_LATE_SYNCS = 3  # a state that is later has a wrong counter; one that is not is accepted, with its age
+# Heartbeats whose uptimes differ by less are of one module; it sends one every 100 ms.
+MAX_HEARTBEAT_GAP_MS = 350
+# A state that is later has a wrong counter; one that is not is accepted, with its age.
+MAX_LATE_SYNCS = 3
 NO_CONTACT = b""  # report of a link that touches nothing
 
 # Signals of each frame in the order in which this module reads them.
@@ -43,11 +45,17 @@ CONTACT_SIGNALS = ("force_x", "force_y", "force_z", "along", "bearing")
 GYRO_SIGNALS = ("rate_x", "rate_y", "rate_z", "count")
 ACCELERATION_SIGNALS = ("acceleration_x", "acceleration_y", "acceleration_z", "count")
 HEALTH_SIGNALS = ("voltage", "current", "motor_temperature", "board_temperature", "leak")
-HEARTBEAT_SIGNALS = ("state", "last_stop", "uptime", *(f"fault_{fault.name.lower()}" for fault in ModuleFault))
+HEARTBEAT_SIGNALS = (
+    "state",
+    "last_stop",
+    "uptime",
+    *(f"fault_{fault.name.lower()}" for fault in ModuleFault),
+)
 
 # The state field has four bits; a number that the protocol does not define counts as FAULT.
 STATES = [ModuleState(i) if i < len(ModuleState) else ModuleState.FAULT for i in range(16)]
-LATCHED_STATES = (ModuleState.FAULT, ModuleState.EMERGENCY)  # a module leaves them only after a Clear
+# A module leaves them only after a Clear.
+LATCHED_STATES = ModuleState.FAULT, ModuleState.EMERGENCY
 
 
 @dataclass
@@ -67,7 +75,8 @@ class ModuleStatus:
     repeated_state_count: int = 0  # consecutive states with the same count
     wrong_counter_count: int = 0  # consecutive
     corrupt_state_count: int = 0  # consecutive states with a wrong checksum
-    double_answers: int = 0  # consecutive Syncs that were answered more than once, up to `double_answer_sync`
+    # Consecutive Syncs that were answered more than once, up to `double_answer_sync`.
+    double_answers: int = 0
     double_answer_sync: int = -1
     frame_count: int = 0  # in this control cycle
 
@@ -75,7 +84,8 @@ class ModuleStatus:
     uptime_ms: int = -1  # -1: no heartbeat yet
     previous_uptime_ms: int = -1
     uptime_decreased: bool = False  # in the newest heartbeat
-    restarts: int = 0  # times that the uptime decreased and continued from there, unlike after a late heartbeat
+    # Times that the uptime decreased and continued from there, unlike after a late heartbeat.
+    restarts: int = 0
     faults: int = 0  # bits of ModuleFault, from the newest heartbeat
     last_stop: LastStop = LastStop.NONE
     heartbeat_sync: int = -1  # the Sync before the newest heartbeat
@@ -118,7 +128,8 @@ class ModuleReports:
         self.answers_missing = 0  # to parameter requests
 
         # Frames that no module of this robot should send.
-        self.unknown_node_frame_counts: Counter[int] = Counter()  # frames by node, since the last control cycle
+        # Frames by node, since the last control cycle.
+        self.unknown_node_frame_counts: Counter[int] = Counter()
         self.other_host_frame_counts: Counter[Opcode] = Counter()
         self.malformed = 0  # frames of known modules with a wrong length
 
@@ -181,7 +192,8 @@ class ModuleReports:
         self.states_missing = sum(module.is_awaited for module in self.modules)
         self.contacts_missing = 0
         if contacts:
-            is_tail_awaited = tail and self.modules[0].is_awaited  # the first module also reports for the tail link
+            # The first module also reports for the tail link.
+            is_tail_awaited = tail and self.modules[0].is_awaited
             self.contacts_missing = self.states_missing + is_tail_awaited
             self._contacts = [None] * len(self._contacts)
         self.answers_missing = questions
@@ -241,7 +253,9 @@ class ModuleReports:
 
     def list_contacts(self) -> list[tuple[int, tuple[int, ...]]]:
         """Return every link that reported a contact at this Sync, with the raw numbers of CONTACT_SIGNALS."""
-        return [(link, self._read_contact(data)) for link, data in enumerate(self._contacts) if data]
+        return [
+            (link, self._read_contact(data)) for link, data in enumerate(self._contacts) if data
+        ]
 
     def pop_imu_reports(self) -> list[tuple[int, Sequence[int], Sequence[int]]]:
         """Remove and return the complete reports of all IMUs that have arrived since the last call.
@@ -253,14 +267,17 @@ class ModuleReports:
             Link index, raw angular rates (3,) and raw accelerations (3,) of each complete report.
         """
         reports: list[tuple[int, Sequence[int], Sequence[int]]] = []
-        for joint, (gyro, acceleration) in enumerate(zip(self._gyro, self._acceleration, strict=True)):
+        for joint, (gyro, acceleration) in enumerate(
+            zip(self._gyro, self._acceleration, strict=True)
+        ):
             if gyro is None or acceleration is None:
                 continue
             *rates, gyro_sync_counter = gyro
             *accelerations, acceleration_sync_counter = acceleration
             if gyro_sync_counter != acceleration_sync_counter:
                 continue
-            link = joint + 1  # a module carries its IMU in the link ahead of its joint; link 0 is the tail
+            # A module carries its IMU in the link ahead of its joint; link 0 is the tail.
+            link = joint + 1
             reports.append((link, rates, accelerations))
             self._gyro[joint] = None
             self._acceleration[joint] = None
@@ -283,7 +300,9 @@ class ModuleReports:
             frame: Received joint state.
         """
         identifier, data = frame
-        if crc_hqx(data[:-1], identifier) & 0xFF != data[-1]:  # `has_valid_checksum`, without the cost of a call
+        if (
+            crc_hqx(data[:-1], identifier) & 0xFF != data[-1]
+        ):  # `has_valid_checksum`, without the cost of a call
             module.corrupt_state_count += 1
             return
         raw_values = self._read_state(data)
@@ -351,7 +370,9 @@ class ModuleReports:
         continues = 0 <= uptime_ms - module.uptime_ms < MAX_HEARTBEAT_GAP_MS
         if module.uptime_decreased and continues and uptime_ms < module.previous_uptime_ms:
             module.restarts += 1
-        module.uptime_decreased = uptime_ms < module.uptime_ms and not has_wrapped(module.uptime_ms, uptime_ms)
+        module.uptime_decreased = uptime_ms < module.uptime_ms and not has_wrapped(
+            module.uptime_ms, uptime_ms
+        )
         module.previous_uptime_ms = module.uptime_ms
         module.uptime_ms = uptime_ms
 

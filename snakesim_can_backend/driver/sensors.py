@@ -20,7 +20,15 @@ from snakesim_hal.model.kinematics import compute_contact_tangents
 from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Contact, Contacts, Imu, JointState, Message, Power, SensorDescription
+from snakesim_hal.wire.messages import (
+    Contact,
+    Contacts,
+    Imu,
+    JointState,
+    Message,
+    Power,
+    SensorDescription,
+)
 from snakesim_hal.wire.quantities import Vector
 
 NEVER_RECEIVED_AGE_NS = 3600 * 10**9  # age of the state of a module that has sent none
@@ -33,7 +41,11 @@ class SampleBuilder:
     """Makes messages from the reports of all modules."""
 
     def __init__(
-        self, config: RunConfig, reports: ReportSchedule, module_reports: ModuleReports, mocap: MocapReceiver | None
+        self,
+        config: RunConfig,
+        reports: ReportSchedule,
+        module_reports: ModuleReports,
+        mocap: MocapReceiver | None,
     ) -> None:
         """Prepare to convert the raw reports of all modules into messages, with the units and scales of the protocol.
 
@@ -73,7 +85,8 @@ class SampleBuilder:
         self._rate_step_rad_s = layouts[Opcode.GYRO].signals["rate_x"].scale
         self._acceleration_step_m_s2 = layouts[Opcode.ACCELEROMETER].signals["acceleration_x"].scale
         self._health_signals = [
-            health[name] for name in ("voltage", "current", "motor_temperature", "board_temperature")
+            health[name]
+            for name in ("voltage", "current", "motor_temperature", "board_temperature")
         ]
 
     def make_samples(self, tick: int, timestamp_ns: int) -> Samples:
@@ -102,7 +115,9 @@ class SampleBuilder:
             timestamp_ns: Robot time of the cycle.
         """
         module_reports = self._module_reports
-        angle_rad, velocity_rad_s, torque_nm = to_joint_values(module_reports, self._joint_mounting).tolist()
+        angle_rad, velocity_rad_s, torque_nm = to_joint_values(
+            module_reports, self._joint_mounting
+        ).tolist()
         ages_ns: list[int] = []
         for module in module_reports.modules:
             if module.sync < 0:  # no joint state was received yet
@@ -120,11 +135,17 @@ class SampleBuilder:
         )
 
     def _make_contacts(self, tick: int, timestamp_ns: int) -> Contacts:
-        measured_contacts = [self._make_contact(link, raw) for link, raw in self._module_reports.list_contacts()]
-        contacts_above_threshold = [
-            contact for contact in measured_contacts if math.hypot(*contact.force_l) >= self._min_force_n
+        measured_contacts = [
+            self._make_contact(link, raw) for link, raw in self._module_reports.list_contacts()
         ]
-        self._mean_force.add_sample({contact.link: math.hypot(*contact.force_l) for contact in measured_contacts})
+        contacts_above_threshold = [
+            contact
+            for contact in measured_contacts
+            if math.hypot(*contact.force_l) >= self._min_force_n
+        ]
+        self._mean_force.add_sample(
+            {contact.link: math.hypot(*contact.force_l) for contact in measured_contacts}
+        )
         return Contacts(
             tick=tick,
             timestamp_ns=timestamp_ns,
@@ -169,9 +190,12 @@ class SampleBuilder:
             tick=tick,
             timestamp_ns=timestamp_ns,
             link=[link for link, _, _ in reports],
-            angular_velocity_rad_s=[_scale_vector(rates, self._rate_step_rad_s) for _, rates, _ in reports],
+            angular_velocity_rad_s=[
+                _scale_vector(rates, self._rate_step_rad_s) for _, rates, _ in reports
+            ],
             acceleration_m_s2=[
-                _scale_vector(accelerations, self._acceleration_step_m_s2) for _, _, accelerations in reports
+                _scale_vector(accelerations, self._acceleration_step_m_s2)
+                for _, _, accelerations in reports
             ],
         )
 
@@ -236,16 +260,24 @@ def describe_sensors(
     rate_hz = config.rate_hz
     sensors = [SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=0.0)]
     if reports.contact_every:
-        sensors.append(SensorDescription(key=keys.CONTACTS, rate_hz=rate_hz / reports.contact_every, delay_s=0.0))
+        sensors.append(
+            SensorDescription(
+                key=keys.CONTACTS, rate_hz=rate_hz / reports.contact_every, delay_s=0.0
+            )
+        )
     if reports.imu_every:
-        sensors.append(SensorDescription(key=keys.IMU, rate_hz=rate_hz / reports.imu_every, delay_s=0.0))
+        sensors.append(
+            SensorDescription(key=keys.IMU, rate_hz=rate_hz / reports.imu_every, delay_s=0.0)
+        )
     sensors.append(SensorDescription(key=keys.POWER, rate_hz=1 / HEALTH_PERIOD_S, delay_s=0.0))
     if pose_delay_s is not None:
         sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate_hz, delay_s=pose_delay_s))
     return sensors
 
 
-def locate_on_capsule(along_m: float, bearing_rad: float, length_m: float, radius_m: float) -> tuple[Vector, Vector]:
+def locate_on_capsule(
+    along_m: float, bearing_rad: float, length_m: float, radius_m: float
+) -> tuple[Vector, Vector]:
     """Convert the position of a contact, as the sensor of a link measures it, to a point on the link's surface.
 
     A link is a capsule. Beyond its ends it is a sphere, and its normal tilts forward or back.
@@ -262,7 +294,11 @@ def locate_on_capsule(along_m: float, bearing_rad: float, length_m: float, radiu
     axis_m = min(max(along_m, 0.0), length_m)  # nearest point on the capsule's axis
     axial_normal = min(max((along_m - axis_m) / radius_m, -1.0), 1.0)
     radial_normal = math.sqrt(1.0 - axial_normal * axial_normal)
-    outward = (axial_normal, radial_normal * math.cos(bearing_rad), radial_normal * math.sin(bearing_rad))
+    outward = (
+        axial_normal,
+        radial_normal * math.cos(bearing_rad),
+        radial_normal * math.sin(bearing_rad),
+    )
     point = (axis_m + radius_m * outward[0], radius_m * outward[1], radius_m * outward[2])
     return outward, point
 

@@ -17,7 +17,8 @@ OPCODE_COUNT = 32  # an opcode has five bits
 ID_BITS = 11
 MAX_DATA_BYTES = 8  # on classic CAN
 MAX_AHEAD_US = 20_000.0  # of frames that the host sends faster than any bus could carry
-UNREPLACEABLE_OPCODES = frozenset((Opcode.PARAMETER_ANSWER,))  # each answers another question: none replaces another
+# Each answers another question: none replaces another.
+UNREPLACEABLE_OPCODES = frozenset((Opcode.PARAMETER_ANSWER,))
 MAX_WAITING_RESPONSES = 64  # that wait at once
 
 
@@ -58,13 +59,15 @@ class BusTime:
         self._waiting_frame_by_mailbox_by_sender: dict[int, dict[int, tuple[CanFrame, float]]] = {}
         # Heap of (id, sender, mailbox) of the first frame of every sender: the lowest id wins the arbitration.
         self._arbitration_heap: list[tuple[int, int, int]] = []
-        self._response_count = 0  # frames of UNREPLACEABLE_OPCODES so far; each gets a mailbox of its own
+        # Frames of UNREPLACEABLE_OPCODES so far; each gets a mailbox of its own.
+        self._response_count = 0
         # The frame that a defective sender (a "babbling idiot") repeats without a pause.
         self._babble_frame_by_sender: dict[int, CanFrame] = {}
 
         # The bus.
         self._bus_free_us = 0.0  # when the bus will be free
-        self._transmission: tuple[CanFrame, float] | None = None  # the frame on the bus, and its end
+        # The frame on the bus, and its end.
+        self._transmission: tuple[CanFrame, float] | None = None
         self._sent_frames: list[CanFrame] = []
 
         # Statistics.

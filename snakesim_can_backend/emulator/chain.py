@@ -45,12 +45,10 @@ from snakesim_hal.wire.messages import JointMode
 MAX_AT_ONCE_US = 200_000.0  # after a longer delay of this process, the modules skip the rest of it
 THERMAL_DECIMATION = 10  # physics steps; windings heat up slowly
 SYNC_TIME_RANGE_US = 1 << 32  # the time in a Sync has 32 bits and wraps around
-MAX_SYNC_INTERVAL_US = (
-    60_000_000  # a Sync that is later by more is of another clock; no lockstep bus is cut for that long
-)
-MIN_HOST_RESTART_US = (
-    1_000_000  # a Sync that is earlier by this much is of a restarted host, not a late one of another bus
-)
+# A Sync that is later by more is of another clock; no lockstep bus is cut for that long.
+MAX_SYNC_INTERVAL_US = 60_000_000
+# A Sync that is earlier by this much is of a restarted host, not a late one of another bus.
+MIN_HOST_RESTART_US = 1_000_000
 DUPLICATE_SERIAL_MASK = 0x0D0B1E00  # makes the serial number of an injected duplicate
 HEARTBEAT_BYTES = 8
 
@@ -92,11 +90,15 @@ class ModuleChain:
         self._configured_joints = robot.joint_table  # as the robot file describes them
         self._joints = build_actual_joints(robot, settings.mounted)  # as they are really built
         unconnected = {name for name, mount in settings.mounted.items() if not mount.connected}
-        self._unconnected_joints = {i for i, joint in enumerate(self._joints) if joint.name in unconnected}
+        self._unconnected_joints = {
+            i for i, joint in enumerate(self._joints) if joint.name in unconnected
+        }
 
         # The body.
         self.physics_model = physics_model
-        self.motors = PowerStages(build_actual_config(config, settings.mounted).robot, physics_model.step_s)
+        self.motors = PowerStages(
+            build_actual_config(config, settings.mounted).robot, physics_model.step_s
+        )
         self.thermal = ThermalModel(self._joints)
 
         # Time.
@@ -109,12 +111,16 @@ class ModuleChain:
 
         # Frames.
         self.refused = 0  # frames that no host sends
-        self._outgoing: list[list[CanFrame]] = [[] for _ in self.modules_per_bus]  # by bus, in stepped time
+        # By bus, in stepped time.
+        self._outgoing: list[list[CanFrame]] = [[] for _ in self.modules_per_bus]
 
         # Injected faults.
         self.fault_log: list[str] = []  # each start and end of a fault
-        self._injection_plan = InjectionPlan(parse_fault(text, self.module_count) for text in settings.faults)
-        self._babble_start_us_by_slot: dict[ModuleSlot, float] = {}  # in stepped time: until when they have sent
+        self._injection_plan = InjectionPlan(
+            parse_fault(text, self.module_count) for text in settings.faults
+        )
+        # In stepped time: until when they have sent.
+        self._babble_start_us_by_slot: dict[ModuleSlot, float] = {}
 
         # Motion capture.
         self._send_pose = send_pose
@@ -123,7 +129,9 @@ class ModuleChain:
         self._encode = msgspec.json.Encoder().encode
         if send_pose is not None and robot.sensors.pose is not None:
             camera_seed = (config.seed, len(self.modules_per_bus))
-            self._camera = PoseCamera(robot.sensors.pose, physics_model, camera_seed, config.period_ns)
+            self._camera = PoseCamera(
+                robot.sensors.pose, physics_model, camera_seed, config.period_ns
+            )
 
         self._sensors: list[ModuleSensors] = []  # by bus
         starts = [0, *accumulate(self.modules_per_bus)]
@@ -134,10 +142,14 @@ class ModuleChain:
                 serial = crc32(f"{config.seed}:{joint + 1}".encode())
                 self._add_module(joint, channel, serial, -BOOT_US if stepped else 0.0)
             mounting = DriveMounting(self._joints[first : first + count])
-            self._sensors.append(ModuleSensors(robot, physics_model, mounting, first, (config.seed, channel)))
+            self._sensors.append(
+                ModuleSensors(robot, physics_model, mounting, first, (config.seed, channel))
+            )
         self._poll_modules(0.0)
 
-    def _add_module(self, joint_index: int, channel: int, serial: int, now_us: float, *, drives: bool = True) -> None:
+    def _add_module(
+        self, joint_index: int, channel: int, serial: int, now_us: float, *, drives: bool = True
+    ) -> None:
         """Put a module of a joint on a bus; drives: whether a motor of its own moves the joint."""
         joint_model = self._joints[joint_index]
         limits = joint_model.limits
@@ -146,14 +158,20 @@ class ModuleChain:
         firmware = ModuleFirmware(
             self._node_ids[joint_index],
             serial,
-            ParameterStore(make_factory_defaults(limits.torque_nm / gear, limits.speed_rad_s * gear)),
+            ParameterStore(
+                make_factory_defaults(limits.torque_nm / gear, limits.speed_rad_s * gear)
+            ),
             self.thermal.limits[joint_index],
             min_voltage_v=limits.min_voltage_v,
             stepped=self.stepped,
             now_us=now_us,
         )
         has_motor = drives and joint_index not in self._unconnected_joints
-        self.slots.append(ModuleSlot(len(self.slots), channel, joint_index, firmware, joint_model, drives=has_motor))
+        self.slots.append(
+            ModuleSlot(
+                len(self.slots), channel, joint_index, firmware, joint_model, drives=has_motor
+            )
+        )
 
     # --- time ----------------------------------------------------------------------------------------------
 
@@ -180,7 +198,9 @@ class ModuleChain:
         motors = self.motors
         step_us = self._step_us
         for _ in range(step_count):
-            physics_model.advance(motors.compute_torques(physics_model.angle_rad, physics_model.velocity_rad_s))
+            physics_model.advance(
+                motors.compute_torques(physics_model.angle_rad, physics_model.velocity_rad_s)
+            )
             self._step_count += 1
             if self._step_count % THERMAL_DECIMATION == 0:
                 self._heat_motors()
@@ -219,11 +239,15 @@ class ModuleChain:
         speeds_rad_s = self.physics_model.velocity_rad_s.tolist()
         windings_c = self.thermal.winding_temperature_c.tolist()
         boards_c = self.thermal.compute_board_temperatures_c().tolist()
-        powers_w = self.thermal.compute_power_w(self.motors.torque_nm, self.physics_model.velocity_rad_s).tolist()
+        powers_w = self.thermal.compute_power_w(
+            self.motors.torque_nm, self.physics_model.velocity_rad_s
+        ).tolist()
         due_us = self._injection_plan.next_transition_s() * 1e6
         for slot in self.slots:
             joint = slot.joint
-            slot.update_health(speeds_rad_s[joint], powers_w[joint], windings_c[joint], boards_c[joint])
+            slot.update_health(
+                speeds_rad_s[joint], powers_w[joint], windings_c[joint], boards_c[joint]
+            )
             due_us = min(due_us, slot.module.poll(now_us))
             self._apply_module_outputs(slot)
         if self._babble_start_us_by_slot:
@@ -304,7 +328,9 @@ class ModuleChain:
         if 1 <= node_id <= self.module_count:
             slots.append(self.slots[self._node_ids.index(node_id)])
         if len(self.slots) > self.module_count:
-            slots += [slot for slot in self.slots[self.module_count :] if slot.module.node == node_id]
+            slots += [
+                slot for slot in self.slots[self.module_count :] if slot.module.node == node_id
+            ]
         return [slot for slot in slots if slot.channel == channel]
 
     # --- a Sync --------------------------------------------------------------------------------------------
@@ -325,10 +351,13 @@ class ModuleChain:
             self._advance_to_sync(time_us)
         self._send_pose_once(time_us)
 
-        slots_on_bus = [slot for slot in self.slots if slot.channel == channel]  # tail to head, then duplicates
+        # Tail to head, then duplicates.
+        slots_on_bus = [slot for slot in self.slots if slot.channel == channel]
         joint_slots = slots_on_bus[: self.modules_per_bus[channel]]
         is_imu_due = [slot.module.is_imu_due() for slot in joint_slots]
-        readings = self._sensors[channel].read(self.motors.torque_nm, self.motors.find_derated(), is_imu_due)
+        readings = self._sensors[channel].read(
+            self.motors.torque_nm, self.motors.find_derated(), is_imu_due
+        )
         first_joint = sum(self.modules_per_bus[:channel])
         for slot in slots_on_bus:
             slot.module.handle_sync(count, readings[slot.joint - first_joint])
@@ -387,7 +416,9 @@ class ModuleChain:
             damping = ModuleParameter.DAMPING
         torque_limit_nm = inf
         if demand.mode != JointMode.PASSIVE:
-            torque_limit_nm = min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT]) * gear
+            torque_limit_nm = (
+                min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT]) * gear
+            )
         self.motors.set_demand(
             slot.joint,
             demand.mode,
@@ -429,7 +460,9 @@ class ModuleChain:
             self._add_module(slot.joint, slot.channel, serial, now_us - BOOT_US, drives=False)
             return
         duplicates = self.slots[self.module_count :]
-        self.slots[self.module_count :] = [other for other in duplicates if other.joint != slot.joint]
+        self.slots[self.module_count :] = [
+            other for other in duplicates if other.joint != slot.joint
+        ]
 
     def _set_babbling(self, slot: ModuleSlot, begins: bool, now_us: float) -> None:
         """Let a module send heartbeats without a pause, or end that."""

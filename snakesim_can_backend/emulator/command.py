@@ -12,14 +12,22 @@ from typing import NoReturn
 import msgspec
 
 from snakesim_can_backend.arguments import DEFAULT_CHANNEL, add_module_emulation
-from snakesim_can_backend.bus.adapter import is_emulated, open_wire, split_channel, validate_channels
+from snakesim_can_backend.bus.adapter import (
+    is_emulated,
+    open_wire,
+    split_channel,
+    validate_channels,
+)
 from snakesim_can_backend.bus.bus import Wire, inject_into, wait
 from snakesim_can_backend.bus.load import count_joints_per_bus, format_bit_rate
 from snakesim_can_backend.bus.unix_wire import UNIX
 from snakesim_can_backend.emulator.bus_time import BusTraffic, traffic_by_opcode
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.faults import parse_fault, validate_fault
-from snakesim_can_backend.emulator.reference_firmware import replace_this_process, validate_firmware_settings
+from snakesim_can_backend.emulator.reference_firmware import (
+    replace_this_process,
+    validate_firmware_settings,
+)
 from snakesim_can_backend.emulator.server import EmulatorServer
 from snakesim_can_backend.protocol.definitions import FROM_HOST, ModuleState
 from snakesim_can_backend.settings import CanSettings
@@ -27,7 +35,11 @@ from snakesim_drivers.emulation.emulator_control import EmulatorControl, TrueSta
 from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.process import call_on_stop_signals, set_parent_death_signal, tune_garbage_collector
+from snakesim_hal.base.process import (
+    call_on_stop_signals,
+    set_parent_death_signal,
+    tune_garbage_collector,
+)
 from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.files import ConfigTable, decode_table
@@ -82,7 +94,9 @@ def emulate(arguments: argparse.Namespace) -> int:
             wire = open_wire(channel, FROM_HOST, settings.bit_rate)
             wires.append(exit_stack.enter_context(closing(wire)))
         physics_model = make_physics_model(loaded.config, settings, "can")
-        chain = ModuleChain(loaded.config, settings, physics_model, stepped=arguments.stepped, send_pose=send_pose)
+        chain = ModuleChain(
+            loaded.config, settings, physics_model, stepped=arguments.stepped, send_pose=send_pose
+        )
         loop = EmulatorLoop(EmulatorServer(wires, chain), arguments, settings.bit_rate)
         control = EmulatorControl(arguments, loop.inject_typed, loop.read_true_state, exit_stack)
         call_on_stop_signals(loop.stop)
@@ -94,17 +108,27 @@ def emulate(arguments: argparse.Namespace) -> int:
         return 0
 
 
-def _run_reference_firmware(arguments: argparse.Namespace, loaded: LoadedScenario, settings: CanSettings) -> NoReturn:
+def _run_reference_firmware(
+    arguments: argparse.Namespace, loaded: LoadedScenario, settings: CanSettings
+) -> NoReturn:
     """Run the reference firmware in C instead of this process. Raises ConfigError, and BackendError."""
     validate_firmware_settings(settings)
-    sockets = [name for interface, name in map(split_channel, settings.channels) if interface == UNIX]
+    sockets = [
+        name for interface, name in map(split_channel, settings.channels) if interface == UNIX
+    ]
     if len(settings.channels) != 1 or not sockets:
         raise ConfigError(
             f"--firmware: the reference firmware has one bus, which is a Unix socket, not {settings.channels}; add "
             "--channel unix:PATH, such as unix:/tmp/modules.sock",
             code="bus/invalid-channel",
         )
-    replace_this_process(loaded.config, settings, sockets[0], duration_s=arguments.duration, stepped=arguments.stepped)
+    replace_this_process(
+        loaded.config,
+        settings,
+        sockets[0],
+        duration_s=arguments.duration,
+        stepped=arguments.stepped,
+    )
 
 
 def _load_configuration(arguments: argparse.Namespace) -> LoadedScenario:
@@ -119,7 +143,9 @@ def _load_configuration(arguments: argparse.Namespace) -> LoadedScenario:
 def _make_settings(arguments: argparse.Namespace, loaded: LoadedScenario) -> CanSettings:
     """Return the settings of the backend, with those that the command line replaces or adds."""
     section = loaded.config.backends.get("can", {})
-    settings: CanSettings = decode_table(ConfigTable(section, arguments.scenario), CanSettings, "backends.can")
+    settings: CanSettings = decode_table(
+        ConfigTable(section, arguments.scenario), CanSettings, "backends.can"
+    )
     return msgspec.structs.replace(
         settings,
         channels=arguments.channel or settings.channels or [DEFAULT_CHANNEL],
@@ -142,7 +168,9 @@ def _validate_virtual_channels(channels: Sequence[str], *, on_real_bus: bool) ->
 class EmulatorLoop:
     """Serves the emulators until it is stopped, and keeps statistics."""
 
-    def __init__(self, server: EmulatorServer, arguments: argparse.Namespace, bit_rate: int) -> None:
+    def __init__(
+        self, server: EmulatorServer, arguments: argparse.Namespace, bit_rate: int
+    ) -> None:
         """Prepare to serve the emulators with the options of the command line.
 
         Args:
@@ -196,13 +224,19 @@ class EmulatorLoop:
     def summary(self) -> list[str]:
         """Return lines about the traffic of the buses, the timing accuracy, and injected faults."""
         duration_s = time.monotonic() - self._start_s
-        lines = [f"{duration_s:.1f} s; latest wake-up {1e3 * self._max_lateness_s:.1f} ms after its time"]
-        for wire, before, after in zip(self._server.wires, self._start_traffic, self._chain.traffic(), strict=True):
+        lines = [
+            f"{duration_s:.1f} s; latest wake-up {1e3 * self._max_lateness_s:.1f} ms after its time"
+        ]
+        for wire, before, after in zip(
+            self._server.wires, self._start_traffic, self._chain.traffic(), strict=True
+        ):
             lines += self._describe_traffic(wire.channel, before, after)
         if self._server.unsent:
             lines.append(f"{self._server.unsent} frames were not accepted by their interface")
         if self._chain.skipped_us:
-            lines.append(f"{self._chain.skipped_us / 1e3:.0f} ms skipped: this computer was too busy")
+            lines.append(
+                f"{self._chain.skipped_us / 1e3:.0f} ms skipped: this computer was too busy"
+            )
         lines += [f"fault: {text}" for text in self._chain.fault_log]
         return lines
 
@@ -231,7 +265,9 @@ class EmulatorLoop:
         if inject_into(self._server.wires, fault, begins=begins):
             return
         validate_fault(fault, self._chain.module_count)
-        self._chain.inject(dataclasses.replace(fault, start_s=self._chain.now_us * 1e-6), begins=begins)
+        self._chain.inject(
+            dataclasses.replace(fault, start_s=self._chain.now_us * 1e-6), begins=begins
+        )
 
     def read_true_state(self) -> TrueState:
         """Return what the modules really do now."""

@@ -47,4 +47,6 @@ def validate_fault(fault: FaultInjection, joint_count: int) -> FaultInjection:
 
 def describe_faults() -> str:
     """Return every kind with its description, one a line, for a command's help."""
-    return "\n".join(f"  {kind:<13} {description}" for kind, description in FAULT_DESCRIPTIONS.items())
+    return "\n".join(
+        f"  {kind:<13} {description}" for kind, description in FAULT_DESCRIPTIONS.items()
+    )

@@ -113,7 +113,8 @@ class ModuleFirmware:
         # What the caller exchanges with it.
         self.frames: list[CanFrame] = []  # to send
         self.health = EmulatedHealth()  # present internal measurements
-        self.is_hanging = False  # whether the main loop hangs, so that only the hardware still works
+        # Whether the main loop hangs, so that only the hardware still works.
+        self.is_hanging = False
         self.rejected_frame_count = 0  # frames with a wrong checksum, count or length
 
         self._last_joint_state: CanFrame | None = None
@@ -195,7 +196,9 @@ class ModuleFirmware:
         if mode > JointMode.TORQUE:
             self.rejected_frame_count += 1
             return
-        if self._has_sync_since_setpoint:  # otherwise a host without Syncs would keep an old demand active for ever
+        if (
+            self._has_sync_since_setpoint
+        ):  # otherwise a host without Syncs would keep an old demand active for ever
             self._watchdog_fed_us = now_us
             self._has_sync_since_setpoint = False
         target = target_steps * TARGET_STEPS[mode]  # position, velocity and torque share their bits
@@ -338,7 +341,8 @@ class ModuleFirmware:
         self._expected_count: int | None = None  # counter of the next setpoint; None: any
         self._wrong_counts = 0  # in a row
         self._sync_count = 0
-        self._has_sync_since_setpoint = True  # whether a Sync has come since the setpoint that last fed the watchdog
+        # Whether a Sync has come since the setpoint that last fed the watchdog.
+        self._has_sync_since_setpoint = True
 
         # Times.
         self._boot_start_us = now_us
@@ -348,7 +352,11 @@ class ModuleFirmware:
         self._next_health_us = now_us  # when the next Health is due
 
     def _enter_state(
-        self, state: ModuleState, now_us: float, reason: LastStop | None = None, demand: MotorDemand = PASSIVE
+        self,
+        state: ModuleState,
+        now_us: float,
+        reason: LastStop | None = None,
+        demand: MotorDemand = PASSIVE,
     ) -> None:
         """Change the state of the module, drop all setpoints, and send a heartbeat.
 
@@ -381,7 +389,9 @@ class ModuleFirmware:
     def _stop(self, now_us: float) -> None:
         if self.state == ModuleState.ARMED:
             self._stopping_start_us = now_us
-            self._enter_state(ModuleState.STOPPING, now_us, LastStop.STOP, self._make_stopping_demand())
+            self._enter_state(
+                ModuleState.STOPPING, now_us, LastStop.STOP, self._make_stopping_demand()
+            )
 
     def _make_stopping_demand(self) -> MotorDemand:
         """Return the demand while the module comes to rest in its stop mode."""
@@ -435,14 +445,23 @@ class ModuleFirmware:
         """Return the present heartbeat."""
         uptime_ms = min(round(now_us - self._boot_start_us) // 1000, MAX_UPTIME_MS)
         fault_bits = [self.faults >> fault & 1 for fault in ModuleFault]
-        return write_heartbeat(self.node, (self.state, self.demand.mode, self.last_stop, *fault_bits, uptime_ms))
+        return write_heartbeat(
+            self.node, (self.state, self.demand.mode, self.last_stop, *fault_bits, uptime_ms)
+        )
 
     def _send_identity(self) -> None:
         identity = (self.serial, *FIRMWARE_VERSION, PROTOCOL_VERSION, IS_EMULATED, self._stepped)
         self.frames.append(write_identity(self.node, identity))
 
     def _report_joint_state(self, count: int, reading: ModuleReadings) -> None:
-        raw_values = (reading.angle, reading.velocity, reading.torque, count, self.state, reading.derated)
+        raw_values = (
+            reading.angle,
+            reading.velocity,
+            reading.torque,
+            count,
+            self.state,
+            reading.derated,
+        )
         self._last_joint_state = write_joint_state(self.node, raw_values)
         self.frames.append(self._last_joint_state)
 

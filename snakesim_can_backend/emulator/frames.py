@@ -45,7 +45,8 @@ class EmulatedHealth:
     voltage_v: float = 24.0
     current_a: float = 0.0
     leak: bool = False
-    sensor_failed: bool = False  # whether the joint's angle or the motor's current cannot be measured
+    # Whether the joint's angle or the motor's current cannot be measured.
+    sensor_failed: bool = False
 
 
 class SignalRounder:
@@ -69,7 +70,9 @@ class SignalRounder:
         """Return the nearest steps within the range, as `to_raw` does for one value."""
         steps = (values - self._offset) * self._steps_per_unit
         finite_steps = np.nan_to_num(steps, posinf=MAX_STEPS, neginf=-MAX_STEPS)
-        return np.clip(np.rint(finite_steps), self._min_raw, self._max_raw).astype(np.int64).tolist()
+        return (
+            np.clip(np.rint(finite_steps), self._min_raw, self._max_raw).astype(np.int64).tolist()
+        )
 
 
 def encode_contact(load: LinkLoad) -> tuple[int, int, int, int, int, int]:
@@ -127,7 +130,9 @@ TORQUE_LIMIT_STEP_NM = _setpoint_signals["torque_limit"].scale  # 0 to 65.535 NÂ
 
 _CONTACT_SIGNALS = ("force_x", "force_y", "force_z", "along", "bearing", "touched", "count")
 
-write_joint_state = _layouts[Opcode.JOINT_STATE].make_writer("angle", "velocity", "torque", "count", "state", "derated")
+write_joint_state = _layouts[Opcode.JOINT_STATE].make_writer(
+    "angle", "velocity", "torque", "count", "state", "derated"
+)
 write_contact = _layouts[Opcode.CONTACT].make_writer(*_CONTACT_SIGNALS)
 write_tail_contact = _layouts[Opcode.TAIL_CONTACT].make_writer(*_CONTACT_SIGNALS)
 write_gyro = _layouts[Opcode.GYRO].make_writer("rate_x", "rate_y", "rate_z", "count")
@@ -136,7 +141,11 @@ write_acceleration = _layouts[Opcode.ACCELEROMETER].make_writer(
 )
 write_shaft_load = _layouts[Opcode.SHAFT_LOAD].make_writer("torque", "count")
 write_heartbeat = _layouts[Opcode.HEARTBEAT].make_writer(
-    "state", "mode", "last_stop", *(f"fault_{fault.name.lower()}" for fault in ModuleFault), "uptime"
+    "state",
+    "mode",
+    "last_stop",
+    *(f"fault_{fault.name.lower()}" for fault in ModuleFault),
+    "uptime",
 )
 write_health = _layouts[Opcode.HEALTH].make_writer(
     "voltage", "current", "motor_temperature", "board_temperature", "leak", "water"

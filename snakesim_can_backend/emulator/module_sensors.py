@@ -65,7 +65,9 @@ class ModuleSensors:
         self._has_joint_noise = any(sigmas)
         self._torque_sigma_nm = joints.torque_noise_nm
 
-    def read(self, torque_nm: Floats, derated: NDArray[np.bool_], is_imu_due: Sequence[bool]) -> list[ModuleReadings]:
+    def read(
+        self, torque_nm: Floats, derated: NDArray[np.bool_], is_imu_due: Sequence[bool]
+    ) -> list[ModuleReadings]:
         """Return the current readings of every module on this bus.
 
         Args:
@@ -83,7 +85,13 @@ class ModuleSensors:
         """Return readings with angle, velocity and torque of the modules' shafts."""
         model = self._physics_model
         joint_slice = self._joints
-        joints = np.stack((model.angle_rad[joint_slice], model.velocity_rad_s[joint_slice], torque_nm[joint_slice]))
+        joints = np.stack(
+            (
+                model.angle_rad[joint_slice],
+                model.velocity_rad_s[joint_slice],
+                torque_nm[joint_slice],
+            )
+        )
         if self._has_joint_noise:
             joints += self._joint_sigma * self._draw_standard_normal((3, self._joint_count))
         angle_rad, velocity_rad_s, joint_torque_nm = joints
@@ -94,7 +102,10 @@ class ModuleSensors:
             derated[joint_slice],
             strict=True,
         )
-        return [ModuleReadings(angle, velocity, torque, bool(hot)) for angle, velocity, torque, hot in rows]
+        return [
+            ModuleReadings(angle, velocity, torque, bool(hot))
+            for angle, velocity, torque, hot in rows
+        ]
 
     def _add_contacts(self, readings: list[ModuleReadings]) -> None:
         """Add the contacts whose force is above the threshold."""
@@ -122,14 +133,20 @@ class ModuleSensors:
         sigma_m = sensor.position_noise_m
         sigma_n = sensor.force_noise_n
         position = (x + sigma_m * noise[0], y + sigma_m * noise[1], z + sigma_m * noise[2])
-        force = (force_x + sigma_n * noise[3], force_y + sigma_n * noise[4], force_z + sigma_n * noise[5])
+        force = (
+            force_x + sigma_n * noise[3],
+            force_y + sigma_n * noise[4],
+            force_z + sigma_n * noise[5],
+        )
         return LinkLoad(load.link, position, force)
 
     def _add_imus(self, readings: list[ModuleReadings], due: Sequence[bool]) -> None:
         """Add shaft load, gyro and accelerometer to the readings of the modules that report them."""
         shaft_torque_nm = self._physics_model.shaft_torque_nm()[self._joints]
         noise_nm = self._torque_sigma_nm * self._draw_standard_normal(self._joint_count)
-        shaft_loads = SHAFT_LOAD.to_raw_array(self._mounting.to_drive_torque_nm(shaft_torque_nm + noise_nm))
+        shaft_loads = SHAFT_LOAD.to_raw_array(
+            self._mounting.to_drive_torque_nm(shaft_torque_nm + noise_nm)
+        )
         imu = self._physics_model.imu() if self._imu_sensor is not None else None
         for i, reading in enumerate(readings):
             if not due[i]:

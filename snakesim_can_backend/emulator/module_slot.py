@@ -69,7 +69,9 @@ class ModuleSlot:
             case _:
                 pass
 
-    def update_health(self, speed_rad_s: float, power_w: float, winding_c: float, board_c: float) -> None:
+    def update_health(
+        self, speed_rad_s: float, power_w: float, winding_c: float, board_c: float
+    ) -> None:
         """Update the internal measurements of the module."""
         health = self.module.health
         health.speed_rad_s = speed_rad_s

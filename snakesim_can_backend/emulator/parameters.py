@@ -16,7 +16,12 @@ from snakesim_can_backend.protocol.definitions import (
 )
 
 INTEGER_PARAMETERS = frozenset(
-    (ModuleParameter.STOP_MODE, ModuleParameter.CONTACT_EVERY, ModuleParameter.IMU_EVERY, ModuleParameter.TAIL)
+    (
+        ModuleParameter.STOP_MODE,
+        ModuleParameter.CONTACT_EVERY,
+        ModuleParameter.IMU_EVERY,
+        ModuleParameter.TAIL,
+    )
 )
 FACTORY_WATCHDOG_S = 0.1
 FACTORY_CONTACT_EVERY = 1.0  # Syncs
@@ -26,7 +31,9 @@ FLOAT_MASK = 0xFFFFFFFF
 FLOAT32_STRUCT = Struct("<f")
 
 
-def make_factory_defaults(rated_torque_nm: float, rated_speed_rad_s: float) -> dict[ModuleParameter, float]:
+def make_factory_defaults(
+    rated_torque_nm: float, rated_speed_rad_s: float
+) -> dict[ModuleParameter, float]:
     """Return the flash of a new module. Gains are 0: a module that has not been configured holds nothing."""
     torque_nm = min(rated_torque_nm, PARAMETERS[ModuleParameter.RATED_TORQUE].high)
     speed_rad_s = min(rated_speed_rad_s, PARAMETERS[ModuleParameter.RATED_SPEED].high)
@@ -96,7 +103,9 @@ class ParameterStore:
 
     def _write_value(self, parameter: ModuleParameter, raw_value: int) -> ParameterResult:
         """Set the current value of a parameter to the float with these bits, if it is allowed."""
-        (requested,) = FLOAT32_STRUCT.unpack((raw_value & FLOAT_MASK).to_bytes(FLOAT_BYTES, "little"))
+        (requested,) = FLOAT32_STRUCT.unpack(
+            (raw_value & FLOAT_MASK).to_bytes(FLOAT_BYTES, "little")
+        )
         value = clamp_to_range(PARAMETERS[parameter], requested)
         if value is None:
             return ParameterResult.OUT_OF_RANGE
@@ -120,5 +129,9 @@ def clamp_to_range(allowed: ParameterRange, value: float) -> float | None:
     return min(max(value, allowed.low), allowed.high)
 
 
-_decode_request = load_layouts()[Opcode.PARAMETER_REQUEST].make_reader("index", "operation", "value")
-_encode_response = load_layouts()[Opcode.PARAMETER_ANSWER].make_writer("index", "operation", "result", "value")
+_decode_request = load_layouts()[Opcode.PARAMETER_REQUEST].make_reader(
+    "index", "operation", "value"
+)
+_encode_response = load_layouts()[Opcode.PARAMETER_ANSWER].make_writer(
+    "index", "operation", "result", "value"
+)

@@ -72,7 +72,12 @@ def make_program_arguments(
 
 
 def replace_this_process(
-    config: RunConfig, settings: CanSettings, socket_path: str, *, duration_s: float | None, stepped: bool
+    config: RunConfig,
+    settings: CanSettings,
+    socket_path: str,
+    *,
+    duration_s: float | None,
+    stepped: bool,
 ) -> NoReturn:
     """Run the program instead of this process. The description of its modules is a file in memory.
 
@@ -87,7 +92,8 @@ def replace_this_process(
         BackendError: The program cannot be compiled.
     """
     program = build_program()
-    descriptor = os.memfd_create("modules", 0)  # without MFD_CLOEXEC, so that the program can read it
+    # Without MFD_CLOEXEC, so that the program can read it.
+    descriptor = os.memfd_create("modules", 0)
     os.write(descriptor, describe_modules(config, settings).encode())
     modules_path = f"/proc/self/fd/{descriptor}"
     arguments = make_program_arguments(socket_path, modules_path, duration_s, stepped=stepped)
@@ -133,7 +139,9 @@ def _describe_joint(joint: Joint, link_inertia_kg_m2: float, start_rad: float) -
     limits = joint.limits
     drive = joint.drive
     ratio = drive.sign * drive.gear
-    ends_rad = sorted(drive.zero_rad + ratio * angle for angle in (limits.lower_rad, limits.upper_rad))
+    ends_rad = sorted(
+        drive.zero_rad + ratio * angle for angle in (limits.lower_rad, limits.upper_rad)
+    )
     inertia_kg_m2 = max(motor.armature_kg_m2 + link_inertia_kg_m2, MIN_INERTIA_KG_M2)
     return {
         "response_time_s": motor.response_time_s,

@@ -19,7 +19,8 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.scenario import RunConfig
 
-MAX_LAG_US = 2000.0  # of the physics model behind the present, so that a Sync needs little computing
+# Of the physics model behind the present, so that a Sync needs little computing.
+MAX_LAG_US = 2000.0
 MIN_PAUSE_US = 200.0  # frames are released in groups of this length, for fewer wake-ups
 
 
@@ -30,7 +31,8 @@ class EmulatorServer:
         """Connect a chain to its buses. Raises ConfigError if their numbers differ."""
         if len(wires) != len(chain.modules_per_bus):
             raise ConfigError(
-                f"{len(wires)} channels for modules on {len(chain.modules_per_bus)} buses", code="bus/invalid-channel"
+                f"{len(wires)} channels for modules on {len(chain.modules_per_bus)} buses",
+                code="bus/invalid-channel",
             )
         self.wires = wires
         self.chain = chain
@@ -62,7 +64,9 @@ class EmulatorServer:
         pause_us = min(self.chain.next_us() - self.chain.now_us, MAX_LAG_US)
         return max(pause_us, MIN_PAUSE_US) * 1e-6
 
-    def _receive_at_arrival_times(self, received: Sequence[Sequence[CanFrame]], clock_us: float) -> None:
+    def _receive_at_arrival_times(
+        self, received: Sequence[Sequence[CanFrame]], clock_us: float
+    ) -> None:
         """Process received frames at their estimated times of arrival.
 
         After a delay of this process several periods are in the queue. They are spread over the time since the last
@@ -83,7 +87,9 @@ class EmulatorServer:
             for frame in frames:
                 if _is_sync(frame):
                     syncs_so_far += 1
-                    self.chain.advance_to(last_run_us + (clock_us - last_run_us) * syncs_so_far / syncs)
+                    self.chain.advance_to(
+                        last_run_us + (clock_us - last_run_us) * syncs_so_far / syncs
+                    )
                 self.chain.receive(channel, frame)
 
     def _send(self) -> None:
@@ -100,7 +106,9 @@ def _is_sync(frame: CanFrame) -> bool:
 class InProcessEmulators:
     """Emulators in this process, at the other end of a virtual bus: a call runs them."""
 
-    def __init__(self, server: EmulatorServer, pose_sender: PoseSender | None, clock_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, server: EmulatorServer, pose_sender: PoseSender | None, clock_ns: Callable[[], int]
+    ) -> None:
         self.server = server
         self._send_pose = pose_sender
         self._clock_ns = clock_ns

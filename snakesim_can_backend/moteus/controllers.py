@@ -73,13 +73,16 @@ class MoteusControllers(CanDrives):
     """All controllers of a bus."""
 
     missing_identity_text = (
-        "does not report its register map: it is off, has another id, or the bus another bit rate or sample point"
+        "does not report its register map: it is off, has another id, or the bus "
+        "another bit rate or sample point"
     )
 
     def __init__(self, context: CanDrivesContext) -> None:
         """Compute the gains that setpoints carry."""
         super().__init__(context)
-        kp_nm_per_turn, kd_nm_s_per_turn = get_configured_gains(context.all_joints, context.settings)
+        kp_nm_per_turn, kd_nm_s_per_turn = get_configured_gains(
+            context.all_joints, context.settings
+        )
         self._gain_fractions: list[ShaftGains] = []
         for joint in context.joints:
             gains = compute_shaft_gains(joint)
@@ -131,7 +134,9 @@ class MoteusControllers(CanDrives):
         self._modes[i] = mode
         self.readings.mark_checked(i)
         self.readings.set_motion(
-            i, registers[Register.POSITION] * REVOLUTION_RAD, registers[Register.VELOCITY] * REVOLUTION_RAD
+            i,
+            registers[Register.POSITION] * REVOLUTION_RAD,
+            registers[Register.VELOCITY] * REVOLUTION_RAD,
         )
         self.readings.set_torque(i, registers[Register.TORQUE])
         self.states.record_report(i, enabled=mode == MoteusMode.POSITION, state=f"in mode {mode}")
@@ -141,7 +146,9 @@ class MoteusControllers(CanDrives):
         voltage_v = registers[Register.VOLTAGE]
         current_a = registers[Register.POWER] / max(voltage_v, MIN_DIVISOR_V)
         self.readings.set_supply(i, voltage_v, current_a)
-        self.readings.set_temperatures(i, registers[Register.MOTOR_TEMPERATURE], registers[Register.BOARD_TEMPERATURE])
+        self.readings.set_temperatures(
+            i, registers[Register.MOTOR_TEMPERATURE], registers[Register.BOARD_TEMPERATURE]
+        )
 
     # --- bring-up, reset and end ------------------------------------------------------------------------------
 
@@ -162,7 +169,9 @@ class MoteusControllers(CanDrives):
     def clear_leftover_errors(self, i: int) -> None:
         """Clear an expired watchdog."""
         if self._modes[i] == MoteusMode.TIMEOUT:
-            _log.warning("%s: clearing an expired watchdog of an earlier run", self.states.drives[i].label)
+            _log.warning(
+                "%s: clearing an expired watchdog of an earlier run", self.states.drives[i].label
+            )
             self._send_stop(i)
 
     def write_settings(self, i: int) -> None:
@@ -219,7 +228,9 @@ class MoteusControllers(CanDrives):
         self._send(
             i,
             encode_subframe(WRITE, INT8, Register.MODE, MoteusMode.POSITION),
-            encode_subframe(WRITE, FLOAT, Register.COMMAND, position, velocity, torque, kp, kd, limit_nm),
+            encode_subframe(
+                WRITE, FLOAT, Register.COMMAND, position, velocity, torque, kp, kd, limit_nm
+            ),
             encode_subframe(WRITE, FLOAT, Register.WATCHDOG, self._watchdog_s, NO_LIMIT, NO_LIMIT),
         )
 

@@ -8,7 +8,11 @@ import math
 from dataclasses import dataclass, field
 
 from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
-from snakesim_can_backend.moteus.controllers import REVOLUTION_RAD, SERIAL_WORDS, get_configured_gains
+from snakesim_can_backend.moteus.controllers import (
+    REVOLUTION_RAD,
+    SERIAL_WORDS,
+    get_configured_gains,
+)
 from snakesim_can_backend.moteus.protocol import (
     BROADCAST_ID,
     FLOAT,
@@ -30,7 +34,8 @@ from snakesim_hal.wire.messages import JointMode
 
 OVER_TEMPERATURE = 38  # fault number
 UPPER_SERIAL_WORDS = (0x65115510, 0x30333636)  # the same for all controllers
-DUPLICATE_SERIAL_BITS = 0x01_0000  # in which the serial number of a second controller with the same id differs
+# In which the serial number of a second controller with the same id differs.
+DUPLICATE_SERIAL_BITS = 0x01_0000
 HOME_STATE_ROTOR = 1  # home state: the position has a reference within a turn of the rotor
 FIRST_COMMAND_REGISTER = int(Register.COMMAND)
 # Values of the registers that a command does not write.
@@ -74,7 +79,9 @@ class EmulatedMoteus(CanEmulator):
         """Create one emulated, stopped controller for each joint."""
         super().__init__(context)
         self.controllers = [EmulatedController(joint.id) for joint in context.body.joints]
-        self._kp_nm_per_turn, self._kd_nm_s_per_turn = get_configured_gains(context.joints, context.settings)
+        self._kp_nm_per_turn, self._kd_nm_s_per_turn = get_configured_gains(
+            context.joints, context.settings
+        )
 
     def find_destination_node(self, frame: CanFrame) -> int:
         """Return the destination of a frame."""
@@ -88,7 +95,9 @@ class EmulatedMoteus(CanEmulator):
             values = list(subframe.values)
             if subframe.register == Register.SERIAL:
                 values[0] = int(values[0]) ^ DUPLICATE_SERIAL_BITS
-            response_subframes.append(encode_subframe(subframe.kind, subframe.type, subframe.register, *values))
+            response_subframes.append(
+                encode_subframe(subframe.kind, subframe.type, subframe.register, *values)
+            )
         return make_frame(*split_addresses(frame), *response_subframes)
 
     def restart(self, i: int) -> None:
@@ -109,7 +118,9 @@ class EmulatedMoteus(CanEmulator):
             self._change_mode(i, mode, written_values)
         if frame.id & REPLY_REQUESTED_BIT:
             response_subframes = [
-                self._read_registers(i, subframe) for subframe in subframes if subframe.kind not in (WRITE, REPLY)
+                self._read_registers(i, subframe)
+                for subframe in subframes
+                if subframe.kind not in (WRITE, REPLY)
             ]
             source, _ = split_addresses(frame)
             self.send_frame(i, make_frame(self.controllers[i].id, source, *response_subframes))
@@ -121,8 +132,12 @@ class EmulatedMoteus(CanEmulator):
         """Stop controllers whose watchdog has expired, and those that are too hot."""
         for i, controller in enumerate(self.controllers):
             if controller.mode == MoteusMode.POSITION:
-                watchdog_timeout_us = controller.command[Register.WATCHDOG] * 1e6 or self.watchdog_us
-                if now_us - controller.watchdog_fed_us > watchdog_timeout_us:  # never true if the limit is NaN
+                watchdog_timeout_us = (
+                    controller.command[Register.WATCHDOG] * 1e6 or self.watchdog_us
+                )
+                if (
+                    now_us - controller.watchdog_fed_us > watchdog_timeout_us
+                ):  # never true if the limit is NaN
                     controller.mode = MoteusMode.TIMEOUT
                     self._drive_motor(i)
             if self.body.is_too_hot(i) and controller.mode != MoteusMode.FAULT:
@@ -161,7 +176,9 @@ class EmulatedMoteus(CanEmulator):
             value = self._read_register(i, register)
             if request.type != FLOAT:
                 resolution = (
-                    INTEGER_RESOLUTIONS[Register(register)][request.type] if register in INTEGER_RESOLUTIONS else 1.0
+                    INTEGER_RESOLUTIONS[Register(register)][request.type]
+                    if register in INTEGER_RESOLUTIONS
+                    else 1.0
                 )
                 max_integer = (1 << 8 * VALUE_FORMATS[request.type].size - 1) - 1
                 value = min(max(round(value / resolution), -max_integer), max_integer)
@@ -189,7 +206,12 @@ class EmulatedMoteus(CanEmulator):
                 return velocity_rad_s / REVOLUTION_RAD
             case Register.TORQUE:
                 return torque_nm
-            case Register.POWER | Register.VOLTAGE | Register.MOTOR_TEMPERATURE | Register.BOARD_TEMPERATURE:
+            case (
+                Register.POWER
+                | Register.VOLTAGE
+                | Register.MOTOR_TEMPERATURE
+                | Register.BOARD_TEMPERATURE
+            ):
                 return self._read_health_register(i, register)
             case Register.FAULT:
                 return controller.fault
@@ -232,7 +254,9 @@ class EmulatedMoteus(CanEmulator):
             target = 0.0
         elif kp:
             mode = JointMode.POSITION
-            target = self.body.read_shaft(i)[0] if math.isnan(position) else position * REVOLUTION_RAD
+            target = (
+                self.body.read_shaft(i)[0] if math.isnan(position) else position * REVOLUTION_RAD
+            )
         elif kd:
             mode = JointMode.VELOCITY
             target = velocity * REVOLUTION_RAD

@@ -27,7 +27,10 @@ class ControllerProbe(CanDriveProbe):
     def read_status(self, timeout_s: float) -> DriveStatus | None:
         """Read mode and fault."""
         registers = self._read_registers(
-            [encode_subframe(READ, INT8, Register.MODE, count=1), encode_subframe(READ, INT8, Register.FAULT, count=1)],
+            [
+                encode_subframe(READ, INT8, Register.MODE, count=1),
+                encode_subframe(READ, INT8, Register.FAULT, count=1),
+            ],
             Register.MODE,
             timeout_s,
         )
@@ -35,7 +38,9 @@ class ControllerProbe(CanDriveProbe):
             return None
         mode = int(registers[Register.MODE])
         reason = describe_fault(mode, int(registers.get(Register.FAULT, 0)))
-        return DriveStatus(mode == MoteusMode.POSITION, f"mode {mode}" + (f", {reason}" if reason else ""))
+        return DriveStatus(
+            mode == MoteusMode.POSITION, f"mode {mode}" + (f", {reason}" if reason else "")
+        )
 
     def read_configuration(self, timeout_s: float) -> list[ReadBack]:
         """Read the version of the register map."""
@@ -55,7 +60,11 @@ class ControllerProbe(CanDriveProbe):
             values: dict[int, float] = {}
             for subframe in decode_subframes(frame.data):
                 if subframe.kind == REPLY:
-                    values |= {subframe.register + i: value for i, value in enumerate(subframe.values)}
+                    values |= {
+                        subframe.register + i: value for i, value in enumerate(subframe.values)
+                    }
             return values if required_register in values else None
 
-        return self.request(make_frame(PROBE_ID, self.node_id, *subframes, reply=True), decode, timeout_s)
+        return self.request(
+            make_frame(PROBE_ID, self.node_id, *subframes, reply=True), decode, timeout_s
+        )

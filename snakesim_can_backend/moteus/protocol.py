@@ -28,7 +28,8 @@ INT16 = 1
 INT32 = 2
 FLOAT = 3
 VALUE_FORMATS = (Struct("<b"), Struct("<h"), Struct("<i"), Struct("<f"))
-CAN_FD_DATA_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # possible data lengths of CAN FD, bytes
+# Possible data lengths of CAN FD, bytes.
+CAN_FD_DATA_LENGTHS = *range(9), 12, 16, 20, 24, 32, 48, 64
 
 
 class Register(IntEnum):

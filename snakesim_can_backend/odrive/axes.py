@@ -42,7 +42,8 @@ from snakesim_hal.wire.messages import JointMode
 
 REVOLUTION_RAD = 2 * math.pi  # rad
 EMULATED_CONSTANT_NM_PER_A = 1.0  # torque constant of emulated axes whose robot file names none
-UNKNOWN_MAX_CURRENT_A = 1.0  # used if an axis' own limit cannot be read: even a small motor withstands it
+# Used if an axis' own limit cannot be read: even a small motor withstands it.
+UNKNOWN_MAX_CURRENT_A = 1.0
 NO_LIMIT_SENT = -1.0
 RELATIVE_TOLERANCE = 1e-3  # relative: settings are single precision, and people round them
 LEFTOVER_ERRORS = AxisError.WATCHDOG_TIMER_EXPIRED  # of a driver that was killed
@@ -69,7 +70,8 @@ class OdriveAxis:
     torque_nm: float  # that the joint may command
     # What the axis reports.
     max_current_a: float  # the driver never sends a higher limit
-    configured: dict[AxisSetting, float] = field(default_factory=dict[AxisSetting, float])  # read in bring-up
+    # Read in bring-up.
+    configured: dict[AxisSetting, float] = field(default_factory=dict[AxisSetting, float])
     errors: int = 0
     # What the driver has sent.
     mode: JointMode | None = None
@@ -80,7 +82,8 @@ class OdriveAxes(CanDrives):
     """All axes of a bus."""
 
     missing_identity_text = (
-        "does not report its version: it is off, has another id or bit rate, or firmware 0.5, which does not report it"
+        "does not report its version: it is off, has another id or bit rate, or firmware "
+        "0.5, which does not report it"
     )
 
     def __init__(self, context: CanDrivesContext) -> None:
@@ -161,7 +164,9 @@ class OdriveAxes(CanDrives):
                 pass
 
     def _handle_heartbeat(self, i: int, error_count: int, state: int) -> None:
-        self.states.record_report(i, enabled=state == AxisState.CLOSED_LOOP, state=f"in state {state}")
+        self.states.record_report(
+            i, enabled=state == AxisState.CLOSED_LOOP, state=f"in state {state}"
+        )
         self._store_errors(i, error_count)
         if state == AxisState.IDLE and not self.states.drives[i].should_be_enabled:
             # A driver that is killed while its motors are off then leaves no lowered limits behind.
@@ -171,7 +176,9 @@ class OdriveAxes(CanDrives):
         self.readings.mark_checked(i)
         self.axes[i].errors = error_count
         drive = self.states.drives[i]
-        if drive.is_emergency_stopped:  # this driver has requested it, so it is no fault of the drive
+        if (
+            drive.is_emergency_stopped
+        ):  # this driver has requested it, so it is no fault of the drive
             error_count &= ~AxisError.ESTOP_REQUESTED
         drive.errors = describe_errors(error_count)
 
@@ -179,7 +186,9 @@ class OdriveAxes(CanDrives):
         self.firmware[i] = firmware
         self.readings.set_identity(i, firmware=_join_version(firmware))
         self._hardware_versions[i] = _join_version(hardware)
-        if firmware[:2] == FIRMWARE:  # firmware 0.5 would take the request for the address as a new node id
+        if (
+            firmware[:2] == FIRMWARE
+        ):  # firmware 0.5 would take the request for the address as a new node id
             self._request(i, MessageId.ADDRESS)
             self._request_next_setting(i)
 
@@ -216,17 +225,23 @@ class OdriveAxes(CanDrives):
         firmware = _join_version(self.firmware[i])
         if self.firmware[i][:2] != FIRMWARE:
             return f"has firmware {firmware}; this driver knows {FIRMWARE[0]}.{FIRMWARE[1]}"
-        if not self._endpoint_files:  # the limits are unknown: `OdriveAxis.max_current_a` caps the current
+        if (
+            not self._endpoint_files
+        ):  # the limits are unknown: `OdriveAxis.max_current_a` caps the current
             return ""
         if self._find_endpoints(i) is None:
-            files = ", ".join(f"{file.firmware} on {file.hardware}" for file in self._endpoint_files)
+            files = ", ".join(
+                f"{file.firmware} on {file.hardware}" for file in self._endpoint_files
+            )
             return (
                 f"has firmware {firmware} on hardware {self._hardware_versions[i]}, and `backends.odrive.endpoints` "
                 f"names files of {files}: add the flat_endpoints.json of its firmware"
             )
         missing = self._list_missing_settings(i)
         if missing:
-            return f"does not report `{missing[0]}`: is `backends.odrive.endpoints` of its firmware?"
+            return (
+                f"does not report `{missing[0]}`: is `backends.odrive.endpoints` of its firmware?"
+            )
         axis = self.axes[i]
         axis.max_current_a = min(axis.configured[AxisSetting.CURRENT], self._max_allowed_current_a)
         return "; ".join(find_configuration_problems(axis, self._watchdog_s))
@@ -298,7 +313,9 @@ class OdriveAxes(CanDrives):
 
     def request_health(self, i: int) -> None:
         """Request supply, temperatures and errors; and the serial number, to notice a second axis with this id."""
-        self._request(i, MessageId.SUPPLY, MessageId.TEMPERATURE, MessageId.ERROR, MessageId.ADDRESS)
+        self._request(
+            i, MessageId.SUPPLY, MessageId.TEMPERATURE, MessageId.ERROR, MessageId.ADDRESS
+        )
 
     def send_setpoint(self, i: int, mode: JointMode, target: float, limit_nm: float) -> None:
         """Send the setpoint of an axis; before it the limits, and after it gains and mode, if they have changed."""
@@ -330,7 +347,8 @@ class OdriveAxes(CanDrives):
     def _send_limits(self, i: int, limit_nm: float) -> None:
         """Send the speed and current limits; the axis never gets a higher current than it was configured for."""
         axis = self.axes[i]
-        current_a = min(limit_nm / axis.torque_constant, axis.max_current_a)  # assigns `current_soft_max`
+        # Assigns `current_soft_max`.
+        current_a = min(limit_nm / axis.torque_constant, axis.max_current_a)
         if self._send(i, MessageId.SET_LIMITS, axis.speed_limit, current_a):
             axis.limit_nm = limit_nm
 
@@ -348,7 +366,9 @@ class OdriveAxes(CanDrives):
 
     def _request(self, i: int, *messages: MessageId) -> bool:
         """Send a request for each of these messages. Returns whether the bus accepted all of them."""
-        accepted = [self.wire.send(encode_request(self.node_ids[i], message_id)) for message_id in messages]
+        accepted = [
+            self.wire.send(encode_request(self.node_ids[i], message_id)) for message_id in messages
+        ]
         return all(accepted)
 
 

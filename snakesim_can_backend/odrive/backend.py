@@ -71,7 +71,9 @@ class OdriveBackend(CanDriveBackend):
         cls.validate_current_limit(config, settings, joint)
 
     @classmethod
-    def validate_current_limit(cls, config: RunConfig, settings: OdriveSettings, joint: Joint) -> None:
+    def validate_current_limit(
+        cls, config: RunConfig, settings: OdriveSettings, joint: Joint
+    ) -> None:
         """Check that the torque limit of a joint needs no more current than the driver may set.
 
         Args:
@@ -89,7 +91,9 @@ class OdriveBackend(CanDriveBackend):
         required_current_a = compute_required_current_a(joint)
         if required_current_a <= max_current_a * (1 + RELATIVE_TOLERANCE):
             return
-        torque_constant_nm_per_a = joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
+        torque_constant_nm_per_a = (
+            joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A
+        )
         suggestion = "raise `backends.odrive.max_current_a`, if the axis is configured for more"
         if settings.max_current_a is None:
             suggestion = (
@@ -104,7 +108,9 @@ class OdriveBackend(CanDriveBackend):
         )
 
     @classmethod
-    def check_drives(cls, config: RunConfig, settings: OdriveSettings, joints: Sequence[Joint]) -> None:
+    def check_drives(
+        cls, config: RunConfig, settings: OdriveSettings, joints: Sequence[Joint]
+    ) -> None:
         """Check also the endpoint files that the settings name."""
         read_all_endpoints(settings.endpoints)
         super().check_drives(config, settings, joints)

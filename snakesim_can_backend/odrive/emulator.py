@@ -9,7 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from snakesim_can_backend.can_drives.emulator import CanEmulator, CanEmulatorContext
-from snakesim_can_backend.odrive.axes import EMULATED_CONSTANT_NM_PER_A, REVOLUTION_RAD, compute_required_current_a
+from snakesim_can_backend.odrive.axes import (
+    EMULATED_CONSTANT_NM_PER_A,
+    REVOLUTION_RAD,
+    compute_required_current_a,
+)
 from snakesim_can_backend.odrive.endpoints import (
     EMULATED,
     SETTING_TYPES,
@@ -39,17 +43,15 @@ HEARTBEAT_US = 100_000.0  # ODrive's default period
 COUNTS_PER_TURN = 16384  # of the encoder
 VERSION = (2, 4, 4, 58, 0, 6, 11, 0)  # protocol, hardware (3), firmware (3), unreleased
 FIRST_SERIAL = 0x3855_0000_0001
-DUPLICATE_SERIAL_BITS = 0x0000_0100_0000  # in which the serial number of a second axis with the same id differs
+# In which the serial number of a second axis with the same id differs.
+DUPLICATE_SERIAL_BITS = 0x0000_0100_0000
 MODE_BY_CONTROL_MODE = {
     ControlMode.TORQUE: JointMode.TORQUE,
     ControlMode.VELOCITY: JointMode.VELOCITY,
     ControlMode.POSITION: JointMode.POSITION,
 }
-SETPOINT_INDEX = {
-    MessageId.SET_TORQUE: 0,
-    MessageId.SET_VELOCITY: 1,
-    MessageId.SET_POSITION: 2,
-}  # `EmulatedAxis.setpoints`
+# `EmulatedAxis.setpoints`.
+SETPOINT_INDEX = {MessageId.SET_TORQUE: 0, MessageId.SET_VELOCITY: 1, MessageId.SET_POSITION: 2}
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ class EmulatedAxis:
     watchdog_fed_us: float = 0.0  # when the watchdog was fed
     # Inputs and gains.
     control_mode: int = ControlMode.POSITION
-    setpoints: tuple[float, ...] = (0.0, 0.0, 0.0)  # torque in N·m, velocity in turns/s, position in turns
+    # Torque in N·m, velocity in turns/s, position in turns.
+    setpoints: tuple[float, ...] = 0.0, 0.0, 0.0
     position_gain: float = 20.0  # 1/s
     velocity_gain: float = 0.16  # N·m / (turn/s)
 
@@ -120,7 +123,8 @@ class EmulatedOdrive(CanEmulator):
         self.axes = [
             EmulatedAxis(
                 node=true_joint.id,
-                torque_constant=true_joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A,
+                torque_constant=true_joint.motor.torque_constant_nm_per_a
+                or EMULATED_CONSTANT_NM_PER_A,
                 saved=make_configuration(joint, settings),
             )
             for joint, true_joint in zip(context.joints, context.body.joints, strict=True)
@@ -139,7 +143,9 @@ class EmulatedOdrive(CanEmulator):
             return frame
         node, serial, connection = PAYLOADS[MessageId.ADDRESS].unpack(frame.data)
         other_serial = int.from_bytes(serial, "little") ^ DUPLICATE_SERIAL_BITS
-        return encode_message(node, MessageId.ADDRESS, node, other_serial.to_bytes(6, "little"), connection)
+        return encode_message(
+            node, MessageId.ADDRESS, node, other_serial.to_bytes(6, "little"), connection
+        )
 
     def restart(self, i: int) -> None:
         """Restart an axis. It loses the settings that were not saved."""
@@ -166,7 +172,10 @@ class EmulatedOdrive(CanEmulator):
     def on_step(self, now_us: float) -> None:
         """Stop axes whose watchdog has expired; at each heartbeat, also those that are too hot."""
         for i, axis in enumerate(self.axes):
-            if axis.state == AxisState.CLOSED_LOOP and now_us - axis.watchdog_fed_us > axis.watchdog_us:
+            if (
+                axis.state == AxisState.CLOSED_LOOP
+                and now_us - axis.watchdog_fed_us > axis.watchdog_us
+            ):
                 self._fail(i, axis, AxisError.WATCHDOG_TIMER_EXPIRED)
         if now_us - self._last_heartbeat_us < HEARTBEAT_US:
             return
@@ -178,7 +187,9 @@ class EmulatedOdrive(CanEmulator):
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _execute_command(self, i: int, axis: EmulatedAxis, message_id: MessageId, values: tuple[float, ...]) -> None:
+    def _execute_command(
+        self, i: int, axis: EmulatedAxis, message_id: MessageId, values: tuple[float, ...]
+    ) -> None:
         """Execute a command that the host has sent to an axis; an unknown command has no effect.
 
         Args:

@@ -47,7 +47,9 @@ class EndpointIds:
 
 
 # Of emulated axes. The numbers are their own: no firmware of ODrive has them.
-EMULATED = EndpointIds("0.6.11", "4.4.58", {setting: 200 + i for i, setting in enumerate(AxisSetting)})
+EMULATED = EndpointIds(
+    "0.6.11", "4.4.58", {setting: 200 + i for i, setting in enumerate(AxisSetting)}
+)
 
 
 class _EndpointEntry(msgspec.Struct):
@@ -89,7 +91,9 @@ def read_endpoints(path: str) -> EndpointIds:
     except ConfigError as error:
         raise ConfigError(f"{context}: {error}; {suggestion}", code="file/not-readable") from None
     except (msgspec.DecodeError, RecursionError) as error:
-        raise ConfigError(f"{context}: {path}: {error}; {suggestion}", code="file/not-readable") from None
+        raise ConfigError(
+            f"{context}: {path}: {error}; {suggestion}", code="file/not-readable"
+        ) from None
     ids: dict[AxisSetting, int] = {}
     for setting in AxisSetting:
         endpoint = file.endpoints.get(setting)
@@ -105,5 +109,6 @@ def read_endpoints(path: str) -> EndpointIds:
                 code="file/not-readable",
             )
         ids[setting] = endpoint.id
-    firmware = file.fw_version.partition("-")[0]  # a release may have a suffix, which axes do not report
+    # A release may have a suffix, which axes do not report.
+    firmware = file.fw_version.partition("-")[0]
     return EndpointIds(firmware, file.hw_version, ids)

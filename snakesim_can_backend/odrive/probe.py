@@ -46,12 +46,17 @@ class AxisProbe(CanDriveProbe):
     def read_configuration(self, timeout_s: float) -> list[ReadBack]:
         """Read the watchdog, if an endpoint file of the firmware is known."""
         endpoints = self._find_endpoints(timeout_s)
-        required = {AxisSetting.WATCHDOG_ENABLED: 1.0, AxisSetting.WATCHDOG_TIMEOUT: self.settings.watchdog_s}
+        required = {
+            AxisSetting.WATCHDOG_ENABLED: 1.0,
+            AxisSetting.WATCHDOG_TIMEOUT: self.settings.watchdog_s,
+        }
         values: list[ReadBack] = []
         for setting, value in required.items():
             reported = None
             if endpoints is not None:
-                reported = self._read_setting(endpoints.ids[setting], SETTING_TYPES[setting], timeout_s)
+                reported = self._read_setting(
+                    endpoints.ids[setting], SETTING_TYPES[setting], timeout_s
+                )
             unit = "s" if setting is AxisSetting.WATCHDOG_TIMEOUT else "1"
             values.append(ReadBack(str(setting), unit, value, reported, WATCHDOG_TOLERANCE_S))
         return values

@@ -88,10 +88,14 @@ class AxisError(IntFlag):
 
 PAYLOADS = {
     MessageId.VERSION: Struct("<8B"),  # protocol, hardware (3), firmware (3), unreleased
-    MessageId.HEARTBEAT: Struct("<IBBBx"),  # active errors, state, result of the last procedure, trajectory done
+    MessageId.HEARTBEAT: Struct(
+        "<IBBBx"
+    ),  # active errors, state, result of the last procedure, trajectory done
     MessageId.ESTOP: Struct(""),
     MessageId.ERROR: Struct("<II"),  # active errors, reason of the last disarming
-    MessageId.ADDRESS: Struct("<B6sB"),  # node, serial number, connection; only of 0.6: a command in 0.5
+    MessageId.ADDRESS: Struct(
+        "<B6sB"
+    ),  # node, serial number, connection; only of 0.6: a command in 0.5
     MessageId.SET_STATE: Struct("<I"),
     MessageId.MOTION: Struct("<ff"),  # turns, turns/s
     MessageId.SET_MODE: Struct("<II"),  # what it controls, input mode
@@ -108,7 +112,8 @@ PAYLOADS = {
 }
 READ_SETTING = 0  # first byte of RxSdo
 WRITE_SETTING = 1
-SDO_HEADER = Struct("<BHB")  # opcode, or reserved in an answer; endpoint id; reserved. The value follows
+# Opcode, or reserved in an answer; endpoint id; reserved. The value follows.
+SDO_HEADER = Struct("<BHB")
 SETTERS = frozenset(message_id for message_id in MessageId if message_id.name.startswith("SET_"))
 FROM_HOST = SETTERS | {MessageId.ESTOP, MessageId.CLEAR_ERRORS}  # messages that only a host sends
 
@@ -125,12 +130,16 @@ def encode_request(node_id: int, message_id: MessageId) -> CanFrame:
 
 def encode_setting_request(node_id: int, endpoint: int) -> CanFrame:
     """Return the request for the setting with an endpoint id."""
-    return CanFrame(node_id << NODE_BITS | MessageId.RX_SDO, SDO_HEADER.pack(READ_SETTING, endpoint, 0))
+    return CanFrame(
+        node_id << NODE_BITS | MessageId.RX_SDO, SDO_HEADER.pack(READ_SETTING, endpoint, 0)
+    )
 
 
 def encode_setting_answer(node_id: int, endpoint: int, value: bytes) -> CanFrame:
     """Return an axis' answer to the request for a setting."""
-    return CanFrame(node_id << NODE_BITS | MessageId.TX_SDO, SDO_HEADER.pack(0, endpoint, 0) + value)
+    return CanFrame(
+        node_id << NODE_BITS | MessageId.TX_SDO, SDO_HEADER.pack(0, endpoint, 0) + value
+    )
 
 
 def decode_setting_answer(data: bytes) -> tuple[int, bytes]:

@@ -29,7 +29,9 @@ class MountedAxis(MountedDrive, frozen=True, kw_only=True):
 class OdriveSettings(CanDriveSettings, frozen=True, kw_only=True):
     """The scenario's `[backends.odrive]` section. `watchdog_s` is what the axes have in `watchdog_timeout`."""
 
-    endpoints: Annotated[list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)] = []
+    endpoints: Annotated[
+        list[Annotated[str, Meta(min_length=1, max_length=4096)]], Meta(max_length=8)
+    ] = []
     """Files flat_endpoints.json, which ODrive publishes with each firmware: one for each firmware on the bus.
 
     With them the driver reads watchdog, current and speed limits of every axis at the start. Empty: they are unknown.

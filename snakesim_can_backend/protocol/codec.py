@@ -76,7 +76,9 @@ class FrameSignal:
     def encode(self, value: float) -> int:
         """Return the raw number that is nearest to a value. Raises CodecError for a value out of range."""
         if not self.low <= value <= self.high:  # which NaN fails too
-            raise CodecError(f"{self.name} = {value} {self.unit} does not fit; allowed are {self.low} to {self.high}")
+            raise CodecError(
+                f"{self.name} = {value} {self.unit} does not fit; allowed are {self.low} to {self.high}"
+            )
         if self.is_float:
             return int.from_bytes(_single.pack(value), "little")
         return round((value - self.offset) / self.scale)
@@ -97,7 +99,9 @@ class MessageLayout:
         self.name: str = message.name
         self.opcode = Opcode(message.frame_id >> NODE_BITS)
         self.length: int = message.length  # bytes
-        self.signals: dict[str, FrameSignal] = {signal.name: _make_signal(signal) for signal in message.signals}
+        self.signals: dict[str, FrameSignal] = {
+            signal.name: _make_signal(signal) for signal in message.signals
+        }
         self._has_checksum = self.opcode in WITH_CHECKSUM
         self._readers = {name: self.make_reader(name) for name in self.signals}
 

@@ -27,7 +27,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import JointMode, LifecycleState
 
 LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
-MAX_TARGET_RAW = 32767  # of a signed number of 16 bits; -32768 is not used, so that the range is symmetric
+# Of a signed number of 16 bits; -32768 is not used, so that the range is symmetric.
+MAX_TARGET_RAW = 32767
 MAX_TORQUE_LIMIT_RAW = 65535  # of an unsigned number of 16 bits
 SYNC_COUNT_MASK = 0xFF
 SYNC_TIME_MASK = 0xFFFFFFFF
@@ -42,7 +43,8 @@ class SetpointWriter:
         self._write = layout.make_writer("mode", "count", "position", "torque_limit")
         self._count = [0] * joint_count
         scales = [layout.signals[name].scale for name in ("position", "velocity", "torque")]
-        self._steps_per_unit = 1.0 / np.array([math.inf, *scales])  # by mode; a passive joint has no target
+        # By mode; a passive joint has no target.
+        self._steps_per_unit = 1.0 / np.array([math.inf, *scales])
         self._limit_steps_per_nm = 1.0 / layout.signals["torque_limit"].scale
 
     def encode(self, modes: list[JointMode], targets: Floats, limits_nm: Floats) -> list[CanFrame]:
@@ -54,7 +56,9 @@ class SetpointWriter:
             limits_nm: (n_joints,) torque limits at the module's shaft.
         """
         mode_indices = np.array(modes, dtype=np.intp)
-        targets_raw = _round_steps(targets * self._steps_per_unit[mode_indices], -MAX_TARGET_RAW, MAX_TARGET_RAW)
+        targets_raw = _round_steps(
+            targets * self._steps_per_unit[mode_indices], -MAX_TARGET_RAW, MAX_TARGET_RAW
+        )
         limits_raw = _round_steps(limits_nm * self._limit_steps_per_nm, 0, MAX_TORQUE_LIMIT_RAW)
         rows = zip(modes, self._count, targets_raw.tolist(), limits_raw.tolist(), strict=True)
         return [self._write(node, row) for node, row in enumerate(rows, start=1)]
@@ -96,12 +100,17 @@ def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[
     return frames
 
 
-def make_repeated_command(lifecycle: LifecycleState, state: ModuleState, node_id: int) -> CanFrame | None:
+def make_repeated_command(
+    lifecycle: LifecycleState, state: ModuleState, node_id: int
+) -> CanFrame | None:
     """Return the frame to repeat to a module in an unexpected state, because an earlier one may have been lost."""
     match lifecycle, state:
         case "armed", ModuleState.DISARMED:
             return make_command(CommandAction.ARM, node_id)
-        case "estop", ModuleState.DISARMED | ModuleState.ARMED | ModuleState.STOPPING | ModuleState.FAULT:
+        case (
+            "estop",
+            ModuleState.DISARMED | ModuleState.ARMED | ModuleState.STOPPING | ModuleState.FAULT,
+        ):
             return make_emergency()
         case (("disarmed" | "fault"), ModuleState.ARMED):
             return make_command(CommandAction.STOP, node_id)
@@ -121,7 +130,9 @@ def make_command(action: CommandAction, node_id: int = BROADCAST) -> CanFrame:
 def make_query(node_id: int) -> CanFrame:
     """Return a request for a constant parameter. Its answer comes after all earlier frames of the module."""
     layout = load_layouts()[Opcode.PARAMETER_REQUEST]
-    return layout.encode(node_id, index=ModuleParameter.TAIL, operation=ParameterOperation.READ, value=0.0)
+    return layout.encode(
+        node_id, index=ModuleParameter.TAIL, operation=ParameterOperation.READ, value=0.0
+    )
 
 
 def make_emergency() -> CanFrame:

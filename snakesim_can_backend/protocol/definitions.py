@@ -22,7 +22,8 @@ COMMAND_KEY = 0x5AAE  # in every Command, so that no other frame can be taken fo
 
 # Counters of setpoints and states.
 COUNTER_MODULUS = 16  # they have four bits
-MAX_LOST_SETPOINTS = 2  # that may be missing before one; a count further ahead, or an earlier one, is wrong
+# That may be missing before one; a count further ahead, or an earlier one, is wrong.
+MAX_LOST_SETPOINTS = 2
 MAX_WRONG_COUNTS = 5  # in a row, after which a module stops
 
 # Reports that modules send by themselves.
@@ -52,7 +53,9 @@ class Opcode(IntEnum):
     PARAMETER_REQUEST = 16
 
 
-FROM_HOST = frozenset((Opcode.EMERGENCY, Opcode.COMMAND, Opcode.SYNC, Opcode.SET_POINT, Opcode.PARAMETER_REQUEST))
+FROM_HOST = frozenset(
+    (Opcode.EMERGENCY, Opcode.COMMAND, Opcode.SYNC, Opcode.SET_POINT, Opcode.PARAMETER_REQUEST)
+)
 WITH_CHECKSUM = frozenset((Opcode.COMMAND, Opcode.SET_POINT, Opcode.JOINT_STATE))
 
 

@@ -9,7 +9,13 @@ from collections.abc import Iterable
 from cantools.database.can import Database, Message
 
 from snakesim_can_backend.protocol.codec import load_database
-from snakesim_can_backend.protocol.definitions import BROADCAST, FIRST_NODE, LAST_NODE, NODE_BITS, Opcode
+from snakesim_can_backend.protocol.definitions import (
+    BROADCAST,
+    FIRST_NODE,
+    LAST_NODE,
+    NODE_BITS,
+    Opcode,
+)
 
 TO_ALL = (Opcode.EMERGENCY, Opcode.SYNC)
 TO_ONE_OR_ALL = (Opcode.COMMAND,)
@@ -26,7 +32,9 @@ def make_expanded_dbc() -> str:
             if node != BROADCAST:
                 node_message.name = f"{message.name}_{node:02d}"
             messages.append(node_message)
-    database = Database(messages, nodes=source.nodes, version=source.version, dbc_specifics=source.dbc, strict=True)
+    database = Database(
+        messages, nodes=source.nodes, version=source.version, dbc_specifics=source.dbc, strict=True
+    )
     return database.as_dbc_string(sort_signals="default").replace("\r\n", "\n")
 
 

@@ -32,7 +32,9 @@ class BendingHand:
         self._modified_ns = -1
         self._target_rad: Floats | None = None  # None: the hand has released the joints
 
-    def bend(self, angle_rad: Floats, velocity_rad_s: Floats, torque_nm: Floats, step_s: float) -> None:
+    def bend(
+        self, angle_rad: Floats, velocity_rad_s: Floats, torque_nm: Floats, step_s: float
+    ) -> None:
         """Set the velocities of joints whose motors are off, so that one step turns them towards the pose.
 
         Args:

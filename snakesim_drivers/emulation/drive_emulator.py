@@ -18,7 +18,8 @@ from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.fault_kinds import FaultInjection
 
 MAX_WAIT_S = 0.001  # longest wait for frames or bytes, of drives in a process of their own
-MAX_REALTIME_BUSY_S = 0.2  # computing without a pause, after which emulated drives give up their real-time priority
+# Computing without a pause, after which emulated drives give up their real-time priority.
+MAX_REALTIME_BUSY_S = 0.2
 
 
 def serve_until_stopped(
@@ -72,7 +73,9 @@ class DriveEmulator(ABC, Generic[BusEndT]):
     lock of the body.
     """
 
-    def __init__(self, body: EmulatedBody, bus_ends: Sequence[BusEndT], clock_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, body: EmulatedBody, bus_ends: Sequence[BusEndT], clock_ns: Callable[[], int]
+    ) -> None:
         """Start to simulate at the current time of the clock.
 
         Args:
@@ -84,7 +87,9 @@ class DriveEmulator(ABC, Generic[BusEndT]):
         self.body = body
         self._clock_ns = clock_ns
         self._start_ns = clock_ns()
-        self._bus_ends: list[BusEndT] = list({id(bus_end): bus_end for bus_end in bus_ends}.values())  # each once
+        self._bus_ends: list[BusEndT] = list(
+            {id(bus_end): bus_end for bus_end in bus_ends}.values()
+        )  # each once
         body.add_step_callback(self.on_step)
 
     @abstractmethod
@@ -101,7 +106,10 @@ class DriveEmulator(ABC, Generic[BusEndT]):
 
     def read_true_state(self) -> TrueState:
         """Return what the drives really do now."""
-        return TrueState(self.list_enabled(), [self.body.read_joint_angle_rad(i) for i in range(len(self.body.joints))])
+        return TrueState(
+            self.list_enabled(),
+            [self.body.read_joint_angle_rad(i) for i in range(len(self.body.joints))],
+        )
 
     def inject_typed(self, injection: FaultInjection, begins: bool) -> None:
         """Start or end a fault that was typed: of a drive, or of a bus at the drives' end.

@@ -13,7 +13,8 @@ from snakesim_hal.wire.messages import JointMode
 
 BOOT_US = 500_000.0  # in which a drive that restarts neither receives nor sends; a guess
 UNDERVOLTAGE_V = 12.0  # of a supply that an injected fault lets fall
-FAULTS = ("mute", "reboot", "overheat", "undervoltage", "duplicate")  # that can be injected into emulated drives
+# That can be injected into emulated drives.
+FAULTS = "mute", "reboot", "overheat", "undervoltage", "duplicate"
 
 
 class ShaftState(NamedTuple):
@@ -97,7 +98,8 @@ class EmulatedBody:
             speed_rad_s: Speed limit.
         """
         drive = self.joints[i].drive
-        gear = drive.gear  # revolutions of the shaft for one of the joint, so torques at the joint are higher by it
+        # Revolutions of the shaft for one of the joint, so torques at the joint are higher by it.
+        gear = drive.gear
         self.motors.set_demand(
             self._joint_indices[i],
             mode,
@@ -116,7 +118,9 @@ class EmulatedBody:
         angle_rad = float(self.physics_model.angle_rad[j])
         velocity_rad_s = float(self.physics_model.velocity_rad_s[j])
         torque_nm = float(self.motors.torque_nm[j])
-        return ShaftState(drive.zero_rad + ratio * angle_rad, ratio * velocity_rad_s, torque_nm / ratio)
+        return ShaftState(
+            drive.zero_rad + ratio * angle_rad, ratio * velocity_rad_s, torque_nm / ratio
+        )
 
     def read_joint_angle_rad(self, i: int) -> float:
         """Return the true angle of a drive's joint, however the drive is mounted."""
@@ -126,14 +130,18 @@ class EmulatedBody:
         """Return the voltage in V and the current in A of a drive's supply."""
         supply = self.joints[i].supply
         j = self._joint_indices[i]
-        power_w = self.thermal.compute_power_w(self.motors.torque_nm, self.physics_model.velocity_rad_s)[j]
+        power_w = self.thermal.compute_power_w(
+            self.motors.torque_nm, self.physics_model.velocity_rad_s
+        )[j]
         voltage_v = UNDERVOLTAGE_V if j in self._shared.undervoltage_joints else supply.voltage_v
         return voltage_v, supply.idle_a + float(power_w) / voltage_v
 
     def read_temperatures(self, i: int) -> tuple[float, float]:
         """Return the temperatures of a drive's winding and of its electronics in °C."""
         j = self._joint_indices[i]
-        return float(self.thermal.winding_temperature_c[j]), float(self.thermal.compute_board_temperatures_c()[j])
+        return float(self.thermal.winding_temperature_c[j]), float(
+            self.thermal.compute_board_temperatures_c()[j]
+        )
 
     def is_too_hot(self, i: int) -> bool:
         """Return whether a drive's winding has reached `stop_at_c`."""
@@ -173,7 +181,8 @@ class EmulatedBody:
         """
         if injection.target_type != "joint" or injection.kind not in FAULTS:
             raise ConfigError(
-                f"fault {str(injection)!r}: emulated drives know {', '.join(FAULTS)}", code="injection/unknown-fault"
+                f"fault {str(injection)!r}: emulated drives know {', '.join(FAULTS)}",
+                code="injection/unknown-fault",
             )
         i = injection.target_index
         if i >= len(self.joints):

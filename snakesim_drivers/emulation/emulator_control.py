@@ -17,9 +17,15 @@ from typing import TextIO
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.model.fault_kinds import MAX_TEXT_LENGTH, FaultInjection, validate_and_complete_injection
+from snakesim_hal.model.fault_kinds import (
+    MAX_TEXT_LENGTH,
+    FaultInjection,
+    validate_and_complete_injection,
+)
 
-TYPED_FAULT_PATTERN = re.compile(r"(?P<kind>[a-z_]+)[ :]+(?P<target>(joint|bus)_[0-9]+)(?: +(?P<off>off))?")
+TYPED_FAULT_PATTERN = re.compile(
+    r"(?P<kind>[a-z_]+)[ :]+(?P<target>(joint|bus)_[0-9]+)(?: +(?P<off>off))?"
+)
 LOGGED_STEP_RAD = 0.001  # change of an angle after which the log gets a line
 
 
@@ -43,7 +49,9 @@ class DriveLog:
         """Write a line if a drive was enabled or disabled, or if a joint has moved."""
         logged = self._logged
         if logged is not None and list(logged.enabled) == list(state.enabled):
-            moved_rad = max(abs(a - b) for a, b in zip(logged.angle_rad, state.angle_rad, strict=True))
+            moved_rad = max(
+                abs(a - b) for a, b in zip(logged.angle_rad, state.angle_rad, strict=True)
+            )
             if moved_rad < LOGGED_STEP_RAD:
                 return
         self._logged = TrueState(list(state.enabled), list(state.angle_rad))
@@ -87,7 +95,8 @@ class EmulatorControl:
                 exit_stack.enter_context(file)
             except OSError as error:
                 raise ConfigError(
-                    f"--drive-log {arguments.drive_log}: {error.strerror}; give another name", code="file/not-writable"
+                    f"--drive-log {arguments.drive_log}: {error.strerror}; give another name",
+                    code="file/not-writable",
                 ) from error
             self._log = DriveLog(file)
 
@@ -133,5 +142,7 @@ def parse_typed_fault(text: str) -> tuple[FaultInjection, bool]:
             f"`mute joint_3` or `cut bus_1`",
             code="injection/unknown-fault",
         )
-    fault = validate_and_complete_injection(FaultInjection(match["kind"], match["target"]), text.strip())
+    fault = validate_and_complete_injection(
+        FaultInjection(match["kind"], match["target"]), text.strip()
+    )
     return fault, match["off"] is None

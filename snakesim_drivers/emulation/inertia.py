@@ -24,7 +24,8 @@ from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.quantities import from_zero
 
 MIN_INERTIA_KG_M2 = 1e-6  # of a joint, so that the equations have a solution for any robot file
-STEP_COUNT_TOLERANCE = 1e-9  # steps per period; a quotient of floats may exceed its whole number by less
+# Steps per period; a quotient of floats may exceed its whole number by less.
+STEP_COUNT_TOLERANCE = 1e-9
 
 
 class InertiaSettings(FileStruct, frozen=True, kw_only=True):
@@ -61,7 +62,9 @@ class InertiaModel(PhysicsModel):
         joints = robot.joint_table
         count = len(joints)
         period_s = config.period_ns * 1e-9
-        steps_per_period = max(int(np.ceil(period_s / settings.timestep_s - STEP_COUNT_TOLERANCE)), 1)
+        steps_per_period = max(
+            int(np.ceil(period_s / settings.timestep_s - STEP_COUNT_TOLERANCE)), 1
+        )
         self.step_s = period_s / steps_per_period
 
         # Inertia and friction of every joint.
@@ -70,14 +73,20 @@ class InertiaModel(PhysicsModel):
             for mass_kg, length_m in zip(robot.link_masses_kg, robot.link_lengths_m, strict=True)
         ]
         rotor_inertias_kg_m2 = np.array([joint.motor.armature_kg_m2 for joint in joints])
-        inertias_kg_m2 = np.maximum(rotor_inertias_kg_m2 + np.array(link_inertias_kg_m2[1:]), MIN_INERTIA_KG_M2)
-        viscous_friction_nm_s_per_rad = np.array([joint.motor.viscous_nm_s_per_rad for joint in joints])
+        inertias_kg_m2 = np.maximum(
+            rotor_inertias_kg_m2 + np.array(link_inertias_kg_m2[1:]), MIN_INERTIA_KG_M2
+        )
+        viscous_friction_nm_s_per_rad = np.array(
+            [joint.motor.viscous_nm_s_per_rad for joint in joints]
+        )
         dry_friction_nm = np.array([joint.motor.friction_nm for joint in joints]) + settings.drag_nm
-        self._velocity_step_per_nm = self.step_s / inertias_kg_m2  # rad/s that 1 N·m adds in one step
-        self._viscous_damping_factor = 1.0 / (1.0 + self._velocity_step_per_nm * viscous_friction_nm_s_per_rad)
-        self._dry_friction_step_rad_s = (
-            self._velocity_step_per_nm * dry_friction_nm
-        )  # velocity that dry friction removes in one step
+        # Rad/s that 1 N·m adds in one step.
+        self._velocity_step_per_nm = self.step_s / inertias_kg_m2
+        self._viscous_damping_factor = 1.0 / (
+            1.0 + self._velocity_step_per_nm * viscous_friction_nm_s_per_rad
+        )
+        # Velocity that dry friction removes in one step.
+        self._dry_friction_step_rad_s = self._velocity_step_per_nm * dry_friction_nm
         self._lower_rad = np.array([joint.limits.lower_rad for joint in joints])
         self._upper_rad = np.array([joint.limits.upper_rad for joint in joints])
 
@@ -85,7 +94,8 @@ class InertiaModel(PhysicsModel):
         self._angle_rad: Floats = np.array(compute_start_pose(config).angles_rad, dtype=np.float64)
         self._velocity_rad_s = np.zeros(count)
         self._torque_nm = np.zeros(count)
-        self._buffer = np.zeros(count)  # of intermediate results, so that a step allocates no memory
+        # Of intermediate results, so that a step allocates no memory.
+        self._buffer = np.zeros(count)
         self._hand: BendingHand | None = None
         if settings.hand_file:
             self._hand = BendingHand(Path(settings.hand_file), count)
@@ -108,7 +118,12 @@ class InertiaModel(PhysicsModel):
         np.multiply(torque_nm, self._velocity_step_per_nm, out=buffer)
         velocity_rad_s += buffer
         velocity_rad_s *= self._viscous_damping_factor
-        np.clip(velocity_rad_s, -self._dry_friction_step_rad_s, self._dry_friction_step_rad_s, out=buffer)
+        np.clip(
+            velocity_rad_s,
+            -self._dry_friction_step_rad_s,
+            self._dry_friction_step_rad_s,
+            out=buffer,
+        )
         velocity_rad_s -= buffer
 
         if self._hand is not None:

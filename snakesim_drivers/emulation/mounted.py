@@ -75,8 +75,12 @@ def build_actual_joints(robot: RobotFile, mounted: Mapping[str, MountedDrive]) -
     for i, joint in enumerate(joints):
         true_mounting = mounted.get(joint.name)
         if true_mounting is not None:
-            drive = msgspec.structs.replace(joint.drive, **_collect_overrides(true_mounting, JointDrive))
-            motor = msgspec.structs.replace(joint.motor, **_collect_overrides(true_mounting, JointMotor))
+            drive = msgspec.structs.replace(
+                joint.drive, **_collect_overrides(true_mounting, JointDrive)
+            )
+            motor = msgspec.structs.replace(
+                joint.motor, **_collect_overrides(true_mounting, JointMotor)
+            )
             joints[i] = dataclasses.replace(joint, drive=drive, motor=motor)
     return joints
 
@@ -98,11 +102,17 @@ def build_actual_config(config: RunConfig, mounted: Mapping[str, MountedDrive]) 
     return msgspec.structs.replace(config, robot=robot)
 
 
-def _collect_overrides(true_mounting: MountedDrive, section: type[JointDrive | JointMotor]) -> dict[str, Any]:
+def _collect_overrides(
+    true_mounting: MountedDrive, section: type[JointDrive | JointMotor]
+) -> dict[str, Any]:
     """Return the true values of those fields of `JointDrive` or `JointMotor` that differ from the robot file."""
     common_fields = {*section.__struct_fields__} & {*MountedDrive.__struct_fields__}
     true_values = msgspec.structs.asdict(true_mounting)
-    return {field: value for field, value in true_values.items() if field in common_fields and value is not None}
+    return {
+        field: value
+        for field, value in true_values.items()
+        if field in common_fields and value is not None
+    }
 
 
 def validate_mounting_overrides(

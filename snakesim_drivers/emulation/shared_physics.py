@@ -6,19 +6,31 @@ from typing import Any, Protocol
 
 import msgspec
 
-from snakesim_drivers.emulation.mounted import MountedDrive, build_actual_config, build_actual_joints
+from snakesim_drivers.emulation.mounted import (
+    MountedDrive,
+    build_actual_config,
+    build_actual_joints,
+)
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
-from snakesim_hal.model.plugins import PHYSICS_MODELS, decode_plugin_settings, load_plugin, require_base_class
+from snakesim_hal.model.plugins import (
+    PHYSICS_MODELS,
+    decode_plugin_settings,
+    load_plugin,
+    require_base_class,
+)
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.backlash import BacklashModel, move_rotor_inertia_to_motor_side
 from snakesim_hal.physics.motors import PowerStages
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.physics.thermal import ThermalModel
 
-THERMAL_DECIMATION = 10  # physics steps from one step of the windings' heat to the next: they heat up slowly
+# Physics steps from one step of the windings' heat to the next: they heat up slowly.
+THERMAL_DECIMATION = 10
 MAX_CATCH_UP_US = 200_000.0  # after a longer delay of this process the drives skip the rest of it
-STEP_COUNT_TOLERANCE = 0.49  # a step is simulated as soon as all of it but so much has passed: clocks are rounded
-POSE_TIME_TOLERANCE_US = 1.0  # a pose is captured so long before it is due at the earliest: clocks are rounded
+# A step is simulated as soon as all of it but so much has passed: clocks are rounded.
+STEP_COUNT_TOLERANCE = 0.49
+# A pose is captured so long before it is due at the earliest: clocks are rounded.
+POSE_TIME_TOLERANCE_US = 1.0
 
 
 class PhysicsSettings(Protocol):
@@ -60,14 +72,22 @@ def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: st
     label = f"physics_model {settings.physics_model!r}"
     require_base_class(model_type, PhysicsModel, label)
     section = f"backends.{backend}.physics_model_settings"
-    model_settings = decode_plugin_settings(model_type, settings.physics_model_settings, label, section)
+    model_settings = decode_plugin_settings(
+        model_type, settings.physics_model_settings, label, section
+    )
     # As really built, unlike what the controller assumes.
     actual_config = build_actual_config(config, settings.mounted)
-    backlash_rad = {name: mounted.backlash_rad for name, mounted in settings.mounted.items() if mounted.backlash_rad}
+    backlash_rad = {
+        name: mounted.backlash_rad
+        for name, mounted in settings.mounted.items()
+        if mounted.backlash_rad
+    }
     if not backlash_rad:
         return model_type(actual_config, model_settings)
     joints = build_actual_joints(config.robot, settings.mounted)
-    rigid_gear_model = model_type(move_rotor_inertia_to_motor_side(actual_config, joints, backlash_rad), model_settings)
+    rigid_gear_model = model_type(
+        move_rotor_inertia_to_motor_side(actual_config, joints, backlash_rad), model_settings
+    )
     return BacklashModel(rigid_gear_model, joints, backlash_rad, config.seed)
 
 

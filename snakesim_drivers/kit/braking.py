@@ -24,10 +24,10 @@ class BrakingJoints:
         """
         self._max_braking_durations_ns = max_braking_durations_ns
         self._is_hold_mode = is_hold_mode
-        self._fault_start_ns: int | None = (
-            None  # driver time of the first cycle of the current fault; None without a fault
-        )
-        self._stopped_joints: set[int] = set()  # joints that have finished braking in the current fault
+        # Driver time of the first cycle of the current fault; None without a fault.
+        self._fault_start_ns: int | None = None
+        # Joints that have finished braking in the current fault.
+        self._stopped_joints: set[int] = set()
 
     def reset(self) -> None:
         """Forget the braking of the last fault, because the robot is not in a fault now."""
@@ -35,7 +35,11 @@ class BrakingJoints:
         self._stopped_joints.clear()
 
     def select_braking_joints(
-        self, driven_joints: frozenset[int], modes: Sequence[JointMode], velocity_rad_s: Floats, now_ns: int
+        self,
+        driven_joints: frozenset[int],
+        modes: Sequence[JointMode],
+        velocity_rad_s: Floats,
+        now_ns: int,
     ) -> frozenset[int]:
         """Return the joints that continue to brake in this control cycle of a fault, and remember those that are done.
 
@@ -56,11 +60,16 @@ class BrakingJoints:
         braking_duration_ns = now_ns - self._fault_start_ns
         for i in driven_joints:
             speed_rad_s = abs(float(velocity_rad_s[i]))
-            if modes[i] == JointMode.PASSIVE or self._has_stopped_braking(i, speed_rad_s, braking_duration_ns):
+            if modes[i] == JointMode.PASSIVE or self._has_stopped_braking(
+                i, speed_rad_s, braking_duration_ns
+            ):
                 self._stopped_joints.add(i)
         return driven_joints - self._stopped_joints
 
     def _has_stopped_braking(self, i: int, speed_rad_s: float, braking_duration_ns: int) -> bool:
         if self._is_hold_mode:
             return False
-        return speed_rad_s < AT_REST_SPEED_RAD_S or braking_duration_ns >= self._max_braking_durations_ns[i]
+        return (
+            speed_rad_s < AT_REST_SPEED_RAD_S
+            or braking_duration_ns >= self._max_braking_durations_ns[i]
+        )

@@ -26,7 +26,8 @@ class BusSpec:
 
     name: str  # such as can0
     joints: tuple[int, ...]  # indices in the robot
-    open: Callable[[DriveReadings], Drives]  # gets the readings of these drives; raises ConfigError and BackendError
+    # Gets the readings of these drives; raises ConfigError and BackendError.
+    open: Callable[[DriveReadings], Drives]
     decimation: int = 1  # control cycles from one reading of this bus to the next
     watchdog_s: float = 0.1  # watchdog timeout of its drives
 
@@ -34,7 +35,9 @@ class BusSpec:
 class InlineBus:
     """A bus whose methods work at once, in the calling thread. Joints are numbered by their place on the bus."""
 
-    def __init__(self, spec: BusSpec, joints: Sequence[Joint], clock_ns: Callable[[], int], period_ns: int) -> None:
+    def __init__(
+        self, spec: BusSpec, joints: Sequence[Joint], clock_ns: Callable[[], int], period_ns: int
+    ) -> None:
         """Open one bus of the robot, and guard its drives against pauses of the driver.
 
         Args:
@@ -60,7 +63,8 @@ class InlineBus:
         self._guard = DriveGuard(
             clock_ns, watchdog_timeout_ns=max_pause_ns, reset_grace_period_ns=reset_grace_period_ns
         )
-        self._findings_after_pause: list[FaultFinding] = []  # found after a pause, before any setpoint was sent
+        # Found after a pause, before any setpoint was sent.
+        self._findings_after_pause: list[FaultFinding] = []
 
     def start(self) -> None:
         """Prepare for control cycles. Called in each of them."""
@@ -162,7 +166,9 @@ class InlineBus:
     def _read_drives(self) -> None:
         """Read all drives, and request also the states of those that were silent for long; continue their start-up."""
         silent_drives = [
-            i for i in range(len(self.spec.joints)) if self.readings.compute_age_ns(i) > self._max_pause_ns
+            i
+            for i in range(len(self.spec.joints))
+            if self.readings.compute_age_ns(i) > self._max_pause_ns
         ]
         self.readings.require_check(silent_drives)
         self.readings.start_request()

@@ -19,9 +19,8 @@ from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.scenario import RunConfig
 
-MAX_WAIT_RESPONSE_TIMEOUTS = (
-    1.2  # the host's wait for a bus, in answer limits of its drives: the bus itself takes time too
-)
+# The host's wait for a bus, in answer limits of its drives: the bus itself takes time too.
+MAX_WAIT_RESPONSE_TIMEOUTS = 1.2
 CLOSE_TIMEOUT_S = 2.0  # for all buses together, before those that hang are left
 
 
@@ -182,7 +181,10 @@ class RobotBuses(Drives):
         Args:
             advance_time: Function that advances the driver's time by a number of ns.
         """
-        while any(bus.drives.start_up is not None and bus.drives.start_up.can_continue() for bus in self.buses):
+        while any(
+            bus.drives.start_up is not None and bus.drives.start_up.can_continue()
+            for bus in self.buses
+        ):
             advance_time(self._period_ns)
             for bus in self.buses:
                 bus.request_reading()
@@ -209,8 +211,11 @@ class RobotBuses(Drives):
     def _inject_into_drive(self, injection: FaultInjection, *, begins: bool) -> bool:
         for bus in self.buses:
             if injection.target_index in bus.spec.joints:
-                local_number = bus.spec.joints.index(injection.target_index) + 1  # targets count from 1
-                return bus.drives.inject(replace(injection, target=f"joint_{local_number}"), begins=begins)
+                # Targets count from 1.
+                local_number = bus.spec.joints.index(injection.target_index) + 1
+                return bus.drives.inject(
+                    replace(injection, target=f"joint_{local_number}"), begins=begins
+                )
         return False
 
 

@@ -13,10 +13,14 @@ from snakesim_hal.programs.commands import CommandGroup, Commands
 
 DRIVE_NOUNS: Commands = (
     CommandGroup(
-        name="drive", heading="robot", help="Scan, emulate and examine the drives of a robot, by driver type."
+        name="drive",
+        heading="robot",
+        help="Scan, emulate and examine the drives of a robot, by driver type.",
     ),
     CommandGroup(name="drive scan", help="List the drives that answer on a bus. It moves nothing."),
-    CommandGroup(name="drive emulate", help="Emulate the drives of a robot, as a process on a bus."),
+    CommandGroup(
+        name="drive emulate", help="Emulate the drives of a robot, as a process on a bus."
+    ),
     CommandGroup(name="drive load", help="Print how much of a bus the drives of a scenario use."),
     CommandGroup(name="drive replay", help="Read the log of a bus as the driver does."),
 )
@@ -24,7 +28,9 @@ DRIVE_NOUNS: Commands = (
 
 def add_channel(parser: argparse.ArgumentParser, about: str) -> None:
     """Add the option `--channel`, the bus of emulated drives; `about` is its help text."""
-    parser.add_argument("--channel", action="append", metavar="CHANNEL", help=f"{about} (may be repeated)")
+    parser.add_argument(
+        "--channel", action="append", metavar="CHANNEL", help=f"{about} (may be repeated)"
+    )
 
 
 def add_channels(parser: argparse.ArgumentParser, about: str) -> None:
@@ -35,7 +41,9 @@ def add_channels(parser: argparse.ArgumentParser, about: str) -> None:
 
 def add_pose(parser: argparse.ArgumentParser, about: str, default: str | None = None) -> None:
     """Add the option `--pose`, the receiver of emulated motion capture; `about` is added to its help text."""
-    parser.add_argument("--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({about})")
+    parser.add_argument(
+        "--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({about})"
+    )
 
 
 def add_control_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +54,10 @@ def add_control_arguments(parser: argparse.ArgumentParser) -> None:
         help="read faults from the terminal: `KIND joint_N` or `cut bus_1`, and the same with `off`",
     )
     parser.add_argument(
-        "--drive-log", type=Path, metavar="FILE", help="write when each drive was enabled and disabled, as JSON lines"
+        "--drive-log",
+        type=Path,
+        metavar="FILE",
+        help="write when each drive was enabled and disabled, as JSON lines",
     )
 
 

@@ -25,7 +25,14 @@ from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.robot import add_drive_identities
 from snakesim_hal.model.scenario import RunConfig, describe_run_robot
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Fault, JointMode, LifecycleState, Message, RobotDescription, SensorDescription
+from snakesim_hal.wire.messages import (
+    Fault,
+    JointMode,
+    LifecycleState,
+    Message,
+    RobotDescription,
+    SensorDescription,
+)
 
 LATCHED_STATES = ("fault", "estop")  # only the operator's reset ends them
 MIN_UNANSWERED_REQUESTS = 3  # unanswered ones: a single lost answer is no fault
@@ -43,7 +50,11 @@ class DriverClock:
 
     def now_ns(self) -> int:
         """Return the current time in ns."""
-        return self.robot_time_ns + self._start_up_duration_ns if self._lockstep else time.monotonic_ns()
+        return (
+            self.robot_time_ns + self._start_up_duration_ns
+            if self._lockstep
+            else time.monotonic_ns()
+        )
 
     def advance_start_up_time(self, duration_ns: int) -> None:
         """Advance the driver's time in lockstep while drives start up: the robot's own time is paused until arming."""
@@ -57,18 +68,23 @@ class DriveBackendParts:
     name: str  # of the backend
     hardware: str  # what the backend drives, such as can0+can1; empty if the drives are emulated
     clock: DriverClock
-    mocap: MocapReceiver | None  # receives the base pose; None without motion capture. The backend closes it.
-    open_drives: Callable[[DriveReadings], Drives]  # opens the buses; raises ConfigError and BackendError
+    # Receives the base pose; None without motion capture. The backend closes it.
+    mocap: MocapReceiver | None
+    # Opens the buses; raises ConfigError and BackendError.
+    open_drives: Callable[[DriveReadings], Drives]
     watchdog_timeouts_s: Sequence[float]  # time of each joint's watchdog, from tail to head
     decimation: int = 1  # control cycles from one reading of the slowest bus to the next
-    joints_without_watchdog: frozenset[int] = NO_DRIVES  # joints whose drives do not stop by themselves
+    # Joints whose drives do not stop by themselves.
+    joints_without_watchdog: frozenset[int] = NO_DRIVES
 
 
 class DriveBackend(Backend):
     """A backend on drives. The hooks at the end are for driver types that need more."""
 
-    reset_grace_cycles: ClassVar[int] = RESET_GRACE_CYCLES  # after a reset, in which drives may report older errors
-    polling_feeds_watchdog: ClassVar[bool] = False  # True: packets of any program keep a drive on after its host died
+    # After a reset, in which drives may report older errors.
+    reset_grace_cycles: ClassVar[int] = RESET_GRACE_CYCLES
+    # True: packets of any program keep a drive on after its host died.
+    polling_feeds_watchdog: ClassVar[bool] = False
 
     @classmethod
     def open_probe(cls, config: RunConfig, settings: Any) -> DriveProbe:
@@ -130,7 +146,8 @@ class DriveBackend(Backend):
         self._isolated_joints = NO_DRIVES
         # Joints that were reported as failed since the newest setpoints: the HAL should isolate them.
         self._joints_awaiting_isolation = NO_DRIVES
-        self._remaining_grace_cycles = 0  # left, in which drives may report errors from before a reset
+        # Left, in which drives may report errors from before a reset.
+        self._remaining_grace_cycles = 0
         try:
             self._drives = parts.open_drives(self._readings)
         except BaseException:
@@ -143,7 +160,9 @@ class DriveBackend(Backend):
             self.close()
             raise
         description = self._make_description(config, parts.name, parts.hardware)
-        description = add_drive_identities(description, self._readings.serials, self._readings.firmware)
+        description = add_drive_identities(
+            description, self._readings.serials, self._readings.firmware
+        )
         self._description = _mark_missing_watchdogs(description, parts.joints_without_watchdog)
 
     def describe(self) -> RobotDescription:
@@ -176,7 +195,9 @@ class DriveBackend(Backend):
         reconnected_joints = self._update_isolated_joints(setpoints.isolated)
         connected_joints = frozenset(range(len(self._joint_names))) - self._isolated_joints
         self._reset_faults_if_requested(lifecycle, connected_joints, reconnected_joints)
-        self._driven_joints = self._select_joints_to_drive(lifecycle, connected_joints, setpoints.mode)
+        self._driven_joints = self._select_joints_to_drive(
+            lifecycle, connected_joints, setpoints.mode
+        )
         self._lifecycle = lifecycle  # only now: both calls above compare it with the new state
         command = BusCommand(
             enabled_drives=self._driven_joints,
@@ -206,15 +227,20 @@ class DriveBackend(Backend):
         if not self._is_open:
             return []
         new_findings = self._reported_findings.filter_new(self._collect_relevant_findings())
-        failed_joints = frozenset(finding.joint for finding in new_findings if finding.joint is not None)
+        failed_joints = frozenset(
+            finding.joint for finding in new_findings if finding.joint is not None
+        )
         if self._can_isolate(new_findings, failed_joints):
             self._joints_awaiting_isolation |= failed_joints
         elif new_findings and self._lifecycle not in LATCHED_STATES:
             try:
                 self._send_lifecycle_state("fault", self._isolated_joints)
-            except BackendError as error:  # report the faults all the same; the failing bus raises in the next cycle
+            except (
+                BackendError
+            ) as error:  # report the faults all the same; the failing bus raises in the next cycle
                 new_findings.append(FaultFinding("stop_not_sent", str(error)))
-            self._lifecycle = "fault"  # now, so that a reset before the next control cycle is recognized, too
+            # Now, so that a reset before the next control cycle is recognized, too.
+            self._lifecycle = "fault"
         return [finding.to_fault(self._tick, self._joint_names) for finding in new_findings]
 
     def list_arming_obstacles(self) -> list[str]:
@@ -259,7 +285,10 @@ class DriveBackend(Backend):
         return reconnected_joints
 
     def _select_joints_to_drive(
-        self, lifecycle: LifecycleState, connected_joints: frozenset[int], modes: Sequence[JointMode]
+        self,
+        lifecycle: LifecycleState,
+        connected_joints: frozenset[int],
+        modes: Sequence[JointMode],
     ) -> frozenset[int]:
         """Return the joints whose drives get setpoints in this lifecycle state, and update which joints still brake.
 
@@ -279,14 +308,21 @@ class DriveBackend(Backend):
             case "armed":
                 return connected_joints
             case "fault":
-                velocity_rad_s = self._mounting.to_joint_velocity_rad_s(self._readings.velocity_rad_s)
+                velocity_rad_s = self._mounting.to_joint_velocity_rad_s(
+                    self._readings.velocity_rad_s
+                )
                 driven_before = connected_joints & self._driven_joints
-                return self._braking.select_braking_joints(driven_before, modes, velocity_rad_s, self._clock.now_ns())
+                return self._braking.select_braking_joints(
+                    driven_before, modes, velocity_rad_s, self._clock.now_ns()
+                )
             case _:
                 return NO_DRIVES
 
     def _reset_faults_if_requested(
-        self, lifecycle: LifecycleState, connected_joints: frozenset[int], reconnected_joints: frozenset[int]
+        self,
+        lifecycle: LifecycleState,
+        connected_joints: frozenset[int],
+        reconnected_joints: frozenset[int],
     ) -> None:
         """Reset errors of drives if the operator has just reset the robot; otherwise do nothing.
 
@@ -351,7 +387,9 @@ class DriveBackend(Backend):
         """Return the joint state and the other sensors that are due, from what was read."""
         others: dict[str, Message] = {}
         if tick % len(self._joint_names) == 0:
-            max_age_ns = MAX_HEALTH_AGE_ROUNDS * len(self._joint_names) * self._decimation * self._period_ns
+            max_age_ns = (
+                MAX_HEALTH_AGE_ROUNDS * len(self._joint_names) * self._decimation * self._period_ns
+            )
             others[keys.POWER] = self._readings.make_power(tick, timestamp_ns, max_age_ns)
         if self._mocap is not None:
             pose = self._mocap.read_newest(tick, timestamp_ns)
@@ -369,7 +407,9 @@ class DriveBackend(Backend):
                 findings.append(FaultFinding("drive_silent", cause, i, affects_only_joint=True))
         return findings
 
-    def _describe_sensors(self, config: RunConfig, pose_delay_s: float | None) -> list[SensorDescription]:
+    def _describe_sensors(
+        self, config: RunConfig, pose_delay_s: float | None
+    ) -> list[SensorDescription]:
         """Return the sensors with their rates and delays.
 
         Args:
@@ -380,7 +420,9 @@ class DriveBackend(Backend):
         delay_s = (self._decimation - 1) / rate_hz
         sensors = [
             SensorDescription(key=keys.JOINTS, rate_hz=rate_hz, delay_s=delay_s),
-            SensorDescription(key=keys.POWER, rate_hz=rate_hz / len(self._joint_names), delay_s=0.0),
+            SensorDescription(
+                key=keys.POWER, rate_hz=rate_hz / len(self._joint_names), delay_s=0.0
+            ),
         ]
         if pose_delay_s is not None:
             sensors.append(SensorDescription(key=keys.POSE, rate_hz=rate_hz, delay_s=pose_delay_s))
@@ -390,6 +432,7 @@ class DriveBackend(Backend):
 def _mark_missing_watchdogs(robot: RobotDescription, joints: frozenset[int]) -> RobotDescription:
     """Return a description in which these joints have no watchdog."""
     noted = [
-        msgspec.structs.replace(joint, watchdog=False) if i in joints else joint for i, joint in enumerate(robot.joints)
+        msgspec.structs.replace(joint, watchdog=False) if i in joints else joint
+        for i, joint in enumerate(robot.joints)
     ]
     return msgspec.structs.replace(robot, joints=noted)

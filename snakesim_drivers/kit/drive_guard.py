@@ -9,13 +9,16 @@ from collections.abc import Callable, Iterable
 from snakesim_drivers.kit.findings import FaultFinding
 
 NO_DRIVES: frozenset[int] = frozenset()
-RESET_GRACE_CYCLES = 5  # control cycles after a reset in which drives may still report errors from before it
+# Control cycles after a reset in which drives may still report errors from before it.
+RESET_GRACE_CYCLES = 5
 
 
 class DriveGuard:
     """The drives of one bus, by their indices on it."""
 
-    def __init__(self, clock_ns: Callable[[], int], *, watchdog_timeout_ns: int, reset_grace_period_ns: int) -> None:
+    def __init__(
+        self, clock_ns: Callable[[], int], *, watchdog_timeout_ns: int, reset_grace_period_ns: int
+    ) -> None:
         """Start tracking which drives of one bus have stopped by themselves; at first no drive is enabled.
 
         Args:
@@ -27,12 +30,17 @@ class DriveGuard:
         self._max_pause_ns = watchdog_timeout_ns
         self._reset_grace_period_ns = reset_grace_period_ns
         # Times of the driver.
-        self._last_active_ns: int | None = None  # when the driver last used the bus; None before that
-        self._last_reset_ns: int | None = None  # time of the operator's last reset; None before that
-        self._was_paused = False  # whether the driver paused too long since it last read the states of the drives
+        # When the driver last used the bus; None before that.
+        self._last_active_ns: int | None = None
+        # Time of the operator's last reset; None before that.
+        self._last_reset_ns: int | None = None
+        # Whether the driver paused too long since it last read the states of the drives.
+        self._was_paused = False
         # Drives, by their indices on the bus.
-        self._enabled_drives: frozenset[int] = NO_DRIVES  # drives that got setpoints in the newest command
-        self._self_stopped_drives: frozenset[int] = NO_DRIVES  # drives that stopped by themselves since the last reset
+        # Drives that got setpoints in the newest command.
+        self._enabled_drives: frozenset[int] = NO_DRIVES
+        # Drives that stopped by themselves since the last reset.
+        self._self_stopped_drives: frozenset[int] = NO_DRIVES
         # Whether the bus has switched its drives off by itself since the last reset, for lack of setpoints.
         self._were_drives_released = False
 
@@ -56,7 +64,9 @@ class DriveGuard:
 
     # --- which drives are driven -----------------------------------------------------------------------------
 
-    def select_drives_to_enable(self, requested: frozenset[int], *, may_enable: bool) -> frozenset[int]:
+    def select_drives_to_enable(
+        self, requested: frozenset[int], *, may_enable: bool
+    ) -> frozenset[int]:
         """Return those of the requested drives that get setpoints now, and remember them as enabled.
 
         Args:
@@ -89,9 +99,14 @@ class DriveGuard:
 
     def note_findings(self, findings: Iterable[FaultFinding]) -> None:
         """Note what is wrong with the drives. An enabled drive with a finding is not enabled again before a reset."""
-        if self._last_reset_ns is not None and self._clock_ns() - self._last_reset_ns <= self._reset_grace_period_ns:
+        if (
+            self._last_reset_ns is not None
+            and self._clock_ns() - self._last_reset_ns <= self._reset_grace_period_ns
+        ):
             return
-        drives_with_findings = frozenset(finding.joint for finding in findings if finding.joint is not None)
+        drives_with_findings = frozenset(
+            finding.joint for finding in findings if finding.joint is not None
+        )
         self._self_stopped_drives |= drives_with_findings & self._enabled_drives
 
     def reset(self, drives: frozenset[int]) -> None:

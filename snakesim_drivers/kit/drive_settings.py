@@ -16,10 +16,14 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
-RESPONSE_TIMEOUT_PERIODS = 0.5  # control periods that a bus waits for responses: the rest is for the controller
-LOCKSTEP_RESPONSE_TIMEOUT_S = 2.0  # robot time does not pass while the driver waits, so a busy computer changes nothing
-MIN_WATCHDOG_PERIODS = 2.2  # watchdog timeout in setpoint periods: one lost setpoint must not stop a drive
-MIN_LEASE_ROUNDS = 1.5  # duration of a lease in readings of a bus: joint states have to be younger than a lease
+# Control periods that a bus waits for responses: the rest is for the controller.
+RESPONSE_TIMEOUT_PERIODS = 0.5
+# Robot time does not pass while the driver waits, so a busy computer changes nothing.
+LOCKSTEP_RESPONSE_TIMEOUT_S = 2.0
+# Watchdog timeout in setpoint periods: one lost setpoint must not stop a drive.
+MIN_WATCHDOG_PERIODS = 2.2
+# Duration of a lease in readings of a bus: joint states have to be younger than a lease.
+MIN_LEASE_ROUNDS = 1.5
 
 
 class BodySettings(FileStruct, frozen=True, kw_only=True):
@@ -95,7 +99,9 @@ def validate_body_settings(
         ConfigError: A setting or an injected fault does not suit the robot.
     """
     validate_pose_settings(config, settings.pose_listen)
-    validate_mounting_overrides(config.robot, config.backend_section, settings.mounted, are_emulated=are_emulated)
+    validate_mounting_overrides(
+        config.robot, config.backend_section, settings.mounted, are_emulated=are_emulated
+    )
     possible_fault_kinds = {*bus_fault_kinds}
     if are_emulated:
         possible_fault_kinds |= {*FAULTS}
@@ -112,7 +118,11 @@ def validate_body_settings(
 
 
 def validate_bus_settings(
-    config: RunConfig, settings: DriveSettings, section: str, joints: Sequence[Joint], ports: Collection[str]
+    config: RunConfig,
+    settings: DriveSettings,
+    section: str,
+    joints: Sequence[Joint],
+    ports: Collection[str],
 ) -> None:
     """Check the ports of the joints, and the watchdog timeout and decimation of a driver type.
 
@@ -188,7 +198,9 @@ def assign_ports(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:
     """
     index_by_port = {port: i for i, port in enumerate(ports)}
     joints_per_port = -(-len(joints) // max(len(ports), 1))  # rounded up
-    return [index_by_port.get(joint.drive.port, i // joints_per_port) for i, joint in enumerate(joints)]
+    return [
+        index_by_port.get(joint.drive.port, i // joints_per_port) for i, joint in enumerate(joints)
+    ]
 
 
 def make_joint_label(config: RunConfig, joint: Joint) -> str:

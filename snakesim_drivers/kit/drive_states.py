@@ -10,9 +10,11 @@ from typing import Literal
 
 from snakesim_drivers.kit.findings import FaultFinding
 
-DriveCommand = Literal["follow", "idle", "stop"]  # enable, disable, or the drive's own emergency stop
+# Enable, disable, or the drive's own emergency stop.
+DriveCommand = Literal["follow", "idle", "stop"]
 
-MIN_RESPONSE_REPORT_PERIODS = 1.5  # report periods after a command, from which on reports surely show its effect
+# Report periods after a command, from which on reports surely show its effect.
+MIN_RESPONSE_REPORT_PERIODS = 1.5
 MAX_ENABLE_REPORT_PERIODS = 5  # report periods after a command, within which a drive has to be on
 
 
@@ -39,7 +41,9 @@ class DriveState:
 class DriveStates:
     """The states of several drives, from tail to head."""
 
-    def __init__(self, labels: Sequence[str], report_period_ns: int, clock_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, labels: Sequence[str], report_period_ns: int, clock_ns: Callable[[], int]
+    ) -> None:
         """Create the states of drives that should be off and have not reported anything.
 
         Args:
@@ -67,7 +71,9 @@ class DriveStates:
         if drive.should_be_enabled and enabled and self._has_reported_since_command(drive):
             drive.was_enabled = True
 
-    def update_commands(self, enabled_drives: frozenset[int], *, emergency: bool) -> list[tuple[int, DriveCommand]]:
+    def update_commands(
+        self, enabled_drives: frozenset[int], *, emergency: bool
+    ) -> list[tuple[int, DriveCommand]]:
         """Store which drives should be on, and return the commands to send now.
 
         There is a command for each drive whose target state has changed, and again for each drive that reports that it
@@ -97,7 +103,9 @@ class DriveStates:
 
     def get_enabled_drives(self) -> frozenset[int]:
         """Return the indices of the drives that should be on and report that they are."""
-        return frozenset(i for i, drive in enumerate(self.drives) if drive.should_be_enabled and drive.enabled)
+        return frozenset(
+            i for i, drive in enumerate(self.drives) if drive.should_be_enabled and drive.enabled
+        )
 
     def reset_errors(self, drives: Iterable[int]) -> None:
         """Forget the errors of these drives, because the driver has just cleared them."""
@@ -114,11 +122,20 @@ class DriveStates:
                 findings.append(FaultFinding("safe_torque_off", cause, i))
             elif drive.errors:
                 findings.append(
-                    FaultFinding("drive_fault", f"{drive.label} reports {drive.errors}", i, affects_only_joint=True)
+                    FaultFinding(
+                        "drive_fault",
+                        f"{drive.label} reports {drive.errors}",
+                        i,
+                        affects_only_joint=True,
+                    )
                 )
             elif drive.should_be_enabled and self._should_have_enabled(drive) and not drive.enabled:
-                cause = f"{drive.label} does not follow: it is {drive.state or 'in an unknown state'}"
-                findings.append(FaultFinding("drive_not_armed", cause, i, affects_only_joint=drive.was_enabled))
+                cause = (
+                    f"{drive.label} does not follow: it is {drive.state or 'in an unknown state'}"
+                )
+                findings.append(
+                    FaultFinding("drive_not_armed", cause, i, affects_only_joint=drive.was_enabled)
+                )
         return findings
 
     def _needs_retry(self, drive: DriveState) -> bool:
@@ -129,7 +146,10 @@ class DriveStates:
         """
         if drive.should_be_enabled and self._should_have_enabled(drive):
             return False
-        return self._has_reported_since_command(drive) and drive.enabled not in (None, drive.should_be_enabled)
+        return self._has_reported_since_command(drive) and drive.enabled not in (
+            None,
+            drive.should_be_enabled,
+        )
 
     def _has_reported_since_command(self, drive: DriveState) -> bool:
         """Return whether the last report is so late that it shows the effect of the last command."""
@@ -137,7 +157,10 @@ class DriveStates:
 
     def _should_have_enabled(self, drive: DriveState) -> bool:
         """Return whether a drive was on since the last command, or has had enough time to switch on."""
-        return drive.was_enabled or self._clock_ns() - drive.command_changed_ns > self._max_enable_duration_ns
+        return (
+            drive.was_enabled
+            or self._clock_ns() - drive.command_changed_ns > self._max_enable_duration_ns
+        )
 
 
 def _choose_command(*, should_be_enabled: bool, emergency: bool) -> DriveCommand:

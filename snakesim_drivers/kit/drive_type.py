@@ -56,7 +56,8 @@ class DriverTypeContext:
     settings: Any  # an instance of the driver type's own `Settings`
     joints: Mapping[int, Joint]  # those that it drives, by their indices in the robot
     clock: DriverClock  # the time of the robot
-    body: EmulatedBody | None  # moved by these joints' drives if they are emulated here (None: they are on a bus)
+    # Moved by these joints' drives if they are emulated here (None: they are on a bus).
+    body: EmulatedBody | None
 
 
 class BusesBackend(DriveBackend):
@@ -94,7 +95,9 @@ class BusesBackend(DriveBackend):
         validate_position_gains(config.robot)
         parts = cls.group_joints_by_driver_type(config, settings)
         are_emulated_in_process = _are_emulated_in_process(parts)
-        possible_fault_kinds = [{*part.driver_type.list_bus_faults(part.settings)} for part in parts]
+        possible_fault_kinds = [
+            {*part.driver_type.list_bus_faults(part.settings)} for part in parts
+        ]
         common_fault_kinds = set[str].intersection(*possible_fault_kinds)
         bus_count = sum(max(len(part.ports), 1) for part in parts)
         validate_body_settings(
@@ -157,7 +160,10 @@ class BusesBackend(DriveBackend):
             watchdog_timeouts_s=_list_watchdog_timeouts_s(parts),
             decimation=max(part.settings.decimation for part in parts),
             joints_without_watchdog=frozenset(
-                joint for part in parts if not part.driver_type.has_watchdog for joint in part.joints
+                joint
+                for part in parts
+                if not part.driver_type.has_watchdog
+                for joint in part.joints
             ),
         )
         super().__init__(config, drive_backend_parts)
@@ -268,7 +274,9 @@ def make_bus_specs_by_port(
     port_indices = assign_ports(list(joints.values()), ports)
     specs: list[BusSpec] = []
     for port_index, port in enumerate(ports):
-        joints_on_port = tuple(joint for joint, index in zip(joints, port_indices, strict=True) if index == port_index)
+        joints_on_port = tuple(
+            joint for joint, index in zip(joints, port_indices, strict=True) if index == port_index
+        )
         if not joints_on_port:
             continue
         spec = BusSpec(

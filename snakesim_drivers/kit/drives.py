@@ -47,9 +47,11 @@ from snakesim_hal.wire.messages import JointMode
 class BusCommand(NamedTuple):
     """What all drives of a bus are to do until the next command."""
 
-    enabled_drives: frozenset[int]  # indices of the drives that follow setpoints; all others are switched off
+    # Indices of the drives that follow setpoints; all others are switched off.
+    enabled_drives: frozenset[int]
     modes: list[JointMode]  # of every drive
-    targets: Floats  # (n_drives,) in rad, rad/s or N·m, by the mode of each drive (0 for passive drives)
+    # (n_drives,) in rad, rad/s or N·m, by the mode of each drive (0 for passive drives).
+    targets: Floats
     limits_nm: Floats  # (n_drives,) torque limits, not negative
     may_enable: bool  # True: the robot is armed (False: a drive that is off stays off)
     emergency: bool  # True: drives stop by their own emergency stop, where they have one
@@ -59,7 +61,8 @@ class Drives(ABC):
     """The drives of one driver type on one bus. Derive from it, and implement the abstract methods."""
 
     emulated: bool = False  # whether no real motor moves (set by the constructor)
-    start_up: StartUp | None = None  # steps that take seconds, made by the constructor; None: bring-up is enough
+    # Steps that take seconds, made by the constructor; None: bring-up is enough.
+    start_up: StartUp | None = None
 
     @abstractmethod
     def bring_up(self) -> None:

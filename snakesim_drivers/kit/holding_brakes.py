@@ -25,7 +25,9 @@ class BrakePlan(NamedTuple):
 class HoldingBrakes:
     """The brakes of all drives on one bus, by their indices on it. All are closed at first."""
 
-    def __init__(self, count: int, *, release_s: float, engage_s: float, clock_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, count: int, *, release_s: float, engage_s: float, clock_ns: Callable[[], int]
+    ) -> None:
         """Create the brakes of a bus, all closed.
 
         Args:
@@ -37,16 +39,16 @@ class HoldingBrakes:
         self._release_duration_ns = round(release_s * 1e9)
         self._engage_duration_ns = round(engage_s * 1e9)
         self._clock_ns = clock_ns
-        self._release_start_ns: list[int | None] = [
-            None
-        ] * count  # when each brake was commanded to open; None: it is closed
-        self._engage_start_ns: list[int | None] = [
-            None
-        ] * count  # when each brake was commanded to close; None: it opens or is closed
+        # When each brake was commanded to open; None: it is closed.
+        self._release_start_ns: list[int | None] = [None] * count
+        # When each brake was commanded to close; None: it opens or is closed.
+        self._engage_start_ns: list[int | None] = [None] * count
         self._hold_angles_rad = [0.0] * count
         self._hold_torque_limits_nm = [0.0] * count
 
-    def update_brakes(self, command: BusCommand, enabled_drives: Collection[int], angles_rad: Floats) -> BrakePlan:
+    def update_brakes(
+        self, command: BusCommand, enabled_drives: Collection[int], angles_rad: Floats
+    ) -> BrakePlan:
         """Start to release or engage brakes for a command, and let drives hold their position until that is done.
 
         Call this once in every cycle. The rules are:
@@ -68,20 +70,34 @@ class HoldingBrakes:
         for i, angle in enumerate(angles_rad.tolist()):
             if i in command.enabled_drives:
                 self._start_brake_release(
-                    i, now_ns, is_enabled=i in enabled_drives, angle_rad=angle, limit_nm=float(command.limits_nm[i])
+                    i,
+                    now_ns,
+                    is_enabled=i in enabled_drives,
+                    angle_rad=angle,
+                    limit_nm=float(command.limits_nm[i]),
                 )
                 if self._is_brake_releasing(i, now_ns):
                     holding_drives.add(i)
             else:
                 self._start_brake_engagement(i, now_ns, angle_rad=angle)
-                if self._is_brake_engaging(i, now_ns) and i in enabled_drives and not command.emergency:
+                if (
+                    self._is_brake_engaging(i, now_ns)
+                    and i in enabled_drives
+                    and not command.emergency
+                ):
                     holding_drives.add(i)
         drives_to_release = frozenset(
-            i for i, release_start_ns in enumerate(self._release_start_ns) if release_start_ns is not None
+            i
+            for i, release_start_ns in enumerate(self._release_start_ns)
+            if release_start_ns is not None
         )
-        return BrakePlan(self._replace_with_hold_setpoints(command, holding_drives), drives_to_release)
+        return BrakePlan(
+            self._replace_with_hold_setpoints(command, holding_drives), drives_to_release
+        )
 
-    def _start_brake_release(self, i: int, now_ns: int, *, is_enabled: bool, angle_rad: float, limit_nm: float) -> None:
+    def _start_brake_release(
+        self, i: int, now_ns: int, *, is_enabled: bool, angle_rad: float, limit_nm: float
+    ) -> None:
         self._engage_start_ns[i] = None
         self._hold_torque_limits_nm[i] = limit_nm
         if self._release_start_ns[i] is None:
@@ -103,7 +119,9 @@ class HoldingBrakes:
         engage_start_ns = self._engage_start_ns[i]
         return engage_start_ns is not None and now_ns - engage_start_ns < self._engage_duration_ns
 
-    def _replace_with_hold_setpoints(self, command: BusCommand, holding_drives: set[int]) -> BusCommand:
+    def _replace_with_hold_setpoints(
+        self, command: BusCommand, holding_drives: set[int]
+    ) -> BusCommand:
         """Return the command with these drives enabled, in position mode at the angle that they have to hold."""
         modes = list(command.modes)
         targets = command.targets.copy()
@@ -113,5 +131,8 @@ class HoldingBrakes:
             targets[i] = self._hold_angles_rad[i]
             limits_nm[i] = self._hold_torque_limits_nm[i]
         return command._replace(
-            enabled_drives=command.enabled_drives | holding_drives, modes=modes, targets=targets, limits_nm=limits_nm
+            enabled_drives=command.enabled_drives | holding_drives,
+            modes=modes,
+            targets=targets,
+            limits_nm=limits_nm,
         )

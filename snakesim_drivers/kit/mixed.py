@@ -29,14 +29,21 @@ class MixedBackend(BusesBackend):
     name = "mixed"
 
     @classmethod
-    def group_joints_by_driver_type(cls, config: RunConfig, settings: MixedSettings) -> list[DriverTypePart]:
+    def group_joints_by_driver_type(
+        cls, config: RunConfig, settings: MixedSettings
+    ) -> list[DriverTypePart]:
         """Return the joints of each driver type, with the settings of its section.
 
         Raises:
             ConfigError: A driver type is unknown, its section is wrong, or only some driver types have a bus.
         """
-        driver_types = {joint.drive.driver: load_driver_type(config.robot, joint) for joint in config.robot.joint_table}
-        parts = [_make_part(config, driver, driver_type) for driver, driver_type in driver_types.items()]
+        driver_types = {
+            joint.drive.driver: load_driver_type(config.robot, joint)
+            for joint in config.robot.joint_table
+        }
+        parts = [
+            _make_part(config, driver, driver_type) for driver, driver_type in driver_types.items()
+        ]
         _validate_all_or_no_emulation(parts)
         return parts
 
@@ -47,7 +54,11 @@ class MixedBackend(BusesBackend):
         for joint in robot.joint_table:
             driver_type = load_driver_type(robot, joint)
             if driver_type.unmeasured:
-                measures = [quantity for quantity in joint.drive.measures if quantity not in driver_type.unmeasured]
+                measures = [
+                    quantity
+                    for quantity in joint.drive.measures
+                    if quantity not in driver_type.unmeasured
+                ]
                 exceptions = joints.get(joint.name, JointExceptions())
                 joints[joint.name] = msgspec.structs.replace(exceptions, measures=measures)
             supported_modes = driver_type.supported_modes
@@ -79,7 +90,9 @@ def load_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
     try:
         plugin: Any = load_plugin(BACKENDS, driver)
     except ConfigError as error:
-        raise ConfigError(f"{context} = {driver!r}: {error}; {suggestion}", code="drive/unknown-type") from None
+        raise ConfigError(
+            f"{context} = {driver!r}: {error}; {suggestion}", code="drive/unknown-type"
+        ) from None
     if not (isinstance(plugin, type) and issubclass(plugin, DriverTypeBackend)):
         raise ConfigError(
             f"{context} = {driver!r}, which is a backend of whole robots, and not a driver type; {suggestion}",
@@ -88,7 +101,9 @@ def load_driver_type(robot: RobotFile, joint: Joint) -> type[DriverTypeBackend]:
     return plugin
 
 
-def _make_part(config: RunConfig, driver: str, driver_type: type[DriverTypeBackend]) -> DriverTypePart:
+def _make_part(
+    config: RunConfig, driver: str, driver_type: type[DriverTypeBackend]
+) -> DriverTypePart:
     """Return the joints of a driver type, and its settings from the scenario.
 
     Raises:
@@ -104,8 +119,12 @@ def _make_part(config: RunConfig, driver: str, driver_type: type[DriverTypeBacke
             f"set `backends.mixed.{robot_wide_keys[0]}`",
             code="config/conflict",
         )
-    settings = decode_plugin_settings(driver_type, section_values, f"scenario {config.name!r}", section)
-    joints = {i: joint for i, joint in enumerate(config.robot.joint_table) if joint.drive.driver == driver}
+    settings = decode_plugin_settings(
+        driver_type, section_values, f"scenario {config.name!r}", section
+    )
+    joints = {
+        i: joint for i, joint in enumerate(config.robot.joint_table) if joint.drive.driver == driver
+    }
     return DriverTypePart(driver_type, settings, section, joints)
 
 

@@ -53,8 +53,10 @@ class DriveReadings:
         self.not_ready_reasons = [""] * count
         # Requests are numbered. Every drive starts as one that has not answered for long.
         self._request_number = MAX_AWAITED_REQUESTS  # number of the newest request
-        self._motion_request_number = [0] * count  # number of the newest request that was answered with motion
-        self._torque_request_number = [0] * count  # number of the newest request that was answered with torque
+        # Number of the newest request that was answered with motion.
+        self._motion_request_number = [0] * count
+        # Number of the newest request that was answered with torque.
+        self._torque_request_number = [0] * count
         # Drives that may have switched themselves off.
         self._drives_to_check: set[int] = set()
 
@@ -157,8 +159,12 @@ class DriveReadings:
             self.torque_nm[destination] = source.torque_nm[i]
             self._motion_read_ns[destination] = source._motion_read_ns[i]
             self._torque_read_ns[destination] = source._torque_read_ns[i]
-            self._motion_request_number[destination] = request_number_offset + source._motion_request_number[i]
-            self._torque_request_number[destination] = request_number_offset + source._torque_request_number[i]
+            self._motion_request_number[destination] = (
+                request_number_offset + source._motion_request_number[i]
+            )
+            self._torque_request_number[destination] = (
+                request_number_offset + source._torque_request_number[i]
+            )
             self._voltage_v[destination] = source._voltage_v[i]
             self._current_a[destination] = source._current_a[i]
             self._motor_temperature_c[destination] = source._motor_temperature_c[i]
@@ -205,7 +211,10 @@ class DriveReadings:
     def is_awaiting_responses(self) -> bool:
         """Return whether responses are missing from drives that responded lately, so that waiting is useful."""
         drive_count = len(self._measures_torque)
-        return any(0 < self.count_unanswered_requests(i) <= MAX_AWAITED_REQUESTS for i in range(drive_count))
+        return any(
+            0 < self.count_unanswered_requests(i) <= MAX_AWAITED_REQUESTS
+            for i in range(drive_count)
+        )
 
     def compute_age_ns(self, i: int) -> int:
         """Return the age of the older one of a drive's motion and torque, in ns.
@@ -251,7 +260,9 @@ class DriveReadings:
             max_age_ns: Maximum age of valid values.
         """
         now_ns = self._clock_ns()
-        valid = [read_ns != NEVER and now_ns - read_ns <= max_age_ns for read_ns in self._health_read_ns]
+        valid = [
+            read_ns != NEVER and now_ns - read_ns <= max_age_ns for read_ns in self._health_read_ns
+        ]
         return Power(
             tick=tick,
             timestamp_ns=timestamp_ns,

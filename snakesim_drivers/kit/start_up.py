@@ -37,8 +37,10 @@ class StartUpStep:
     name: str  # as an operator reads it, such as "homing"
     timeout_s: float  # time after which the step has failed
     start: Callable[[int], None]  # sends what starts the step
-    is_done: Callable[[int], bool]  # whether the drive has acknowledged it; called in every cycle of the bus
-    abort: Callable[[int], None] = do_nothing  # sends what ends the step, after a failure or an emergency stop
+    # Whether the drive has acknowledged it; called in every cycle of the bus.
+    is_done: Callable[[int], bool]
+    # Sends what ends the step, after a failure or an emergency stop.
+    abort: Callable[[int], None] = do_nothing
     moves_joint: bool = False  # True: the drive moves its joint by itself, as in homing
 
 
@@ -46,7 +48,8 @@ class StartUpStep:
 class _StartUpProgress:
     """How far one drive is."""
 
-    step: int = 0  # index of the current step; equal to the number of steps if the start-up is finished
+    # Index of the current step; equal to the number of steps if the start-up is finished.
+    step: int = 0
     start_time_ns: int | None = None  # when the current step was started; None: not yet
     failure: str = ""  # why the start-up ended early; empty: it did not
     is_fault: bool = False  # False: the operator ended it, by an emergency stop
@@ -142,7 +145,10 @@ class StartUp:
             if progress.is_fault:
                 findings.append(
                     FaultFinding(
-                        "drive_not_ready", f"{self._labels[i]}: {progress.failure}", i, affects_only_joint=True
+                        "drive_not_ready",
+                        f"{self._labels[i]}: {progress.failure}",
+                        i,
+                        affects_only_joint=True,
                     )
                 )
         return findings
@@ -171,7 +177,9 @@ class StartUp:
                 return
             if not is_done:
                 if self._elapsed_s(progress) > step.timeout_s:
-                    self._abort_start_up(i, progress, f"{step.name} did not end within {step.timeout_s:g} s")
+                    self._abort_start_up(
+                        i, progress, f"{step.name} did not end within {step.timeout_s:g} s"
+                    )
                 return
             progress.step += 1
             progress.start_time_ns = None

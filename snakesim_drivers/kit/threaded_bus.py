@@ -62,7 +62,8 @@ class ThreadedBus(InlineBus):
         self._thread: threading.Thread | None = None
 
         # Used by the bus thread alone.
-        self._setpoint_time_s: float | None = None  # when the setpoints in use were queued; None: no drive is enabled
+        # When the setpoints in use were queued; None: no drive is enabled.
+        self._setpoint_time_s: float | None = None
 
         # Shared by both threads, and guarded by the condition.
         self._condition = threading.Condition()
@@ -70,11 +71,12 @@ class ThreadedBus(InlineBus):
         self._bus_error: Exception | None = None
         # Readings.
         self._published_readings = DriveReadings([joints[j] for j in spec.joints], clock_ns)
-        self._published_readings.copy_from(
-            self.readings, range(len(spec.joints))
-        )  # also which drives are not ready yet
-        self._request_time_s: float | None = None  # when a reading was requested; None: it is complete
-        self._is_next_reading_requested = False  # requested again during a reading: a slow bus reads again at once
+        # Also which drives are not ready yet.
+        self._published_readings.copy_from(self.readings, range(len(spec.joints)))
+        # When a reading was requested; None: it is complete.
+        self._request_time_s: float | None = None
+        # Requested again during a reading: a slow bus reads again at once.
+        self._is_next_reading_requested = False
         self._read_duration_s = 0.0
         self._is_slow = False
         # Commands.
@@ -87,7 +89,9 @@ class ThreadedBus(InlineBus):
     def start(self) -> None:
         """Start the thread in the first control cycle; it inherits the scheduling priority of the host's thread."""
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name=f"bus {self.spec.name}", daemon=True)
+            self._thread = threading.Thread(
+                target=self._run, name=f"bus {self.spec.name}", daemon=True
+            )
             self._thread.start()
 
     def request_reading(self) -> bool:
@@ -125,7 +129,8 @@ class ThreadedBus(InlineBus):
         """Request that the bus thread clears the errors of these drives before it sends the next setpoints."""
         with self._condition:
             self._drives_to_reset |= joints
-            self._new_findings = select_bus_findings(self._new_findings)  # findings of drives are from before the reset
+            # Findings of drives are from before the reset.
+            self._new_findings = select_bus_findings(self._new_findings)
             self._condition.notify_all()
 
     def poll(self) -> None:
@@ -154,7 +159,10 @@ class ThreadedBus(InlineBus):
             return
         self._thread.join(max(deadline_s - time.monotonic(), 0.0))
         if self._thread.is_alive():
-            _log.warning("%s: still busy; it is left, and its drives stop by their own watchdogs", self.spec.name)
+            _log.warning(
+                "%s: still busy; it is left, and its drives stop by their own watchdogs",
+                self.spec.name,
+            )
             return
         with self._condition:
             self._raise_bus_error()
@@ -270,7 +278,9 @@ class ThreadedBus(InlineBus):
         count = len(self.spec.joints)
         zeros = np.zeros(count)
         passive = [JointMode.PASSIVE] * count
-        super().send(BusCommand(NO_DRIVES, passive, zeros, zeros, may_enable=False, emergency=False))
+        super().send(
+            BusCommand(NO_DRIVES, passive, zeros, zeros, may_enable=False, emergency=False)
+        )
         self.drives.poll()
         self._publish_findings()
 

@@ -29,7 +29,8 @@ class PoseSender:
         host, _, port = address.rpartition(":")
         if not host or not port.isdigit() or not 0 < int(port) < 65536:
             raise ConfigError(
-                f"pose address {address!r}: give HOST:PORT, such as 127.0.0.1:7450", code="network/invalid-address"
+                f"pose address {address!r}: give HOST:PORT, such as 127.0.0.1:7450",
+                code="network/invalid-address",
             )
         self._address = (host, int(port))
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -53,7 +54,9 @@ class PoseCamera:
         measured = true * (1, a, b, c) / norm,   a, b, c: normal, with half of the standard deviation of the angle
     """
 
-    def __init__(self, sensor: PoseSensor, physics_model: PhysicsModel, seed: Sequence[int], period_ns: int) -> None:
+    def __init__(
+        self, sensor: PoseSensor, physics_model: PhysicsModel, seed: Sequence[int], period_ns: int
+    ) -> None:
         """Create a camera that has not captured any pose yet.
 
         Args:
@@ -66,7 +69,8 @@ class PoseCamera:
         delay_periods = round(sensor.delay_s * 1e9 / period_ns)
         self._captured_samples: deque[MocapSample] = deque(maxlen=1 + delay_periods)
         self._draw_normal = np.random.default_rng(seed).standard_normal
-        noise_sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]  # a quaternion has half the angle
+        # A quaternion has half the angle.
+        noise_sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]
         self._noise_sigma = np.repeat(noise_sigma, 3)
 
     def capture(self, timestamp_ns: int) -> MocapSample | None:
@@ -95,7 +99,9 @@ class PoseCamera:
             angular_velocity_w=pose.angular_velocity_w,
         )
         self._captured_samples.append(sample)
-        if len(self._captured_samples) < (self._captured_samples.maxlen or 0):  # the delay has not passed yet
+        if len(self._captured_samples) < (
+            self._captured_samples.maxlen or 0
+        ):  # the delay has not passed yet
             return None
         return self._captured_samples[0]
 

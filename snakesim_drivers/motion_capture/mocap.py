@@ -30,10 +30,12 @@ from snakesim_hal.wire.messages import Pose
 MAX_DATAGRAM_BYTES = 2048  # of a datagram
 # Datagrams a control cycle: six times those of a camera with 1 kHz in 10 ms. Rejecting them takes 0.6 ms at worst.
 MAX_DATAGRAMS_PER_CYCLE = 64
-RECEIVE_BUFFER_BYTES = 1 << 15  # the kernel buffers about as many datagrams, so that the rest of a flood is soon read
+# The kernel buffers about as many datagrams, so that the rest of a flood is soon read.
+RECEIVE_BUFFER_BYTES = 1 << 15
 MAX_NORM_ERROR = 0.05  # of a unit quaternion
 MAX_VELOCITY_INTERVAL_NS = 200_000_000  # between two poses that give a velocity
-MAX_SPEED_M_S = 100.0  # of the base; poses that are further apart are of two bodies, or of confused markers
+# Of the base; poses that are further apart are of two bodies, or of confused markers.
+MAX_SPEED_M_S = 100.0
 MAX_DETAIL_CHARACTERS = 200  # of the error of a malformed datagram in the log
 
 _log = logging.getLogger("snakesim.mocap")
@@ -80,13 +82,21 @@ def make_receiver(
     pose_sensor = config.robot.sensors.pose
     if pose_sensor is None or not address:
         return None
-    return MocapReceiver(address, pose_sensor.delay_s, clock, f"{config.backend_section}.pose_listen")
+    return MocapReceiver(
+        address, pose_sensor.delay_s, clock, f"{config.backend_section}.pose_listen"
+    )
 
 
 class MocapReceiver:
     """Receives datagrams and returns the newest pose."""
 
-    def __init__(self, address: str, delay_s: float, clock: Callable[[int], int], setting: str = "pose_listen") -> None:
+    def __init__(
+        self,
+        address: str,
+        delay_s: float,
+        clock: Callable[[int], int],
+        setting: str = "pose_listen",
+    ) -> None:
         """Listen for datagrams of a motion-capture system on a UDP port.
 
         Args:
@@ -140,7 +150,10 @@ class MocapReceiver:
         velocities = self._get_or_derive_velocities(previous, sample)
         if velocities is None:
             return None
-        age_ns = self._capture_times.compute_lateness_ns(sample.timestamp_ns, now_ns) + self._min_latency_ns
+        age_ns = (
+            self._capture_times.compute_lateness_ns(sample.timestamp_ns, now_ns)
+            + self._min_latency_ns
+        )
         if age_ns > timestamp_ns:  # captured before robot time 0
             return None
         # A late control cycle makes poses that arrived meanwhile seem older. But each pose was captured after the one
@@ -159,9 +172,13 @@ class MocapReceiver:
     def close(self) -> None:
         """Stop listening, and log the rejected datagrams."""
         if self.rejected_count_by_reason:
-            counts = ", ".join(f"{count} {reason}" for reason, count in self.rejected_count_by_reason.most_common())
+            counts = ", ".join(
+                f"{count} {reason}" for reason, count in self.rejected_count_by_reason.most_common()
+            )
             _log.warning(
-                "pose: datagrams rejected: %s; its clock jumped %d times", counts, self._capture_times.jump_count
+                "pose: datagrams rejected: %s; its clock jumped %d times",
+                counts,
+                self._capture_times.jump_count,
             )
         self._socket.close()
 
@@ -175,7 +192,9 @@ class MocapReceiver:
         """
         samples = self._read_samples()
         newest: MocapSample | None = None
-        rejections = self._capture_times.check_timestamps([sample.timestamp_ns for sample in samples], now_ns)
+        rejections = self._capture_times.check_timestamps(
+            [sample.timestamp_ns for sample in samples], now_ns
+        )
         for sample, rejection in zip(samples, rejections, strict=True):
             if rejection is None:
                 newest = sample
@@ -184,7 +203,9 @@ class MocapReceiver:
         if self._capture_times.jump_count != self._logged_jump_count:
             self._logged_jump_count = self._capture_times.jump_count
             self._last_sample = None
-            _log.warning("pose: the clock of the motion-capture system has jumped; its new time is accepted")
+            _log.warning(
+                "pose: the clock of the motion-capture system has jumped; its new time is accepted"
+            )
         return newest
 
     def _read_samples(self) -> list[MocapSample]:
@@ -197,7 +218,8 @@ class MocapReceiver:
                 break
             except OSError as error:
                 raise BackendError(
-                    f"`{self._setting}`: poses cannot be received: {error}", code="network/port-in-use"
+                    f"`{self._setting}`: poses cannot be received: {error}",
+                    code="network/port-in-use",
                 ) from error
             sample = self._decode(datagram)
             if sample is not None:
@@ -213,7 +235,10 @@ class MocapReceiver:
             return None
         norm = math.hypot(*sample.orientation_wxyz)
         if abs(norm - 1.0) > MAX_NORM_ERROR:
-            self._count_rejection("malformed", f"orientation_wxyz = {sample.orientation_wxyz} is not a unit quaternion")
+            self._count_rejection(
+                "malformed",
+                f"orientation_wxyz = {sample.orientation_wxyz} is not a unit quaternion",
+            )
             return None
         return sample
 
@@ -229,14 +254,21 @@ class MocapReceiver:
         """Return linear and angular velocity in the world, as sent or as derived from two poses; None if impossible."""
         if sample.velocity_w is not None and sample.angular_velocity_w is not None:
             return sample.velocity_w, sample.angular_velocity_w
-        if previous is None or sample.timestamp_ns - previous.timestamp_ns > MAX_VELOCITY_INTERVAL_NS:
+        if (
+            previous is None
+            or sample.timestamp_ns - previous.timestamp_ns > MAX_VELOCITY_INTERVAL_NS
+        ):
             return None
         duration_s = (sample.timestamp_ns - previous.timestamp_ns) * 1e-9
         if math.dist(previous.position_w, sample.position_w) > MAX_SPEED_M_S * duration_s:
-            self._count_rejection("leap", f"from {previous.position_w} to {sample.position_w} m in {duration_s:.3g} s")
+            self._count_rejection(
+                "leap", f"from {previous.position_w} to {sample.position_w} m in {duration_s:.3g} s"
+            )
             return None
         velocity_w = sample.velocity_w or _derive_velocity(previous, sample, duration_s)
-        angular_velocity_w = sample.angular_velocity_w or _derive_angular_velocity(previous, sample, duration_s)
+        angular_velocity_w = sample.angular_velocity_w or _derive_angular_velocity(
+            previous, sample, duration_s
+        )
         return velocity_w, angular_velocity_w
 
 
@@ -250,7 +282,8 @@ def _open_socket(address: str, setting: str) -> socket.socket:
     except (OSError, OverflowError, ValueError) as error:
         receiver.close()
         raise ConfigError(
-            f"`{setting}` = {address!r}: {error}; choose another port", code="network/invalid-address"
+            f"`{setting}` = {address!r}: {error}; choose another port",
+            code="network/invalid-address",
         ) from error
     receiver.setblocking(False)
     return receiver
@@ -259,12 +292,15 @@ def _open_socket(address: str, setting: str) -> socket.socket:
 def _derive_velocity(previous: MocapSample, sample: MocapSample, duration_s: float) -> q.Vector:
     """Return the mean velocity between two poses, in the world."""
     x, y, z = (
-        (after - before) / duration_s for before, after in zip(previous.position_w, sample.position_w, strict=True)
+        (after - before) / duration_s
+        for before, after in zip(previous.position_w, sample.position_w, strict=True)
     )
     return (x, y, z)
 
 
-def _derive_angular_velocity(previous: MocapSample, sample: MocapSample, duration_s: float) -> q.Vector:
+def _derive_angular_velocity(
+    previous: MocapSample, sample: MocapSample, duration_s: float
+) -> q.Vector:
     """Return the mean angular velocity between two poses, for a small rotation.
 
         angular velocity = 2 / duration * vector part of (orientation * conjugate(previous orientation))
@@ -281,7 +317,9 @@ def _derive_angular_velocity(previous: MocapSample, sample: MocapSample, duratio
     """
     w1, x1, y1, z1 = previous.orientation_wxyz
     w2, x2, y2, z2 = sample.orientation_wxyz
-    quaternion_dot = sum(i * j for i, j in zip(previous.orientation_wxyz, sample.orientation_wxyz, strict=True))
+    quaternion_dot = sum(
+        i * j for i, j in zip(previous.orientation_wxyz, sample.orientation_wxyz, strict=True)
+    )
     factor = math.copysign(2.0 / duration_s, quaternion_dot)
     return (
         factor * (x2 * w1 - w2 * x1 - y2 * z1 + z2 * y1),

@@ -12,4 +12,5 @@ class MocapSample(msgspec.Struct, frozen=True, kw_only=True):
     position_w: q.Vector  # m
     orientation_wxyz: q.Quaternion
     velocity_w: q.VelocityVector | None = None  # m/s; None: the receiver derives it
-    angular_velocity_w: q.AngularVelocityVector | None = None  # rad/s; None: the receiver derives it
+    # Rad/s; None: the receiver derives it.
+    angular_velocity_w: q.AngularVelocityVector | None = None

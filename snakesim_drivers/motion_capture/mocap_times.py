@@ -28,7 +28,8 @@ MAX_LATENESS_NS = 250_000_000
 MAX_EARLINESS_NS = 50_000_000
 MAX_OFFSET_DIFFERENCE_NS = 50_000_000  # two offsets that differ by no more are of one clock
 MIN_CONSISTENT_READINGS = 5  # readings in a row, before a jump of the clock is accepted
-WINDOW_NS = 10_000_000_000  # the offset is the minimum over one to two of these, so that clocks may drift
+# The offset is the minimum over one to two of these, so that clocks may drift.
+WINDOW_NS = 10_000_000_000
 
 
 class CaptureTimes:
@@ -38,7 +39,8 @@ class CaptureTimes:
         """Create the state of a clock of which no timestamp is known yet."""
         self._newest_timestamp_ns: int | None = None  # the newest accepted timestamp
         self._clock_offset = _ClockOffset()
-        self._clock_candidate: _ClockCandidate | None = None  # a clock that only rejected timestamps show
+        # A clock that only rejected timestamps show.
+        self._clock_candidate: _ClockCandidate | None = None
         self.jump_count = 0  # of the other clock
 
     def check_timestamps(self, timestamps_ns: Sequence[int], now_ns: int) -> list[Rejection | None]:
@@ -80,7 +82,10 @@ class CaptureTimes:
         newest_timestamp_ns = self._newest_timestamp_ns
         if newest_timestamp_ns is not None and timestamp_ns < newest_timestamp_ns:
             return "reordered"
-        if newest_timestamp_ns is not None and timestamp_ns < newest_timestamp_ns + MIN_TIMESTAMP_INTERVAL_NS:
+        if (
+            newest_timestamp_ns is not None
+            and timestamp_ns < newest_timestamp_ns + MIN_TIMESTAMP_INTERVAL_NS
+        ):
             return "duplicate"
         lateness_ns = now_ns - timestamp_ns - self._clock_offset.min_ns
         if lateness_ns > MAX_LATENESS_NS:
@@ -131,7 +136,10 @@ class _ClockCandidate:
 
     def agrees_with(self, offset_ns: int, timestamp_ns: int) -> bool:
         """Return whether a timestamp is a later one of the same clock."""
-        return abs(offset_ns - self.offset_ns) <= MAX_OFFSET_DIFFERENCE_NS and timestamp_ns > self.timestamp_ns
+        return (
+            abs(offset_ns - self.offset_ns) <= MAX_OFFSET_DIFFERENCE_NS
+            and timestamp_ns > self.timestamp_ns
+        )
 
 
 class _ClockOffset:

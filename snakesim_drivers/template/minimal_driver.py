@@ -14,7 +14,11 @@ from snakesim_drivers.emulation.emulated_body import FAULTS, EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_settings import DriveSettings
 from snakesim_drivers.kit.drive_states import DriveStates
-from snakesim_drivers.kit.drive_type import DriverTypeBackend, DriverTypeContext, make_bus_specs_by_port
+from snakesim_drivers.kit.drive_type import (
+    DriverTypeBackend,
+    DriverTypeContext,
+    make_bus_specs_by_port,
+)
 from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
@@ -150,7 +154,9 @@ class MinimalEmulator(DriveEmulator[BusEnd]):
         if setpoint.mode == JointMode.VELOCITY:
             damping = joint.motor.velocity_gain_nm_s_per_rad / gear**2
         speed_rad_s = joint.limits.speed_rad_s * gear
-        self.body.drive_motor(i, setpoint.mode, setpoint.target, setpoint.limit_nm, stiffness, damping, speed_rad_s)
+        self.body.drive_motor(
+            i, setpoint.mode, setpoint.target, setpoint.limit_nm, stiffness, damping, speed_rad_s
+        )
 
 
 # --- the driver ------------------------------------------------------------------------------------------------
@@ -174,14 +180,17 @@ class MinimalDrives(Drives):
         self.all_drives = range(len(joints))
         self.labels = [f"{joint.name} (drive {i + 1})" for i, joint in enumerate(joints)]
         self.states = DriveStates(self.labels, period_ns, clock_ns)
-        self.serials: list[set[str]] = [set() for _ in joints]  # that answer for each drive: two are two drives
+        # That answer for each drive: two are two drives.
+        self.serials: list[set[str]] = [set() for _ in joints]
 
     def bring_up(self) -> None:
         self.read()
         missing = [self.labels[i] for i in self.all_drives if not self.readings.has_reported(i)]
         if missing:
             lines = [f"  {label} does not answer" for label in missing]
-            raise BackendError("the robot is not complete; nothing was enabled:", *lines, code="drive/not-complete")
+            raise BackendError(
+                "the robot is not complete; nothing was enabled:", *lines, code="drive/not-complete"
+            )
         for i in self.all_drives:
             self.emulator.handle_message(i, "disable")
             self.emulator.handle_message(i, "clear_error")
@@ -194,9 +203,13 @@ class MinimalDrives(Drives):
 
     def send_setpoints(self, command: BusCommand) -> None:
         for i in sorted(command.enabled_drives):
-            setpoint = Setpoint(command.modes[i], float(command.targets[i]), float(command.limits_nm[i]))
+            setpoint = Setpoint(
+                command.modes[i], float(command.targets[i]), float(command.limits_nm[i])
+            )
             self.emulator.handle_message(i, setpoint)
-        for i, drive_command in self.states.update_commands(command.enabled_drives, emergency=command.emergency):
+        for i, drive_command in self.states.update_commands(
+            command.enabled_drives, emergency=command.emergency
+        ):
             match drive_command:
                 case "follow":
                     self.emulator.handle_message(i, "enable")
@@ -209,7 +222,9 @@ class MinimalDrives(Drives):
     def findings(self) -> list[FaultFinding]:
         findings = self.states.findings()
         if self.emulator.is_cut:
-            findings.append(FaultFinding("interface_down", "the bus is cut; check the adapter and its cable"))
+            findings.append(
+                FaultFinding("interface_down", "the bus is cut; check the adapter and its cable")
+            )
         for i in self.all_drives:
             if len(self.serials[i]) > 1:
                 cause = f"{self.labels[i]}: two drives answer, {' and '.join(sorted(self.serials[i]))}; change one id"
@@ -268,7 +283,9 @@ class MinimalBackend(DriverTypeBackend):
 
     @classmethod
     def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
-        def open_drives(port: str, joint_indices: Sequence[int], readings: DriveReadings) -> MinimalDrives:
+        def open_drives(
+            port: str, joint_indices: Sequence[int], readings: DriveReadings
+        ) -> MinimalDrives:
             assert context.body is not None  # without ports there is always an emulated body
             joints = [context.joints[j] for j in joint_indices]
             clock_ns = context.clock.now_ns

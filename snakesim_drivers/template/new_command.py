@@ -42,7 +42,9 @@ def write_driver_package(name: str, folder: Path | None) -> int:
     print_line("")
     print_line("It passes the contract suite as it is, on emulated drives. Run it:")
     print_line(f"  cd {folder} && {sys.executable} -m pytest")
-    print_line(f"Then replace the protocol in {folder / name}_driver/driver.py by that of your drives.")
+    print_line(
+        f"Then replace the protocol in {folder / name}_driver/driver.py by that of your drives."
+    )
     return 0
 
 
@@ -60,7 +62,8 @@ def validate_driver_name(name: str) -> None:
         )
     if keyword.iskeyword(name):
         raise ConfigError(
-            f"{name!r} is a word of Python; give another name, such as `{name}_drive`", code="config/invalid-value"
+            f"{name!r} is a word of Python; give another name, such as `{name}_drive`",
+            code="config/invalid-value",
         )
     if name in list_installed_plugins(BACKENDS):
         raise ConfigError(

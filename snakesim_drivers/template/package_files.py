@@ -88,8 +88,17 @@ def make_package_files(name: str) -> dict[str, str]:
     """
     package = f"{name}_driver"
     title = "".join(word.capitalize() for word in name.split("_"))
-    imports = "".join(f"from snakesim_testing.contract.test_{subject} import *  # noqa: F403\n" for subject in SUBJECTS)
-    values = {"name": name, "dashed": name.replace("_", "-"), "package": package, "title": title, "imports": imports}
+    imports = "".join(
+        f"from snakesim_testing.contract.test_{subject} import *  # noqa: F403\n"
+        for subject in SUBJECTS
+    )
+    values = {
+        "name": name,
+        "dashed": name.replace("_", "-"),
+        "package": package,
+        "title": title,
+        "imports": imports,
+    }
     return {
         "pyproject.toml": PYPROJECT_TEMPLATE.format(**values),
         "README.md": README_TEMPLATE.format(**values),

@@ -6,14 +6,16 @@ from collections import deque
 from snakesim_hal.model.locomotion import WINDOW_S
 from snakesim_hal.wire.quantities import Vector
 
-FILTER_TIME_CONSTANT_S = 0.1  # time constant of the low-pass filter that removes pose noise from the center
+# Time constant of the low-pass filter that removes pose noise from the center.
+FILTER_TIME_CONSTANT_S = 0.1
 
 
 class RecentAdvance:
     """Tracks the body's center of mass over a sliding window. It hardly moves while the body only wriggles."""
 
     def __init__(self) -> None:
-        self._recent_centers: deque[tuple[float, Vector]] = deque()  # time in s and smoothed center in m, over WINDOW_S
+        # Time in s and smoothed center in m, over WINDOW_S.
+        self._recent_centers: deque[tuple[float, Vector]] = deque()
 
     def add_center(self, time_s: float, center_w: Vector) -> None:
         """Add the center of mass at a time; ignore a time that is not later than the last one.

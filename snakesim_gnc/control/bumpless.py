@@ -14,7 +14,12 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.controller import ControllerCommand, Observation, Telemetry, make_position_setpoints
+from snakesim_hal.controller import (
+    ControllerCommand,
+    Observation,
+    Telemetry,
+    make_position_setpoints,
+)
 from snakesim_hal.wire.messages import JointState, RobotDescription
 from snakesim_hal.wire.quantities import above
 from snakesim_hal.wire.setpoints import RequestedSetpoints
@@ -73,7 +78,12 @@ class BumplessTransfer:
         self._ramp_fraction = min(1.0, self._ramp_fraction + fraction)
 
     def switch_torque_joint(
-        self, torque_joint: int | None, joints: JointState, reference_rad: Floats, *, restart_ramp: bool = False
+        self,
+        torque_joint: int | None,
+        joints: JointState,
+        reference_rad: Floats,
+        *,
+        restart_ramp: bool = False,
     ) -> None:
         """Switch which joint is in torque mode, without a jump of the torque of the old or of the new joint.
 
@@ -92,7 +102,9 @@ class BumplessTransfer:
         released = self._torque_joint
         if released is not None and torque_joint != released:
             # The released joint's target is offset so that its drive produces the measured torque at once.
-            load_nm = joints.torque_nm[released] + self._kd[released] * joints.velocity_rad_s[released]
+            load_nm = (
+                joints.torque_nm[released] + self._kd[released] * joints.velocity_rad_s[released]
+            )
             target_rad = joints.angle_rad[released] + load_nm / self._kp[released]
             self._target_offsets_rad[released] = target_rad - reference_rad[released]
         if torque_joint is not None:
@@ -107,7 +119,9 @@ class BumplessTransfer:
 
     def compute_torque_target_nm(self, requested_nm: float) -> float:
         """Return the target of the joint in torque mode, between its torque at the switch and the requested torque."""
-        return (1.0 - self._ramp_fraction) * self._torque_at_switch_nm + self._ramp_fraction * requested_nm
+        return (
+            1.0 - self._ramp_fraction
+        ) * self._torque_at_switch_nm + self._ramp_fraction * requested_nm
 
 
 class BumplessFollower:
@@ -123,7 +137,8 @@ class BumplessFollower:
         self._robot = robot
         self._blend_s = blend_s
         self._bumpless_transfer = BumplessTransfer(robot)
-        self.reference_rad: Floats | None = None  # of the tick before; None if the joints were not in position mode
+        # Of the tick before; None if the joints were not in position mode.
+        self.reference_rad: Floats | None = None
 
     def make_setpoints(
         self, observation: Observation, reference_rad: Floats, *, may_have_jumped: bool = False
@@ -142,7 +157,8 @@ class BumplessFollower:
         self.reference_rad = reference_rad
         self._bumpless_transfer.advance_ramps(observation.period_s / self._blend_s)
         return make_position_setpoints(
-            self._robot, self._bumpless_transfer.compute_position_targets_rad(reference_rad).tolist()
+            self._robot,
+            self._bumpless_transfer.compute_position_targets_rad(reference_rad).tolist(),
         )
 
     def leave_position_mode(self) -> None:
@@ -163,4 +179,6 @@ class BumplessFollower:
         if reference_rad is None:
             reference_rad = np.array(observation.joints.angle_rad)
         setpoints = self.make_setpoints(observation, reference_rad)
-        return ControllerCommand(setpoints, Telemetry(reason=reason, reference_rad=reference_rad.tolist()))
+        return ControllerCommand(
+            setpoints, Telemetry(reason=reason, reference_rad=reference_rad.tolist())
+        )

@@ -39,7 +39,9 @@ class PlatformClimb:
         self._pitch_joints = [i for i, joint in enumerate(robot.joints) if joint.axis == "pitch"]
 
         # Arc lengths of the tail end, the pitch joints and the head end on the body.
-        self._bend_points_s_m = np.concatenate(([0.0], joint_s_m[self._pitch_joints], joint_s_m[-1:]))
+        self._bend_points_s_m = np.concatenate(
+            ([0.0], joint_s_m[self._pitch_joints], joint_s_m[-1:])
+        )
 
     def compute_pitch_angles_rad(self, rises: list[PathRise], tail_s_m: float) -> Floats:
         """Compute the pitch angles with which the body follows the height of its path over platforms.
@@ -57,7 +59,9 @@ class PlatformClimb:
         angles_rad = np.zeros(self._joint_count)
         if not rises or not self._pitch_joints:
             return angles_rad
-        heights_m = np.array([compute_path_height_m(rises, tail_s_m + s_m) for s_m in self._bend_points_s_m])
+        heights_m = np.array(
+            [compute_path_height_m(rises, tail_s_m + s_m) for s_m in self._bend_points_s_m]
+        )
         sines = np.clip(np.diff(heights_m) / np.diff(self._bend_points_s_m), -1.0, 1.0)
         slopes_rad = np.arcsin(sines)
         angles_rad[self._pitch_joints] = -np.diff(slopes_rad)

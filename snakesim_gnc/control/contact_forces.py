@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from snakesim_hal.model.measured_force import FORCE_WINDOW_S
 from snakesim_hal.wire.messages import WorldContact, WorldModel
 
-JAM_FORCE_RATIO = 0.5  # contacts that push backward with more than this ratio of the forward push jam the body
+# Contacts that push backward with more than this ratio of the forward push jam the body.
+JAM_FORCE_RATIO = 0.5
 
 
 @dataclass(frozen=True)
@@ -24,16 +25,16 @@ class NetContactForce:
     forward_n: float  # sum of the contacts that push the body forward
     backward_n: float  # sum of the contacts that push the body backward, as a positive number
     blocking_obstacle: str  # the obstacle with the largest backward force; "" without contacts
-    touched_obstacles: frozenset[
-        str | None
-    ]  # names of the obstacles in contact; None stands for an obstacle without a name
+    # Names of the obstacles in contact; None stands for an obstacle without a name.
+    touched_obstacles: frozenset[str | None]
 
 
 class MeasuredContacts:
     """Averages the measured contact forces of the newest world models."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, Sequence[WorldContact]]] = deque()  # sensor timestamp in ns, contacts
+        # Sensor timestamp in ns, contacts.
+        self._samples: deque[tuple[int, Sequence[WorldContact]]] = deque()
 
     def add_world(self, world: WorldModel) -> None:
         """Add the contacts of a world model to the average, unless they were added before.
@@ -113,7 +114,9 @@ class MeasuredContacts:
             for contact in contacts:
                 contact_id = (contact.link, contact.obstacle)
                 force_w = contact.force_w
-                forward_n = (force_w[0] * direction_w[0] + force_w[1] * direction_w[1]) / direction_length
+                forward_n = (
+                    force_w[0] * direction_w[0] + force_w[1] * direction_w[1]
+                ) / direction_length
                 forward_force_by_contact_n[contact_id] = (
                     forward_force_by_contact_n.get(contact_id, 0.0) + sample_weight * forward_n
                 )
@@ -122,8 +125,12 @@ class MeasuredContacts:
                 ) + sample_weight * math.hypot(*force_w)
         return NetContactForce(
             max_contact_n=max(magnitude_by_contact_n.values(), default=0.0),
-            forward_n=math.fsum(force_n for force_n in forward_force_by_contact_n.values() if force_n > 0.0),
-            backward_n=-math.fsum(force_n for force_n in forward_force_by_contact_n.values() if force_n < 0.0),
+            forward_n=math.fsum(
+                force_n for force_n in forward_force_by_contact_n.values() if force_n > 0.0
+            ),
+            backward_n=-math.fsum(
+                force_n for force_n in forward_force_by_contact_n.values() if force_n < 0.0
+            ),
             blocking_obstacle=_find_blocking_obstacle(forward_force_by_contact_n),
             touched_obstacles=frozenset(obstacle for _, obstacle in forward_force_by_contact_n),
         )
@@ -154,11 +161,19 @@ def explain_standstill(
     if net_force is None:
         return False, f"{push_description}; what holds it is unknown without a sensor of contacts"
     if net_force.max_contact_n == 0.0:
-        return False, f"{push_description}, and no obstacle touches the body, so there is nothing to push off"
+        return (
+            False,
+            f"{push_description}, and no obstacle touches the body, so there is nothing to push off",
+        )
     if net_force.backward_n > JAM_FORCE_RATIO * max(net_force.forward_n, force_n):
         forces = f"push it on with {net_force.forward_n:.0f} N and hold it back with {net_force.backward_n:.0f} N"
-        return True, f"jammed: {push_description}; obstacles {forces}, {net_force.blocking_obstacle} most"
-    obstacles_without_contact = [name for name in push_points if name not in net_force.touched_obstacles]
+        return (
+            True,
+            f"jammed: {push_description}; obstacles {forces}, {net_force.blocking_obstacle} most",
+        )
+    obstacles_without_contact = [
+        name for name in push_points if name not in net_force.touched_obstacles
+    ]
     no_contact_note = ""
     if obstacles_without_contact:
         no_contact_note = f" (no contact at {', '.join(obstacles_without_contact)})"

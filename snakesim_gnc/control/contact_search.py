@@ -20,23 +20,34 @@ from msgspec.structs import replace
 
 from snakesim_gnc.control.force_feedback_wave import ForceFeedbackWave, compute_joint_spacing_ratio
 from snakesim_gnc.control.standstill import StandstillDetector
-from snakesim_gnc.control.undulation import HeadSteeredUndulation, HeadSteeredUndulationParameters, LateralUndulation
+from snakesim_gnc.control.undulation import (
+    HeadSteeredUndulation,
+    HeadSteeredUndulationParameters,
+    LateralUndulation,
+)
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import RobotDescription
 
-MAX_STANDSTILL_DISTANCE_M = 0.02  # a body stands that moves less than this, or less than half of what it should
-MIN_PROGRESS_M = 0.05  # a wave makes progress if the goal comes so much nearer within PROGRESS_TIMEOUT_S
+# A body stands that moves less than this, or less than half of what it should.
+MAX_STANDSTILL_DISTANCE_M = 0.02
+# A wave makes progress if the goal comes so much nearer within PROGRESS_TIMEOUT_S.
+MIN_PROGRESS_M = 0.05
 PROGRESS_TIMEOUT_S = 3.0
-MIN_PUSHED_DISTANCE_M = 0.1  # a body that has moved so far since the last search has advanced by pushing
+# A body that has moved so far since the last search has advanced by pushing.
+MIN_PUSHED_DISTANCE_M = 0.1
 SLOW_TIME_SCALE = 2.0  # of the first wave of such a body
-FORWARD_WAVE = HeadSteeredUndulationParameters(amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3)
+FORWARD_WAVE = HeadSteeredUndulationParameters(
+    amplitude_rad=0.7, period_s=0.8, lag_rad=-0.75, steering=0.3
+)
 
 
 class ContactSearch:
     """Decides whether to search, and by which wave."""
 
-    def __init__(self, robot: RobotDescription, *, standstill_duration_s: float, search_duration_s: float) -> None:
+    def __init__(
+        self, robot: RobotDescription, *, standstill_duration_s: float, search_duration_s: float
+    ) -> None:
         """Prepare the waves with which a stationary body searches for obstacles to push off.
 
         Args:
@@ -57,7 +68,8 @@ class ContactSearch:
         # When to begin.
         self._standstill_duration_s = standstill_duration_s
         self._standstill_detector = StandstillDetector(standstill_duration_s)
-        self._path_start_w: Floats | None = None  # center of the body when it began to move along the path
+        # Center of the body when it began to move along the path.
+        self._path_start_w: Floats | None = None
         # The search in progress.
         self._wave: LateralUndulation | None = None
         self._search_duration_s = search_duration_s
@@ -67,7 +79,12 @@ class ContactSearch:
         self.has_changed_wave = False  # a wave began or ended in this tick
 
     def choose_wave(
-        self, observation: Observation, center_w: Floats, *, desired_m_s: float, has_near_obstacles: bool
+        self,
+        observation: Observation,
+        center_w: Floats,
+        *,
+        desired_m_s: float,
+        has_near_obstacles: bool,
     ) -> LateralUndulation | None:
         """Choose the wave by which the body moves at this tick, or none if it should follow its path.
 
@@ -87,7 +104,10 @@ class ContactSearch:
         if last_wave is None:
             if self._is_stationary(observation, center_w, abs(desired_m_s)):
                 self._search_start_s = observation.time_s
-                self._start_wave(self._choose_first_wave(center_w, has_near_obstacles=has_near_obstacles), observation)
+                self._start_wave(
+                    self._choose_first_wave(center_w, has_near_obstacles=has_near_obstacles),
+                    observation,
+                )
         elif observation.time_s - self._search_start_s >= self._search_duration_s:
             self.stop()
         elif not self._makes_progress(observation, center_w):
@@ -105,11 +125,16 @@ class ContactSearch:
         self._wave = None
         self._standstill_detector.reset()
 
-    def _choose_first_wave(self, center_w: Floats, *, has_near_obstacles: bool) -> LateralUndulation:
+    def _choose_first_wave(
+        self, center_w: Floats, *, has_near_obstacles: bool
+    ) -> LateralUndulation:
         """Return the wave with which a search starts; it is slower if the body has advanced since the last search."""
         if not has_near_obstacles:
             return self._forward_wave
-        if self._path_start_w is not None and math.dist(center_w, self._path_start_w) > MIN_PUSHED_DISTANCE_M:
+        if (
+            self._path_start_w is not None
+            and math.dist(center_w, self._path_start_w) > MIN_PUSHED_DISTANCE_M
+        ):
             return self._slow_feedback_wave
         return self._feedback_wave
 
@@ -135,9 +160,15 @@ class ContactSearch:
             self._goal_distance_at_progress_m = distance_m
         return observation.time_s - self._last_progress_s < PROGRESS_TIMEOUT_S
 
-    def _is_stationary(self, observation: Observation, center_w: Floats, desired_m_s: float) -> bool:
+    def _is_stationary(
+        self, observation: Observation, center_w: Floats, desired_m_s: float
+    ) -> bool:
         """Add the center of the body at this tick, and return whether the body has been stationary long enough."""
         if self._path_start_w is None:
             self._path_start_w = center_w
-        max_distance_m = min(MAX_STANDSTILL_DISTANCE_M, 0.5 * desired_m_s * self._standstill_duration_s)
-        return self._standstill_detector.update(observation.time_s, observation.period_s, center_w, max_distance_m)
+        max_distance_m = min(
+            MAX_STANDSTILL_DISTANCE_M, 0.5 * desired_m_s * self._standstill_duration_s
+        )
+        return self._standstill_detector.update(
+            observation.time_s, observation.period_s, center_w, max_distance_m
+        )

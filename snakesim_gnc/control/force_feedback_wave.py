@@ -23,7 +23,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.control.undulation import LateralUndulation, LateralUndulationParameters, compute_direction_angle_rad
+from snakesim_gnc.control.undulation import (
+    LateralUndulation,
+    LateralUndulationParameters,
+    compute_direction_angle_rad,
+)
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import RobotDescription
@@ -43,7 +47,8 @@ HEAD_STEERING_RAD = 0.039155 * 13
 ANGLE_GAINS = np.array([-0.646916, -0.096146, 0.21155]) / 0.5  # 1/rad
 VELOCITY_GAINS = np.array([0.172301, 0.047595, 0.425563]) / 2.0  # s/rad
 TORQUE_GAINS = np.array([0.556468, -0.344171, -0.676491]) / 5.0  # 1/(N m)
-CONTACT_GAINS = np.array([0.335405, 0.117568]) / 50.0  # rad/N, for the links behind and ahead of a joint
+# Rad/N, for the links behind and ahead of a joint.
+CONTACT_GAINS = np.array([0.335405, 0.117568]) / 50.0
 MAX_FEEDBACK_RAD = 0.4
 MAX_FEEDBACK_RAD_S = 5.0
 
@@ -68,7 +73,10 @@ class ForceFeedbackWave(LateralUndulation):
             time_scale: Factor on all times; 2 moves at half the speed.
         """
         scale = compute_joint_spacing_ratio(robot)
-        super().__init__(robot, LateralUndulationParameters(period_s=time_scale * PERIOD_S, lag_rad=scale * LAG_RAD))
+        super().__init__(
+            robot,
+            LateralUndulationParameters(period_s=time_scale * PERIOD_S, lag_rad=scale * LAG_RAD),
+        )
         joint_count = len(self._body.yaw_joints)
         x = np.arange(joint_count)[::-1] / max(joint_count - 1, 1)  # 0 at the head, 1 at the tail
         self._base_amplitude_rad = scale * (AMPLITUDE_RAD + GROWTH_RAD * x)
@@ -78,7 +86,8 @@ class ForceFeedbackWave(LateralUndulation):
         self._torque_scale = np.array(self._body.torque_limit_nm) / TRAINED_TORQUE_NM
         self._max_feedback_rad = scale * MAX_FEEDBACK_RAD
         self._max_feedback_rad_s = scale * MAX_FEEDBACK_RAD_S / time_scale
-        self._feedback_rad: NDArray[np.float64] | None = None  # of the last tick; None if the next is not limited
+        # Of the last tick; None if the next is not limited.
+        self._feedback_rad: NDArray[np.float64] | None = None
 
     def match_phase_to_angles(self, angles_rad: NDArray[np.float64]) -> None:
         """Set the phase at which the wave is most similar to measured joint angles, (n_joints,) in rad.
@@ -88,7 +97,9 @@ class ForceFeedbackWave(LateralUndulation):
         super().match_phase_to_angles(angles_rad)
         self._feedback_rad = None
 
-    def compute_reference_rad(self, observation: Observation, elapsed_s: float) -> NDArray[np.float64]:
+    def compute_reference_rad(
+        self, observation: Observation, elapsed_s: float
+    ) -> NDArray[np.float64]:
         """Advance the wave, and compute the reference angles of all joints with the feedback of the measurements.
 
         Args:
@@ -115,9 +126,12 @@ class ForceFeedbackWave(LateralUndulation):
         scaled_torque_nm = np.array(joints.torque_nm) / self._torque_scale
         weighted_sum = np.zeros(len(bends))
         for values, gains in zip(
-            (joints.angle_rad, joints.velocity_rad_s, scaled_torque_nm), self._feedback_gains, strict=True
+            (joints.angle_rad, joints.velocity_rad_s, scaled_torque_nm),
+            self._feedback_gains,
+            strict=True,
         ):
-            padded = np.pad(np.array(values)[bends], 1)  # the first and the last joint have one neighbor
+            # The first and the last joint have one neighbor.
+            padded = np.pad(np.array(values)[bends], 1)
             weighted_sum += gains[0] * padded[:-2] + gains[1] * padded[1:-1] + gains[2] * padded[2:]
         return self._max_feedback_rad * np.tanh(weighted_sum)
 
@@ -125,9 +139,13 @@ class ForceFeedbackWave(LateralUndulation):
         """Return the bend towards the goal. It ignores the path, which a body pushed by obstacles does not follow."""
         if observation.world is None or observation.trajectory is None:
             return 0.0
-        body_points_w = self._body.compute_body_points_w(observation.world, observation.joints.angle_rad).T
+        body_points_w = self._body.compute_body_points_w(
+            observation.world, observation.joints.angle_rad
+        ).T
         goal_w = observation.trajectory.goal_w or observation.trajectory.path_w[-1]
-        return self._steering_rad * math.sin(compute_direction_angle_rad(body_points_w, goal_w - body_points_w[-1]))
+        return self._steering_rad * math.sin(
+            compute_direction_angle_rad(body_points_w, goal_w - body_points_w[-1])
+        )
 
     def _compute_amplitude_rad(
         self, observation: Observation, _waves: NDArray[np.float64], _elapsed_s: float

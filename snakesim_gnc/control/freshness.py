@@ -21,8 +21,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.freshness import max_state_age_ns
 from snakesim_hal.wire.messages import JointState, RobotDescription, Trajectory, WorldModel
 
-MAX_MISSED_SAMPLES = 3  # in a row that are tolerated; the fourth means that the publisher has stopped
-MIN_MARGIN_S = 0.2  # guidance and navigation have no real-time priority: a busy computer delays them
+# In a row that are tolerated; the fourth means that the publisher has stopped.
+MAX_MISSED_SAMPLES = 3
+# Guidance and navigation have no real-time priority: a busy computer delays them.
+MIN_MARGIN_S = 0.2
 
 # Sensors that a map is made from: the beginnings of their keys, and their name in messages.
 DEPTH_PREFIXES = (keys.DEPTH_ALL.rstrip("*"), keys.RANGE_ALL.rstrip("*"))
@@ -36,7 +38,8 @@ class AgeLimits:
     joints_s: float
     world_s: float
     trajectory_s: float
-    sensors_s: dict[str, float]  # by key: the sensors that a world model is made from; none for an absent sensor
+    # By key: the sensors that a world model is made from; none for an absent sensor.
+    sensors_s: dict[str, float]
 
     @staticmethod
     def from_config(config: RunConfig, robot: RobotDescription) -> "AgeLimits":
@@ -51,8 +54,10 @@ class AgeLimits:
         plan_age_s = guidance_cycle_s + guidance_latency_s + navigation.latency_ticks * period_s
         return AgeLimits(
             joints_s=max_age.joints_s or max_state_age_ns(robot) * 1e-9,
-            world_s=max_age.world_s or guidance_latency_s + _compute_silence_margin_s(guidance_cycle_s),
-            trajectory_s=max_age.trajectory_s or plan_age_s + _compute_silence_margin_s(navigation_cycle_s),
+            world_s=max_age.world_s
+            or guidance_latency_s + _compute_silence_margin_s(guidance_cycle_s),
+            trajectory_s=max_age.trajectory_s
+            or plan_age_s + _compute_silence_margin_s(navigation_cycle_s),
             sensors_s=_compute_sensor_limits_s(config, robot, guidance_cycle_s, guidance_latency_s),
         )
 
@@ -70,7 +75,10 @@ class AgeLimits:
             keys.CONTACTS: world.contacts_timestamp_ns,
             DEPTH_SENSORS: world.depth_timestamp_ns,
         }
-        reasons = [_check_age(key, timestamps_ns[key], now_ns, max_age_s) for key, max_age_s in self.sensors_s.items()]
+        reasons = [
+            _check_age(key, timestamps_ns[key], now_ns, max_age_s)
+            for key, max_age_s in self.sensors_s.items()
+        ]
         return "; ".join(filter(None, reasons))
 
     def check_sensors(self, timestamps_ns: Mapping[str, int | None], now_ns: int) -> dict[str, str]:
@@ -122,7 +130,10 @@ def _compute_sensor_limits_s(
     for sensor in robot.sensors:
         if sensor.key in configured_s:
             default_s = (
-                sensor.delay_s + guidance_cycle_s + guidance_latency_s + _compute_silence_margin_s(1.0 / sensor.rate_hz)
+                sensor.delay_s
+                + guidance_cycle_s
+                + guidance_latency_s
+                + _compute_silence_margin_s(1.0 / sensor.rate_hz)
             )
             limits_s[sensor.key] = configured_s[sensor.key] or default_s
 
@@ -135,13 +146,20 @@ def _compute_sensor_limits_s(
         publication_delay_s = publisher.latency_ticks * period_s + _compute_silence_margin_s(
             publisher.decimation * period_s
         )
-        limits_s[keys.POSE] = max_age.pose_s or guidance_cycle_s + guidance_latency_s + publication_delay_s
+        limits_s[keys.POSE] = (
+            max_age.pose_s or guidance_cycle_s + guidance_latency_s + publication_delay_s
+        )
 
     if config.mission.map == "perceived":
-        depth_sensors = [sensor for sensor in robot.sensors if sensor.key.startswith(DEPTH_PREFIXES)]
+        depth_sensors = [
+            sensor for sensor in robot.sensors if sensor.key.startswith(DEPTH_PREFIXES)
+        ]
         if depth_sensors:
             ages_s = [
-                sensor.delay_s + guidance_cycle_s + guidance_latency_s + _compute_silence_margin_s(1.0 / sensor.rate_hz)
+                sensor.delay_s
+                + guidance_cycle_s
+                + guidance_latency_s
+                + _compute_silence_margin_s(1.0 / sensor.rate_hz)
                 for sensor in depth_sensors
             ]
             limits_s[DEPTH_SENSORS] = max_age.depth_s or min(ages_s)

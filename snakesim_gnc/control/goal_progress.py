@@ -38,10 +38,15 @@ class GoalProgress:
 
         # Results.
         # Position and quaternion of the tail end.
-        self.pose: tuple[Sequence[float], Sequence[float]] = (task.start_position_w, task.start_wxyz)
+        self.pose: tuple[Sequence[float], Sequence[float]] = (
+            task.start_position_w,
+            task.start_wxyz,
+        )
         self.advance_m = 0.0  # advance towards the goal since the start
-        self.goal_bearing_rad = 0.0  # direction of the goal relative to the heading of the body, left positive
-        self.goal_distance_m: float | None = None  # distance of the goal from the start; None without a goal
+        # Direction of the goal relative to the heading of the body, left positive.
+        self.goal_bearing_rad = 0.0
+        # Distance of the goal from the start; None without a goal.
+        self.goal_distance_m: float | None = None
 
     def update(self, joints: JointState, pose: Pose | None) -> None:
         """Update advance and goal bearing with the newest samples.
@@ -166,5 +171,7 @@ class BodyLocator:
         # The mass of every link is at its middle. The last link reaches from its origin to the head.
         origins_w = body_points_w[:, :-1, :2]
         middles_w = 0.5 * (origins_w[:, 1:] + origins_w[:, :-1])
-        last_moments_w = self._mass_fractions[-1] * 0.5 * (origins_w[:, -1] + body_points_w[:, -1, :2])
+        last_moments_w = (
+            self._mass_fractions[-1] * 0.5 * (origins_w[:, -1] + body_points_w[:, -1, :2])
+        )
         return body_points_w, self._mass_fractions[:-1] @ middles_w + last_moments_w

@@ -24,7 +24,11 @@ class GuardedController:
     """A checked controller, constructed for one arm session. Every call may raise ControllerError."""
 
     def __init__(
-        self, name: str, controller_class: type[Controller[Any]], robot: RobotDescription, parameters: Any
+        self,
+        name: str,
+        controller_class: type[Controller[Any]],
+        robot: RobotDescription,
+        parameters: Any,
     ) -> None:
         """Construct a controller, and convert exceptions of its constructor into a ControllerError.
 
@@ -67,10 +71,14 @@ class GuardedController:
             raise self.make_error(str(error)) from error.__cause__
         except (Exception, SystemExit) as error:
             traceback.print_exc()
-            raise self.make_error(f"{method}() {describe_exception(error, self._controller_module)}") from error
+            raise self.make_error(
+                f"{method}() {describe_exception(error, self._controller_module)}"
+            ) from error
 
 
-def validate_command(command: ControllerCommand, joint_descriptions: Sequence[JointDescription]) -> None:
+def validate_command(
+    command: ControllerCommand, joint_descriptions: Sequence[JointDescription]
+) -> None:
     """Check that a command of a controller, which may be a plug-in, has valid types, modes and numbers.
 
     Args:
@@ -81,13 +89,19 @@ def validate_command(command: ControllerCommand, joint_descriptions: Sequence[Jo
         ValueError: The command cannot be sent; the error names the field, its value and what is allowed.
     """
     if not isinstance(command, ControllerCommand):
-        raise ValueError(f"update() returned {_format_value(command)}, must return a ControllerCommand")
+        raise ValueError(
+            f"update() returned {_format_value(command)}, must return a ControllerCommand"
+        )
     setpoints = command.setpoints
     telemetry = command.telemetry
     if not isinstance(setpoints, RequestedSetpoints):
-        raise ValueError(f"ControllerCommand.setpoints is {_format_value(setpoints)}, must be RequestedSetpoints")
+        raise ValueError(
+            f"ControllerCommand.setpoints is {_format_value(setpoints)}, must be RequestedSetpoints"
+        )
     if not isinstance(telemetry, Telemetry):
-        raise ValueError(f"ControllerCommand.telemetry is {_format_value(telemetry)}, must be Telemetry")
+        raise ValueError(
+            f"ControllerCommand.telemetry is {_format_value(telemetry)}, must be Telemetry"
+        )
     joint_names = [joint.name for joint in joint_descriptions]
     _check_modes(setpoints.mode, joint_descriptions, joint_names)
     _check_numbers("target", setpoints.target, joint_names, minimum=-MAX_TARGET)
@@ -95,7 +109,9 @@ def validate_command(command: ControllerCommand, joint_descriptions: Sequence[Jo
     _check_telemetry(telemetry, joint_names)
 
 
-def _check_modes(modes: Any, joint_descriptions: Sequence[JointDescription], joint_names: Sequence[str]) -> None:
+def _check_modes(
+    modes: Any, joint_descriptions: Sequence[JointDescription], joint_names: Sequence[str]
+) -> None:
     """Check that the modes of a command are a list of one Mode per joint that the joint supports. Raises ValueError."""
     _check_length("mode", modes, joint_names)
     for i, mode in enumerate(modes):
@@ -113,23 +129,33 @@ def _check_length(field: str, values: Any, joint_names: Sequence[str]) -> None:
     """Check that a field of a command is a list with one value per joint. Raises ValueError."""
     if type(values) is not list:
         hint = "; use .tolist()" if hasattr(values, "tolist") else ""
-        raise ValueError(f"RequestedSetpoints.{field} is {_format_value(values)}, must be a list{hint}")
+        raise ValueError(
+            f"RequestedSetpoints.{field} is {_format_value(values)}, must be a list{hint}"
+        )
     if len(values) != len(joint_names):
         expected_count = f"{len(joint_names)}: one a joint, {joint_names[0]} to {joint_names[-1]}"
-        raise ValueError(f"RequestedSetpoints.{field} has {len(values)} values, must have {expected_count}")
+        raise ValueError(
+            f"RequestedSetpoints.{field} has {len(values)} values, must have {expected_count}"
+        )
 
 
 def _check_numbers(field: str, values: Any, joint_names: Sequence[str], *, minimum: float) -> None:
     """Check that a field has one plain number per joint, from `minimum` to MAX_TARGET. Raises ValueError."""
     _check_length(field, values, joint_names)
     for i, value in enumerate(values):
-        if type(value) in PLAIN_NUMBER_TYPES and minimum <= value <= MAX_TARGET:  # the comparison is false for NaN
+        if (
+            type(value) in PLAIN_NUMBER_TYPES and minimum <= value <= MAX_TARGET
+        ):  # the comparison is false for NaN
             continue
         found = f"RequestedSetpoints.{field}[{i}] ({joint_names[i]}) is {_format_value(value)}"
         if type(value) not in PLAIN_NUMBER_TYPES:
-            raise ValueError(f"{found}, must be a plain float: use float(), or .tolist() of an array")
+            raise ValueError(
+                f"{found}, must be a plain float: use float(), or .tolist() of an array"
+            )
         unit = "N·m" if field == "torque_limit_nm" else "rad, rad/s or N·m"
-        raise ValueError(f"{found}, must be a finite number of {unit} from {minimum:g} to {MAX_TARGET:g}")
+        raise ValueError(
+            f"{found}, must be a finite number of {unit} from {minimum:g} to {MAX_TARGET:g}"
+        )
 
 
 def _check_telemetry(telemetry: Telemetry, joint_names: Sequence[str]) -> None:

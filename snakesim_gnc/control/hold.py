@@ -18,7 +18,8 @@ class HoldPose(Controller[NoParameters]):
 
     def __init__(self, robot: RobotDescription, parameters: NoParameters) -> None:
         super().__init__(robot, parameters)
-        self._start_angles_rad: list[float] | None = None  # None if there has been no observation yet
+        # None if there has been no observation yet.
+        self._start_angles_rad: list[float] | None = None
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Return the angles of the first observation."""

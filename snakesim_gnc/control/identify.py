@@ -11,15 +11,20 @@ import random
 from dataclasses import dataclass
 from typing import Annotated
 
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    Observation,
+    Telemetry,
+    make_position_setpoints,
+)
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import bounded
 
 JOINT_LIMIT_MARGIN_RAD = 0.02  # between a target and the joint's limit
-MAX_SPEED_RATIO = (
-    0.8  # of a target's maximum speed to the joint's limit, so that the drive never limits the motion itself
-)
+# Of a target's maximum speed to the joint's limit, so that the drive never limits the motion itself.
+MAX_SPEED_RATIO = 0.8
 TONES_PER_JOINT = 4  # one in each quarter of the band
 MAX_TO_MIN_FREQUENCY_RATIO = 10  # of the highest to the lowest frequency
 PHASE_SEED = 25  # of the phases, so that every run moves alike
@@ -91,13 +96,21 @@ class Identification(Controller[IdentifyParameters]):
         """
         if not self._start_angles_rad:
             self._start_angles_rad = list(observation.joints.angle_rad)
-        triangle_amplitude_rad = self.parameters.swing_rad * self._compute_fade_in_fraction(observation.time_s)
+        triangle_amplitude_rad = self.parameters.swing_rad * self._compute_fade_in_fraction(
+            observation.time_s
+        )
         multisine_time_s = observation.time_s - self.parameters.shake_after_s
-        multisine_amplitude_rad = self.parameters.shake_rad * self._compute_fade_in_fraction(multisine_time_s)
+        multisine_amplitude_rad = self.parameters.shake_rad * self._compute_fade_in_fraction(
+            multisine_time_s
+        )
         targets_rad: list[float] = []
         for i, joint in enumerate(self.robot.joints):
-            triangle_rad = self._compute_triangle_offset_rad(i, observation.time_s, triangle_amplitude_rad)
-            multisine_rad = self._compute_multisine_offset_rad(i, multisine_time_s, multisine_amplitude_rad)
+            triangle_rad = self._compute_triangle_offset_rad(
+                i, observation.time_s, triangle_amplitude_rad
+            )
+            multisine_rad = self._compute_multisine_offset_rad(
+                i, multisine_time_s, multisine_amplitude_rad
+            )
             offset_rad = triangle_rad + multisine_rad
             min_rad = joint.angle_min_rad + JOINT_LIMIT_MARGIN_RAD
             max_rad = joint.angle_max_rad - JOINT_LIMIT_MARGIN_RAD
@@ -105,16 +118,23 @@ class Identification(Controller[IdentifyParameters]):
         if self._last_targets_rad:
             targets_rad = self._limit_target_speed(targets_rad, observation.period_s)
         self._last_targets_rad = targets_rad
-        phase = "shaking every joint" if multisine_amplitude_rad else "slowly back and forth, every joint"
+        phase = (
+            "shaking every joint"
+            if multisine_amplitude_rad
+            else "slowly back and forth, every joint"
+        )
         return ControllerCommand(
-            make_position_setpoints(self.robot, targets_rad), Telemetry(reason=phase, reference_rad=targets_rad)
+            make_position_setpoints(self.robot, targets_rad),
+            Telemetry(reason=phase, reference_rad=targets_rad),
         )
 
     def _compute_fade_in_fraction(self, time_s: float) -> float:
         """Return the fraction of the full amplitude, 0 to 1, at a time after the start of a motion."""
         return min(max(time_s / self.parameters.fade_s, 0.0), 1.0)
 
-    def _compute_triangle_offset_rad(self, joint_index: int, time_s: float, amplitude_rad: float) -> float:
+    def _compute_triangle_offset_rad(
+        self, joint_index: int, time_s: float, amplitude_rad: float
+    ) -> float:
         """Return the offset of the slow triangle wave from the start angle of a joint, in rad.
 
         The period grows towards the head, from `swing_s` to nearly one and a half times as much. The start directions
@@ -124,10 +144,13 @@ class Identification(Controller[IdentifyParameters]):
         sign = (-1) ** (joint_index // 2 + joint_index)
         return sign * amplitude_rad * compute_triangle_wave(time_s / period_s)
 
-    def _compute_multisine_offset_rad(self, joint_index: int, multisine_time_s: float, amplitude_rad: float) -> float:
+    def _compute_multisine_offset_rad(
+        self, joint_index: int, multisine_time_s: float, amplitude_rad: float
+    ) -> float:
         """Return the offset of the multisine from the start angle of a joint, in rad."""
         unit_sum = sum(
-            tone.amplitude * math.sin(math.tau * tone.frequency_hz * multisine_time_s + tone.phase_rad)
+            tone.amplitude
+            * math.sin(math.tau * tone.frequency_hz * multisine_time_s + tone.phase_rad)
             for tone in self._tones[joint_index]
         )
         return amplitude_rad * unit_sum
@@ -135,9 +158,13 @@ class Identification(Controller[IdentifyParameters]):
     def _limit_target_speed(self, targets_rad: list[float], period_s: float) -> list[float]:
         """Return the targets, bounded so that each joint moves at most at MAX_SPEED_RATIO times its speed limit."""
         limited_rad: list[float] = []
-        for joint, target_rad, last_rad in zip(self.robot.joints, targets_rad, self._last_targets_rad, strict=True):
+        for joint, target_rad, last_rad in zip(
+            self.robot.joints, targets_rad, self._last_targets_rad, strict=True
+        ):
             max_step_rad = MAX_SPEED_RATIO * joint.speed_limit_rad_s * period_s
-            limited_rad.append(min(max(target_rad, last_rad - max_step_rad), last_rad + max_step_rad))
+            limited_rad.append(
+                min(max(target_rad, last_rad - max_step_rad), last_rad + max_step_rad)
+            )
         return limited_rad
 
 

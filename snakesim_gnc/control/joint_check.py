@@ -7,7 +7,13 @@ evaluates afterwards what the motors, the encoders and the IMUs measured.
 from enum import Enum, auto
 from typing import Annotated
 
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    Observation,
+    Telemetry,
+    make_position_setpoints,
+)
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import bounded
@@ -57,8 +63,10 @@ class JointCheck(Controller[JointCheckParameters]):
 
         # The joint under test.
         self._joint_index = 0
-        self._remaining_directions: list[int] = []  # directions in which it still has to move: +1, -1
-        self._angle_before_motion_rad = 0.0  # measured before the motion; a drive without current may have let it sink
+        # Directions in which it still has to move: +1, -1.
+        self._remaining_directions: list[int] = []
+        # Measured before the motion; a drive without current may have let it sink.
+        self._angle_before_motion_rad = 0.0
 
         # Its current motion.
         self._phase = _MotionPhase.REST
@@ -94,7 +102,9 @@ class JointCheck(Controller[JointCheckParameters]):
         # The call above may have ended the motion in the last direction of this joint; then the joint holds.
         targets_rad = list(self._start_angles_rad)
         if self._joint_index < len(targets_rad) and self._remaining_directions:
-            targets_rad[self._joint_index] += self._remaining_directions[0] * self._target_offset_rad
+            targets_rad[self._joint_index] += (
+                self._remaining_directions[0] * self._target_offset_rad
+            )
         return ControllerCommand(
             make_position_setpoints(self.robot, targets_rad),
             Telemetry(reason=f"moving {name}", reference_rad=targets_rad),
@@ -102,7 +112,9 @@ class JointCheck(Controller[JointCheckParameters]):
 
     def _hold_pose(self, reason: str) -> ControllerCommand:
         """Return setpoints that hold every joint at its start angle. The reason is reported as telemetry."""
-        return ControllerCommand(make_position_setpoints(self.robot, self._start_angles_rad), Telemetry(reason=reason))
+        return ControllerCommand(
+            make_position_setpoints(self.robot, self._start_angles_rad), Telemetry(reason=reason)
+        )
 
     def _update_rest(self, observation: Observation) -> None:
         """Advance the rest before a motion; when the rest is over, start the next motion or select the next joint."""
@@ -131,9 +143,12 @@ class JointCheck(Controller[JointCheckParameters]):
         """
         parameters = self.parameters
         self._target_offset_rad += parameters.speed_rad_s * observation.period_s
-        moved_rad = abs(observation.joints.angle_rad[self._joint_index] - self._angle_before_motion_rad)
+        moved_rad = abs(
+            observation.joints.angle_rad[self._joint_index] - self._angle_before_motion_rad
+        )
         max_offset_rad = min(
-            parameters.give_up_rad, self._compute_free_range_rad(self._joint_index, self._remaining_directions[0])
+            parameters.give_up_rad,
+            self._compute_free_range_rad(self._joint_index, self._remaining_directions[0]),
         )
         if moved_rad >= parameters.move_rad:
             self._phase = _MotionPhase.MOVE_BACK
@@ -156,7 +171,9 @@ class JointCheck(Controller[JointCheckParameters]):
         The other direction is left out if the joint has too little range in it.
         """
         limits = self.robot.joints[joint_index]
-        is_nearer_to_minimum = 2 * self._start_angles_rad[joint_index] <= limits.angle_min_rad + limits.angle_max_rad
+        is_nearer_to_minimum = (
+            2 * self._start_angles_rad[joint_index] <= limits.angle_min_rad + limits.angle_max_rad
+        )
         away_direction = 1 if is_nearer_to_minimum else -1
         has_room = (
             self._compute_free_range_rad(joint_index, -away_direction)

@@ -20,7 +20,13 @@ from snakesim_hal.network.mailbox import Mailbox
 from snakesim_hal.network.streams import IncomingQuery
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE, MessageDecoder
-from snakesim_hal.wire.messages import Answer, Clock, ControlParameters, ParametersRequest, RobotDescription
+from snakesim_hal.wire.messages import (
+    Answer,
+    Clock,
+    ControlParameters,
+    ParametersRequest,
+    RobotDescription,
+)
 from snakesim_hal.wire.quantities import MAX_PARAMETERS_JSON, MAX_SCHEMA
 
 MAX_WAITING_REQUESTS = 8  # a later request displaces the oldest, which gets no answer
@@ -51,8 +57,11 @@ class LiveParameters:
         self._robot: RobotDescription | None = None  # None if `configure` has not been called yet
 
         # The parameters in force.
-        self._parameters = self._check_parameters(config.controller_parameters, f"scenario {config.name!r}")
-        self._schema_json = _make_schema_json(type(self._parameters))  # reads a source file, so not in a control cycle
+        self._parameters = self._check_parameters(
+            config.controller_parameters, f"scenario {config.name!r}"
+        )
+        # Reads a source file, so not in a control cycle.
+        self._schema_json = _make_schema_json(type(self._parameters))
         self._last_requester: str | None = None  # None if they are those of the configuration
         self._change_count = 0
         self._published_change_count = -1  # number of the change that was published last
@@ -61,7 +70,9 @@ class LiveParameters:
         self._request_queue: Mailbox[IncomingQuery] = Mailbox((MAX_WAITING_REQUESTS,))
         self._decoder = MessageDecoder(ParametersRequest)
         client.session.on_query(keys.PARAMETERS, self._request_queue.put)
-        self._publisher = client.session.declare_latched_publisher(keys.PARAMETERS_IN_FORCE, ControlParameters)
+        self._publisher = client.session.declare_latched_publisher(
+            keys.PARAMETERS_IN_FORCE, ControlParameters
+        )
 
     @property
     def uses_sensors(self) -> bool:
@@ -117,24 +128,33 @@ class LiveParameters:
             return Answer(ok=False, reason=reason, refusal="wrong_controller")
         try:
             parameter_values = msgspec.json.decode(request.parameters, type=dict[str, Any])
-            parameters = self._check_parameters(parameter_values, f"request of {request.requester!r}")
-            self._construct_controller(parameters)  # a trial: a constructor may refuse more than the schema does
+            parameters = self._check_parameters(
+                parameter_values, f"request of {request.requester!r}"
+            )
+            # A trial: a constructor may refuse more than the schema does.
+            self._construct_controller(parameters)
         except (ConfigError, ControllerError, *UNDECODABLE) as error:
             return Answer(ok=False, reason=str(error)[:MAX_REASON_LENGTH], refusal="bad_parameters")
         self._parameters = parameters
         self._last_requester = request.requester
         self._change_count += 1
-        print_stderr(f"parameters changed by {request.requester!r}: {_to_json(parameters)[:MAX_LOGGED_LENGTH]}")
+        print_stderr(
+            f"parameters changed by {request.requester!r}: {_to_json(parameters)[:MAX_LOGGED_LENGTH]}"
+        )
         return Answer(ok=True, reason=f"{self._name} has the parameters of {request.requester}")
 
     def _check_parameters(self, section: dict[str, Any], source: str) -> Any:
         """Return the controller's parameters from a section of TOML or JSON; `source` is named in a ConfigError."""
-        return decode_parameters(self.controller_class, section, source, self._config.control_section)
+        return decode_parameters(
+            self.controller_class, section, source, self._config.control_section
+        )
 
     def _construct_controller(self, parameters: Any) -> GuardedController:
         if self._robot is None:
             raise ControllerError("control has not met the robot yet")
-        return GuardedController(self._config.controller, self.controller_class, self._robot, parameters)
+        return GuardedController(
+            self._config.controller, self.controller_class, self._robot, parameters
+        )
 
     def _publish_parameters(self, clock: Clock) -> None:
         """Publish the parameters in force, unless they or their schema are too long for a message.

@@ -44,7 +44,11 @@ class ObservationPart:
 
 
 def _make_symmetric_part(
-    names: Sequence[str], unit: str, maximum: float | Sequence[float], read: ReadValues, sensor: str | None = None
+    names: Sequence[str],
+    unit: str,
+    maximum: float | Sequence[float],
+    read: ReadValues,
+    sensor: str | None = None,
 ) -> ObservationPart:
     """Make a part of the observation whose values are bounded symmetrically, by -maximum and maximum.
 
@@ -62,7 +66,12 @@ def _make_symmetric_part(
 
 def make_observation_parts(robot: RobotDescription) -> dict[str, ObservationPart]:
     """Return all parts of an observation that a robot with every sensor can have, by name."""
-    return _make_joint_parts(robot) | _make_goal_parts() | _make_contact_parts(robot) | _make_pose_parts()
+    return (
+        _make_joint_parts(robot)
+        | _make_goal_parts()
+        | _make_contact_parts(robot)
+        | _make_pose_parts()
+    )
 
 
 def _make_joint_parts(robot: RobotDescription) -> dict[str, ObservationPart]:
@@ -91,9 +100,16 @@ def _make_joint_parts(robot: RobotDescription) -> dict[str, ObservationPart]:
 def _make_goal_parts() -> dict[str, ObservationPart]:
     """Make the parts for the bearing of the goal relative to the body's heading, and for the remaining distance."""
     return {
-        "goal_bearing": _make_symmetric_part(["cos", "sin"], "1", 1.0, _read_goal_bearing, keys.POSE),
+        "goal_bearing": _make_symmetric_part(
+            ["cos", "sin"], "1", 1.0, _read_goal_bearing, keys.POSE
+        ),
         "goal_m": ObservationPart(
-            ["left"], "m", [0.0], [MAX_DISTANCE_M], lambda _, progress: [progress.remaining_distance_m], keys.POSE
+            ["left"],
+            "m",
+            [0.0],
+            [MAX_DISTANCE_M],
+            lambda _, progress: [progress.remaining_distance_m],
+            keys.POSE,
         ),
     }
 
@@ -106,7 +122,12 @@ def _make_contact_parts(robot: RobotDescription) -> dict[str, ObservationPart]:
     high = [MAX_FORCE_N] * link_count
     return {
         "contact_n": ObservationPart(
-            names, "N", low, high, lambda observation, _: _read_contact_forces(observation, link_count), keys.CONTACTS
+            names,
+            "N",
+            low,
+            high,
+            lambda observation, _: _read_contact_forces(observation, link_count),
+            keys.CONTACTS,
         )
     }
 
@@ -121,7 +142,9 @@ def _make_pose_parts() -> dict[str, ObservationPart]:
         "orientation_wxyz": _make_symmetric_part(
             ["w", "x", "y", "z"], "1", 1.0, lambda _, progress: progress.pose[1], keys.POSE
         ),
-        "velocity_w_m_s": _make_symmetric_part(axes, "m/s", MAX_SPEED_M_S, _read_velocity, keys.POSE),
+        "velocity_w_m_s": _make_symmetric_part(
+            axes, "m/s", MAX_SPEED_M_S, _read_velocity, keys.POSE
+        ),
         "angular_velocity_w_rad_s": _make_symmetric_part(
             axes, "rad/s", MAX_ANGULAR_VELOCITY_RAD_S, _read_angular_velocity, keys.POSE
         ),
@@ -131,7 +154,9 @@ def _make_pose_parts() -> dict[str, ObservationPart]:
 DEFAULT_PARTS = ("angle_rad", "velocity_rad_s", "torque_nm", "goal_bearing", "goal_m", "contact_n")
 
 
-def select_observation_parts(robot: RobotDescription, observe: Sequence[str] | None) -> dict[str, ObservationPart]:
+def select_observation_parts(
+    robot: RobotDescription, observe: Sequence[str] | None
+) -> dict[str, ObservationPart]:
     """Return the parts that make up the observation of a policy, by their names.
 
     Args:
@@ -146,7 +171,9 @@ def select_observation_parts(robot: RobotDescription, observe: Sequence[str] | N
     """
     parts = make_observation_parts(robot)
     sensors = {sensor.key for sensor in robot.sensors}
-    observable = {name: part for name, part in parts.items() if part.sensor is None or part.sensor in sensors}
+    observable = {
+        name: part for name, part in parts.items() if part.sensor is None or part.sensor in sensors
+    }
     if observe is None:
         return {name: observable[name] for name in DEFAULT_PARTS if name in observable}
     if isinstance(observe, str) or not observe:
@@ -158,7 +185,8 @@ def select_observation_parts(robot: RobotDescription, observe: Sequence[str] | N
         if name not in parts:
             hint = suggest_word(str(name), parts)
             raise ConfigError(
-                f"observe: no part {name!r:.60}; {hint}there are {', '.join(parts)}", code="policy/invalid"
+                f"observe: no part {name!r:.60}; {hint}there are {', '.join(parts)}",
+                code="policy/invalid",
             )
         if name not in observable:
             raise ConfigError(
@@ -194,7 +222,9 @@ class ObservationBuilder:
 
         The progress towards the goal is measured from the first call on.
         """
-        assert observation.sensor_samples is not None, "a controller with an Observer declares uses_sensors = True"
+        assert observation.sensor_samples is not None, (
+            "a controller with an Observer declares uses_sensors = True"
+        )
         progress = self._progress
         if progress is None:
             progress = GoalProgress(self._robot, observation.sensor_samples.task)

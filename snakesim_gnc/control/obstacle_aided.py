@@ -33,7 +33,13 @@ from snakesim_gnc.control.climb import PlatformClimb
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.contact_search import ContactSearch
 from snakesim_gnc.control.progress import BodyLocation, PathProgress, SpeedFilter
-from snakesim_gnc.control.push import BodyContacts, NormalizedPush, PushLowPassFilter, find_body_contacts, solve_push
+from snakesim_gnc.control.push import (
+    BodyContacts,
+    NormalizedPush,
+    PushLowPassFilter,
+    find_body_contacts,
+    solve_push,
+)
 from snakesim_gnc.control.push_report import explain_push_standstill, make_push_point_messages
 from snakesim_gnc.control.undulation import LateralUndulation
 from snakesim_gnc.geometry.planar_body import PlanarBody
@@ -44,26 +50,31 @@ from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import JointMode, RobotDescription, WorldContact, WorldModel
 from snakesim_hal.wire.quantities import above, from_zero
 
-MAX_CONTINUOUS_CHANGE_RAD = 0.1  # a new path whose reference differs more than this starts with a small look-ahead
+# A new path whose reference differs more than this starts with a small look-ahead.
+MAX_CONTINUOUS_CHANGE_RAD = 0.1
 DERIVATIVE_STEP_M = 0.02  # step of the finite difference for theta'
 RANDOM_SIGNS = np.random.default_rng(1).choice((-1.0, 1.0), 4096)  # the same in every run
 
 # Which contacts push, and how hard.
-MAX_UNBALANCED_RATIO = 0.3  # fraction of a push; the rest turns the body a little, until it touches other obstacles
-CONTACT_FORCE_SCALE_N = 0.5  # at this measured force, the extra cost of a contact without force has fallen to 1/e
+# Fraction of a push; the rest turns the body a little, until it touches other obstacles.
+MAX_UNBALANCED_RATIO = 0.3
+# At this measured force, the extra cost of a contact without force has fallen to 1/e.
+CONTACT_FORCE_SCALE_N = 0.5
 ACTUATION_DELAY_S = 0.03  # from a measurement until the motors act on it
-MAX_CREEP_SPEED_M_S = 0.05  # below it, the integral of the push grows CREEP_INTEGRAL_GAIN times as fast
+# Below it, the integral of the push grows CREEP_INTEGRAL_GAIN times as fast.
+MAX_CREEP_SPEED_M_S = 0.05
 CREEP_INTEGRAL_GAIN = 2.0
 
 # Torque mode.
-MAX_UNBALANCED_RATIO_IN_TORQUE_MODE = 0.03  # fraction of a push that may be unbalanced in torque mode
+# Fraction of a push that may be unbalanced in torque mode.
+MAX_UNBALANCED_RATIO_IN_TORQUE_MODE = 0.03
 MIN_BALANCED_DURATION_S = 0.1  # how long contacts must have been able to balance a push before
-MIN_SLOPE_SQUARED_PER_M2 = 20.0  # sum of theta'^2 below which the shape hardly depends on the place on the path
+# Sum of theta'^2 below which the shape hardly depends on the place on the path.
+MIN_SLOPE_SQUARED_PER_M2 = 20.0
 
 # Reports.
-MAX_STANDSTILL_SPEED_M_S = (
-    0.01  # a body that was slower than this for MIN_STANDSTILL_DURATION_S is reported as stationary
-)
+# A body that was slower than this for MIN_STANDSTILL_DURATION_S is reported as stationary.
+MAX_STANDSTILL_SPEED_M_S = 0.01
 MIN_STANDSTILL_DURATION_S = 0.5
 
 
@@ -169,7 +180,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         # Joints.
         self._yaw_joints = self._body.yaw_joints  # indices of the joints that bend
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
-        self._has_torque_mode = all(robot.joints[i].supports_mode(JointMode.TORQUE) for i in self._yaw_joints)
+        self._has_torque_mode = all(
+            robot.joints[i].supports_mode(JointMode.TORQUE) for i in self._yaw_joints
+        )
         self._bumpless_follower = BumplessFollower(robot, parameters.blend_s)
         self._is_holding = False  # the joints hold a pose; the next reference may jump
         # Look-ahead.
@@ -178,15 +191,19 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         self._push_filter = PushLowPassFilter(parameters.push_filter_s)
         self._push_snapshot: PushSnapshot | None = None
         self._unit_torques_nm = np.zeros(len(robot.joints))  # joint torques for 1 N along the path
-        self._push_torques_nm = np.zeros(len(robot.joints))  # filtered joint torques of the commanded push
+        # Filtered joint torques of the commanded push.
+        self._push_torques_nm = np.zeros(len(robot.joints))
         self._push_integral_n = 0.0
         self._max_push_force_n = 0.0  # what contacts and torque limits allow
         self._push_force_n = 0.0  # commanded push
         self._last_unbalanced_time_s = 0.0  # when the contacts could last not balance a push
         # Supervision.
-        self._last_motion_time_s = 0.0  # when the body was last faster than MAX_STANDSTILL_SPEED_M_S
+        # When the body was last faster than MAX_STANDSTILL_SPEED_M_S.
+        self._last_motion_time_s = 0.0
         self._contact_search = ContactSearch(
-            robot, standstill_duration_s=parameters.search_after_s, search_duration_s=parameters.search_s
+            robot,
+            standstill_duration_s=parameters.search_after_s,
+            search_duration_s=parameters.search_s,
         )
 
     def update(self, observation: Observation) -> ControllerCommand:
@@ -210,10 +227,15 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         desired_m_s = location.trajectory.speed_m_s
         if desired_m_s == 0.0:  # whatever path is planned meanwhile
             return self._command_rest(observation)
-        pitch_rad = self._platform_climb.compute_pitch_angles_rad(location.trajectory.rises, location.tail_s_m)
+        pitch_rad = self._platform_climb.compute_pitch_angles_rad(
+            location.trajectory.rises, location.tail_s_m
+        )
         center_w = location.body_points_w.mean(axis=1)
         wave = self._contact_search.choose_wave(
-            observation, center_w, desired_m_s=desired_m_s, has_near_obstacles=self._has_near_obstacles()
+            observation,
+            center_w,
+            desired_m_s=desired_m_s,
+            has_near_obstacles=self._has_near_obstacles(),
         )
         if wave is not None:
             return self._command_search_wave(observation, wave, pitch_rad)
@@ -225,7 +247,8 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         look_ahead_m = scale * look_ahead_m
         theta = self._compute_angles_on_path(location, location.tail_s_m)  # joint angles, rad
         theta_ahead = self._compute_angles_on_path(location, location.tail_s_m + DERIVATIVE_STEP_M)
-        theta_prime = (theta_ahead - theta) / DERIVATIVE_STEP_M  # derivative by the arc length, rad/m
+        # Derivative by the arc length, rad/m.
+        theta_prime = (theta_ahead - theta) / DERIVATIVE_STEP_M
         push_torques_nm = scale * self._update_push_torques(observation, location, theta_prime)
         if self._can_use_torque_mode(observation.time_s) and not pitch_rad.any():
             return self._command_torques(observation, location, theta, theta_prime, push_torques_nm)
@@ -291,10 +314,13 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         k = self.parameters.shape_nm_per_rad
         d = self.parameters.shape_nm_s_per_rad
         angle_error_rad = theta - np.array(observation.joints.angle_rad)
-        velocity_error_rad_s = theta_prime * location.speed_m_s - np.array(observation.joints.velocity_rad_s)
+        velocity_error_rad_s = theta_prime * location.speed_m_s - np.array(
+            observation.joints.velocity_rad_s
+        )
         shape_nm = k * angle_error_rad + d * velocity_error_rad_s
         slope = theta_prime[self._yaw_joints]
-        along_n = float(slope @ shape_nm[self._yaw_joints])  # force of tau_shape along the path, by virtual work
+        # Force of tau_shape along the path, by virtual work.
+        along_n = float(slope @ shape_nm[self._yaw_joints])
         shape_nm = shape_nm - theta_prime * along_n / (slope @ slope + MIN_SLOPE_SQUARED_PER_M2)
 
         setpoints = self._bumpless_follower.make_setpoints(observation, theta)
@@ -309,7 +335,11 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         return ControllerCommand(setpoints, self._make_telemetry(observation, location, 0.0, theta))
 
     def _command_positions(
-        self, observation: Observation, location: BodyLocation, reference: Floats, look_ahead_n: float
+        self,
+        observation: Observation,
+        location: BodyLocation,
+        reference: Floats,
+        look_ahead_n: float,
     ) -> ControllerCommand:
         """Command reference angles in position mode, without a jump of the targets.
 
@@ -319,7 +349,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             reference: (n_joints,) reference angles, rad.
             look_ahead_n: Force along the path that the look-ahead of the reference causes, for the telemetry.
         """
-        may_have_jumped = location.may_have_jumped or self._is_holding or self._contact_search.has_changed_wave
+        may_have_jumped = (
+            location.may_have_jumped or self._is_holding or self._contact_search.has_changed_wave
+        )
         last_reference = self._bumpless_follower.reference_rad
         if (
             may_have_jumped
@@ -327,9 +359,13 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             and np.abs(reference - last_reference).max() > MAX_CONTINUOUS_CHANGE_RAD
         ):
             self._limit_look_ahead_integral()
-        setpoints = self._bumpless_follower.make_setpoints(observation, reference, may_have_jumped=may_have_jumped)
+        setpoints = self._bumpless_follower.make_setpoints(
+            observation, reference, may_have_jumped=may_have_jumped
+        )
         self._is_holding = False
-        return ControllerCommand(setpoints, self._make_telemetry(observation, location, look_ahead_n, reference))
+        return ControllerCommand(
+            setpoints, self._make_telemetry(observation, location, look_ahead_n, reference)
+        )
 
     def _command_search_wave(
         self, observation: Observation, wave: LateralUndulation, pitch_rad: Floats
@@ -347,7 +383,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             observation, reference, may_have_jumped=self._contact_search.has_changed_wave
         )
         reason = "the body does not advance: it moves by a wave, in search of contacts"
-        return ControllerCommand(setpoints, Telemetry(reason=reason, reference_rad=reference.tolist()))
+        return ControllerCommand(
+            setpoints, Telemetry(reason=reason, reference_rad=reference.tolist())
+        )
 
     def _command_rest(self, observation: Observation) -> ControllerCommand:
         """Command every joint to stay where it is, and reset push, look-ahead and search: the desired speed is 0."""
@@ -359,7 +397,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             command = self._bumpless_follower.hold_pose(observation, "")
         else:
             reference = np.array(observation.joints.angle_rad)
-            setpoints = self._bumpless_follower.make_setpoints(observation, reference, may_have_jumped=True)
+            setpoints = self._bumpless_follower.make_setpoints(
+                observation, reference, may_have_jumped=True
+            )
             command = ControllerCommand(setpoints, Telemetry(reference_rad=reference.tolist()))
         self._is_holding = True
         return command
@@ -380,12 +420,18 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         error_m_s = location.trajectory.speed_m_s - location.speed_m_s
         self._look_ahead_integral_m += self.parameters.integral_per_s * error_m_s * period_s
         self._look_ahead_integral_m = min(max(self._look_ahead_integral_m, -max_m), max_m)
-        return min(max(self._look_ahead_integral_m + self.parameters.speed_kp_s * error_m_s, -max_m), max_m)
+        return min(
+            max(self._look_ahead_integral_m + self.parameters.speed_kp_s * error_m_s, -max_m), max_m
+        )
 
     def _limit_look_ahead_integral(self) -> None:
-        self._look_ahead_integral_m = min(self._look_ahead_integral_m, self.parameters.fresh_look_ahead_m)
+        self._look_ahead_integral_m = min(
+            self._look_ahead_integral_m, self.parameters.fresh_look_ahead_m
+        )
 
-    def _update_push_torques(self, observation: Observation, location: BodyLocation, theta_prime: Floats) -> Floats:
+    def _update_push_torques(
+        self, observation: Observation, location: BodyLocation, theta_prime: Floats
+    ) -> Floats:
         """Return the filtered joint torques tau_push of a force F along the path that controls the speed.
 
         F = lag_kp * integral of e dt + speed_kp * e, with the speed error e. F is limited to `max_push_n` and to what
@@ -410,7 +456,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         integral_gain = 1.0
         if abs(location.speed_m_s) < MAX_CREEP_SPEED_M_S:
             integral_gain = CREEP_INTEGRAL_GAIN
-        self._push_integral_n += integral_gain * parameters.lag_kp_n_per_m * error_m_s * observation.period_s
+        self._push_integral_n += (
+            integral_gain * parameters.lag_kp_n_per_m * error_m_s * observation.period_s
+        )
         self._push_integral_n = min(max(self._push_integral_n, 0.0), parameters.max_push_n)
         force_n = self._push_integral_n + parameters.speed_kp_n_s_per_m * error_m_s
         force_n = min(max(force_n, 0.0), parameters.max_push_n)
@@ -420,7 +468,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         self._push_integral_n = min(self._push_integral_n, self._max_push_force_n)
         self._push_force_n = min(force_n, self._max_push_force_n)
         decay = np.exp(-observation.period_s / parameters.torque_filter_s)  # of a low-pass filter
-        self._push_torques_nm = decay * self._push_torques_nm + (1 - decay) * self._push_force_n * self._unit_torques_nm
+        self._push_torques_nm = (
+            decay * self._push_torques_nm + (1 - decay) * self._push_force_n * self._unit_torques_nm
+        )
         return np.clip(self._push_torques_nm, -parameters.max_torque_nm, parameters.max_torque_nm)
 
     def _update_contacts(self, time_s: float, location: BodyLocation, theta_prime: Floats) -> None:
@@ -459,7 +509,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         if is_balanced and max_lambda > 0.0:
             self._unit_torques_nm[self._yaw_joints] = push.joint_torques_nm
             max_unit_nm = float(np.abs(push.joint_torques_nm).max(initial=0.0)) + 1e-9
-            self._max_push_force_n = min(parameters.max_torque_nm / max_unit_nm, parameters.max_contact_n / max_lambda)
+            self._max_push_force_n = min(
+                parameters.max_torque_nm / max_unit_nm, parameters.max_contact_n / max_lambda
+            )
 
     def _predict_body_points_w(self, location: BodyLocation) -> Floats:
         """Predict the points of the body, (2, n_points) in m, at the time when the motors act on this tick's command.
@@ -494,7 +546,11 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     # --- reports -------------------------------------------------------------------------------------------------
 
     def _make_telemetry(
-        self, observation: Observation, location: BodyLocation, look_ahead_n: float, reference: Floats
+        self,
+        observation: Observation,
+        location: BodyLocation,
+        look_ahead_n: float,
+        reference: Floats,
     ) -> Telemetry:
         """Report the push along the path, and why the body is stationary if it is.
 
@@ -524,7 +580,8 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             desired_force_n=[float(np.hypot(*contact.force_w[:2])) for contact in points],
             bending_torque_nm=self._push_torques_nm.tolist(),
             reference_rad=reference.tolist(),
-            torque_headroom_nm=self.parameters.max_torque_nm - float(np.abs(self._push_torques_nm).max()),
+            torque_headroom_nm=self.parameters.max_torque_nm
+            - float(np.abs(self._push_torques_nm).max()),
             saturated=0.0 < self._max_push_force_n <= self._push_force_n,
             jammed=is_stationary and jammed,
         )
@@ -537,7 +594,9 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             self._body, snapshot.world, snapshot.contacts, snapshot.push, self._push_force_n
         )
 
-    def _explain_standstill(self, location: BodyLocation, points: list[WorldContact]) -> tuple[bool, str]:
+    def _explain_standstill(
+        self, location: BodyLocation, points: list[WorldContact]
+    ) -> tuple[bool, str]:
         """Explain why the body would be stationary if it does not move.
 
         Args:
@@ -554,5 +613,10 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         towards_head_w = (location.body_points_w[:, -1] - location.body_points_w[:, 0]).tolist()
         net_force = self._measured_contacts.resolve_along(towards_head_w)
         return explain_push_standstill(
-            snapshot.contacts, snapshot.push, self._push_force_n, self._max_push_force_n, net_force, names
+            snapshot.contacts,
+            snapshot.push,
+            self._push_force_n,
+            self._max_push_force_n,
+            net_force,
+            names,
         )

@@ -66,12 +66,20 @@ class PathFollowing(Controller[PathFollowingParameters]):
         if location.may_have_jumped:
             self._reference_s_m = tail_s_m
         advanced_s_m = self._reference_s_m + location.trajectory.speed_m_s * observation.period_s
-        self._reference_s_m = min(max(advanced_s_m, tail_s_m), tail_s_m + self.parameters.look_ahead_m)
+        self._reference_s_m = min(
+            max(advanced_s_m, tail_s_m), tail_s_m + self.parameters.look_ahead_m
+        )
 
-        yaw_rad = self._body.expand_joint_angles(location.body_on_path.compute_pose_at(self._reference_s_m))
-        pitch_rad = self._platform_climb.compute_pitch_angles_rad(location.trajectory.rises, self._reference_s_m)
+        yaw_rad = self._body.expand_joint_angles(
+            location.body_on_path.compute_pose_at(self._reference_s_m)
+        )
+        pitch_rad = self._platform_climb.compute_pitch_angles_rad(
+            location.trajectory.rises, self._reference_s_m
+        )
         reference_rad = yaw_rad + pitch_rad
         setpoints = self._bumpless_follower.make_setpoints(
             observation, reference_rad, may_have_jumped=location.may_have_jumped
         )
-        return ControllerCommand(setpoints, Telemetry(path_s_m=tail_s_m, reference_rad=reference_rad.tolist()))
+        return ControllerCommand(
+            setpoints, Telemetry(path_s_m=tail_s_m, reference_rad=reference_rad.tolist())
+        )

@@ -20,7 +20,13 @@ from snakesim_gnc.control.observations import (
     select_observation_parts,
 )
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    Observation,
+    Telemetry,
+    make_position_setpoints,
+)
 from snakesim_hal.model.files import SHIPPED_FILES_DIR, FileStruct, expand_home
 from snakesim_hal.model.plugins import make_pip_install_command
 from snakesim_hal.model.textfiles import read_bytes
@@ -40,7 +46,11 @@ ACTION_KEY = "snakesim.action"
 JOINTS_KEY = "snakesim.joints"
 FRAME_SKIP_KEY = "snakesim.frame_skip"
 
-MODE_BY_ACTION = {"position": JointMode.POSITION, "velocity": JointMode.VELOCITY, "torque": JointMode.TORQUE}
+MODE_BY_ACTION = {
+    "position": JointMode.POSITION,
+    "velocity": JointMode.VELOCITY,
+    "torque": JointMode.TORQUE,
+}
 MAX_FRAME_SKIP = 1000  # ticks; a longer pause between two targets is a mistake
 MAX_INTEGER_DIGITS = 9  # of a number in the metadata; more digits are a mistake
 
@@ -68,7 +78,8 @@ class PolicyModel:
         # What the model observes and returns.
         self.parts = metadata.read_parts(robot)
         self.action = metadata.read_choice(ACTION_KEY, MODE_BY_ACTION)
-        self.frame_skip = metadata.read_integer(FRAME_SKIP_KEY, MAX_FRAME_SKIP, "ticks")  # ticks per inference
+        # Ticks per inference.
+        self.frame_skip = metadata.read_integer(FRAME_SKIP_KEY, MAX_FRAME_SKIP, "ticks")
         _check_joints_of_model(metadata, robot, self.action, self.parts)
 
         # Names of the model's tensors.
@@ -89,7 +100,10 @@ class PolicyModel:
 
 
 def _check_joints_of_model(
-    metadata: "_ModelMetadata", robot: RobotDescription, action: str, parts: Mapping[str, ObservationPart]
+    metadata: "_ModelMetadata",
+    robot: RobotDescription,
+    action: str,
+    parts: Mapping[str, ObservationPart],
 ) -> None:
     """Check that the robot has the joints that the model commands and observes. Raises ConfigError."""
     joint_count = len(robot.joints)
@@ -100,7 +114,9 @@ def _check_joints_of_model(
     for joint in robot.joints:
         if not joint.supports_mode(MODE_BY_ACTION[action]):
             available = [name for name, mode in MODE_BY_ACTION.items() if joint.supports_mode(mode)]
-            raise metadata.make_error(ACTION_KEY, action, f"what {joint.name} can do: {', '.join(available)}")
+            raise metadata.make_error(
+                ACTION_KEY, action, f"what {joint.name} can do: {', '.join(available)}"
+            )
         if "torque_nm" in parts and "torque" not in joint.measures:
             allowed = f"without torque_nm: {joint.name} measures none"
             raise metadata.make_error(OBSERVATIONS_KEY, ",".join(parts), allowed)
@@ -158,15 +174,24 @@ class PolicyController(Controller[PolicyParameters]):
         if late_reason:
             return self._hold_pose(observation, late_reason)
         self._hold_setpoints = None
-        if self._last_targets is None or observation.tick - self._last_inference_tick >= self._model.frame_skip:
-            self._last_targets = self._model(self._observation_builder.build_observation(observation))
+        if (
+            self._last_targets is None
+            or observation.tick - self._last_inference_tick >= self._model.frame_skip
+        ):
+            self._last_targets = self._model(
+                self._observation_builder.build_observation(observation)
+            )
             self._last_inference_tick = observation.tick
         modes = [self._mode] * len(self._last_targets)
-        setpoints = RequestedSetpoints(modes, list(self._last_targets), list(self._torque_limits_nm))
+        setpoints = RequestedSetpoints(
+            modes, list(self._last_targets), list(self._torque_limits_nm)
+        )
         reference: Sequence[float] = ()
         if self._mode is JointMode.POSITION:
             reference = self._last_targets
-        return ControllerCommand(setpoints, Telemetry(reason="a policy moves the joints", reference_rad=reference))
+        return ControllerCommand(
+            setpoints, Telemetry(reason="a policy moves the joints", reference_rad=reference)
+        )
 
     def _describe_late_sensors(self, observation: Observation) -> str:
         """Return why samples that the model needs are too old; an empty text if all are fresh."""
@@ -174,7 +199,8 @@ class PolicyController(Controller[PolicyParameters]):
             return ""
         late_reasons_by_key = observation.sensor_samples.late
         return "; ".join(
-            late_reasons_by_key[key] for key in sorted(self._observation_builder.sensors & late_reasons_by_key.keys())
+            late_reasons_by_key[key]
+            for key in sorted(self._observation_builder.sensors & late_reasons_by_key.keys())
         )
 
     def _hold_pose(self, observation: Observation, reason: str) -> ControllerCommand:
@@ -209,7 +235,8 @@ class _ModelMetadata:
             return select_observation_parts(robot, names)
         except ConfigError as error:
             raise ConfigError(
-                f"{self._file}: metadata `{OBSERVATIONS_KEY}` is {shorten(text)!r}: {error}", code="policy/invalid"
+                f"{self._file}: metadata `{OBSERVATIONS_KEY}` is {shorten(text)!r}: {error}",
+                code="policy/invalid",
             ) from None
 
     def read_choice(self, field: str, choices: Mapping[str, Any]) -> str:
@@ -249,7 +276,8 @@ class _ModelMetadata:
     def make_error(self, field: str, value: object, allowed: str) -> ConfigError:
         """Return an error that names the file, the field, its value and what is allowed."""
         return ConfigError(
-            f"{self._file}: metadata `{field}` is {shorten(str(value))!r}, must be {allowed}", code="policy/invalid"
+            f"{self._file}: metadata `{field}` is {shorten(str(value))!r}, must be {allowed}",
+            code="policy/invalid",
         )
 
     def _read_text(self, field: str, allowed: str) -> str:
@@ -295,23 +323,28 @@ def load_model(file: str) -> tuple[Any, Mapping[str, str]]:
     data = read_bytes(_find_model_file(file))
     if ONNX_RUNTIME is None:
         raise ConfigError(
-            f"controller policy needs onnxruntime: {make_pip_install_command('policy')}", code="extra/not-installed"
+            f"controller policy needs onnxruntime: {make_pip_install_command('policy')}",
+            code="extra/not-installed",
         )
     options = ONNX_RUNTIME.SessionOptions()
     # One thread adds in the same order on every computer, so that results are equal to the bit.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # errors only: they are raised as well, and would be printed twice below
+    # Errors only: they are raised as well, and would be printed twice below.
+    options.log_severity_level = 3
     try:
         session = ONNX_RUNTIME.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises many classes that share no base class
         raise ConfigError(
-            f"{shorten(file)}: cannot be loaded as an ONNX model: {shorten(str(error), 300)}", code="policy/invalid"
+            f"{shorten(file)}: cannot be loaded as an ONNX model: {shorten(str(error), 300)}",
+            code="policy/invalid",
         ) from error
     return session, session.get_modelmeta().custom_metadata_map
 
 
-def _find_only_tensor_name(kind: str, tensors: Sequence[Any], width: int, content: str, file: str) -> str:
+def _find_only_tensor_name(
+    kind: str, tensors: Sequence[Any], width: int, content: str, file: str
+) -> str:
     """Return the name of a model's only input or output tensor, after a check of its type and shape.
 
     Args:

@@ -18,7 +18,8 @@ from snakesim_hal.wire.messages import Trajectory, WorldModel
 from snakesim_hal.wire.quantities import from_zero
 
 SpeedFilter = Annotated[float, from_zero(1, "s")]
-RELOCALIZATION_ITERATIONS = 8  # iterations for a body that may have slid while its position was unknown
+# Iterations for a body that may have slid while its position was unknown.
+RELOCALIZATION_ITERATIONS = 8
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,8 @@ class PathProgress:
 
         # The last world model and the last pose.
         self._last_world_tick: int | None = None
-        self._last_pose_ns: int | None = None  # time of the pose; None if the body's position is unknown
+        # Time of the pose; None if the body's position is unknown.
+        self._last_pose_ns: int | None = None
         self._body_points_w = np.empty((2, 0))
 
         # The state of the filter at that time.
@@ -96,13 +98,19 @@ class PathProgress:
         body_on_path = self._body_on_path
         is_new_path = body_on_path is None or trajectory.path_id != self._path_id
         if body_on_path is None or is_new_path:
-            body_on_path = BodyOnPath(Route(trajectory.path_w), self._planar_body.segments_m, trajectory.rises)
+            body_on_path = BodyOnPath(
+                Route(trajectory.path_w), self._planar_body.segments_m, trajectory.rises
+            )
             self._body_on_path = body_on_path
             self._path_id = trajectory.path_id
 
         last_pose_ns = self._last_pose_ns
-        newest_pose_ns = self._localize_if_new(body_on_path, world, observation, is_new_path=is_new_path)
-        elapsed_s = _convert_to_seconds(observation.joints.timestamp_ns - newest_pose_ns, observation)
+        newest_pose_ns = self._localize_if_new(
+            body_on_path, world, observation, is_new_path=is_new_path
+        )
+        elapsed_s = _convert_to_seconds(
+            observation.joints.timestamp_ns - newest_pose_ns, observation
+        )
         is_new_world = world.tick != self._last_world_tick
         self._last_world_tick = world.tick
         return BodyLocation(
@@ -118,7 +126,12 @@ class PathProgress:
         )
 
     def _localize_if_new(
-        self, body_on_path: BodyOnPath, world: WorldModel, observation: Observation, *, is_new_path: bool
+        self,
+        body_on_path: BodyOnPath,
+        world: WorldModel,
+        observation: Observation,
+        *,
+        is_new_path: bool,
     ) -> int:
         """Localize the body on the path if the path or the pose is new since the last tick.
 
@@ -152,7 +165,8 @@ class PathProgress:
             self._speed_m_s = 0.0
         elif pose_ns > last_pose_ns:
             self._update_filter(
-                body_on_path, max(_convert_to_seconds(pose_ns - last_pose_ns, observation), observation.period_s)
+                body_on_path,
+                max(_convert_to_seconds(pose_ns - last_pose_ns, observation), observation.period_s),
             )
         return newest_pose_ns
 
@@ -167,7 +181,10 @@ class PathProgress:
             v = v + (1 - k)^2 r / T
         """
         predicted_s_m = self._s_m + self._speed_m_s * dt_s
-        residual_m = body_on_path.refine_tail_s_m(self._body_points_w, predicted_s_m, step_count=1) - predicted_s_m
+        residual_m = (
+            body_on_path.refine_tail_s_m(self._body_points_w, predicted_s_m, step_count=1)
+            - predicted_s_m
+        )
         k = 0.0
         if self._speed_filter_s > 0:
             k = float(np.exp(-dt_s / self._speed_filter_s))

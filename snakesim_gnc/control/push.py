@@ -27,10 +27,16 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.geometry.planar import cross_2d
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import LINK_FRACTIONS, ObstacleOutlines, find_nearest_points_on_chain
+from snakesim_hal.model.outlines import (
+    LINK_FRACTIONS,
+    ObstacleOutlines,
+    find_nearest_points_on_chain,
+)
 
-MAX_NORMAL_ALONG_BODY = 0.6  # |n . t| of a contact; above it, the obstacle stands in front of the head
-MAX_BALANCE_RESIDUAL = 0.05  # unbalanced fraction of the force up to which contacts count as able to push
+# |n . t| of a contact; above it, the obstacle stands in front of the head.
+MAX_NORMAL_ALONG_BODY = 0.6
+# Unbalanced fraction of the force up to which contacts count as able to push.
+MAX_BALANCE_RESIDUAL = 0.05
 MAX_SOLVER_ITERATIONS = 30  # of the solver; it needs one for each contact that carries force
 MIN_GRADIENT = 1e-9  # contacts with a smaller gradient do not improve the solution
 
@@ -66,7 +72,9 @@ class NormalizedPush:
     @property
     def is_balanced(self) -> bool:
         """Whether these contacts can push at all."""
-        return self.balance_residual < MAX_BALANCE_RESIDUAL and bool((self.contact_forces > 0.0).any())
+        return self.balance_residual < MAX_BALANCE_RESIDUAL and bool(
+            (self.contact_forces > 0.0).any()
+        )
 
 
 class PushLowPassFilter:
@@ -83,7 +91,9 @@ class PushLowPassFilter:
         self._last_joint_torques_nm: Floats | float = 0.0
         self._last_residual = 0.0
 
-    def update(self, time_s: float, push: NormalizedPush, obstacles: Sequence[str]) -> NormalizedPush:
+    def update(
+        self, time_s: float, push: NormalizedPush, obstacles: Sequence[str]
+    ) -> NormalizedPush:
         """Filter the contact forces of a push by a low-pass filter of first order, contact by contact.
 
         With the time dt since the last push, decay = exp(-dt / time constant) and alpha = 1 - decay, the output is
@@ -101,7 +111,9 @@ class PushLowPassFilter:
         alpha = 1.0 - decay
         filtered_forces: list[float] = []
         for name, new_force in zip(obstacles, push.contact_forces, strict=True):
-            filtered_forces.append(alpha * new_force + decay * self._last_forces_by_obstacle.get(name, 0.0))
+            filtered_forces.append(
+                alpha * new_force + decay * self._last_forces_by_obstacle.get(name, 0.0)
+            )
         joint_torques_nm = alpha * push.joint_torques_nm + decay * self._last_joint_torques_nm
         balance_residual = alpha * push.balance_residual + decay * self._last_residual
         self._last_time_s = time_s
@@ -112,7 +124,12 @@ class PushLowPassFilter:
 
 
 def find_body_contacts(
-    body_points_w: Floats, radius_m: float, outlines: ObstacleOutlines, *, max_gap_m: float, friction: float
+    body_points_w: Floats,
+    radius_m: float,
+    outlines: ObstacleOutlines,
+    *,
+    max_gap_m: float,
+    friction: float,
 ) -> BodyContacts:
     """Find the point of the body that is nearest to each obstacle within reach and beside the body.
 
@@ -195,13 +212,19 @@ def solve_push(
     drag_moment = length_fraction @ cross_2d(middles_w - center_w, tangents)
     b = np.array([*drag_force, drag_moment])  # (3,)
     arms_m = contacts.positions_w - center_w
-    a = np.column_stack([contacts.directions_w, cross_2d(arms_m, contacts.directions_w)]).T  # (3, k)
+    # (3, k).
+    a = np.column_stack([contacts.directions_w, cross_2d(arms_m, contacts.directions_w)]).T
 
     joints_w = body_points_w[:, 1:-1].T  # (n_joints, 2), p_i
     is_ahead = contacts.body_s_m[None, :] > np.cumsum(lengths_m)[:-1, None]
-    lever = -(is_ahead * cross_2d(contacts.positions_w[None] - joints_w[:, None], contacts.directions_w[None]))
+    lever = -(
+        is_ahead
+        * cross_2d(contacts.positions_w[None] - joints_w[:, None], contacts.directions_w[None])
+    )
     link_is_ahead = np.triu(np.ones((len(joints_w), len(lengths_m)), dtype=bool), 1)
-    drag_torque = (link_is_ahead * cross_2d(middles_w[None] - joints_w[:, None], tangents[None])) @ length_fraction
+    drag_torque = (
+        link_is_ahead * cross_2d(middles_w[None] - joints_w[:, None], tangents[None])
+    ) @ length_fraction
 
     # Solve for x = W lambda, so that the last part of the cost is that of a unit matrix.
     weight = 1.0 + np.maximum(contacts.gap_m, 0.0) / contact_gap_scale_m + extra_cost
@@ -248,7 +271,9 @@ def _solve_nonnegative(matrix: Floats, right_side: Floats) -> Floats:
     return x
 
 
-def _solve_free_variables(matrix: Floats, right_side: Floats, x: Floats, is_free: NDArray[np.bool_]) -> Floats:
+def _solve_free_variables(
+    matrix: Floats, right_side: Floats, x: Floats, is_free: NDArray[np.bool_]
+) -> Floats:
     """Solve least squares for the free variables, and bind those at 0 that would become negative.
 
     Args:
@@ -267,7 +292,9 @@ def _solve_free_variables(matrix: Floats, right_side: Floats, x: Floats, is_free
             return trial_solution
         # Go towards the trial until the first variable reaches 0.
         is_negative = is_free & (trial_solution <= 0)
-        step_fraction = float(np.min(x[is_negative] / np.maximum(x[is_negative] - trial_solution[is_negative], 1e-12)))
+        step_fraction = float(
+            np.min(x[is_negative] / np.maximum(x[is_negative] - trial_solution[is_negative], 1e-12))
+        )
         x = x + step_fraction * (trial_solution - x)
         is_free &= x > 1e-12
         if not is_free.any():

@@ -13,7 +13,11 @@ MAX_REPORTED_PUSH_POINTS = 64  # push-points in a message
 
 
 def make_push_point_messages(
-    body: PlanarBody, world: WorldModel, contacts: BodyContacts, push: NormalizedPush, force_n: float
+    body: PlanarBody,
+    world: WorldModel,
+    contacts: BodyContacts,
+    push: NormalizedPush,
+    force_n: float,
 ) -> list[WorldContact]:
     """Return the contacts that push, as messages with their desired forces.
 
@@ -30,12 +34,20 @@ def make_push_point_messages(
     points: list[WorldContact] = []
     for k in np.argsort(contacts.body_s_m, kind="stable").tolist():
         if push.contact_forces[k] > 0.0:
-            points.append(_describe_push_point(body, world, contacts, k, force_n * float(push.contact_forces[k])))
+            points.append(
+                _describe_push_point(
+                    body, world, contacts, k, force_n * float(push.contact_forces[k])
+                )
+            )
     return points[:MAX_REPORTED_PUSH_POINTS]
 
 
 def _describe_push_point(
-    body: PlanarBody, world: WorldModel, contacts: BodyContacts, contact_index: int, push_magnitude_n: float
+    body: PlanarBody,
+    world: WorldModel,
+    contacts: BodyContacts,
+    contact_index: int,
+    push_magnitude_n: float,
 ) -> WorldContact:
     """Return the message that reports one contact and the force with which the body pushes there.
 
@@ -95,7 +107,13 @@ def explain_push_standstill(
         obstacles = "the obstacle"
         if len(contacts) > 1:
             obstacles = f"the {len(contacts)} obstacles"
-        return False, f"standing still: contacts lost, {obstacles} beside the body cannot push it forward"
+        return (
+            False,
+            f"standing still: contacts lost, {obstacles} beside the body cannot push it forward",
+        )
     if force_n >= max_force_n:
-        return False, f"standing still: torques and contacts allow no more than {max_force_n:.1f} N along the body"
+        return (
+            False,
+            f"standing still: torques and contacts allow no more than {max_force_n:.1f} N along the body",
+        )
     return explain_standstill(force_n, net_force, push_points)

@@ -85,14 +85,19 @@ class ControlService(Service):
     def _subscribe_to_sensors(self) -> None:
         """Subscribe to those sensors in SENSED that the robot has."""
         sensors = self._config.robot.sensors
-        is_mounted = {keys.POSE: sensors.pose is not None, keys.CONTACTS: sensors.contacts is not None}
+        is_mounted = {
+            keys.POSE: sensors.pose is not None,
+            keys.CONTACTS: sensors.contacts is not None,
+        }
         for key, message_type in SENSOR_MESSAGE_TYPES.items():
             if is_mounted[key]:
                 self._sensor_feeds[key] = self._client.subscribe(key, message_type)
 
     def configure(self, robot: RobotDescription) -> None:
         """Prepare to command this robot. Raises ControllerError if the robot cannot do what the controller needs."""
-        missing = find_missing_capability(robot.joints, self._parameters.controller_class, self._config.controller)
+        missing = find_missing_capability(
+            robot.joints, self._parameters.controller_class, self._config.controller
+        )
         if missing is not None:
             raise ControllerError(f"robot {robot.robot!r}: {missing}")
         self._parameters.configure(robot)
@@ -126,9 +131,13 @@ class ControlService(Service):
         if not (is_armed and holds_lease):
             self._controller = None
         if not holds_lease:
-            lease_reason = f"no right to command: {self._commander.lease_refusal or 'the lease is not ours'}"
+            lease_reason = (
+                f"no right to command: {self._commander.lease_refusal or 'the lease is not ours'}"
+            )
             return _list_state_messages(
-                self._state_reports.make_state(clock, is_armed=is_armed, missing_inputs=lease_reason)
+                self._state_reports.make_state(
+                    clock, is_armed=is_armed, missing_inputs=lease_reason
+                )
             )
         late_reason = self._age_limits.check_joints(joints, clock.timestamp_ns)
         if late_reason:
@@ -157,12 +166,16 @@ class ControlService(Service):
         statuses = self._status_reader.drain()
         if not statuses:
             silence_reason = f"neither clock nor status from the HAL for {SILENCE_S:g} s, after tick {clock.tick}"
-            return _list_state_messages(self._state_reports.make_state(clock, silence_reason=silence_reason))
+            return _list_state_messages(
+                self._state_reports.make_state(clock, silence_reason=silence_reason)
+            )
         status = statuses[-1]
         pause_reason = status.held_up or f"no tick for {SILENCE_S:g} s, after tick {clock.tick}"
         is_armed = status.lifecycle == "armed"
         reason = f"robot time is paused: {pause_reason}"
-        return _list_state_messages(self._state_reports.make_state(clock, is_armed=is_armed, pause_reason=reason))
+        return _list_state_messages(
+            self._state_reports.make_state(clock, is_armed=is_armed, pause_reason=reason)
+        )
 
     def _apply_new_parameters(self, clock: Clock) -> None:
         """Answer requests to change parameters. After a change, discard the controller, so that it is made again."""
@@ -200,12 +213,18 @@ class ControlService(Service):
             rest_reason = _explain_no_motion(trajectory)
             try:
                 state = self._state_reports.make_state(
-                    clock, command.telemetry, is_armed=True, missing_inputs=missing_inputs, rest_reason=rest_reason
+                    clock,
+                    command.telemetry,
+                    is_armed=True,
+                    missing_inputs=missing_inputs,
+                    rest_reason=rest_reason,
                 )
             except ValueError as error:
                 raise controller.make_error(str(error)) from None
         except ControllerError as error:
-            self._client.publish(keys.CONTROL_STATE, self._state_reports.make_failure_state(clock, str(error)))
+            self._client.publish(
+                keys.CONTROL_STATE, self._state_reports.make_failure_state(clock, str(error))
+            )
             raise
         return _list_state_messages(state)
 
@@ -249,7 +268,10 @@ class ControlService(Service):
             sample = self._client.read(feed)
             if sample is not None:
                 self._sensor_samples[key] = sample
-        timestamps_ns = {key: getattr(sample, "timestamp_ns", None) for key, sample in self._sensor_samples.items()}
+        timestamps_ns = {
+            key: getattr(sample, "timestamp_ns", None)
+            for key, sample in self._sensor_samples.items()
+        }
         late_reasons_by_key = self._age_limits.check_sensors(timestamps_ns, clock.timestamp_ns)
         return SensorSamples(dict(self._sensor_samples), late_reasons_by_key, self._task)
 
@@ -279,7 +301,9 @@ class ControlService(Service):
         if self.too_slow and not was_too_slow:
             print_stderr(f"{clock.timestamp_ns * 1e-9:.3f} s: {self.too_slow}")
 
-    def _log_late_streams(self, clock: Clock, late_reasons: Sequence[str] = (), consequence: str = "") -> None:
+    def _log_late_streams(
+        self, clock: Clock, late_reasons: Sequence[str] = (), consequence: str = ""
+    ) -> None:
         """Log if the set of input streams that are too old has changed since the last tick.
 
         Args:

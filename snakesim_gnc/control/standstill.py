@@ -10,7 +10,8 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 
-CENTER_FILTER_S = 0.2  # time constant of the low-pass filter that removes pose noise from the body's center
+# Time constant of the low-pass filter that removes pose noise from the body's center.
+CENTER_FILTER_S = 0.2
 
 
 class StandstillDetector:
@@ -29,7 +30,9 @@ class StandstillDetector:
         """Start a new window."""
         self._filtered_centers = deque[tuple[float, Floats]]()
 
-    def update(self, time_s: float, period_s: float, center_w: Floats, max_distance_m: float) -> bool:
+    def update(
+        self, time_s: float, period_s: float, center_w: Floats, max_distance_m: float
+    ) -> bool:
         """Add the center of the body at this tick, and decide whether the body is stationary.
 
         Call it in every tick. The centers are low-pass filtered.

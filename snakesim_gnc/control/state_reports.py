@@ -6,14 +6,19 @@ from snakesim_gnc.control.advance import RecentAdvance
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.states import determine_locomotion_state
 from snakesim_hal.controller import Telemetry
-from snakesim_hal.wire.messages import Clock, ControlState, LocomotionState, RobotDescription, WorldModel
+from snakesim_hal.wire.messages import (
+    Clock,
+    ControlState,
+    LocomotionState,
+    RobotDescription,
+    WorldModel,
+)
 from snakesim_hal.wire.outgoing import describe_invalid_field
 
 TELEMETRY_PERIOD_S = 0.05  # period of the messages while the state does not change
 MAX_REASON_LENGTH = 500  # characters, as the wire allows
-MAX_NAME_LENGTH = (
-    64  # characters of a controller's name on the wire; the end of a path identifies it better than its beginning
-)
+# Characters of a controller's name on the wire; the end of a path identifies it better than its beginning.
+MAX_NAME_LENGTH = 64
 
 
 class StateReports:
@@ -26,7 +31,8 @@ class StateReports:
             controller: Name of the controller as configured.
             robot: Description of the robot.
         """
-        self.too_slow_reason = ""  # why the controller misses its deadlines; it is in every message from then on
+        # Why the controller misses its deadlines; it is in every message from then on.
+        self.too_slow_reason = ""
         self._controller = controller[-MAX_NAME_LENGTH:]
         self._joint_names = [joint.name for joint in robot.joints]
 

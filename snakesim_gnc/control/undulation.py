@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from snakesim_gnc.control.bumpless import Blend, BumplessFollower
 from snakesim_gnc.control.standstill import StandstillDetector
 from snakesim_gnc.geometry.planar_body import PlanarBody
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, is_motion_requested
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    Observation,
+    Telemetry,
+    is_motion_requested,
+)
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import above, bounded, from_zero
@@ -26,7 +32,9 @@ MAX_JAM_DISTANCE_M = 0.02  # a body that moves less than this within `jam_after_
 Steering = Annotated[float, from_zero(2, "1")]
 
 
-def compute_direction_angle_rad(body_points_w: NDArray[np.float64], direction_w: NDArray[np.float64]) -> float:
+def compute_direction_angle_rad(
+    body_points_w: NDArray[np.float64], direction_w: NDArray[np.float64]
+) -> float:
     """Compute the angle from the direction of a body (tail to head) to another direction, left positive.
 
     Args:
@@ -37,7 +45,9 @@ def compute_direction_angle_rad(body_points_w: NDArray[np.float64], direction_w:
         The angle in rad, between -2 pi and 2 pi.
     """
     body_direction_w = body_points_w[-1] - body_points_w[0]
-    return math.atan2(direction_w[1], direction_w[0]) - math.atan2(body_direction_w[1], body_direction_w[0])
+    return math.atan2(direction_w[1], direction_w[0]) - math.atan2(
+        body_direction_w[1], body_direction_w[0]
+    )
 
 
 class LateralUndulationParameters(FileStruct, frozen=True, kw_only=True):
@@ -88,7 +98,9 @@ class LateralUndulation(Controller[LateralUndulationParameters]):
         correlation = angles_rad[self._body.yaw_joints] @ np.exp(1j * lags_rad)
         self._phase_rad = float(np.angle(1j * correlation))
 
-    def compute_reference_rad(self, observation: Observation, elapsed_s: float) -> NDArray[np.float64]:
+    def compute_reference_rad(
+        self, observation: Observation, elapsed_s: float
+    ) -> NDArray[np.float64]:
         """Advance the phase of the wave, and compute the reference angles of all joints.
 
         Args:
@@ -118,16 +130,30 @@ class LateralUndulation(Controller[LateralUndulationParameters]):
 
         A body that moves by a wave towards the head turns against its bend, so the bend has the sign of the lag.
         """
-        if self.parameters.steering == 0.0 or observation.world is None or observation.trajectory is None:
+        if (
+            self.parameters.steering == 0.0
+            or observation.world is None
+            or observation.trajectory is None
+        ):
             return 0.0
-        body_points_w = self._body.compute_body_points_w(observation.world, observation.joints.angle_rad).T
+        body_points_w = self._body.compute_body_points_w(
+            observation.world, observation.joints.angle_rad
+        ).T
         head_w = body_points_w[-1]
         target_w = _find_steering_target(np.array(observation.trajectory.path_w), head_w)
-        angle_rad = math.remainder(compute_direction_angle_rad(body_points_w, target_w - head_w), math.tau)
-        return math.copysign(self.parameters.steering, self.parameters.lag_rad) * angle_rad / len(self._body.yaw_joints)
+        angle_rad = math.remainder(
+            compute_direction_angle_rad(body_points_w, target_w - head_w), math.tau
+        )
+        return (
+            math.copysign(self.parameters.steering, self.parameters.lag_rad)
+            * angle_rad
+            / len(self._body.yaw_joints)
+        )
 
 
-def _find_steering_target(path_w: NDArray[np.float64], head_w: NDArray[np.float64]) -> NDArray[np.float64]:
+def _find_steering_target(
+    path_w: NDArray[np.float64], head_w: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the point of a path, (n, 2), that is STEERING_DISTANCE_M ahead of the head, or its last point."""
     nearest_index = np.argmin(np.hypot(*(path_w - head_w).T))
     ahead_w = path_w[nearest_index:]
@@ -187,7 +213,9 @@ class CompliantUndulation(HeadSteeredUndulation):
         self._reverse_duration_s = parameters.back_s
         self._reverse_end_s = -math.inf
 
-    def compute_reference_rad(self, observation: Observation, elapsed_s: float) -> NDArray[np.float64]:
+    def compute_reference_rad(
+        self, observation: Observation, elapsed_s: float
+    ) -> NDArray[np.float64]:
         """Advance the phase of the wave, or turn it back during a jam, and compute the reference angles of all joints.
 
         Args:
@@ -210,19 +238,29 @@ class CompliantUndulation(HeadSteeredUndulation):
             return False
         if observation.time_s < self._reverse_end_s:
             return True
-        center_w = self._body.compute_body_points_w(observation.world, observation.joints.angle_rad).mean(axis=1)
-        if self._standstill_detector.update(observation.time_s, elapsed_s, center_w, MAX_JAM_DISTANCE_M):
+        center_w = self._body.compute_body_points_w(
+            observation.world, observation.joints.angle_rad
+        ).mean(axis=1)
+        if self._standstill_detector.update(
+            observation.time_s, elapsed_s, center_w, MAX_JAM_DISTANCE_M
+        ):
             self._reverse_end_s = observation.time_s + self._reverse_duration_s
             self._standstill_detector.reset()
         return False
 
-    def _compute_amplitude_rad(self, observation: Observation, waves: NDArray[np.float64], elapsed_s: float) -> float:
+    def _compute_amplitude_rad(
+        self, observation: Observation, waves: NDArray[np.float64], elapsed_s: float
+    ) -> float:
         """Return the amplitude A: a first-order lag of A0 + softness sum_i w_i tau_i, bounded to 0 to 2 A0."""
         parameters = self.parameters
         assert isinstance(parameters, CompliantUndulationParameters)
         # Drives measure their own torque; the torque from outside is opposite to it.
-        generalized_force_nm = -float(waves @ np.array(observation.joints.torque_nm)[self._body.yaw_joints])
-        desired_rad = parameters.amplitude_rad + parameters.softness_rad_per_nm * generalized_force_nm
+        generalized_force_nm = -float(
+            waves @ np.array(observation.joints.torque_nm)[self._body.yaw_joints]
+        )
+        desired_rad = (
+            parameters.amplitude_rad + parameters.softness_rad_per_nm * generalized_force_nm
+        )
         bounded_rad = min(max(desired_rad, 0.0), 2.0 * parameters.amplitude_rad)
         alpha = 1.0 - math.exp(-abs(elapsed_s) / parameters.yield_s)
         self._yielded_amplitude_rad += alpha * (bounded_rad - self._yielded_amplitude_rad)

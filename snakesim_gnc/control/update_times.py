@@ -38,7 +38,9 @@ class UpdateTimes:
         outlasts_lease = self._max_duration_s > self._lease_s
         if not outlasts_lease and self._late_count <= max_late:
             return ""
-        longest_text = f"update() took {_format_ms(self._max_duration_s)} of {_format_ms(self._period_s)}"
+        longest_text = (
+            f"update() took {_format_ms(self._max_duration_s)} of {_format_ms(self._period_s)}"
+        )
         if self._update_count == 1:
             return longest_text
         return f"{longest_text}; {self._late_count} of {self._update_count} updates took longer than a period"

@@ -38,7 +38,9 @@ class BodyOnPath:
     A cached pose is an array of its angles, the points' x, the points' y, and the points' arc lengths.
     """
 
-    def __init__(self, route: Route, segments_m: list[float], rises: Sequence[PathRise] = ()) -> None:
+    def __init__(
+        self, route: Route, segments_m: list[float], rises: Sequence[PathRise] = ()
+    ) -> None:
         """Prepare to lay a body on a path, with empty caches.
 
         Args:
@@ -77,7 +79,11 @@ class BodyOnPath:
         return self.refine_tail_s_m(measured_points_w, first_guess_m, step_count=FIRST_ITERATIONS)
 
     def refine_tail_s_m(
-        self, measured_points_w: Floats, first_guess_s_m: float, *, step_count: int = REFINE_ITERATIONS
+        self,
+        measured_points_w: Floats,
+        first_guess_s_m: float,
+        *,
+        step_count: int = REFINE_ITERATIONS,
     ) -> float:
         """Return the arc length of the tail at which the body on the path is closest to a measured body.
 
@@ -95,7 +101,9 @@ class BodyOnPath:
             pose, pose_derivative = self._interpolate_pose(s_m)
             points_derivative = pose_derivative[self._points_slice]
             step_m = float(
-                (measured_xy - pose[self._points_slice]) @ points_derivative / (points_derivative @ points_derivative)
+                (measured_xy - pose[self._points_slice])
+                @ points_derivative
+                / (points_derivative @ points_derivative)
             )
             s_m += min(max(step_m, -MAX_STEP_M), MAX_STEP_M)
         return s_m
@@ -142,7 +150,9 @@ class BodyOnPath:
             points_s_m.append(s_m)
             points_x.append(x)
             points_y.append(y)
-        angles_rad = [math.remainder(ahead - behind, math.tau) for behind, ahead in pairwise(headings_rad)]
+        angles_rad = [
+            math.remainder(ahead - behind, math.tau) for behind, ahead in pairwise(headings_rad)
+        ]
         return np.array([*angles_rad, *points_x, *points_y, *points_s_m])
 
     def _interpolate_chord_end_m(self, s_m: float, length_m: float) -> float:
@@ -167,7 +177,9 @@ class BodyOnPath:
 
     def _find_chord_end_m(self, s_m: float, length_m: float) -> float:
         """Return the arc length at which a straight piece ends that begins at an arc length."""
-        climb_m = compute_path_height_m(self._rises, s_m + length_m) - compute_path_height_m(self._rises, s_m)
+        climb_m = compute_path_height_m(self._rises, s_m + length_m) - compute_path_height_m(
+            self._rises, s_m
+        )
         level_m = length_m
         if climb_m:
             level_m = math.sqrt(length_m**2 - min(climb_m**2, 0.5 * length_m**2))
@@ -175,7 +187,10 @@ class BodyOnPath:
 
 
 def compute_chain_points(
-    tail_w: tuple[float, float], heading_rad: float, angles_rad: Sequence[float], segments_m: Sequence[float]
+    tail_w: tuple[float, float],
+    heading_rad: float,
+    angles_rad: Sequence[float],
+    segments_m: Sequence[float],
 ) -> Floats:
     """Compute the points of a planar chain from its joint angles: tail end, joints that bend, head end.
 

@@ -8,7 +8,11 @@ from statistics import median
 
 import numpy as np
 
-from snakesim_gnc.geometry.body_on_path import PathBodyPose, compute_chain_points, compute_heading_rad
+from snakesim_gnc.geometry.body_on_path import (
+    PathBodyPose,
+    compute_chain_points,
+    compute_heading_rad,
+)
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import compute_body_points_w
 from snakesim_hal.model.route import compute_yaw_segments_m
@@ -45,7 +49,8 @@ class PlanarBody:
         self.yaw_joints = [i for i, axis in enumerate(axes) if axis == "yaw"]
         self._are_all_yaw_joints = len(self.yaw_joints) == len(axes)
         self.segments_m = compute_yaw_segments_m(axes, lengths)
-        self.spacing_m = median(self.segments_m[1:-1] or self.segments_m)  # of neighboring joints that bend
+        # Of neighboring joints that bend.
+        self.spacing_m = median(self.segments_m[1:-1] or self.segments_m)
         self.body_points_s_m: list[float] = [0.0, *np.cumsum(self.segments_m).tolist()]
         self.length_m = self.body_points_s_m[-1]
         # Indices of the body points among the tail end (0), all joints (joint i is i + 1) and the head end.
@@ -71,11 +76,15 @@ class PlanarBody:
         """
         if not self._are_all_yaw_joints:
             # A link that is pitched up is shorter, as seen from above.
-            chain_w = compute_body_points_w(self._robot, world.base_position_w, world.base_orientation_wxyz, angles_rad)
+            chain_w = compute_body_points_w(
+                self._robot, world.base_position_w, world.base_orientation_wxyz, angles_rad
+            )
             return chain_w[self._body_point_rows, :2].T
         bend_angles_rad = [angles_rad[i] for i in self.yaw_joints]
         heading_rad = compute_heading_rad(world.base_orientation_wxyz)
-        return compute_chain_points(world.base_position_w[:2], heading_rad, bend_angles_rad, self.segments_m)
+        return compute_chain_points(
+            world.base_position_w[:2], heading_rad, bend_angles_rad, self.segments_m
+        )
 
     def compute_joint_positions_w(self, body_pose: PathBodyPose) -> Floats:
         """Compute the positions of all joints of a body on its path, (n_joints, 2) in m."""

@@ -23,7 +23,8 @@ from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import Contact, KnownObstacle, RobotDescription
 
 MIN_FORCE_N = 1.0  # a weaker push may be noise
-MAX_CONTACT_DISTANCE_LINKS = 1.5  # along the body, in link lengths: how far an estimated contact may be from its place
+# Along the body, in link lengths: how far an estimated contact may be from its place.
+MAX_CONTACT_DISTANCE_LINKS = 1.5
 MAX_GAP_M = 0.06  # a contact does not belong to an obstacle farther away than this
 MAX_DEPTH_M = 0.04  # deeper than this, the body may lie on either side of the obstacle
 POINTS_PER_LINK = 12  # on the axis of each link, at which gaps are computed
@@ -49,10 +50,15 @@ class ObstacleAnchors:
         self._outlines = ObstacleOutlines.from_obstacles(known_obstacles)
         self._lengths_m = np.array([link.length_m for link in robot.links])
         self._radii_m = np.array([link.radius_m for link in robot.links])
-        self._point_fractions = (np.arange(POINTS_PER_LINK) + 0.5) / POINTS_PER_LINK  # of each link's length
+        # Of each link's length.
+        self._point_fractions = (np.arange(POINTS_PER_LINK) + 0.5) / POINTS_PER_LINK
 
     def correct_pose(
-        self, localizer: PoseLocalizer, angles_rad: Floats, contacts: Sequence[Contact], trust: GapTrust
+        self,
+        localizer: PoseLocalizer,
+        angles_rad: Floats,
+        contacts: Sequence[Contact],
+        trust: GapTrust,
     ) -> None:
         """Correct an estimated base pose by the known obstacles near the body.
 
@@ -69,7 +75,10 @@ class ObstacleAnchors:
             return
         body = localizer.history.compute_frames(localizer.base, angles_rad)
         axis_w = self._sample_axis_w(body)
-        gaps_m = self._outlines.compute_distances_m(axis_w) - np.repeat(self._radii_m, POINTS_PER_LINK)[:, None]
+        gaps_m = (
+            self._outlines.compute_distances_m(axis_w)
+            - np.repeat(self._radii_m, POINTS_PER_LINK)[:, None]
+        )
         nearest_points = gaps_m.argmin(axis=0)  # index of the body point nearest to each obstacle
         min_gaps_m = gaps_m.min(axis=0)
         near_obstacles = np.flatnonzero((min_gaps_m < MAX_GAP_M) & (min_gaps_m > -MAX_DEPTH_M))
@@ -84,7 +93,10 @@ class ObstacleAnchors:
             point_index = int(nearest_points[obstacle])
             gap_m = float(gaps_m[point_index, obstacle])
             is_sunk = gap_m < 0.0
-            is_pushed = self._sum_pushing_contact_forces(body, contacts, point_index, normal_w) > MIN_FORCE_N
+            is_pushed = (
+                self._sum_pushing_contact_forces(body, contacts, point_index, normal_w)
+                > MIN_FORCE_N
+            )
             if not is_sunk and not is_pushed:
                 continue
             measured_gaps_m.append(gap_m)
@@ -93,7 +105,9 @@ class ObstacleAnchors:
             # How the gap changes with x, y and heading of the base.
             rows.append(np.array([normal_w[0], normal_w[1], normal_w[1] * x - normal_w[0] * y]))
         if rows:
-            localizer.correct_by_linear_measurements(np.array(rows), -np.array(measured_gaps_m), np.array(sds_m))
+            localizer.correct_by_linear_measurements(
+                np.array(rows), -np.array(measured_gaps_m), np.array(sds_m)
+            )
 
     def _sample_axis_w(self, body: BodyFrames) -> Floats:
         """Return POINTS_PER_LINK points on the axis of each link, (points, 2), tail to head."""
@@ -115,12 +129,18 @@ class ObstacleAnchors:
         Returns:
             Sum of the magnitudes of these forces in N.
         """
-        point_position_in_links = (point_index + 0.5) / POINTS_PER_LINK  # distance from the tail end, in link lengths
+        # Distance from the tail end, in link lengths.
+        point_position_in_links = (point_index + 0.5) / POINTS_PER_LINK
         forces_n: list[float] = []
         for contact in contacts:
-            contact_position_in_links = contact.link + contact.position_l[0] / self._lengths_m[contact.link]
+            contact_position_in_links = (
+                contact.link + contact.position_l[0] / self._lengths_m[contact.link]
+            )
             contact_normal_w = (body.rotations[contact.link] @ np.array(contact.normal_l))[:2]
-            is_near = abs(contact_position_in_links - point_position_in_links) < MAX_CONTACT_DISTANCE_LINKS
+            is_near = (
+                abs(contact_position_in_links - point_position_in_links)
+                < MAX_CONTACT_DISTANCE_LINKS
+            )
             if is_near and float(contact_normal_w @ normal_w) > 0.0:
                 forces_n.append(math.hypot(*contact.force_l))
         return math.fsum(forces_n)

@@ -12,7 +12,8 @@ from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import RobotDescription
 
 HISTORY_NS = 1_000_000_000
-MAX_AHEAD_NS = 50_000_000  # a sample may be this much newer than the newest joint state, which is used then
+# A sample may be this much newer than the newest joint state, which is used then.
+MAX_AHEAD_NS = 50_000_000
 AXIS_POINT_SPACING_M = 0.02
 
 

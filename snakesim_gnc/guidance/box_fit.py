@@ -61,7 +61,9 @@ class _RotatedPoints:
     direction_to_sensor: tuple[Floats, Floats]
 
     @classmethod
-    def rotate_points(cls, points_w: Floats, directions_to_sensor: Floats, yaw_rad: Floats) -> "_RotatedPoints":
+    def rotate_points(
+        cls, points_w: Floats, directions_to_sensor: Floats, yaw_rad: Floats
+    ) -> "_RotatedPoints":
         """Rotate points and directions to the sensor from the world into the axes of candidate boxes.
 
         Args:
@@ -72,7 +74,8 @@ class _RotatedPoints:
         return cls(_rotate(points_w, yaw_rad), _rotate(directions_to_sensor, yaw_rad))
 
 
-Faces = list[Floats]  # positions of the four faces along their axes: low and high of axis 0, low and high of axis 1
+# Positions of the four faces along their axes: low and high of axis 0, low and high of axis 1.
+Faces = list[Floats]
 
 
 def fit_boxes(points: Floats, weights: Floats, directions_to_sensor: Floats) -> FittedBoxes:
@@ -92,14 +95,20 @@ def fit_boxes(points: Floats, weights: Floats, directions_to_sensor: Floats) -> 
     weights = soften_weights(weights)
     rows = np.arange(len(points))
     coarse_rad = np.broadcast_to(COARSE_YAWS_RAD, (len(points), len(COARSE_YAWS_RAD)))
-    _, fit_cost = _fit_faces(_RotatedPoints.rotate_points(points, directions_to_sensor, coarse_rad), weights)
+    _, fit_cost = _fit_faces(
+        _RotatedPoints.rotate_points(points, directions_to_sensor, coarse_rad), weights
+    )
     best_candidate = fit_cost.argmin(axis=1)
 
     fine_rad = coarse_rad[rows, best_candidate][:, None] + FINE_YAW_OFFSETS_RAD
-    _, fit_cost = _fit_faces(_RotatedPoints.rotate_points(points, directions_to_sensor, fine_rad), weights)
+    _, fit_cost = _fit_faces(
+        _RotatedPoints.rotate_points(points, directions_to_sensor, fine_rad), weights
+    )
     best_candidate = fit_cost.argmin(axis=1)
 
-    yaw_rad = fine_rad[rows, best_candidate] + _interpolate_best_yaw_offset_rad(fit_cost, best_candidate)
+    yaw_rad = fine_rad[rows, best_candidate] + _interpolate_best_yaw_offset_rad(
+        fit_cost, best_candidate
+    )
     rotated_points = _RotatedPoints.rotate_points(points, directions_to_sensor, yaw_rad[:, None])
     faces, fit_cost = _fit_faces(rotated_points, weights)
     return _complete_boxes(rotated_points, weights, yaw_rad, faces, fit_cost[:, 0])
@@ -140,7 +149,9 @@ def _fit_faces(points: _RotatedPoints, weights: Floats) -> tuple[Faces, Floats]:
     faces = _find_outermost_faces(points, weights)
     for _ in range(REWEIGHTING_ITERATIONS):
         error_m, is_first_axis = _assign_points_to_faces(points, faces)
-        huber_factors = np.minimum(1.0, OUTLIER_THRESHOLD_SD / np.maximum(np.abs(error_m) * np.sqrt(weights), 1e-9))
+        huber_factors = np.minimum(
+            1.0, OUTLIER_THRESHOLD_SD / np.maximum(np.abs(error_m) * np.sqrt(weights), 1e-9)
+        )
         robust_weights = weights * huber_factors
         for axis in (0, 1):
             is_this_axis = is_first_axis if axis == 0 else ~is_first_axis
@@ -148,7 +159,9 @@ def _fit_faces(points: _RotatedPoints, weights: Floats) -> tuple[Faces, Floats]:
                 is_on_face = is_this_axis & (direction * points.direction_to_sensor[axis] > 0)
                 face_weight = robust_weights * is_on_face
                 total_weight = face_weight.sum(axis=2)
-                mean_m = (face_weight * points.position_m[axis]).sum(axis=2) / np.maximum(total_weight, 1e-12)
+                mean_m = (face_weight * points.position_m[axis]).sum(axis=2) / np.maximum(
+                    total_weight, 1e-12
+                )
                 faces[face] = np.where(total_weight > 0, mean_m, faces[face])
     error_m, _ = _assign_points_to_faces(points, faces)
     fit_cost = np.minimum(weights * error_m * error_m, OUTLIER_THRESHOLD_SD**2).sum(axis=2)
@@ -168,8 +181,12 @@ def _find_outermost_faces(points: _RotatedPoints, weights: Floats) -> Faces:
     faces: Faces = []
     for axis in (0, 1):
         for direction in (LOW_SIDE, HIGH_SIDE):
-            looks_this_way = (weights > 0) & (direction * points.direction_to_sensor[axis] > MIN_DIRECTION_PART)
-            extreme_m = np.where(looks_this_way, direction * points.position_m[axis], -UNSEEN_FACE_M).max(axis=2)
+            looks_this_way = (weights > 0) & (
+                direction * points.direction_to_sensor[axis] > MIN_DIRECTION_PART
+            )
+            extreme_m = np.where(
+                looks_this_way, direction * points.position_m[axis], -UNSEEN_FACE_M
+            ).max(axis=2)
             faces.append(direction * np.where(extreme_m > -UNSEEN_FACE_M, extreme_m, UNSEEN_FACE_M))
     return faces
 
@@ -188,7 +205,9 @@ def _assign_points_to_faces(points: _RotatedPoints, faces: Faces) -> tuple[Float
     for axis in (0, 1):
         low_m = faces[2 * axis][..., None]
         high_m = faces[2 * axis + 1][..., None]
-        distances.append(points.position_m[axis] - np.where(points.direction_to_sensor[axis] > 0, high_m, low_m))
+        distances.append(
+            points.position_m[axis] - np.where(points.direction_to_sensor[axis] > 0, high_m, low_m)
+        )
     is_first_axis = np.abs(distances[0]) <= np.abs(distances[1])
     return np.where(is_first_axis, distances[0], distances[1]), is_first_axis
 
@@ -210,7 +229,9 @@ def _interpolate_best_yaw_offset_rad(fit_cost: Floats, best_candidate: NDArray[n
     middle_cost = fit_cost[rows, center_candidate]
     right_cost = fit_cost[rows, center_candidate + 1]
     curvature = left_cost - 2 * middle_cost + right_cost
-    offset = np.where(curvature > 1e-9, 0.5 * (left_cost - right_cost) / np.maximum(curvature, 1e-9), 0.0)
+    offset = np.where(
+        curvature > 1e-9, 0.5 * (left_cost - right_cost) / np.maximum(curvature, 1e-9), 0.0
+    )
     step_rad = FINE_YAW_OFFSETS_RAD[1] - FINE_YAW_OFFSETS_RAD[0]
     return np.where(center_candidate == best_candidate, np.clip(offset, -0.5, 0.5) * step_rad, 0.0)
 
@@ -238,12 +259,15 @@ def _complete_boxes(
     extent_y_m = extents.high_m[1] - extents.low_m[1]
     longest_m = np.maximum(extent_x_m, extent_y_m)
     is_wall = longest_m > MIN_WALL_LENGTH_M
-    assumed_depth_m = np.where(is_wall, WALL_THICKNESS_M, ASSUMED_DEPTH_M)  # of a box of which one face was seen
+    # Of a box of which one face was seen.
+    assumed_depth_m = np.where(is_wall, WALL_THICKNESS_M, ASSUMED_DEPTH_M)
     center_box_m = np.empty((len(yaw_rad), 2))  # along the yaw direction and across it
     half_m = np.empty((len(yaw_rad), 2))  # half of the size
     end_sd_m = np.empty((len(yaw_rad), 2))
     for axis in (0, 1):
-        low_end_m, high_end_m, end_sd_m[:, axis] = _find_box_ends(axis, extents, faces, assumed_depth_m)
+        low_end_m, high_end_m, end_sd_m[:, axis] = _find_box_ends(
+            axis, extents, faces, assumed_depth_m
+        )
         center_box_m[:, axis] = 0.5 * (low_end_m + high_end_m)
         half_m[:, axis] = np.maximum(0.5 * (high_end_m - low_end_m), MIN_HALF_SIZE_M)
 
@@ -297,7 +321,9 @@ def _measure_extents(points: _RotatedPoints, weights: Floats, faces: Faces) -> _
         extents.high_m.append(np.where(is_point, position_m, -np.inf).max(axis=1))
         is_this_axis = (is_first_axis if axis == 0 else ~is_first_axis)[:, 0]
         for direction in (LOW_SIDE, HIGH_SIDE):
-            is_on_face = is_point & is_this_axis & (direction * points.direction_to_sensor[axis][:, 0] > 0)
+            is_on_face = (
+                is_point & is_this_axis & (direction * points.direction_to_sensor[axis][:, 0] > 0)
+            )
             left_m = np.where(is_on_face, along_face_m, np.inf).min(axis=1)
             right_m = np.where(is_on_face, along_face_m, -np.inf).max(axis=1)
             extents.is_seen.append(right_m - left_m > MIN_FACE_M)
@@ -336,9 +362,13 @@ def _find_box_ends(
     low_face_m = faces[low_face][:, 0]
     high_face_m = faces[high_face][:, 0]
 
-    low_end_if_unseen_m = np.where(saw_other_axis | ~saw_high, first_point_m, high_face_m - assumed_size_m)
+    low_end_if_unseen_m = np.where(
+        saw_other_axis | ~saw_high, first_point_m, high_face_m - assumed_size_m
+    )
     low_end_m = np.where(saw_low, low_face_m, low_end_if_unseen_m)
-    high_end_if_unseen_m = np.where(saw_other_axis | ~saw_low, last_point_m, low_face_m + assumed_size_m)
+    high_end_if_unseen_m = np.where(
+        saw_other_axis | ~saw_low, last_point_m, low_face_m + assumed_size_m
+    )
     high_end_m = np.where(saw_high, high_face_m, high_end_if_unseen_m)
 
     unseen_sd_m = np.where(saw_other_axis, FACE_END_SD_M, ASSUMED_DEPTH_SD_M)

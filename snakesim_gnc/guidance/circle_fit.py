@@ -20,7 +20,8 @@ CENTER_PRIOR_INFORMATION = 1.0  # 1 / m², a prior so weak that it only keeps th
 ITERATIONS = 5
 MAX_STEP_M = 0.04
 OUTLIER_THRESHOLD_SD = 3.0  # standard deviations from which on a point counts less
-SHAPE_MODEL_SD_M = 0.0015  # of real surfaces from a circle or box, and of points that are means over a cell
+# Of real surfaces from a circle or box, and of points that are means over a cell.
+SHAPE_MODEL_SD_M = 0.0015
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,11 @@ class FittedCircles:
 
 
 def fit_circles(
-    points_w: Floats, weights: Floats, outward_directions: Floats, normal_weights: Floats, initial_centers_w: Floats
+    points_w: Floats,
+    weights: Floats,
+    outward_directions: Floats,
+    normal_weights: Floats,
+    initial_centers_w: Floats,
 ) -> FittedCircles:
     """Fit a circle with center c and radius r to the points q of each obstacle.
 
@@ -52,11 +57,15 @@ def fit_circles(
         One circle for each obstacle, with the covariance (3, 3) of x, y and radius, and the misfit.
     """
     weights = soften_weights(weights)
-    centers_w, radii_m = _make_initial_circles(points_w, weights, outward_directions, initial_centers_w)
+    centers_w, radii_m = _make_initial_circles(
+        points_w, weights, outward_directions, initial_centers_w
+    )
     information = np.zeros((len(points_w), 3, 3))
     for _ in range(ITERATIONS):
         offset = points_w - centers_w[:, None]
-        information, gradient = _linearize(offset, radii_m, weights, outward_directions, normal_weights)
+        information, gradient = _linearize(
+            offset, radii_m, weights, outward_directions, normal_weights
+        )
         step = -np.linalg.solve(information, gradient[..., None])[..., 0]
         longest_m = np.maximum(np.abs(step).max(axis=1), 1e-9)
         step *= np.minimum(1.0, MAX_STEP_M / longest_m)[:, None]
@@ -68,7 +77,9 @@ def fit_circles(
     surplus_points = np.maximum((weights > 0).sum(axis=1) - 3, 1)
     # If the points scatter more than their weights imply, the covariance is larger by that ratio.
     excess = np.maximum(fit_cost / surplus_points, 1.0)
-    return FittedCircles(centers_w, radii_m, np.linalg.inv(information) * excess[:, None, None], fit_cost)
+    return FittedCircles(
+        centers_w, radii_m, np.linalg.inv(information) * excess[:, None, None], fit_cost
+    )
 
 
 def soften_weights(weights: Floats) -> Floats:
@@ -95,12 +106,18 @@ def _make_initial_circles(
     ratio = weights / weights.sum(axis=1, keepdims=True)
     behind_surface = np.einsum("bp,bpk->bk", ratio, points_w - PRIOR_RADIUS_M * outward_directions)
     centers_w = np.where(np.isnan(initial_centers_w), behind_surface, initial_centers_w)
-    distances_m = np.hypot(points_w[..., 0] - centers_w[:, None, 0], points_w[..., 1] - centers_w[:, None, 1])
+    distances_m = np.hypot(
+        points_w[..., 0] - centers_w[:, None, 0], points_w[..., 1] - centers_w[:, None, 1]
+    )
     return centers_w, np.einsum("bp,bp->b", ratio, distances_m)
 
 
 def _linearize(
-    offsets_m: Floats, radii_m: Floats, weights: Floats, outward_directions: Floats, normal_weights: Floats
+    offsets_m: Floats,
+    radii_m: Floats,
+    weights: Floats,
+    outward_directions: Floats,
+    normal_weights: Floats,
 ) -> tuple[Floats, Floats]:
     """Linearize the circle fit at the current circles, for a Gauss-Newton step of x, y and radius.
 
@@ -116,17 +133,25 @@ def _linearize(
     """
     distances_m = np.maximum(np.hypot(offsets_m[..., 0], offsets_m[..., 1]), 1e-9)
     errors_m = distances_m - radii_m[:, None]
-    huber_factors = np.minimum(1.0, OUTLIER_THRESHOLD_SD / np.maximum(np.abs(errors_m) * np.sqrt(weights), 1e-9))
+    huber_factors = np.minimum(
+        1.0, OUTLIER_THRESHOLD_SD / np.maximum(np.abs(errors_m) * np.sqrt(weights), 1e-9)
+    )
     robust_weights = weights * huber_factors
     rows = np.stack(
-        [-offsets_m[..., 0] / distances_m, -offsets_m[..., 1] / distances_m, -np.ones_like(distances_m)], axis=-1
+        [
+            -offsets_m[..., 0] / distances_m,
+            -offsets_m[..., 1] / distances_m,
+            -np.ones_like(distances_m),
+        ],
+        axis=-1,
     )
     information = np.einsum("bp,bpi,bpj->bij", robust_weights, rows, rows)
     gradient = np.einsum("bp,bpi->bi", robust_weights * errors_m, rows)
 
     # The line through a point along its measured normal leads through the center.
     normal_rows = np.stack(
-        [outward_directions[..., 1], -outward_directions[..., 0], np.zeros_like(distances_m)], axis=-1
+        [outward_directions[..., 1], -outward_directions[..., 0], np.zeros_like(distances_m)],
+        axis=-1,
     )
     normal_errors_m = np.einsum("bpk,bpk->bp", normal_rows[..., :2], -offsets_m)
     information += np.einsum("bp,bpi,bpj->bij", normal_weights, normal_rows, normal_rows)

@@ -17,7 +17,8 @@ MAX_MISSED_BINS = 1  # that dropped out within a surface
 NOISE_MARGIN_SD = 3.0  # standard deviations that are added to a limit
 
 # Concave corners.
-MAX_CONCAVITY_M = 0.025  # an obstacle is convex: its points are not this far behind the line between its ends
+# An obstacle is convex: its points are not this far behind the line between its ends.
+MAX_CONCAVITY_M = 0.025
 MIN_SPLIT_POINTS = 5  # a shorter run is not cut
 MIN_CHORD_M = 1e-6
 
@@ -72,7 +73,10 @@ def _split_at_corners(surface_bins: Indices, scan: AzimuthScan) -> list[Indices]
     if depth_m is None:
         return [surface_bins]
     deepest_index = int(np.argmax(depth_m))
-    is_convex = depth_m[deepest_index] < MAX_CONCAVITY_M + NOISE_MARGIN_SD * scan.sd_m[surface_bins[deepest_index]]
+    is_convex = (
+        depth_m[deepest_index]
+        < MAX_CONCAVITY_M + NOISE_MARGIN_SD * scan.sd_m[surface_bins[deepest_index]]
+    )
     is_inside = 1 < deepest_index < len(surface_bins) - 2
     if is_convex or not is_inside:
         return [surface_bins]

@@ -154,7 +154,9 @@ def _list_candidate_pushes(chain: ChainDynamics) -> list[_CandidatePush]:
     end_fractions = np.array([candidate.end_fraction for candidate in candidates])
     outward_l = np.array([_get_outward_normal_l(candidate.side) for candidate in candidates])
     distances_from_rear_m = end_fractions * chain.lengths_m[links]
-    surface_points_l = distances_from_rear_m[:, None] * [1.0, 0.0, 0.0] + chain.radii_m[links, None] * outward_l
+    surface_points_l = (
+        distances_from_rear_m[:, None] * [1.0, 0.0, 0.0] + chain.radii_m[links, None] * outward_l
+    )
     base_from_link = chain.frames[links]
     # Rotate the vector of each candidate from the frame of its link to that of the base.
     points_b = chain.rear_b[links] + np.einsum("kij,kj->ki", base_from_link, surface_points_l)
@@ -176,7 +178,10 @@ def _get_outward_normal_l(side: int) -> list[float]:
 
 
 def _merge_pushes(
-    chain: ChainDynamics, candidate_pushes: Sequence[_CandidatePush], forces_n: Floats, covariance: Floats
+    chain: ChainDynamics,
+    candidate_pushes: Sequence[_CandidatePush],
+    forces_n: Floats,
+    covariance: Floats,
 ) -> list[EstimatedPush]:
     """Merge neighboring unit pushes on one side into one push, and leave out the insignificant results.
 
@@ -189,15 +194,22 @@ def _merge_pushes(
     Returns:
         The pushes whose force is at least MIN_SIGNIFICANCE_SD times its standard deviation, sorted.
     """
-    link_starts_m = np.append(0.0, np.cumsum(chain.lengths_m))  # arc length at which each link begins
+    # Arc length at which each link begins.
+    link_starts_m = np.append(0.0, np.cumsum(chain.lengths_m))
     max_gap_m = MAX_MERGE_RATIO * chain.lengths_m.max()
     merged: list[EstimatedPush] = []
     for side in (LEFT_SIDE, RIGHT_SIDE, HEAD_TIP):
-        indices = [i for i, push in enumerate(candidate_pushes) if push.side == side and forces_n[i] > 0.0]
+        indices = [
+            i for i, push in enumerate(candidate_pushes) if push.side == side and forces_n[i] > 0.0
+        ]
         if not indices:
             continue
         candidates_s_m = np.array(
-            [link_starts_m[candidate_pushes[i].link] + candidate_pushes[i].distance_from_rear_joint_m for i in indices]
+            [
+                link_starts_m[candidate_pushes[i].link]
+                + candidate_pushes[i].distance_from_rear_joint_m
+                for i in indices
+            ]
         )
         order = np.argsort(candidates_s_m, kind="stable")
         group_starts = np.flatnonzero(np.diff(candidates_s_m[order]) > max_gap_m) + 1

@@ -20,7 +20,8 @@ from snakesim_hal.wire.messages import (
     WorldModel,
 )
 
-POSE_CONFIDENCE_DECAY_TIME_S = 0.5  # confidence in a pose falls to 1/e after this time without a new one
+# Confidence in a pose falls to 1/e after this time without a new one.
+POSE_CONFIDENCE_DECAY_TIME_S = 0.5
 MAX_CONTACT_GAP_M = 0.03  # a contact farther from every known obstacle belongs to none
 
 
@@ -28,7 +29,11 @@ class SurveyedWorld:
     """Makes world models from the newest sample of each sensor."""
 
     def __init__(
-        self, robot: RobotDescription, known_obstacles: Sequence[KnownObstacle], *, map_radius_m: float = 0.5
+        self,
+        robot: RobotDescription,
+        known_obstacles: Sequence[KnownObstacle],
+        *,
+        map_radius_m: float = 0.5,
     ) -> None:
         """Prepare to make world models of a robot among surveyed obstacles.
 
@@ -51,7 +56,9 @@ class SurveyedWorld:
         self._obstacle_y = np.ascontiguousarray(self._outlines.center_w[:, 1])
         self._map_radius_m = map_radius_m
 
-    def update(self, tick: int, now_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose) -> WorldModel:
+    def update(
+        self, tick: int, now_ns: int, joints: JointState, contacts: Contacts | None, pose: Pose
+    ) -> WorldModel:
         """Compute the world model from the newest samples, with contacts and center of mass in the world frame.
 
         Args:
@@ -102,7 +109,11 @@ class SurveyedWorld:
             return []
         return [
             transform_contact(
-                contact, origins_w, rotations, self._link_rear_s_m, partial(self._name_obstacle, contact.obstacle)
+                contact,
+                origins_w,
+                rotations,
+                self._link_rear_s_m,
+                partial(self._name_obstacle, contact.obstacle),
             )
             for contact in contacts.contacts
             if contact.link < len(origins_w)
@@ -129,7 +140,9 @@ class SurveyedWorld:
         difference_y = self._obstacle_y[:, None] - origins_w[:, 1]
         distances_m = np.hypot(difference_x, difference_y)
         gaps_m = distances_m.min(axis=1) - self._outlines.bounding_radius_m
-        return [self._known_obstacles[index] for index in np.flatnonzero(gaps_m < self._map_radius_m)]
+        return [
+            self._known_obstacles[index] for index in np.flatnonzero(gaps_m < self._map_radius_m)
+        ]
 
 
 def transform_contact(
@@ -149,7 +162,9 @@ def transform_contact(
         find_name: Returns the name of the obstacle at a position (3,) in the world.
     """
     rotation = rotations[contact.link]
-    vectors_l = np.array([contact.position_l, contact.normal_l, contact.tangent_1_l, contact.force_l])
+    vectors_l = np.array(
+        [contact.position_l, contact.normal_l, contact.tangent_1_l, contact.force_l]
+    )
     from_origin_w, normal_w, tangent_w, force_w = vectors_l @ rotation.T
     position_w = from_origin_w + origins_w[contact.link]
     return WorldContact(

@@ -8,11 +8,22 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from snakesim_gnc.guidance.anchoring import ESTIMATED_CONTACT_TRUST, MEASURED_CONTACT_TRUST, ObstacleAnchors
+from snakesim_gnc.guidance.anchoring import (
+    ESTIMATED_CONTACT_TRUST,
+    MEASURED_CONTACT_TRUST,
+    ObstacleAnchors,
+)
 from snakesim_gnc.guidance.body_history import BasePose
 from snakesim_gnc.guidance.localization import PoseLocalizer, PoseNoise
 from snakesim_gnc.guidance.perceived_world import compute_confidence, quaternion_from_rotation
-from snakesim_hal.wire.messages import Contacts, JointState, KnownObstacle, Pose, RobotDescription, WorldModel
+from snakesim_hal.wire.messages import (
+    Contacts,
+    JointState,
+    KnownObstacle,
+    Pose,
+    RobotDescription,
+    WorldModel,
+)
 
 MAX_POSITION_SD_M = 1e3  # upper limits of what is reported
 MAX_YAW_SD_RAD = 10.0
@@ -21,7 +32,9 @@ MAX_YAW_SD_RAD = 10.0
 class DeadReckonedPose:
     """Computes poses from joint states and contacts."""
 
-    def __init__(self, robot: RobotDescription, start: BasePose, known_obstacles: Sequence[KnownObstacle]) -> None:
+    def __init__(
+        self, robot: RobotDescription, start: BasePose, known_obstacles: Sequence[KnownObstacle]
+    ) -> None:
         """Create a dead-reckoned pose that starts at a known pose.
 
         Args:
@@ -33,7 +46,9 @@ class DeadReckonedPose:
         self._anchors = ObstacleAnchors(robot, known_obstacles)
         self._timestamp_ns = -1
 
-    def update(self, joints: JointState, contacts: Contacts | None, *, are_contacts_estimated: bool) -> Pose:
+    def update(
+        self, joints: JointState, contacts: Contacts | None, *, are_contacts_estimated: bool
+    ) -> Pose:
         """Update the dead-reckoned base pose by a joint state, and return it.
 
         The odometry moves the pose, and contacts with known obstacles correct it. A joint state that is not newer than

@@ -30,7 +30,8 @@ MAX_SPREAD_CELL_RATIO = 0.6  # of a cell, in addition
 MIN_SURFACE_SD_M = 0.001  # of a surface's range, however many pixels it is the mean of
 
 MIN_RANGE_M = 0.03
-MIN_BAND_MARGIN_M = 0.02  # above the ground's offset from the camera, that the band of heights includes at least
+# Above the ground's offset from the camera, that the band of heights includes at least.
+MIN_BAND_MARGIN_M = 0.02
 GROUND_PIXEL_STRIDE = 7  # one pixel in so many is used for the ground's plane
 
 
@@ -48,7 +49,9 @@ class CameraIntrinsics:
     @staticmethod
     def from_image(image: DepthImage) -> "CameraIntrinsics":
         """Return the intrinsics of the image's camera."""
-        return CameraIntrinsics(image.width, image.height, image.fx_px, image.fy_px, image.cx_px, image.cy_px)
+        return CameraIntrinsics(
+            image.width, image.height, image.fx_px, image.fy_px, image.cx_px, image.cy_px
+        )
 
     def compute_rays(self) -> Float32Array:
         """Compute the direction of each pixel in the camera's frame, (height * width, 3), row by row from the top.
@@ -91,10 +94,18 @@ class DepthScanner:
         self._rays = intrinsics.compute_rays()
         self._noise = noise
         self._step_rad = 1.0 / intrinsics.fx_px
-        self._cell_count = math.ceil(CELL_GROWTH_RANGE_M * math.asinh(MAX_RANGE_M / CELL_GROWTH_RANGE_M) / CELL_M) + 1
+        self._cell_count = (
+            math.ceil(CELL_GROWTH_RANGE_M * math.asinh(MAX_RANGE_M / CELL_GROWTH_RANGE_M) / CELL_M)
+            + 1
+        )
 
     def make_scan(
-        self, depth_m: Float32Array, timestamp_ns: int, position_w: Floats, rotation: Floats, plane: Floats
+        self,
+        depth_m: Float32Array,
+        timestamp_ns: int,
+        position_w: Floats,
+        rotation: Floats,
+        plane: Floats,
     ) -> AzimuthScan:
         """Convert a depth image into a scan of the upright surfaces around the robot.
 
@@ -124,7 +135,9 @@ class DepthScanner:
         heading_rad, fov_rad = self._compute_view(rotation)
         first_azimuth_rad = heading_rad - fov_rad / 2
         azimuth_from_first_rad = np.arctan2(rays[:, 1], rays[:, 0]) - np.float32(first_azimuth_rad)
-        bins = (np.mod(azimuth_from_first_rad, np.float32(2 * math.pi)) / np.float32(self._step_rad)).astype(np.int32)
+        bins = (
+            np.mod(azimuth_from_first_rad, np.float32(2 * math.pi)) / np.float32(self._step_rad)
+        ).astype(np.int32)
         bin_count = math.ceil(fov_rad / self._step_rad)
 
         is_valid = (ranges_m > MIN_RANGE_M) & (ranges_m < MAX_RANGE_M) & (bins < bin_count)
@@ -135,19 +148,30 @@ class DepthScanner:
         band_pixels = np.flatnonzero(is_valid & (heights_m > lowest_m) & (heights_m < highest_m))
         free_m = np.zeros(bin_count)
         np.maximum.at(free_m, bins[is_ground], ranges_m[is_ground])
-        pixels = _DepthPixels(bins[band_pixels], points[band_pixels], ranges_m[band_pixels], heights_m[band_pixels])
-        return self._make_scan_from_pixels(timestamp_ns, position_w[:2], first_azimuth_rad, free_m, pixels)
+        pixels = _DepthPixels(
+            bins[band_pixels], points[band_pixels], ranges_m[band_pixels], heights_m[band_pixels]
+        )
+        return self._make_scan_from_pixels(
+            timestamp_ns, position_w[:2], first_azimuth_rad, free_m, pixels
+        )
 
     def _compute_view(self, rotation: Floats) -> tuple[float, float]:
         """Return the azimuth of the middle of the field of view in the world, and the width of the view, in rad."""
-        corners = self._rays[[0, self.intrinsics.width - 1, -self.intrinsics.width, -1]] @ rotation.T
+        corners = (
+            self._rays[[0, self.intrinsics.width - 1, -self.intrinsics.width, -1]] @ rotation.T
+        )
         heading_rad = math.atan2(rotation[1, 0], rotation[0, 0])
         corner_offsets_rad = np.arctan2(corners[:, 1], corners[:, 0]) - heading_rad
         half_fov_rad = float(np.abs((corner_offsets_rad + math.pi) % (2 * math.pi) - math.pi).max())
         return heading_rad, min(2 * half_fov_rad + 2 * self._step_rad, 2 * math.pi)
 
     def _make_scan_from_pixels(
-        self, timestamp_ns: int, origin_w: Floats, first_azimuth_rad: float, free_m: Floats, pixels: _DepthPixels
+        self,
+        timestamp_ns: int,
+        origin_w: Floats,
+        first_azimuth_rad: float,
+        free_m: Floats,
+        pixels: _DepthPixels,
     ) -> AzimuthScan:
         """Return the scan whose points are the mean of the pixels of the nearest upright surface in each bin.
 
@@ -169,7 +193,10 @@ class DepthScanner:
         has_surface = pixel_count > 0
         total_x = np.bincount(bins, points[:, 0], bin_count)
         total_y = np.bincount(bins, points[:, 1], bin_count)
-        mean_xy = np.stack([total_x, total_y], axis=1) / np.where(has_surface, pixel_count, np.nan)[:, None]
+        mean_xy = (
+            np.stack([total_x, total_y], axis=1)
+            / np.where(has_surface, pixel_count, np.nan)[:, None]
+        )
         top_m = np.full(bin_count, -np.inf)
         np.maximum.at(top_m, bins, pixels.heights_m[is_on_surface])
         mean_sd_m = pixel_sd_m / np.sqrt(np.maximum(pixel_count, 1.0))
@@ -195,9 +222,9 @@ class DepthScanner:
         Returns:
             (bin_count,) ranges of the nearest cell with an upright surface in m; NaN for a bin without one.
         """
-        cell_of_bin = (np.arcsinh(pixels.ranges_m / CELL_GROWTH_RANGE_M) * (CELL_GROWTH_RANGE_M / CELL_M)).astype(
-            np.int32
-        )
+        cell_of_bin = (
+            np.arcsinh(pixels.ranges_m / CELL_GROWTH_RANGE_M) * (CELL_GROWTH_RANGE_M / CELL_M)
+        ).astype(np.int32)
         cell = pixels.bins * self._cell_count + cell_of_bin
         cell_count = bin_count * self._cell_count
         pixel_count = np.bincount(cell, minlength=cell_count)
@@ -208,7 +235,9 @@ class DepthScanner:
         is_upright = (pixel_count >= MIN_PIXEL_COUNT) & (high_m - low_m >= MIN_RISE_M)
         is_upright = is_upright.reshape(bin_count, self._cell_count)
         nearest_cells = is_upright.argmax(axis=1)
-        range_m = CELL_GROWTH_RANGE_M * np.sinh((nearest_cells + 0.5) * (CELL_M / CELL_GROWTH_RANGE_M))
+        range_m = CELL_GROWTH_RANGE_M * np.sinh(
+            (nearest_cells + 0.5) * (CELL_M / CELL_GROWTH_RANGE_M)
+        )
         return np.where(is_upright.any(axis=1), range_m, np.nan)
 
 

@@ -7,7 +7,15 @@ import numpy as np
 
 from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.model.kinematics import compute_contact_tangents
-from snakesim_hal.wire.messages import Contact, Contacts, Imu, JointState, Pose, RobotDescription, WorldModel
+from snakesim_hal.wire.messages import (
+    Contact,
+    Contacts,
+    Imu,
+    JointState,
+    Pose,
+    RobotDescription,
+    WorldModel,
+)
 
 NO_IMU = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
 
@@ -28,7 +36,9 @@ class ContactEstimator:
     def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
 
-    def estimate_contacts(self, joints: JointState, imu: Imu | None, pose: Pose | None) -> EstimatedContacts | None:
+    def estimate_contacts(
+        self, joints: JointState, imu: Imu | None, pose: Pose | None
+    ) -> EstimatedContacts | None:
         """Estimate the contacts of the body from its joint torques, or return None while a joint's values are outdated.
 
         Args:
@@ -60,7 +70,8 @@ class ContactEstimator:
         """Convert a push into the message of a contact at the skin of the link, on the side of the obstacle."""
         normal_l = np.array(push.normal_l)
         position_l = (
-            np.array([push.distance_from_rear_joint_m, 0.0, 0.0]) - self._robot.links[push.link].radius_m * normal_l
+            np.array([push.distance_from_rear_joint_m, 0.0, 0.0])
+            - self._robot.links[push.link].radius_m * normal_l
         )
         tangent_1_l, tangent_2_l = compute_contact_tangents(push.normal_l)
         return Contact(

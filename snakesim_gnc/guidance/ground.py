@@ -74,7 +74,9 @@ def refine_plane(plane: Floats, points: Floats) -> Floats:
         if np.count_nonzero(tukey_weights) < MIN_POINTS:
             return first_guess
         right_side = rows.T @ (z * tukey_weights) + FIRST_GUESS_WEIGHTS @ first_guess
-        plane = np.linalg.solve(rows.T @ (rows * tukey_weights[:, None]) + FIRST_GUESS_WEIGHTS, right_side)
+        plane = np.linalg.solve(
+            rows.T @ (rows * tukey_weights[:, None]) + FIRST_GUESS_WEIGHTS, right_side
+        )
     if np.abs(plane[1:]).max() < MAX_SLOPE:
         return plane
     return first_guess

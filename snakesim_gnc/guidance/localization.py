@@ -11,7 +11,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from snakesim_gnc.guidance.body_history import BasePose, BodyHistory, make_rotation_about_z, wrap_angle
+from snakesim_gnc.guidance.body_history import (
+    BasePose,
+    BodyHistory,
+    make_rotation_about_z,
+    wrap_angle,
+)
 from snakesim_gnc.guidance.odometry import ChainOdometry, OdometryStep
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
@@ -20,9 +25,11 @@ from snakesim_hal.wire.messages import Contacts, Imu, JointState, Pose, RobotDes
 MessageT = TypeVar("MessageT", Contacts, Imu)
 
 # Standard deviations of x, y and heading, in m and rad.
-MIN_POSE_SD = np.array([0.0005, 0.0005, 0.001])  # of a pose sensor, even if its file has smaller ones
+# Of a pose sensor, even if its file has smaller ones.
+MIN_POSE_SD = np.array([0.0005, 0.0005, 0.001])
 START_SD = np.array([0.01, 0.01, 0.02])  # of the pose at which a robot without a pose sensor starts
-PLAUSIBILITY_MARGIN_SD = np.array([0.005, 0.005, 0.01])  # added before a pose is judged as implausible
+# Added before a pose is judged as implausible.
+PLAUSIBILITY_MARGIN_SD = np.array([0.005, 0.005, 0.01])
 
 # When a pose is believed.
 MAX_SQUARED_MAHALANOBIS_DISTANCE = 25.0  # squared Mahalanobis distance
@@ -62,12 +69,14 @@ class PoseLocalizer:
         self.covariance = np.diag(START_SD**2)  # (3, 3) of x, y and heading
         self.history = BodyHistory(robot)
         self._odometry = ChainOdometry(robot)
-        self._mean_specific_force_b: Floats | None = None  # (3,) averaged specific force of the tail link
+        # (3,) averaged specific force of the tail link.
+        self._mean_specific_force_b: Floats | None = None
 
         # The pose sensor.
         self.pose_timestamp_ns: int | None = None  # of the newest pose that was accepted
         self.rejected_pose_count = 0
-        self.jump_distance_m = 0.0  # by which the newest pose showed that the robot was carried; 0 if it was not
+        # By which the newest pose showed that the robot was carried; 0 if it was not.
+        self.jump_distance_m = 0.0
         self._rejected_since_ns: int | None = None
         pose_sd = np.maximum([noise.position_m, noise.position_m, noise.angle_rad], MIN_POSE_SD)
         self._pose_variance = np.square(pose_sd)  # (3,)
@@ -132,11 +141,17 @@ class PoseLocalizer:
             self.covariance = JUMP_COVARIANCE.copy()
         self._rejected_since_ns = None
         self.pose_timestamp_ns = pose.timestamp_ns
-        self.base = BasePose(self.base.planar_w, pose.position_w[2], make_rotation_about_z(-yaw_rad) @ rotation)
+        self.base = BasePose(
+            self.base.planar_w, pose.position_w[2], make_rotation_about_z(-yaw_rad) @ rotation
+        )
         self.correct_by_pose(estimate_then, measured_w, np.diag(self._pose_variance))
 
     def correct_by_pose(
-        self, estimate: BasePose, measured_w: Floats, measurement_covariance: Floats, map_variance_m2: float = 0.0
+        self,
+        estimate: BasePose,
+        measured_w: Floats,
+        measurement_covariance: Floats,
+        map_variance_m2: float = 0.0,
     ) -> None:
         """Correct the base pose by a measurement of x, y and heading at some time (Kalman update, Joseph form).
 
@@ -151,11 +166,15 @@ class PoseLocalizer:
                 added at the end, because no number of measurements lowers it.
         """
         mean_variance_m2 = 0.5 * float(np.trace(self.covariance[:2, :2]))
-        independent_ratio = max(1.0 - map_variance_m2 / max(mean_variance_m2, 1e-12), MIN_INDEPENDENT_RATIO)
+        independent_ratio = max(
+            1.0 - map_variance_m2 / max(mean_variance_m2, 1e-12), MIN_INDEPENDENT_RATIO
+        )
         independent_covariance = self.covariance * independent_ratio
         pose_error = measured_w - estimate.planar_w
         pose_error[2] = wrap_angle(pose_error[2])
-        kalman_gain = independent_covariance @ np.linalg.inv(independent_covariance + measurement_covariance)
+        kalman_gain = independent_covariance @ np.linalg.inv(
+            independent_covariance + measurement_covariance
+        )
         remaining = np.eye(3) - kalman_gain
         map_covariance = np.diag([map_variance_m2, map_variance_m2, 0.0])
         self.covariance = (
@@ -176,7 +195,9 @@ class PoseLocalizer:
         cross_covariance = self.covariance @ rows.T
         kalman_gain = cross_covariance @ np.linalg.inv(rows @ cross_covariance + np.diag(sds_m**2))
         remaining = np.eye(3) - kalman_gain @ rows
-        self.covariance = remaining @ self.covariance @ remaining.T + (kalman_gain * sds_m**2) @ kalman_gain.T
+        self.covariance = (
+            remaining @ self.covariance @ remaining.T + (kalman_gain * sds_m**2) @ kalman_gain.T
+        )
         self._shift_base_and_history(self.base.planar_w[:2].copy(), kalman_gain @ errors_m)
 
     def _shift_base_and_history(self, center_w: Floats, shift: Floats) -> None:
@@ -248,12 +269,17 @@ class PoseLocalizer:
         else:
             self._mean_specific_force_b = (
                 self._mean_specific_force_b
-                + (force_b - self._mean_specific_force_b) * IMU_PERIOD_S / TILT_FILTER_TIME_CONSTANT_S
+                + (force_b - self._mean_specific_force_b)
+                * IMU_PERIOD_S
+                / TILT_FILTER_TIME_CONSTANT_S
             )
-        z = self._mean_specific_force_b / max(float(np.linalg.norm(self._mean_specific_force_b)), 1e-6)
+        z = self._mean_specific_force_b / max(
+            float(np.linalg.norm(self._mean_specific_force_b)), 1e-6
+        )
         forward = np.array([1.0, 0.0, 0.0]) - z[0] * z
         x = forward / max(float(np.linalg.norm(forward)), 1e-6)
-        tilt: Floats = np.array([x, np.cross(z, x), z], dtype=np.float64)  # rows: axes of the level frame in the base
+        # Rows: axes of the level frame in the base.
+        tilt: Floats = np.array([x, np.cross(z, x), z], dtype=np.float64)
         self.base = BasePose(self.base.planar_w, self.base.z_m, tilt)
 
 

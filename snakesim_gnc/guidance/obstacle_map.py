@@ -47,11 +47,13 @@ WELL_KNOWN_SD_M = 0.01
 WELL_KNOWN_CELLS = 6
 
 # Merging two obstacles into one.
-MERGE_OVERLAP_M = 0.01  # a point that is nearer to the other's outline than this, or inside, overlaps
+# A point that is nearer to the other's outline than this, or inside, overlaps.
+MERGE_OVERLAP_M = 0.01
 MERGE_RATIO = 0.4  # of the points of one obstacle that overlap with the other
 
 # Evidence against an obstacle.
-SEEN_THROUGH_DISTANCE_M = 0.03  # a ray that ends farther behind a point than this has seen through it
+# A ray that ends farther behind a point than this has seen through it.
+SEEN_THROUGH_DISTANCE_M = 0.03
 MAX_TRACK_SD_M = 0.05  # of an obstacle's position that a ray must pass, in addition
 SEEN_THROUGH_RATIO = 0.5  # of the visible surface
 MAX_OVERLAP_WITH_BODY_M = 0.008  # an obstacle deeper in the body than this is not there
@@ -109,7 +111,8 @@ class ObstacleMap:
         outlines = make_outlines(nearby_tracks)
         bins_by_track: dict[int, list[Indices]] = {}  # by the track's number
         seen_track_by_number: dict[int, ObstacleTrack] = {}  # by the track's number
-        adjacent_pairs: list[tuple[ObstacleTrack, ObstacleTrack]] = []  # tracks side by side in one cluster
+        # Tracks side by side in one cluster.
+        adjacent_pairs: list[tuple[ObstacleTrack, ObstacleTrack]] = []
         for cluster in find_clusters(scan):
             claims = self._assign_cluster_to_tracks(cluster, scan, nearby_tracks, outlines, sd_m)
             for track, bins in claims:
@@ -141,7 +144,9 @@ class ObstacleMap:
             # The normal of a cylinder leads through its center; that of a box hardly determines its place.
             is_round = track.shape == "cylinder"
             normal_weight = 1.0 / (NORMAL_SD_RAD * track.radius_m) ** 2 if is_round else 0.0
-            track.surface.add(position_w[None], np.array([TOUCH_SD_M]), normal_w[None], np.array([normal_weight]))
+            track.surface.add(
+                position_w[None], np.array([TOUCH_SD_M]), normal_w[None], np.array([normal_weight])
+            )
             track.is_touched = True
             track.last_seen_ns = max(track.last_seen_ns, timestamp_ns)
             track.add_evidence(TOUCH_LOG_ODDS)
@@ -177,7 +182,9 @@ class ObstacleMap:
         changed_tracks: list[ObstacleTrack] = []
         for index in np.flatnonzero(gaps_m.min(axis=0) < min_distance_m):
             is_in_body = gaps_m[:, index] < min_distance_m
-            _remove_surface_in_body(tracks_with_surface[index], axis_w, left_w, is_in_body, radius_m, min_distance_m)
+            _remove_surface_in_body(
+                tracks_with_surface[index], axis_w, left_w, is_in_body, radius_m, min_distance_m
+            )
             changed_tracks.append(tracks_with_surface[index])
         self._drop_disproved_tracks()
         fit_shapes([track for track in changed_tracks if len(track.surface)])
@@ -220,8 +227,11 @@ class ObstacleMap:
         """
         if not nearby_tracks:
             return self._start_track_for_cluster(cluster, scan)
-        distance_m = np.abs(outlines.compute_distances_m(scan.points_w[cluster]))  # (points, tracks)
-        track_gate_m = np.minimum(BASE_GATE_M + 2 * get_position_sds_m(nearby_tracks) + sd_m, MAX_GATE_M)
+        # (points, tracks).
+        distance_m = np.abs(outlines.compute_distances_m(scan.points_w[cluster]))
+        track_gate_m = np.minimum(
+            BASE_GATE_M + 2 * get_position_sds_m(nearby_tracks) + sd_m, MAX_GATE_M
+        )
         gate_m = track_gate_m + 2 * scan.sd_m[cluster][:, None]  # (points, tracks)
         rows = np.arange(len(cluster))
         nearest_tracks = distance_m.argmin(axis=1)
@@ -240,8 +250,13 @@ class ObstacleMap:
         is_apart = np.zeros(len(cluster), dtype=bool)
         for index in owners:
             if _is_well_known_circle(nearby_tracks[index]):
-                is_apart |= (owner_of_point == index) & (distance_m[:, index] > gate_m[:, index] + MIN_APART_DISTANCE_M)
-        claims = [(nearby_tracks[index], cluster[(owner_of_point == index) & ~is_apart]) for index in owners]
+                is_apart |= (owner_of_point == index) & (
+                    distance_m[:, index] > gate_m[:, index] + MIN_APART_DISTANCE_M
+                )
+        claims = [
+            (nearby_tracks[index], cluster[(owner_of_point == index) & ~is_apart])
+            for index in owners
+        ]
         if np.count_nonzero(is_apart) > MIN_CLUSTER_POINTS:
             claims.append((self._start_seen_track(), cluster[is_apart]))
         claims = [(track, bins) for track, bins in claims if len(bins)]
@@ -285,18 +300,25 @@ class ObstacleMap:
             bins, ranges_m = scan.find_bins(surface.points_w)
             is_in_view = bins >= 0
             margin_m = min(track.position_sd_m, MAX_TRACK_SD_M)
-            seen_through_range_m = ranges_m + SEEN_THROUGH_DISTANCE_M + 3 * scan.sd_m[bins] + margin_m
+            seen_through_range_m = (
+                ranges_m + SEEN_THROUGH_DISTANCE_M + 3 * scan.sd_m[bins] + margin_m
+            )
             is_seen_through = is_in_view & (clear_m[bins] > seen_through_range_m)
             surface.seen_through_counts = np.where(
                 is_seen_through, surface.seen_through_counts + 1, surface.seen_through_counts
             )
             surface.keep_cells(surface.seen_through_counts < MAX_SEEN_THROUGH_COUNT)
             visible = max(np.count_nonzero(is_in_view), 1)
-            if track.number not in seen_numbers and np.count_nonzero(is_seen_through) > SEEN_THROUGH_RATIO * visible:
+            if (
+                track.number not in seen_numbers
+                and np.count_nonzero(is_seen_through) > SEEN_THROUGH_RATIO * visible
+            ):
                 track.add_evidence(MISS_LOG_ODDS)
 
     def _merge_duplicates(
-        self, seen_tracks: Sequence[ObstacleTrack], adjacent_pairs: Sequence[tuple[ObstacleTrack, ObstacleTrack]]
+        self,
+        seen_tracks: Sequence[ObstacleTrack],
+        adjacent_pairs: Sequence[tuple[ObstacleTrack, ObstacleTrack]],
     ) -> None:
         """Merge tracks that overlap, and adjacent tracks that one shape explains as well as two shapes.
 
@@ -315,7 +337,9 @@ class ObstacleMap:
                 merged_numbers.add(newer_track.number)
         self.tracks = [track for track in self.tracks if track.number not in merged_numbers]
 
-    def _find_overlaps(self, seen_tracks: Sequence[ObstacleTrack]) -> list[tuple[ObstacleTrack, ObstacleTrack]]:
+    def _find_overlaps(
+        self, seen_tracks: Sequence[ObstacleTrack]
+    ) -> list[tuple[ObstacleTrack, ObstacleTrack]]:
         """Find tracks that may be the same obstacle, because one covers a large part of the other's surface.
 
         Args:
@@ -337,12 +361,17 @@ class ObstacleMap:
                 other = self.tracks[index]
                 if other is track:
                     continue
-                is_covered = make_outlines([other]).compute_distances_m(track.surface.points_w)[:, 0] < MERGE_OVERLAP_M
+                is_covered = (
+                    make_outlines([other]).compute_distances_m(track.surface.points_w)[:, 0]
+                    < MERGE_OVERLAP_M
+                )
                 if np.count_nonzero(is_covered) > MERGE_RATIO * len(is_covered):
                     pairs.append((track, other))
         return pairs
 
-    def _merge_if_plausible(self, older: ObstacleTrack, newer: ObstacleTrack, *, overlaps: bool) -> bool:
+    def _merge_if_plausible(
+        self, older: ObstacleTrack, newer: ObstacleTrack, *, overlaps: bool
+    ) -> bool:
         """Merge a newer track into an older one, unless two shapes explain their points better than one.
 
         Args:
@@ -406,7 +435,11 @@ class ObstacleMap:
         return track
 
     def _drop_disproved_tracks(self) -> None:
-        self.tracks = [track for track in self.tracks if track.log_odds > MIN_KEPT_LOG_ODDS and len(track.surface)]
+        self.tracks = [
+            track
+            for track in self.tracks
+            if track.log_odds > MIN_KEPT_LOG_ODDS and len(track.surface)
+        ]
 
 
 def _remove_surface_in_body(
@@ -432,9 +465,13 @@ def _remove_surface_in_body(
     offset = surface.points_w[:, None] - axis_w
     distance_m = np.hypot(offset[..., 0], offset[..., 1])  # (cells, n)
     nearest_axis_points = distance_m.argmin(axis=1)
-    is_left = (offset[np.arange(cell_count), nearest_axis_points] * left_w[nearest_axis_points]).sum(axis=1) > 0
+    is_left = (
+        offset[np.arange(cell_count), nearest_axis_points] * left_w[nearest_axis_points]
+    ).sum(axis=1) > 0
     surface.keep_cells(distance_m.min(axis=1) > min_distance_m)
-    body_goes_through = MIN_LEFT_RATIO_WHEN_CROSSING < np.mean(is_left) < MAX_LEFT_RATIO_WHEN_CROSSING
+    body_goes_through = (
+        MIN_LEFT_RATIO_WHEN_CROSSING < np.mean(is_left) < MAX_LEFT_RATIO_WHEN_CROSSING
+    )
     if len(surface) < cell_count or body_goes_through:
         track.add_evidence(MISS_LOG_ODDS)
         return
@@ -451,7 +488,11 @@ def _is_in_range(track: ObstacleTrack, scan: AzimuthScan) -> bool:
 
 
 def _is_well_known_circle(track: ObstacleTrack) -> bool:
-    return track.shape == "cylinder" and track.position_sd_m < WELL_KNOWN_SD_M and len(track.surface) > WELL_KNOWN_CELLS
+    return (
+        track.shape == "cylinder"
+        and track.position_sd_m < WELL_KNOWN_SD_M
+        and len(track.surface) > WELL_KNOWN_CELLS
+    )
 
 
 def _compute_distance_m(track: ObstacleTrack, axis_w: Floats) -> float:

@@ -34,9 +34,8 @@ ROTATION_SD_WITHOUT_GYRO_RAD_S = 1.0  # without a gyroscope
 SLIP_CORRELATION_TIME_S = 2.0  # time for which an error lasts
 MAX_STEP_DURATION_S = 0.2  # between two joint states; a step over a longer gap is only uncertain
 GAP_SD_PER_S = (0.3, 0.3, 1.0)  # standard deviations of such a step, in m/s and rad/s
-MIN_HORIZONTAL_NORMAL_PART = (
-    0.5  # part of a normal in the plane of the ground: with less, the body lies on the obstacle
-)
+# Part of a normal in the plane of the ground: with less, the body lies on the obstacle.
+MIN_HORIZONTAL_NORMAL_PART = 0.5
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,9 @@ class ChainOdometry:
         Returns:
             The step with its covariance; None at the first call, and if the joint state is not newer than the last one.
         """
-        origins, rotations = compute_link_frames(np.zeros(3), tilt, joints.angle_rad, self._axes, self._link_lengths_m)
+        origins, rotations = compute_link_frames(
+            np.zeros(3), tilt, joints.angle_rad, self._axes, self._link_lengths_m
+        )
         current = _LinkFrames(joints.timestamp_ns, origins, rotations)
         previous = self._previous_frames
         if previous is None:
@@ -120,7 +121,10 @@ class ChainOdometry:
         rows = np.vstack([equations.rows, np.eye(3)])
         values = np.concatenate([equations.values, [0.0, 0.0, rotation_rad]])
         standard_deviations = np.concatenate(
-            [equations.standard_deviations * period_s, [translation_sd_m, translation_sd_m, rotation_sd_rad]]
+            [
+                equations.standard_deviations * period_s,
+                [translation_sd_m, translation_sd_m, rotation_sd_rad],
+            ]
         )
 
         information = rows.T @ (rows / np.square(standard_deviations)[:, None])
@@ -149,7 +153,9 @@ class ChainOdometry:
         Returns:
             One equation for each link. The standard deviations are speeds in m/s.
         """
-        middles_before = previous.origins + self._half_lengths_m[:, None] * previous.rotations[:, :, 0]
+        middles_before = (
+            previous.origins + self._half_lengths_m[:, None] * previous.rotations[:, :, 0]
+        )
         middles = current.origins + self._half_lengths_m[:, None] * current.rotations[:, :, 0]
         moved = (middles - middles_before)[:, :2]  # by the joints alone
         left = current.rotations[:, :2, 1]
@@ -191,7 +197,9 @@ def _make_contact_equations(
         position_before = (previous.origins[link] + previous.rotations[link] @ position_l)[:2]
         rows.append(_make_step_rows(normal[None], position[None]))
         values.append(-float(normal @ (position - position_before)))
-    return _MotionEquations(np.vstack(rows), np.array(values), np.full(len(values), ALONG_NORMAL_SD_M_S))
+    return _MotionEquations(
+        np.vstack(rows), np.array(values), np.full(len(values), ALONG_NORMAL_SD_M_S)
+    )
 
 
 def _measure_base_rotation(
@@ -216,7 +224,9 @@ def _measure_base_rotation(
     for link, rate in zip(imu.link, imu.angular_velocity_rad_s, strict=True):
         rotation = current.rotations[link]
         relative = rotation @ previous.rotations[link].T
-        by_joints_rad = float(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
+        by_joints_rad = float(
+            np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1])
+        )
         rotation_rad = float((rotation @ np.array(rate))[2]) * period_s
         rotations_rad.append(rotation_rad - by_joints_rad)
     return float(np.mean(rotations_rad)), GYRO_SD_RAD_S * period_s

@@ -31,12 +31,15 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 
-TOUCH_MAPPING_PERIOD_NS = 50_000_000  # contacts are mapped this often: the body slides a few millimeters meanwhile
+# Contacts are mapped this often: the body slides a few millimeters meanwhile.
+TOUCH_MAPPING_PERIOD_NS = 50_000_000
 OWN_BODY_MARGIN_M = 0.01  # beyond the body's radius: nearer points of a scan are on the body itself
 HALF_CONFIDENCE_SD_M = 0.05  # of the position, at which the confidence in it is one half
-MAX_VERTICAL_NORMAL_PART = 0.7  # part of a contact's normal: with more, the body lies on the obstacle
+# Part of a contact's normal: with more, the body lies on the obstacle.
+MAX_VERTICAL_NORMAL_PART = 0.7
 MAX_TRUSTED_POSE_AGE_NS = 300_000_000  # with a pose newer than this, scans do not correct the base
-MAX_CARVE_SD_M = 0.01  # limit of the position's standard deviation that the map assumes for the body
+# Limit of the position's standard deviation that the map assumes for the body.
+MAX_CARVE_SD_M = 0.01
 MAX_SCAN_SD_M = 0.02  # likewise for scans
 MAX_POSITION_SD_M = 1e3  # upper limits of what is reported
 MAX_YAW_SD_RAD = 10.0
@@ -67,12 +70,14 @@ class PerceivedWorld:
         self._variance_at_last_scan_m2 = 0.0  # of the position, after the last scan
 
         # Samples.
-        self.rejected_sample_counts: Counter[str] = Counter()  # samples that could not be used, by reason
+        # Samples that could not be used, by reason.
+        self.rejected_sample_counts: Counter[str] = Counter()
         self.depth_timestamp_ns: int | None = None  # of the newest image or ranges in the map
         self._scanners: dict[tuple[CameraIntrinsics, RangeNoise], DepthScanner] = {}
         self._joints: JointState | None = None
         self._contacts: Contacts | None = None
-        self._last_touch_ns = 0  # timestamp of the newest contacts in the map; 0 before the first ones
+        # Timestamp of the newest contacts in the map; 0 before the first ones.
+        self._last_touch_ns = 0
 
     def add_joints(self, joints: JointState, contacts: Contacts | None, imu: Imu | None) -> None:
         """Move the estimated body to a joint state by dead reckoning. A joint state that is not newer is ignored.
@@ -131,7 +136,9 @@ class PerceivedWorld:
             sample: Depth image or ranges, with the mounting of the sensor on its link.
             noise: Noise of the measured distances.
         """
-        body = self._find_body_at_sample(sample.timestamp_ns, "image" if isinstance(sample, DepthImage) else "ranges")
+        body = self._find_body_at_sample(
+            sample.timestamp_ns, "image" if isinstance(sample, DepthImage) else "ranges"
+        )
         if body is None or sample.link >= len(body.origins_w):
             return
         position_w, rotation = _compute_sensor_pose(body, sample)
@@ -139,7 +146,9 @@ class PerceivedWorld:
         plane = fit_plane_under_body(lowest_points_w, position_w[:2])
         if isinstance(sample, DepthImage):
             scanner = self._get_scanner(CameraIntrinsics.from_image(sample), noise)
-            scan = scanner.make_scan(decode_depth_m(sample), sample.timestamp_ns, position_w, rotation, plane)
+            scan = scanner.make_scan(
+                decode_depth_m(sample), sample.timestamp_ns, position_w, rotation, plane
+            )
         else:
             scan = make_scan(sample, position_w, rotation, float(plane[0]), noise)
         self._add_scan_to_map(scan, body)
@@ -161,7 +170,9 @@ class PerceivedWorld:
         base = localizer.base
         body = localizer.history.compute_frames(base, np.asarray(joints.angle_rad))
         axis_w = body.compute_axis_w()
-        self.map.remove_surfaces_in_body(axis_w, self._radius_m, min(localizer.position_sd_m, MAX_CARVE_SD_M))
+        self.map.remove_surfaces_in_body(
+            axis_w, self._radius_m, min(localizer.position_sd_m, MAX_CARVE_SD_M)
+        )
         self.map.drop_distant_tracks(axis_w)
         middles_w = body.origins_w + self._half_lengths_m[:, None] * body.rotations[:, :, 0]
         contacts_timestamp_ns = None
@@ -200,7 +211,11 @@ class PerceivedWorld:
         valid = [contact for contact in contacts.contacts if contact.link < len(body.origins_w)]
         return [
             transform_contact(
-                contact, body_then.origins_w, body_then.rotations, self._link_rear_s_m, self._find_obstacle_name
+                contact,
+                body_then.origins_w,
+                body_then.rotations,
+                self._link_rear_s_m,
+                self._find_obstacle_name,
             )
             for contact in valid[:MAX_CONTACTS]
         ]
@@ -275,7 +290,9 @@ class PerceivedWorld:
         match = match_scan(scan, self.map.tracks, base_then.planar_w)
         if match is None:
             return scan
-        self.localizer.correct_by_pose(base_then, match.planar_w, match.covariance, match.map_variance_m2)
+        self.localizer.correct_by_pose(
+            base_then, match.planar_w, match.covariance, match.map_variance_m2
+        )
         return scan.move_to_base(base_then.planar_w, match.planar_w)
 
     def _compute_position_variance_m2(self) -> float:
@@ -297,10 +314,30 @@ def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, flo
     m = rotation
     four_times_products = np.array(
         [
-            [1 + m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], 1 - m[0, 0] + m[1, 1] - m[2, 2], m[2, 1] + m[1, 2]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], 1 - m[0, 0] - m[1, 1] + m[2, 2]],
+            [
+                1 + m[0, 0] + m[1, 1] + m[2, 2],
+                m[2, 1] - m[1, 2],
+                m[0, 2] - m[2, 0],
+                m[1, 0] - m[0, 1],
+            ],
+            [
+                m[2, 1] - m[1, 2],
+                1 + m[0, 0] - m[1, 1] - m[2, 2],
+                m[1, 0] + m[0, 1],
+                m[0, 2] + m[2, 0],
+            ],
+            [
+                m[0, 2] - m[2, 0],
+                m[1, 0] + m[0, 1],
+                1 - m[0, 0] + m[1, 1] - m[2, 2],
+                m[2, 1] + m[1, 2],
+            ],
+            [
+                m[1, 0] - m[0, 1],
+                m[0, 2] + m[2, 0],
+                m[2, 1] + m[1, 2],
+                1 - m[0, 0] - m[1, 1] + m[2, 2],
+            ],
         ]
     )
     best_row = four_times_products[np.argmax(np.diagonal(four_times_products))]

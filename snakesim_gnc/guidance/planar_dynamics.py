@@ -17,7 +17,8 @@ from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose, RobotDescription
 
 FRICTION_SLIP_SPEED_M_S = 0.01  # a slower link is held by friction as much as it is braked
-LOAD_SHARING_SD = 0.06  # of each link's weight, in each direction: the ground does not carry all links alike
+# Of each link's weight, in each direction: the ground does not carry all links alike.
+LOAD_SHARING_SD = 0.06
 ACCELERATION_SD_M_S2 = 0.05  # of an accelerometer of the shipped robots
 # Standard deviations of accelerations before anything is measured: of the links' turning, and of the tail end.
 ANGULAR_ACCELERATION_PRIOR_SD_RAD_S2 = 30.0
@@ -68,7 +69,9 @@ class ChainDynamics:
         """Middle of each link, (n + 1, 3)."""
         return self.rear_b + self.link_vectors_b / 2
 
-    def compute_generalized_forces(self, links: NDArray[np.intp], points_b: Floats, forces_b: Floats) -> Floats:
+    def compute_generalized_forces(
+        self, links: NDArray[np.intp], points_b: Floats, forces_b: Floats
+    ) -> Floats:
         """Compute the generalized forces of m forces: their left-hand sides in all equations of motion.
 
         A force has a moment about each joint behind its link: axis_i . ((r - p_i) x f).
@@ -83,13 +86,16 @@ class ChainDynamics:
         """
         arms = points_b - self.rear_b[1:, None]  # (n, m, 3)
         moments = np.einsum("ij,imj->im", self.axes_b, np.cross(arms, forces_b))
-        moments *= np.arange(len(self.axes_b))[:, None] < links  # joints ahead of the link carry no moment
+        # Joints ahead of the link carry no moment.
+        moments *= np.arange(len(self.axes_b))[:, None] < links
         center_b = self.masses_kg @ self.middles_b / self.masses_kg.sum()
         total_moments = np.cross(points_b - center_b, forces_b)[:, 2]
         return np.vstack([moments, total_moments, forces_b[:, :2].T])
 
 
-def estimate_angular_velocities(chain: ChainDynamics, velocities_rad_s: Sequence[float], imu: Imu) -> Floats:
+def estimate_angular_velocities(
+    chain: ChainDynamics, velocities_rad_s: Sequence[float], imu: Imu
+) -> Floats:
     """Estimate the angular velocity of each link about the vertical axis.
 
     The joint velocities give the differences between links. The mean of the gyroscopes gives the common part, which is
@@ -107,12 +113,15 @@ def estimate_angular_velocities(chain: ChainDynamics, velocities_rad_s: Sequence
     if not imu.link:
         return relative_rad_s
     measured_rad_s = [
-        chain.frames[link][2] @ rate for link, rate in zip(imu.link, imu.angular_velocity_rad_s, strict=True)
+        chain.frames[link][2] @ rate
+        for link, rate in zip(imu.link, imu.angular_velocity_rad_s, strict=True)
     ]
     return relative_rad_s + float(np.mean(np.array(measured_rad_s) - relative_rad_s[imu.link]))
 
 
-def estimate_accelerations(chain: ChainDynamics, angular_velocities_rad_s: Floats, imu: Imu) -> tuple[Floats, Floats]:
+def estimate_accelerations(
+    chain: ChainDynamics, angular_velocities_rad_s: Floats, imu: Imu
+) -> tuple[Floats, Floats]:
     """Estimate the acceleration of the tail end (x, y) and the angular acceleration of each of the n + 1 links.
 
     n is the number of joints. Linear least squares over all accelerometers, with a prior: the motion of the links is
@@ -128,16 +137,17 @@ def estimate_accelerations(chain: ChainDynamics, angular_velocities_rad_s: Float
         covariance.
     """
     unknown_count = len(angular_velocities_rad_s) + 2
-    jacobian_and_bias = _make_acceleration_model(chain, angular_velocities_rad_s)[:, imu.link].reshape(
-        2 * len(imu.link), unknown_count + 1
-    )
+    jacobian_and_bias = _make_acceleration_model(chain, angular_velocities_rad_s)[
+        :, imu.link
+    ].reshape(2 * len(imu.link), unknown_count + 1)
     jacobian = jacobian_and_bias[:, :-1]
-    bias_m_s2 = jacobian_and_bias[
-        :, -1
-    ]  # centripetal accelerations of the sensors, without any of the unknown accelerations
+    # Centripetal accelerations of the sensors, without any of the unknown accelerations.
+    bias_m_s2 = jacobian_and_bias[:, -1]
     # Rows are ordered as in the Jacobian: x of all sensors, then y of all sensors.
     specific_forces_l = np.reshape(imu.acceleration_m_s2, (-1, 3))
-    planar_specific_forces = np.einsum("kij,kj->ki", chain.frames[imu.link], specific_forces_l)[:, :2].T.ravel()
+    planar_specific_forces = np.einsum("kij,kj->ki", chain.frames[imu.link], specific_forces_l)[
+        :, :2
+    ].T.ravel()
     has_imu = len(imu.link) > 0
     if has_imu:
         tail_sd_m_s2 = TAIL_ACCELERATION_PRIOR_SD_M_S2
@@ -145,10 +155,14 @@ def estimate_accelerations(chain: ChainDynamics, angular_velocities_rad_s: Float
     else:
         tail_sd_m_s2 = TAIL_ACCELERATION_PRIOR_SD_WITHOUT_IMU_M_S2
         angular_sd_rad_s2 = ANGULAR_ACCELERATION_PRIOR_SD_WITHOUT_IMU_RAD_S2
-    prior_sd = np.append(np.full(2, tail_sd_m_s2), np.full(len(angular_velocities_rad_s), angular_sd_rad_s2))
+    prior_sd = np.append(
+        np.full(2, tail_sd_m_s2), np.full(len(angular_velocities_rad_s), angular_sd_rad_s2)
+    )
     precision = jacobian.T @ jacobian / ACCELERATION_SD_M_S2**2 + np.diag(prior_sd**-2.0)
     covariance = np.linalg.inv(precision)
-    accelerations = covariance @ jacobian.T @ (planar_specific_forces - bias_m_s2) / ACCELERATION_SD_M_S2**2
+    accelerations = (
+        covariance @ jacobian.T @ (planar_specific_forces - bias_m_s2) / ACCELERATION_SD_M_S2**2
+    )
     return accelerations, np.asarray(np.linalg.cholesky(covariance), np.float64)
 
 
@@ -198,7 +212,8 @@ def compute_inertia_terms(chain: ChainDynamics, angular_velocities_rad_s: Floats
     for axis in (0, 1):
         forces_b = chain.masses_kg[:, None] * np.eye(3)[axis]
         inertia += chain.compute_generalized_forces(links, chain.middles_b, forces_b) @ model[axis]
-    link_inertias_kg_m2 = chain.masses_kg * (chain.lengths_m**2 / 12 + chain.radii_m**2 / 4)  # across its axis
+    # Across its axis.
+    link_inertias_kg_m2 = chain.masses_kg * (chain.lengths_m**2 / 12 + chain.radii_m**2 / 4)
     is_ahead = np.arange(link_count - 1)[:, None] < links
     rotor_terms = chain.rotor_inertias_kg_m2[:, None] * np.diff(np.eye(link_count), axis=0)
     inertia[: link_count - 1, 2:-1] += is_ahead * link_inertias_kg_m2 + rotor_terms
@@ -224,12 +239,19 @@ def compute_unit_friction(
     middles_b = chain.middles_b
     slide_velocities = _compute_slide_directions(chain, angular_velocities_rad_s, pose)
     weights_n = GRAVITY_M_S2 * chain.masses_kg[:, None]
-    friction = chain.compute_generalized_forces(links, middles_b, -weights_n * slide_velocities).sum(axis=1)
-    friction_by_axis = [chain.compute_generalized_forces(links, middles_b, weights_n * axis) for axis in np.eye(3)[:2]]
+    friction = chain.compute_generalized_forces(
+        links, middles_b, -weights_n * slide_velocities
+    ).sum(axis=1)
+    friction_by_axis = [
+        chain.compute_generalized_forces(links, middles_b, weights_n * axis)
+        for axis in np.eye(3)[:2]
+    ]
     return friction, LOAD_SHARING_SD * np.hstack(friction_by_axis)
 
 
-def _compute_slide_directions(chain: ChainDynamics, angular_velocities_rad_s: Floats, pose: Pose | None) -> Floats:
+def _compute_slide_directions(
+    chain: ChainDynamics, angular_velocities_rad_s: Floats, pose: Pose | None
+) -> Floats:
     """Compute the direction in which each link slides over the ground.
 
     Args:
@@ -243,10 +265,16 @@ def _compute_slide_directions(chain: ChainDynamics, angular_velocities_rad_s: Fl
     if pose is None:
         return chain.frames[:, :, 0].copy()
     angular_velocities = angular_velocities_rad_s[:, None]
-    front_end_velocities = np.cumsum(np.cross(UP, chain.link_vectors_b) * angular_velocities, 0)[:-1]
+    front_end_velocities = np.cumsum(np.cross(UP, chain.link_vectors_b) * angular_velocities, 0)[
+        :-1
+    ]
     rear_end_velocities = np.vstack([np.zeros(3), front_end_velocities])
-    slide_velocities = rear_end_velocities + np.cross(UP, chain.middles_b - chain.rear_b) * angular_velocities
+    slide_velocities = (
+        rear_end_velocities + np.cross(UP, chain.middles_b - chain.rear_b) * angular_velocities
+    )
     slide_velocities += rotation_from_quaternion(pose.orientation_wxyz).T @ pose.velocity_w
     slide_velocities[:, 2] = 0.0
-    slide_velocities /= np.hypot(np.linalg.norm(slide_velocities, axis=1), FRICTION_SLIP_SPEED_M_S)[:, None]
+    slide_velocities /= np.hypot(np.linalg.norm(slide_velocities, axis=1), FRICTION_SLIP_SPEED_M_S)[
+        :, None
+    ]
     return slide_velocities

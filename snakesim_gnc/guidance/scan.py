@@ -121,25 +121,31 @@ def make_scan(
     Returns:
         The scan, with one range, point and height for each beam, counter-clockwise.
     """
-    measured_m = np.array([np.nan if value is None else value for value in ranges.range_m], dtype=np.float64)
+    measured_m = np.array(
+        [np.nan if value is None else value for value in ranges.range_m], dtype=np.float64
+    )
     beam_count = len(measured_m)
     step_rad = ranges.angle_step_rad or DEFAULT_STEP_RAD
     angles_rad = ranges.angle_min_rad + step_rad * np.arange(beam_count)
-    beam_directions_l = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(beam_count)], axis=1)
+    beam_directions_l = np.stack(
+        [np.cos(angles_rad), np.sin(angles_rad), np.zeros(beam_count)], axis=1
+    )
     beam_directions = beam_directions_l @ rotation.T
     if step_rad <= 0:
         # The bins of a scan are counter-clockwise.
         beam_directions = beam_directions[::-1]
         measured_m = measured_m[::-1]
     height_m = position_w[2] - ground_z_m + measured_m * beam_directions[:, 2]
-    range_m = measured_m * np.hypot(beam_directions[:, 0], beam_directions[:, 1])  # horizontal distance
+    # Horizontal distance.
+    range_m = measured_m * np.hypot(beam_directions[:, 0], beam_directions[:, 1])
     is_in_range = (range_m <= MAX_RANGE_M) & (measured_m < ranges.range_max_m)
     is_hit = is_in_range & (height_m > OBSTACLE_BAND_M[0]) & (height_m < OBSTACLE_BAND_M[1])
     points_w = position_w[:2] + measured_m[:, None] * beam_directions[:, :2]
     return AzimuthScan(
         timestamp_ns=ranges.timestamp_ns,
         origin_w=position_w[:2],
-        first_azimuth_w=math.atan2(beam_directions[0, 1], beam_directions[0, 0]) - 0.5 * abs(step_rad),
+        first_azimuth_w=math.atan2(beam_directions[0, 1], beam_directions[0, 0])
+        - 0.5 * abs(step_rad),
         step_rad=abs(step_rad),
         range_m=np.where(is_hit, range_m, np.nan),
         points_w=np.where(is_hit[:, None], points_w, np.nan),

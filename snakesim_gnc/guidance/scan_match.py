@@ -26,7 +26,8 @@ ITERATIONS = 4
 DERIVATIVE_STEP_M = 0.001  # step of the numerical derivative
 DAMPING = np.diag([1.0, 1.0, 0.1])
 MAX_ROTATION_RAD = 0.1  # a larger correction means that the scan was matched to the wrong obstacles
-INFORMATION_RATIO = 0.1  # of the points' information that counts: the same points refine the map afterwards
+# Of the points' information that counts: the same points refine the map afterwards.
+INFORMATION_RATIO = 0.1
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class PoseMeasurement:
 
     planar_w: Floats  # (3,) x, y, heading
     covariance: Floats  # (3, 3) relative to the map
-    map_variance_m2: float  # variance of the position of the matched obstacles in the world, the same in x and y
+    # Variance of the position of the matched obstacles in the world, the same in x and y.
+    map_variance_m2: float
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,9 @@ class _ScanResiduals:
     inlier_count: int
 
 
-def match_scan(scan: AzimuthScan, tracks: Sequence[ObstacleTrack], predicted_w: Floats) -> PoseMeasurement | None:
+def match_scan(
+    scan: AzimuthScan, tracks: Sequence[ObstacleTrack], predicted_w: Floats
+) -> PoseMeasurement | None:
     """Estimate the base pose by aligning a range scan with known obstacles.
 
     Gauss-Newton with Huber weights on the distance from each scan point to the nearest obstacle outline (iterative
@@ -78,7 +82,9 @@ def match_scan(scan: AzimuthScan, tracks: Sequence[ObstacleTrack], predicted_w: 
         )
         if residuals.inlier_count < MIN_POINTS:
             return None
-        correction = correction - np.linalg.solve(residuals.information + DAMPING, residuals.gradient)
+        correction = correction - np.linalg.solve(
+            residuals.information + DAMPING, residuals.gradient
+        )
     if residuals is None or not _is_plausible(correction):
         return None
     information = INFORMATION_RATIO * residuals.information + np.eye(3)
@@ -123,7 +129,9 @@ def _compute_residuals(
 
     slopes: list[Floats] = []  # of the distance along x and y
     for axis in np.eye(2):
-        shifted_distance_m = outlines.compute_distances_m(points_w + DERIVATIVE_STEP_M * axis)[rows, nearest]
+        shifted_distance_m = outlines.compute_distances_m(points_w + DERIVATIVE_STEP_M * axis)[
+            rows, nearest
+        ]
         slopes.append((shifted_distance_m - distance_m) / DERIVATIVE_STEP_M)
     slope = np.stack(slopes, axis=1)
     slope_by_heading = slope[:, 1] * rotated[:, 0] - slope[:, 0] * rotated[:, 1]
@@ -131,7 +139,9 @@ def _compute_residuals(
 
     distance_sd_m = np.hypot(np.hypot(sd_m, landmark_sd_m[nearest]), MIN_RANGE_SD_M)
     is_inlier = np.abs(distance_m) < MAX_MATCH_DISTANCE_M
-    huber_factors = np.minimum(1.0, HUBER_THRESHOLD_SD * distance_sd_m / np.maximum(np.abs(distance_m), 1e-9))
+    huber_factors = np.minimum(
+        1.0, HUBER_THRESHOLD_SD * distance_sd_m / np.maximum(np.abs(distance_m), 1e-9)
+    )
     weights = is_inlier / distance_sd_m**2 * huber_factors
     return _ScanResiduals(
         nearest=nearest,

@@ -35,7 +35,8 @@ from snakesim_hal.wire.messages import (
     WorldModel,
 )
 
-MIN_RANGE_NOISE_M = 0.001  # of a ranging sensor; one without noise in the robot's file is not trusted without limit
+# Of a ranging sensor; one without noise in the robot's file is not trusted without limit.
+MIN_RANGE_NOISE_M = 0.001
 
 
 class GuidanceService(Service):
@@ -101,14 +102,17 @@ class _SurveyedSource:
 
         # Models of the robot.
         self._model: SurveyedWorld | None = None
-        self._dead_reckoned_pose: DeadReckonedPose | None = None  # for a robot without a pose sensor
+        # For a robot without a pose sensor.
+        self._dead_reckoned_pose: DeadReckonedPose | None = None
         self._estimator: ContactEstimator | None = None  # for a robot without contact sensors
 
     def configure(self, robot: RobotDescription) -> None:
         self._model = SurveyedWorld(robot, self._surveyed_obstacles)
         self._dead_reckoned_pose = None
         if self._config.uses_dead_reckoning(robot):
-            self._dead_reckoned_pose = DeadReckonedPose(robot, _make_start_pose(self._config), self._surveyed_obstacles)
+            self._dead_reckoned_pose = DeadReckonedPose(
+                robot, _make_start_pose(self._config), self._surveyed_obstacles
+            )
             print_stderr(
                 "no pose sensor: the pose is estimated by dead reckoning from the start, with joints, contacts and map"
             )
@@ -116,7 +120,9 @@ class _SurveyedSource:
         has_contact_sensor = any(sensor.key == keys.CONTACTS for sensor in robot.sensors)
         if not has_contact_sensor and can_estimate_contacts(robot):
             self._estimator = ContactEstimator(robot)
-            print_stderr("no contact sensors: contacts are estimated from the torques of the joints")
+            print_stderr(
+                "no contact sensors: contacts are estimated from the torques of the joints"
+            )
 
     def make_world(self, clock: Clock) -> WorldModel | None:
         """Return the world model of surveyed obstacles, from the newest samples.
@@ -161,7 +167,11 @@ class _SurveyedSource:
         if self._estimator is None:
             return None
         # With dead reckoning no IMU is used at all, see `dead_reckoned_pose`.
-        imu = self._client.read(self._imu_feed) if self._imu_feed and self._dead_reckoned_pose is None else None
+        imu = (
+            self._client.read(self._imu_feed)
+            if self._imu_feed and self._dead_reckoned_pose is None
+            else None
+        )
         return self._estimator.estimate_contacts(joints, imu, pose)
 
 
@@ -186,10 +196,13 @@ class _PerceivedSource:
         # Subscriptions.
         uses_pose = config.mission.localization == "pose_sensor"
         self._joint_feed = client.subscribe(keys.JOINTS, JointState)
-        self._contact_feed = client.subscribe(keys.CONTACTS, Contacts) if robot.sensors.contacts else None
+        self._contact_feed = (
+            client.subscribe(keys.CONTACTS, Contacts) if robot.sensors.contacts else None
+        )
         self._imu_feed = client.subscribe(keys.IMU, Imu) if robot.sensors.imu else None
         self._pose_feed = client.subscribe(keys.POSE, Pose) if uses_pose else None
-        self._ranging_feeds: list[tuple[Any, RangeNoise]] = []  # subscription to a ranging sensor, and its noise
+        # Subscription to a ranging sensor, and its noise.
+        self._ranging_feeds: list[tuple[Any, RangeNoise]] = []
         for key, sensor in robot.sensors.iterate_mounted():
             message_type = keys.find_message(key)
             if (
@@ -197,10 +210,13 @@ class _PerceivedSource:
                 and message_type is not None
                 and message_type in get_args(RangingSample)
             ):
-                self._ranging_feeds.append((client.subscribe(key, message_type), _make_range_noise(sensor)))
+                self._ranging_feeds.append(
+                    (client.subscribe(key, message_type), _make_range_noise(sensor))
+                )
 
         self._model: PerceivedWorld | None = None
-        self._last_used_ns_by_key: dict[str, int] = {}  # timestamp of the newest sample that was used, by key
+        # Timestamp of the newest sample that was used, by key.
+        self._last_used_ns_by_key: dict[str, int] = {}
 
     def configure(self, robot: RobotDescription) -> None:
         self._model = PerceivedWorld(robot, self._start, self._pose_noise)
@@ -246,7 +262,9 @@ class _PerceivedSource:
 def _make_start_pose(config: RunConfig) -> BasePose:
     """Return the pose of the base at the start of the run."""
     start = compute_start_pose(config)
-    return BasePose(np.array([*start.position_w, start.yaw_rad]), config.robot.module.radius_m, np.eye(3))
+    return BasePose(
+        np.array([*start.position_w, start.yaw_rad]), config.robot.module.radius_m, np.eye(3)
+    )
 
 
 def _make_range_noise(sensor: DistanceSensor) -> RangeNoise:

@@ -85,7 +85,9 @@ def _drop_insignificant_columns(
         active = _solve_nonnegative(columns, right_side, amounts, active)
 
 
-def _solve_nonnegative(columns: Floats, right_side: Floats, amounts: Floats, active: list[int]) -> list[int]:
+def _solve_nonnegative(
+    columns: Floats, right_side: Floats, amounts: Floats, active: list[int]
+) -> list[int]:
     """Solve least squares over the active columns, and drop the columns whose amounts would become negative.
 
     The amounts move from their current values towards the solution until the first amount is zero. That column is
@@ -108,7 +110,9 @@ def _solve_nonnegative(columns: Floats, right_side: Floats, amounts: Floats, act
             amounts[:] = 0.0
             amounts[active] = solution
             return active
-        steps_to_zero = current_amounts[is_negative] / (current_amounts[is_negative] - solution[is_negative] + TINY)
+        steps_to_zero = current_amounts[is_negative] / (
+            current_amounts[is_negative] - solution[is_negative] + TINY
+        )
         step = float(np.min(steps_to_zero))
         stepped_amounts = current_amounts + step * (solution - current_amounts)
         is_dropped = is_negative & (stepped_amounts <= ZERO_AMOUNT)

@@ -15,10 +15,12 @@ from snakesim_hal.base.arrays import Floats
 CELL_M = 0.01
 CELL_GROWTH_FACTOR = 1.5
 MAX_CELLS = 48
-MAX_INFORMATION = 1.0 / 0.0015**2  # errors of pose and mount are common to all points, and do not average out
+# Errors of pose and mount are common to all points, and do not average out.
+MAX_INFORMATION = 1.0 / 0.0015**2
 MAX_NORMAL_INFORMATION = 1e5
 MIN_TOUCH_RATIO = 0.2  # of a cell's information that touches must have, so that it has a normal
-COMMON_VARIANCE_RATIO = 0.05  # of one measurement's variance that a cell's mean keeps, however many it is the mean of
+# Of one measurement's variance that a cell's mean keeps, however many it is the mean of.
+COMMON_VARIANCE_RATIO = 0.05
 MAX_SEEN_THROUGH_COUNT = 3  # scans that may see through a cell before it is dropped
 
 
@@ -31,21 +33,27 @@ class SurfaceCells:
     """Cells in the world; n is their number."""
 
     points_w: Floats = field(default_factory=lambda: _make_empty_array(0, 2))  # (n, 2)
-    weights: Floats = field(default_factory=lambda: _make_empty_array(0))  # (n,) information in 1 / m²
+    # (n,) information in 1 / m².
+    weights: Floats = field(default_factory=lambda: _make_empty_array(0))
     # (n, 2) unit vectors towards the sensor, or the normal of a touch
     outward_directions_w: Floats = field(default_factory=lambda: _make_empty_array(0, 2))
     # (n,) information of the direction as a normal; 0 if the cell was only seen
     normal_weights: Floats = field(default_factory=lambda: _make_empty_array(0))
     # (n,) number of measurements, as far as the weight counts them
     measurement_counts: Floats = field(default_factory=lambda: _make_empty_array(0))
-    seen_through_counts: Floats = field(default_factory=lambda: _make_empty_array(0))  # (n,) scans that saw through it
+    # (n,) scans that saw through it.
+    seen_through_counts: Floats = field(default_factory=lambda: _make_empty_array(0))
     cell_m: float = CELL_M
 
     def __len__(self) -> int:
         return len(self.weights)
 
     def add(
-        self, points_w: Floats, sd_m: Floats, outward_directions_w: Floats, normal_weights: Floats | None = None
+        self,
+        points_w: Floats,
+        sd_m: Floats,
+        outward_directions_w: Floats,
+        normal_weights: Floats | None = None,
     ) -> None:
         """Add measured points, and merge them with the points in the same grid cell.
 
@@ -64,9 +72,16 @@ class SurfaceCells:
         all_directions = np.vstack([self.outward_directions_w, outward_directions_w])
         all_normal_weights = np.concatenate([self.normal_weights, normal_weights])
         all_counts = np.concatenate([self.measurement_counts, np.ones(len(normal_weights))])
-        all_seen_through_counts = np.concatenate([self.seen_through_counts, np.zeros(len(normal_weights))])
+        all_seen_through_counts = np.concatenate(
+            [self.seen_through_counts, np.zeros(len(normal_weights))]
+        )
         self._fuse_in_cells(
-            all_points, all_weights, all_directions, all_normal_weights, all_counts, all_seen_through_counts
+            all_points,
+            all_weights,
+            all_directions,
+            all_normal_weights,
+            all_counts,
+            all_seen_through_counts,
         )
         while len(self) > MAX_CELLS:
             self.cell_m *= CELL_GROWTH_FACTOR
@@ -81,7 +96,12 @@ class SurfaceCells:
 
     def add_surface(self, other: "SurfaceCells") -> None:
         """Add the cells of another surface."""
-        self.add(other.points_w, 1.0 / np.sqrt(other.weights), other.outward_directions_w, other.normal_weights)
+        self.add(
+            other.points_w,
+            1.0 / np.sqrt(other.weights),
+            other.outward_directions_w,
+            other.normal_weights,
+        )
 
     def keep_cells(self, is_kept: NDArray[np.bool_]) -> None:
         """Drop all cells except for those that are marked in an array (n,)."""
@@ -125,18 +145,29 @@ class SurfaceCells:
         def compute_cell_means(values: Floats) -> Floats:
             return np.bincount(cell_indices, weights * values) / total_weights
 
-        self.points_w = np.stack([compute_cell_means(points[:, 0]), compute_cell_means(points[:, 1])], axis=1)
+        self.points_w = np.stack(
+            [compute_cell_means(points[:, 0]), compute_cell_means(points[:, 1])], axis=1
+        )
         mean_directions = np.stack(
-            [compute_cell_means(outward_directions[:, 0]), compute_cell_means(outward_directions[:, 1])], axis=1
+            [
+                compute_cell_means(outward_directions[:, 0]),
+                compute_cell_means(outward_directions[:, 1]),
+            ],
+            axis=1,
         )
         length = np.maximum(np.hypot(mean_directions[:, 0], mean_directions[:, 1]), 1e-9)
         self.outward_directions_w = mean_directions / length[:, None]
         self.weights = np.minimum(total_weights, MAX_INFORMATION)
-        self.measurement_counts = np.bincount(cell_indices, measurement_counts) * self.weights / total_weights
+        self.measurement_counts = (
+            np.bincount(cell_indices, measurement_counts) * self.weights / total_weights
+        )
 
         touch_weights = np.bincount(cell_indices, np.where(normal_weights > 0, weights, 0.0))
         has_normal = touch_weights > MIN_TOUCH_RATIO * total_weights
-        self.normal_weights = np.minimum(np.bincount(cell_indices, normal_weights), MAX_NORMAL_INFORMATION) * has_normal
+        self.normal_weights = (
+            np.minimum(np.bincount(cell_indices, normal_weights), MAX_NORMAL_INFORMATION)
+            * has_normal
+        )
 
         self.seen_through_counts = np.full(len(total_weights), np.inf)
         np.minimum.at(self.seen_through_counts, cell_indices, seen_through_counts)
@@ -162,6 +193,8 @@ def stack_surfaces(surfaces: list[SurfaceCells]) -> tuple[Floats, Floats, Floats
         points[row, :cell_count] = surface.points_w
         points[row, cell_count:] = surface.points_w[0] if cell_count else 0.0
         outward_directions[row, :cell_count] = surface.outward_directions_w
-        weights[row, :cell_count] = surface.weights / (1.0 + COMMON_VARIANCE_RATIO * surface.measurement_counts)
+        weights[row, :cell_count] = surface.weights / (
+            1.0 + COMMON_VARIANCE_RATIO * surface.measurement_counts
+        )
         normal_weights[row, :cell_count] = surface.normal_weights
     return points, weights, outward_directions, normal_weights

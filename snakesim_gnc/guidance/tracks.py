@@ -65,7 +65,8 @@ class ObstacleTrack:
     center_w: Floats = field(default_factory=lambda: np.zeros(2))
     yaw_rad: float = 0.0  # of a box
     radius_m: float = PRIOR_RADIUS_M  # of a cylinder
-    half_size_m: Floats = field(default_factory=lambda: np.zeros(2))  # half size of a box along and across yaw
+    # Half size of a box along and across yaw.
+    half_size_m: Floats = field(default_factory=lambda: np.zeros(2))
     position_sd_m: float = math.inf
     size_sd_m: float = math.inf
     penalized_cost: float = math.inf  # misfit of the shape, and the price of its parameters
@@ -148,7 +149,9 @@ def fit_shapes(tracks: Sequence[ObstacleTrack]) -> None:
     """
     if not tracks:
         return
-    points, weights, outward_directions, normal_weights = stack_surfaces([track.surface for track in tracks])
+    points, weights, outward_directions, normal_weights = stack_surfaces(
+        [track.surface for track in tracks]
+    )
     cell_counts = np.array([len(track.surface) for track in tracks])
     log_cell_counts = np.log(np.maximum(cell_counts, 2))
 
@@ -161,7 +164,8 @@ def fit_shapes(tracks: Sequence[ObstacleTrack]) -> None:
     box_row_by_track: dict[int, int] = {}  # row in `boxes`, by index of the track
     boxes: FittedBoxes | None = None
     candidates = np.flatnonzero(
-        (cell_counts >= MIN_BOX_CELLS) & (circles.fit_cost > MAX_GOOD_CIRCLE_COST_PER_CELL * cell_counts)
+        (cell_counts >= MIN_BOX_CELLS)
+        & (circles.fit_cost > MAX_GOOD_CIRCLE_COST_PER_CELL * cell_counts)
     )
     if len(candidates):
         max_cell_count = int(cell_counts[candidates].max())
@@ -170,12 +174,16 @@ def fit_shapes(tracks: Sequence[ObstacleTrack]) -> None:
             weights[candidates, :max_cell_count],
             outward_directions[candidates, :max_cell_count],
         )
-        parameter_counts = np.where(boxes.seen_face_count > 1, BOX_PARAMETER_COUNT, SINGLE_FACE_BOX_PARAMETER_COUNT)
+        parameter_counts = np.where(
+            boxes.seen_face_count > 1, BOX_PARAMETER_COUNT, SINGLE_FACE_BOX_PARAMETER_COUNT
+        )
         box_cost[candidates] = boxes.fit_cost + parameter_counts * log_cell_counts[candidates]
         box_row_by_track = {int(index): row for row, index in enumerate(candidates)}
 
     for index, track in enumerate(tracks):
-        if boxes is None or circle_cost[index] <= box_cost[index] + _compute_circle_preference(track):
+        if boxes is None or circle_cost[index] <= box_cost[index] + _compute_circle_preference(
+            track
+        ):
             track.set_circle(circles, index, float(circle_cost[index]))
         else:
             track.set_box(boxes, box_row_by_track[index], float(box_cost[index]))

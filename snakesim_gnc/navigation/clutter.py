@@ -48,12 +48,15 @@ from snakesim_hal.model.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import KnownObstacle, Trajectory, WorldModel
 
-NODES_PER_S = 250_000  # of robot time: two fifths of what a core expands, see docs/concepts/path-planning.md
+# Of robot time: two fifths of what a core expands, see docs/concepts/path-planning.md.
+NODES_PER_S = 250_000
 
 # When to plan again.
 MIN_PATH_AHEAD_M = 0.6  # of path ahead of the head
-MAX_PATH_DISTANCE_M = 0.12  # median distance of the body's points from the path: no correction leads back
-MIN_SHIFT_M = 0.03  # likewise, after a stall: control has moved the body while it searched for contacts
+# Median distance of the body's points from the path: no correction leads back.
+MAX_PATH_DISTANCE_M = 0.12
+# Likewise, after a stall: control has moved the body while it searched for contacts.
+MIN_SHIFT_M = 0.03
 MIN_GOAL_TURN_RAD = 0.35  # a change of direction that matters
 MAP_RADIUS_M = 1.5  # obstacles within this distance of the head count
 MAP_TOLERANCE_M = 0.005  # a smaller change of their shapes does not matter
@@ -96,7 +99,9 @@ class ClutterPlanner:
 
         # Configuration.
         self._goal = PlanningGoal(goal, search_parameters.body_length_m)
-        self._known_obstacle_grid = None if known_obstacles is None else ObstacleGrid(known_obstacles)
+        self._known_obstacle_grid = (
+            None if known_obstacles is None else ObstacleGrid(known_obstacles)
+        )
         self._search_parameters = search_parameters
         self._nodes_per_update = max(round(NODES_PER_S * update_period_s), 1)
         replan_nodes = round(HORIZON_M / STEP_M) * search_parameters.kept_nodes
@@ -106,8 +111,10 @@ class ClutterPlanner:
         # The path that is followed.
         self._plan: PushPlan | None = None
         self._plan_time_ns = 0
-        self._planned_heading_rad: float | None = None  # None if the path was not planned for a direction
-        self._planned_obstacle_shapes = np.empty((0, 5))  # obstacles around the head when it was planned
+        # None if the path was not planned for a direction.
+        self._planned_heading_rad: float | None = None
+        # Obstacles around the head when it was planned.
+        self._planned_obstacle_shapes = np.empty((0, 5))
         self._newest_path_id = 0  # the newest path of this planner; 0 is a path from elsewhere
         self._published_path_id = 0
         self._last_tick = -1
@@ -124,9 +131,8 @@ class ClutterPlanner:
         self._failed_w: list[Floats] = []  # (k, 2) paths on which the body got stuck near here
         self._first_stall_position_m = 0.0  # along the goal
         self._stall_count = 0
-        self._back_out_start_s_m: float | None = (
-            None  # arc length of the head where it began; None if the body is not backing out
-        )
+        # Arc length of the head where it began; None if the body is not backing out.
+        self._back_out_start_s_m: float | None = None
         self._back_out_end_ns = 0
         self._trail_w: list[Floats] = []
 
@@ -151,7 +157,9 @@ class ClutterPlanner:
         self._failed_w.clear()
         self._trail_w.clear()
 
-    def update(self, tick: int, world: WorldModel, body_points_w: Floats, desired: DesiredMotion) -> Trajectory:
+    def update(
+        self, tick: int, world: WorldModel, body_points_w: Floats, desired: DesiredMotion
+    ) -> Trajectory:
         """Return the trajectory of this tick, and expand at most a fixed number of nodes of the running path search.
 
         Until a new plan is complete, the last complete plan is returned.
@@ -171,7 +179,8 @@ class ClutterPlanner:
             self._start_or_continue_plan(body_w, world, desired)
         self._last_tick = tick
         plan = self._plan
-        assert plan is not None  # `_start_or_continue_plan` makes a straight one if there is none yet
+        # `_start_or_continue_plan` makes a straight one if there is none yet.
+        assert plan is not None
         speed_m_s, hold_reason = self._choose_speed_and_reason(desired)
         goal_x, goal_y = self._goal.position_w
         return Trajectory(
@@ -201,7 +210,9 @@ class ClutterPlanner:
             return desired.speed_m_s * -BACK_OUT_SPEED_RATIO, reason
         return desired.speed_m_s, reason
 
-    def _start_or_continue_plan(self, body_w: Floats, world: WorldModel, desired: DesiredMotion) -> None:
+    def _start_or_continue_plan(
+        self, body_w: Floats, world: WorldModel, desired: DesiredMotion
+    ) -> None:
         """Start a search if another path is needed, and continue the running search by the work of one update.
 
         At the first call the plan becomes a straight line ahead of the body, so that there is always one afterwards.
@@ -223,13 +234,17 @@ class ClutterPlanner:
             committed_m = COMMITTED_M + max(desired.speed_m_s, 0.0) * self._planning_duration_s
             moved_m = self._measure_movement_m(body_w, world.timestamp_ns)
             if self._running_plan is None:
-                reason = self._find_replanning_reason(self._plan, body_w, world, moved_m, committed_m)
+                reason = self._find_replanning_reason(
+                    self._plan, body_w, world, moved_m, committed_m
+                )
                 if reason:
                     self._start_plan(reason, body_w, world, committed_m)
         if self._running_plan is not None:
             self._continue_plan(self._running_plan, world.timestamp_ns)
 
-    def _start_plan(self, reason: str, body_w: Floats, world: WorldModel, committed_m: float) -> None:
+    def _start_plan(
+        self, reason: str, body_w: Floats, world: WorldModel, committed_m: float
+    ) -> None:
         """Start to plan a path from the current position of the body; later updates continue it.
 
         Args:
@@ -241,7 +256,9 @@ class ClutterPlanner:
         assert self._plan is not None
         self._planned_heading_rad = compute_limited_heading_rad(body_w, self._goal.direction_w)
         if self._known_obstacle_grid is None:
-            self._planned_obstacle_shapes = _describe_obstacle_shapes_near(body_w[-1], world.obstacles)
+            self._planned_obstacle_shapes = _describe_obstacle_shapes_near(
+                body_w[-1], world.obstacles
+            )
         task = PlanningTask(
             reason=reason,
             body_w=body_w,
@@ -313,7 +330,12 @@ class ClutterPlanner:
         return float(np.hypot(*(middle_w - oldest_w)))
 
     def _find_replanning_reason(
-        self, plan: PushPlan, body_w: Floats, world: WorldModel, moved_m: float | None, committed_m: float
+        self,
+        plan: PushPlan,
+        body_w: Floats,
+        world: WorldModel,
+        moved_m: float | None,
+        committed_m: float,
     ) -> str:
         """Return why another path is needed, or an empty string. It also starts and ends the backing out of a jam.
 
@@ -336,7 +358,11 @@ class ClutterPlanner:
         )
         if path_distance_m > MAX_PATH_DISTANCE_M:
             return OFF_PATH
-        if self._failed_w and path_distance_m > MIN_SHIFT_M and now_ns - self._plan_time_ns > STUCK_DURATION_S * 1e9:
+        if (
+            self._failed_w
+            and path_distance_m > MIN_SHIFT_M
+            and now_ns - self._plan_time_ns > STUCK_DURATION_S * 1e9
+        ):
             return SHIFTED
         if plan.route.length_m - head_s_m < MIN_PATH_AHEAD_M + committed_m - COMMITTED_M:
             return ENDS_SOON
@@ -371,7 +397,10 @@ class ClutterPlanner:
         if self._planned_heading_rad is None:
             return True
         heading_rad = compute_limited_heading_rad(body_w, self._goal.direction_w)
-        return abs(math.remainder(heading_rad - self._planned_heading_rad, math.tau)) > MIN_GOAL_TURN_RAD
+        return (
+            abs(math.remainder(heading_rad - self._planned_heading_rad, math.tau))
+            > MIN_GOAL_TURN_RAD
+        )
 
     def _has_map_changed(self, head_w: Floats, obstacles: Sequence[KnownObstacle]) -> bool:
         """Return whether the map around the head differs from the one that the current path was planned on."""
@@ -394,7 +423,11 @@ class ClutterPlanner:
             STUCK as the reason to plan another path, or an empty text if the body backs out first.
         """
         position_along_goal_m = float(body_w.mean(axis=0) @ self._goal.direction_w)
-        if self._failed_w and abs(position_along_goal_m - self._first_stall_position_m) > FAILURE_MEMORY_DISTANCE_M:
+        if (
+            self._failed_w
+            and abs(position_along_goal_m - self._first_stall_position_m)
+            > FAILURE_MEMORY_DISTANCE_M
+        ):
             self._failed_w.clear()
         if not self._failed_w:
             self._first_stall_position_m = position_along_goal_m

@@ -10,7 +10,8 @@ from snakesim_hal.wire.messages import LocomotionIntent
 MAX_VALIDITY_NS = 5_000_000_000  # an intent expires after this, whatever validity it asks for
 MAX_SPEED_M_S = 10.0  # as for a scenario's mission
 MAX_SENDERS = 64  # whose newest timestamps are stored
-MAX_TIMESTAMP_AHEAD_NS = 100_000_000  # a sender may have a newer clock than navigation, which acts a few times a second
+# A sender may have a newer clock than navigation, which acts a few times a second.
+MAX_TIMESTAMP_AHEAD_NS = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -33,16 +34,18 @@ class IntentTracker:
         self._mission_speed_m_s = mission_speed_m_s
         self._followed_intent: LocomotionIntent | None = None
         self._stop_reason = ""  # why the robot stands after an intent; empty before the first one
-        self._heading_w_rad: float | None = None  # stays during a stop, so that a stop causes no other path
-        self._newest_timestamp_by_requester: dict[
-            str, int
-        ] = {}  # timestamp of the newest intent that was followed, by its sender
+        # Stays during a stop, so that a stop causes no other path.
+        self._heading_w_rad: float | None = None
+        # Timestamp of the newest intent that was followed, by its sender.
+        self._newest_timestamp_by_requester: dict[str, int] = {}
 
     def reset(self) -> None:
         """Forget all timestamps, because robot time restarts, and stop an intent that is followed."""
         self._newest_timestamp_by_requester.clear()
         if self._followed_intent is not None:
-            self._stop_following(f"the intent of {self._followed_intent.requester} was for another start of the robot")
+            self._stop_following(
+                f"the intent of {self._followed_intent.requester} was for another start of the robot"
+            )
 
     def choose_motion(self, newest_intent: LocomotionIntent | None, now_ns: int) -> DesiredMotion:
         """Choose the desired motion at a robot time, and start or stop to follow an intent.
@@ -53,7 +56,9 @@ class IntentTracker:
         """
         rejection = ""
         if newest_intent is not None and newest_intent != self._followed_intent:
-            rejection = _find_rejection_reason(newest_intent, now_ns) or self._find_reordering_reason(newest_intent)
+            rejection = _find_rejection_reason(
+                newest_intent, now_ns
+            ) or self._find_reordering_reason(newest_intent)
             if not rejection:
                 self._start_following(newest_intent)
         if self._followed_intent is not None:

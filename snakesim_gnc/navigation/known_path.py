@@ -9,7 +9,8 @@ from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_hal.model.route import Route
 from snakesim_hal.wire.messages import KnownObstacle, Trajectory, WorldModel
 
-MAX_PUSH_DISTANCE_M = 0.15  # the body can push on an obstacle whose outline is nearer to the path than this
+# The body can push on an obstacle whose outline is nearer to the path than this.
+MAX_PUSH_DISTANCE_M = 0.15
 PUSH_POINTS_AHEAD_M = 3.0  # length of path whose push-points are reported
 MAX_REASON_LENGTH = 500
 
@@ -18,7 +19,10 @@ class KnownPath:
     """Follows one route at the desired speed."""
 
     def __init__(
-        self, route: Route, obstacles: Sequence[KnownObstacle], assumed_obstacle_friction: float = 0.0
+        self,
+        route: Route,
+        obstacles: Sequence[KnownObstacle],
+        assumed_obstacle_friction: float = 0.0,
     ) -> None:
         """Prepare to follow a route, and find the push-points beside it.
 
@@ -62,14 +66,23 @@ class KnownPath:
         tail_s_m = self._tail_s_m
         if tail_s_m is None:
             return []
-        return [name for s_m, name in self._push_points if tail_s_m <= s_m <= tail_s_m + PUSH_POINTS_AHEAD_M]
+        return [
+            name
+            for s_m, name in self._push_points
+            if tail_s_m <= s_m <= tail_s_m + PUSH_POINTS_AHEAD_M
+        ]
 
 
-def _find_push_points_beside_route(route: Route, obstacles: Sequence[KnownObstacle]) -> list[tuple[float, str]]:
+def _find_push_points_beside_route(
+    route: Route, obstacles: Sequence[KnownObstacle]
+) -> list[tuple[float, str]]:
     """Return arc length in m and name of the obstacles beside a route, in order along it."""
     push_points: list[tuple[float, str]] = []
     for obstacle in obstacles:
         s_m = route.project_point(np.array(obstacle.position_w[:2]))
-        if compute_outline_distance_m(obstacle, route.compute_positions_w(s_m)) < MAX_PUSH_DISTANCE_M:
+        if (
+            compute_outline_distance_m(obstacle, route.compute_positions_w(s_m))
+            < MAX_PUSH_DISTANCE_M
+        ):
             push_points.append((s_m, obstacle.name))
     return sorted(push_points)

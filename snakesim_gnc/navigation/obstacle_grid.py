@@ -26,7 +26,8 @@ CELL_ERROR_M = CELL_M * 0.5**0.5  # distance from a cell's center to its corner
 MAX_DISTANCE_M = 0.30  # a point farther than this from every surface counts as free
 NO_OBSTACLE = -1
 OBSTACLES_PER_STEP = 20
-NODE_COST_PER_OBSTACLE = 100  # nodes that a search (`beam`) could expand in the time that one obstacle takes
+# Nodes that a search (`beam`) could expand in the time that one obstacle takes.
+NODE_COST_PER_OBSTACLE = 100
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,9 @@ class ObstacleGrid:
             pass
 
     @classmethod
-    def build_in_steps(cls, obstacles: Sequence[KnownObstacle]) -> "Generator[int, None, ObstacleGrid]":
+    def build_in_steps(
+        cls, obstacles: Sequence[KnownObstacle]
+    ) -> "Generator[int, None, ObstacleGrid]":
         """Build a grid step by step and return it.
 
         Yields:
@@ -84,18 +87,28 @@ class ObstacleGrid:
         self.min_corner_w = (outlines.center_w - influence_radius_m[:, None]).min(axis=0)
         max_corner_w = (outlines.center_w + influence_radius_m[:, None]).max(axis=0)
         # One more cell, so that the corner itself has one.
-        column_count, row_count = (np.ceil((max_corner_w - self.min_corner_w) / CELL_M).astype(int) + 1).tolist()
+        column_count, row_count = (
+            np.ceil((max_corner_w - self.min_corner_w) / CELL_M).astype(int) + 1
+        ).tolist()
         self.shape = (column_count, row_count)
-        self.nearest_obstacle_by_cell = np.full(column_count * row_count, NO_OBSTACLE, dtype=np.int64)
+        self.nearest_obstacle_by_cell = np.full(
+            column_count * row_count, NO_OBSTACLE, dtype=np.int64
+        )
         self.cell_distance_m = np.full(column_count * row_count, MAX_DISTANCE_M)
         # Writes one obstacle into a window of cells: compiled, or the same in Python.
         mark_obstacle = self._choose_marking_function()
-        for index, (center_w, radius_m) in enumerate(zip(outlines.center_w, influence_radius_m, strict=True)):
+        for index, (center_w, radius_m) in enumerate(
+            zip(outlines.center_w, influence_radius_m, strict=True)
+        ):
             if index % OBSTACLES_PER_STEP == 0:
                 yield NODE_COST_PER_OBSTACLE * min(OBSTACLES_PER_STEP, len(outlines) - index)
             # The last cell is exclusive: + 1 because `astype` rounds down, + 1 for a cell of margin.
-            first_cell = np.maximum(((center_w - radius_m - self.min_corner_w) / CELL_M).astype(int), 0)
-            last_cell = np.minimum(((center_w + radius_m - self.min_corner_w) / CELL_M).astype(int) + 2, self.shape)
+            first_cell = np.maximum(
+                ((center_w - radius_m - self.min_corner_w) / CELL_M).astype(int), 0
+            )
+            last_cell = np.minimum(
+                ((center_w + radius_m - self.min_corner_w) / CELL_M).astype(int) + 2, self.shape
+            )
             mark_obstacle(index, first_cell, last_cell)
 
     def _fill_empty(self) -> None:
@@ -125,7 +138,9 @@ class ObstacleGrid:
         x = self.min_corner_w[0] + CELL_M * np.arange(first_cell[0], last_cell[0])
         y = self.min_corner_w[1] + CELL_M * np.arange(first_cell[1], last_cell[1])
         cells_w = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-        to_obstacle_m, _ = self.outlines.compute_distances_and_normals(cells_w, np.full(cells_w.shape[:2], index))
+        to_obstacle_m, _ = self.outlines.compute_distances_and_normals(
+            cells_w, np.full(cells_w.shape[:2], index)
+        )
         window = (slice(first_cell[0], last_cell[0]), slice(first_cell[1], last_cell[1]))
         distance_m = self.cell_distance_m.reshape(self.shape)[window]
         nearest = self.nearest_obstacle_by_cell.reshape(self.shape)[window]
@@ -153,11 +168,21 @@ class ObstacleGrid:
         grid.nearest = memory.get_array_address(
             "the nearest obstacle of each cell", self.nearest_obstacle_by_cell, cells, INTEGER_DTYPE
         )
-        grid.distance_m = memory.get_array_address("the distance of each cell", self.cell_distance_m, cells)
-        grid.center_m = memory.get_array_address("the centers of the obstacles", outlines.center_w, (count, 2))
-        grid.direction = memory.get_array_address("the directions of the obstacles", outlines.direction, (count, 2))
-        grid.half_size_m = memory.get_array_address("the half sizes of the obstacles", outlines.half_m, (count, 2))
-        grid.rounding_m = memory.get_array_address("the roundings of the obstacles", outlines.rounding_m, (count,))
+        grid.distance_m = memory.get_array_address(
+            "the distance of each cell", self.cell_distance_m, cells
+        )
+        grid.center_m = memory.get_array_address(
+            "the centers of the obstacles", outlines.center_w, (count, 2)
+        )
+        grid.direction = memory.get_array_address(
+            "the directions of the obstacles", outlines.direction, (count, 2)
+        )
+        grid.half_size_m = memory.get_array_address(
+            "the half sizes of the obstacles", outlines.half_m, (count, 2)
+        )
+        grid.rounding_m = memory.get_array_address(
+            "the roundings of the obstacles", outlines.rounding_m, (count,)
+        )
         return grid
 
     def compute_approximate_distance_m(self, x: Floats, y: Floats) -> Floats:
@@ -183,7 +208,9 @@ class ObstacleGrid:
         has_obstacle = obstacle >= 0
         if has_obstacle.any():
             points_w = np.stack([x[has_obstacle], y[has_obstacle]], axis=-1)
-            distances_m, normals_w = self.outlines.compute_distances_and_normals(points_w, obstacle[has_obstacle])
+            distances_m, normals_w = self.outlines.compute_distances_and_normals(
+                points_w, obstacle[has_obstacle]
+            )
             distance_m[has_obstacle] = distances_m
             normal_w[has_obstacle] = normals_w
         return NearestObstacles(obstacle, distance_m, normal_w)
@@ -215,5 +242,7 @@ class NativeObstacleMarker:
 
     def mark_obstacle(self, index: int, first_cell: Ints, last_cell: Ints) -> None:
         """Write an obstacle into the cells of a window that have no nearer one; see `ObstacleGrid`."""
-        window = NativeWindow(int(first_cell[0]), int(last_cell[0]), int(first_cell[1]), int(last_cell[1]))
+        window = NativeWindow(
+            int(first_cell[0]), int(last_cell[0]), int(first_cell[1]), int(last_cell[1])
+        )
         self._library.mark_obstacle(ctypes.byref(self._grid), ctypes.byref(window), index)

@@ -16,10 +16,10 @@ from snakesim_hal.base.arrays import Floats
 Bools = NDArray[np.bool_]
 
 FIXED_WEIGHT = 1e4  # of points that must not move
-MIN_PROPULSION_PART = (
-    0.1  # part of a contact's normal along the goal: with more it pushes, with less than its negative it brakes
-)
-MIN_SIDEWAYS_PART = 0.9  # part of a normal across the path: with more the obstacle is beside the path
+# Part of a contact's normal along the goal: with more it pushes, with less than its negative it brakes.
+MIN_PROPULSION_PART = 0.1
+# Part of a normal across the path: with more the obstacle is beside the path.
+MIN_SIDEWAYS_PART = 0.9
 MIN_SIDEWAYS_WEIGHT = 0.3  # of an obstacle that is ahead rather than beside
 MAX_CURVATURE_PER_M = 6.0  # a sharper bend is noise of the differences
 CORNER_CUT_SCALE = 0.7  # part of the largest corner cut that counts, because few contacts are at the middle of a link
@@ -47,7 +47,11 @@ class PathFitParameters:
 
 
 def fit_path(
-    points_w: Floats, fixed_point_count: int, obstacles: ObstacleGrid, goal_w: Floats, parameters: PathFitParameters
+    points_w: Floats,
+    fixed_point_count: int,
+    obstacles: ObstacleGrid,
+    goal_w: Floats,
+    parameters: PathFitParameters,
 ) -> Floats:
     """Move the points of a path sideways until it has the desired gaps to the obstacles beside it.
 
@@ -66,11 +70,15 @@ def fit_path(
         chords = np.gradient(path_w, axis=0)
         tangents = chords / np.maximum(np.hypot(chords[:, 0], chords[:, 1]), 1e-9)[:, None]
         left_directions = np.stack([-tangents[:, 1], tangents[:, 0]], axis=-1)
-        shifts_m, weights = _find_desired_shifts(path_w, tangents, left_directions, obstacles, goal_w, parameters)
+        shifts_m, weights = _find_desired_shifts(
+            path_w, tangents, left_directions, obstacles, goal_w, parameters
+        )
         shifts_m[:fixed_point_count] = 0.0
         weights[:fixed_point_count] = FIXED_WEIGHT
         path_w = (
-            path_w + _solve_shifts_m(path_w, left_directions, shifts_m, weights, parameters)[:, None] * left_directions
+            path_w
+            + _solve_shifts_m(path_w, left_directions, shifts_m, weights, parameters)[:, None]
+            * left_directions
         )
         path_w = _resample_after_fixed_points(path_w, fixed_point_count)
     return path_w
@@ -117,7 +125,9 @@ def _find_desired_shifts(
     desired_gap_m = np.where(
         propulsion_part > MIN_PROPULSION_PART,
         parameters.push_gap_m,
-        np.where(propulsion_part < -MIN_PROPULSION_PART, parameters.brake_gap_m, parameters.min_gap_m),
+        np.where(
+            propulsion_part < -MIN_PROPULSION_PART, parameters.brake_gap_m, parameters.min_gap_m
+        ),
     )
     is_too_close = is_near & (gap_m < desired_gap_m)
     is_push_point = (
@@ -172,7 +182,11 @@ def _find_points_near_local_minima(obstacle: NDArray[np.intp], gap_m: Floats) ->
 
 
 def _solve_shifts_m(
-    path_w: Floats, left_directions: Floats, desired_m: Floats, weights: Floats, parameters: PathFitParameters
+    path_w: Floats,
+    left_directions: Floats,
+    desired_m: Floats,
+    weights: Floats,
+    parameters: PathFitParameters,
 ) -> Floats:
     """Return the shifts u to the left, (n,) in m, with which the path is smooth and has the desired gaps.
 
@@ -195,9 +209,13 @@ def _solve_shifts_m(
     rows = np.arange(equation_count)
     for axis in (0, 1):
         # Column j of the third difference in this axis, as it depends on the shift of point i + j.
-        columns = [factor * left_directions[j : equation_count + j, axis] for j, factor in enumerate(THIRD_DIFFERENCE)]
+        columns = [
+            factor * left_directions[j : equation_count + j, axis]
+            for j, factor in enumerate(THIRD_DIFFERENCE)
+        ]
         third_difference = sum(
-            factor * path_w[j : equation_count + j, axis] for j, factor in enumerate(THIRD_DIFFERENCE)
+            factor * path_w[j : equation_count + j, axis]
+            for j, factor in enumerate(THIRD_DIFFERENCE)
         )
         for i, row in enumerate(columns):
             right_side[i : equation_count + i] -= stiffness * row * third_difference

@@ -33,7 +33,8 @@ BACKED_OUT = "the body has backed out"
 # Lengths of path that are searched ahead of the head.
 LONG_HORIZON_M = 4.4  # of a path that does not begin with the current one
 HORIZON_M = 2.0
-COMMITTED_M = 0.05  # of the current path ahead of where the head will be: it does not change any more
+# Of the current path ahead of where the head will be: it does not change any more.
+COMMITTED_M = 0.05
 MIN_ARCS_AHEAD = 10  # of a path for the whole body, beyond its head; a shorter one is a dead end
 
 # The search for a path of the whole body.
@@ -46,12 +47,15 @@ GOOD_MARGIN_ARCS = 6  # over which the margin must be good, from where the head 
 FIRST_KEPT_NODES = 2700
 FIRST_KEPT_PER_WIDE_CELL = 48
 
-MAX_TURN_RAD = 1.2  # between where the head points and the direction of one path; later paths turn further
-MIN_TRAIL_GAP_M = 0.1  # between the path's begin and the trail behind it; nearer points would fold the path
+# Between where the head points and the direction of one path; later paths turn further.
+MAX_TURN_RAD = 1.2
+# Between the path's begin and the trail behind it; nearer points would fold the path.
+MIN_TRAIL_GAP_M = 0.1
 MAX_TRAIL_POINTS = 20  # that a path begins with
 MOVABLE_HEAD_POINTS = 3  # at the head end of the body that the path fit may move
 MAX_REPORTED_PUSH_POINTS = 512  # push-points in a message
-NODES_PER_FITTED_POINT = 12  # nodes that could be expanded in the time that the path fit takes for a point
+# Nodes that could be expanded in the time that the path fit takes for a point.
+NODES_PER_FITTED_POINT = 12
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,9 @@ def search_plan(task: PlanningTask, parameters: SearchParameters) -> Generator[i
     if isinstance(task.obstacles, ObstacleGrid):
         grid = task.obstacles
         if task.reason == START:
-            parameters = replace(parameters, kept_nodes=FIRST_KEPT_NODES, kept_per_wide_cell=FIRST_KEPT_PER_WIDE_CELL)
+            parameters = replace(
+                parameters, kept_nodes=FIRST_KEPT_NODES, kept_per_wide_cell=FIRST_KEPT_PER_WIDE_CELL
+            )
     else:
         grid = yield from ObstacleGrid.build_in_steps(task.obstacles)
     joined_path_w, searched_path = yield from _search_path(task, grid, parameters)
@@ -103,7 +109,9 @@ def search_plan(task: PlanningTask, parameters: SearchParameters) -> Generator[i
             [joined_path_w, resample_evenly(searched_path.points_w)[min(len(joined_path_w), 1) :]]
         )
         yield NODES_PER_FITTED_POINT * len(points_w)
-        fit_parameters = PathFitParameters(radius_m=parameters.radius_m, segment_m=parameters.segment_m)
+        fit_parameters = PathFitParameters(
+            radius_m=parameters.radius_m, segment_m=parameters.segment_m
+        )
         fixed_point_count = max(len(joined_path_w) - MOVABLE_HEAD_POINTS, 0)
         points_w = fit_path(points_w, fixed_point_count, grid, task.goal_w, fit_parameters)
     points_w = _prepend_trail(points_w, task.trail_w)
@@ -183,7 +191,9 @@ def _get_committed_path(task: PlanningTask, body_length_m: float) -> Floats:
         # The path crosses itself, so that the projections of tail and head are on the wrong branches.
         return task.body_w
     committed_m = max(min(task.committed_m, route.length_m - head_s_m), COMMITTED_M)
-    return resample_evenly(route.compute_positions_w(np.arange(tail_s_m, head_s_m + committed_m, SPACING_M)))
+    return resample_evenly(
+        route.compute_positions_w(np.arange(tail_s_m, head_s_m + committed_m, SPACING_M))
+    )
 
 
 def _search_whole_body(
@@ -227,13 +237,19 @@ def _prepend_trail(points_w: Floats, trail_w: Sequence[Floats]) -> Floats:
     """
     start_direction = points_w[5] - points_w[0]
     start_direction /= max(float(np.hypot(start_direction[0], start_direction[1])), 1e-9)
-    trail_behind = [point_w for point_w in trail_w if (point_w - points_w[0]) @ start_direction < -MIN_TRAIL_GAP_M]
+    trail_behind = [
+        point_w
+        for point_w in trail_w
+        if (point_w - points_w[0]) @ start_direction < -MIN_TRAIL_GAP_M
+    ]
     if not trail_behind:
         return points_w
     return np.concatenate([np.array(trail_behind[-MAX_TRAIL_POINTS:]), points_w])
 
 
-def _find_push_points(points_w: Floats, grid: ObstacleGrid, goal_w: Floats, radius_m: float) -> list[str]:
+def _find_push_points(
+    points_w: Floats, grid: ObstacleGrid, goal_w: Floats, radius_m: float
+) -> list[str]:
     """Return the names of obstacles that a body on the path touches and that push it on, in order along the path."""
     nearest = grid.find_nearest(points_w[:, 0], points_w[:, 1])
     is_contact = (nearest.obstacle_index != NO_OBSTACLE) & (

@@ -18,7 +18,9 @@ class PlatformRises:
 
     def __init__(self, platforms: Sequence[KnownObstacle]) -> None:
         self._outlines = ObstacleOutlines.from_obstacles(platforms)
-        self._tops_m = np.array([platform.position_w[2] + 0.5 * platform.height_m for platform in platforms])
+        self._tops_m = np.array(
+            [platform.position_w[2] + 0.5 * platform.height_m for platform in platforms]
+        )
         self._path_id = -1
         self._rises: list[PathRise] = []
 
@@ -37,7 +39,8 @@ class PlatformRises:
     def _compute_rises(self, route: Route) -> list[PathRise]:
         """Find the stretches of a route on platforms, at points every SAMPLE_SPACING_M, at most MAX_RISES."""
         s_m = np.arange(0.0, route.length_m, SAMPLE_SPACING_M)
-        distances_m = self._outlines.compute_distances_m(route.compute_positions_w(s_m))  # (points, platforms)
+        # (points, platforms).
+        distances_m = self._outlines.compute_distances_m(route.compute_positions_w(s_m))
         is_on_platform = distances_m <= 0.0
         heights_m = np.where(is_on_platform, self._tops_m, 0.0).max(axis=1)
         points = zip(s_m.tolist(), heights_m.tolist(), strict=True)

@@ -63,7 +63,8 @@ class NavigationService(Service):
         """
         config = self._config
         mission = config.mission
-        surveyed_obstacles = get_noisy_obstacle_map(config)  # of the scene file, whether or not the mission knows them
+        # Of the scene file, whether or not the mission knows them.
+        surveyed_obstacles = get_noisy_obstacle_map(config)
         self._intents.reset()
         self._body = PlanarBody(robot)
         self._recent_angles = JointAngleHistory()
@@ -114,7 +115,9 @@ class NavigationService(Service):
             return None
         return [(keys.TRAJECTORY, self._add_rises(trajectory))]
 
-    def _plan_trajectory(self, clock: Clock, world: WorldModel | None, desired: DesiredMotion) -> Trajectory | None:
+    def _plan_trajectory(
+        self, clock: Clock, world: WorldModel | None, desired: DesiredMotion
+    ) -> Trajectory | None:
         """Return the trajectory of the clutter planner; None without a world model or while time waits for a path."""
         if world is None or not self._recent_angles:
             return None

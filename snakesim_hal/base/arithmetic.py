@@ -31,11 +31,15 @@ COMMON: Mapping[str, str] = {
 COMMON_WITH = "NumPy 2.2 to 2.4"
 # Hashes of the BLAS in other wheels, with the same processor code: such a BLAS rounds alike on all computers.
 OTHER_WHEELS: Mapping[str, str] = {"3f7c15b6": "NumPy 2.5"}
-SINGLE_THREAD_ENV: dict[str, str] = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+SINGLE_THREAD_ENV: dict[str, str] = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+)
 REQUIRED_PROCESSOR_FLAGS = {"avx2", "fma"}  # of the processor
 # The code in NumPy for wider processors, by the version that began to call it so. NumPy warns of names that it does not
 # know, and where warnings are errors it cannot be imported then.
-WIDER_BEFORE_2_3 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_KNL AVX512_KNM"
+WIDER_BEFORE_2_3 = (
+    "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_KNL AVX512_KNM"
+)
 WIDER: Mapping[tuple[int, int], str] = {
     (2, 4): "X86_V4 AVX512_ICL AVX512_SPR",
     (2, 3): f"{WIDER_BEFORE_2_3} AVX512_SPR",
@@ -142,10 +146,26 @@ def _compute_linear_algebra(numbers: list[float]) -> Iterable[Any]:
         tall = np.vstack([a, b.T])
         square = a @ a.T + size * np.eye(size)
         # Products.
-        yield from (a @ b, a.T @ b, b.T @ a, a @ b[:, 0], b[:, 0] @ a, b[:, 0] @ b[:, 1], np.linalg.norm(b))
+        yield from (
+            a @ b,
+            a.T @ b,
+            b.T @ a,
+            a @ b[:, 0],
+            b[:, 0] @ a,
+            b[:, 0] @ b[:, 1],
+            np.linalg.norm(b),
+        )
         # Factorizations.
-        yield from (np.linalg.solve(square, b), np.linalg.inv(square), np.linalg.cholesky(square), square)
-        yield from (np.linalg.eigvalsh(square), np.linalg.lstsq(tall, tall[:, 0] ** 2, rcond=None)[0])
+        yield from (
+            np.linalg.solve(square, b),
+            np.linalg.inv(square),
+            np.linalg.cholesky(square),
+            square,
+        )
+        yield from (
+            np.linalg.eigvalsh(square),
+            np.linalg.lstsq(tall, tall[:, 0] ** 2, rcond=None)[0],
+        )
         yield from (np.linalg.pinv(tall), np.linalg.cond(a))
 
 
@@ -171,7 +191,14 @@ def _compute_elementwise(numbers: list[float]) -> Iterable[Any]:
         np.expm1(x),
         np.sinh(x),
     )
-    yield from (np.sin(x), np.cos(x), np.hypot(x, y), np.sqrt(np.abs(x)), np.arccos(x / 3.0), np.tan(x))
+    yield from (
+        np.sin(x),
+        np.cos(x),
+        np.hypot(x, y),
+        np.sqrt(np.abs(x)),
+        np.arccos(x / 3.0),
+        np.tan(x),
+    )
     # Reductions.
     yield from (
         x.sum(),
@@ -183,7 +210,12 @@ def _compute_elementwise(numbers: list[float]) -> Iterable[Any]:
         np.einsum("i,i", x, y),
     )
     # Complex and single-precision numbers.
-    yield from (np.abs(x + 1j * y), (x + 1j * y) * (y - 1j * x), np.angle(x + 1j * y), np.exp(1j * x))
+    yield from (
+        np.abs(x + 1j * y),
+        (x + 1j * y) * (y - 1j * x),
+        np.angle(x + 1j * y),
+        np.exp(1j * x),
+    )
     yield from (np.sin(x.astype(np.float32)), np.exp(x.astype(np.float32)))
 
 

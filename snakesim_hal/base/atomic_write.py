@@ -52,7 +52,8 @@ def write_through(path: Path, content: bytes, *, durable: bool = False) -> None:
     """
     target = path
     if path.is_symlink():
-        target = path.resolve(strict=True)  # a link to nowhere is a mistake of the user, not a wish for a new file
+        # A link to nowhere is a mistake of the user, not a wish for a new file.
+        target = path.resolve(strict=True)
         if not target.is_file():
             raise OSError(errno.EINVAL, "its symbolic link does not lead to a file", str(path))
     write_atomically(target, content, durable=durable)

@@ -17,7 +17,8 @@ class ErrorCode(NamedTuple):
     title: str
     cause: str
     remedy: str
-    page: str = ""  # a page below docs/ with the steps of the remedy; empty if the remedy is complete
+    # A page below docs/ with the steps of the remedy; empty if the remedy is complete.
+    page: str = ""
 
 
 ERROR_CODES = {

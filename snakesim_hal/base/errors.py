@@ -136,7 +136,11 @@ def _find_plugin_line(error: BaseException, package: str) -> tuple[str, int]:
         frames.insert(0, (module.partition(".")[0], frame.f_code.co_filename, line))
     for frame_package, file, line in frames:
         is_installed = any(f"/{folder}/" in file for folder in INSTALL_FOLDERS)
-        if frame_package not in OUR_PACKAGES and not is_installed and not file.startswith(standard_library_prefixes):
+        if (
+            frame_package not in OUR_PACKAGES
+            and not is_installed
+            and not file.startswith(standard_library_prefixes)
+        ):
             return file, line
     for frame_package, file, line in frames:
         if frame_package == package:

@@ -186,7 +186,9 @@ def drop_priority_after(max_busy_s: float) -> None:
 
     def drop_priority(_number: int, _frame: FrameType | None) -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        print_stderr(f"real time: priority dropped after computing for {max_busy_s * 1e3:.0f} ms without a pause")
+        print_stderr(
+            f"real time: priority dropped after computing for {max_busy_s * 1e3:.0f} ms without a pause"
+        )
 
     signal.signal(signal.SIGXCPU, drop_priority)
     _, hard_limit_us = resource.getrlimit(resource.RLIMIT_RTTIME)

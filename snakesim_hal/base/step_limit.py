@@ -15,7 +15,8 @@ from typing import Self
 
 WATCH_PERIOD_S = 0.25  # between two checks of the current step
 INTERRUPT_AGAIN_S = 2.0  # until a step that has caught the error is interrupted again
-STEP_TIMES_FORMAT = struct.Struct("dd")  # start and deadline of the current step; zeros between steps
+# Start and deadline of the current step; zeros between steps.
+STEP_TIMES_FORMAT = struct.Struct("dd")
 
 
 class StepTooLongError(BaseException):
@@ -77,7 +78,8 @@ class StepWatchdog:
         self.step_timeout_s = step_timeout_s
         self._step_times = step_times
         self._error_type = error_type
-        self._lock = threading.RLock()  # a signal handler may interrupt its own thread while that holds it
+        # A signal handler may interrupt its own thread while that holds it.
+        self._lock = threading.RLock()
         self._closed = threading.Event()
         self._watcher: threading.Thread | None = None
         # The current step.

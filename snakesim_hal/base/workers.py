@@ -19,7 +19,8 @@ from snakesim_hal.base.terminal import print_stderr
 # The pause between an error and the next attempt. It doubles with each error in a row.
 FIRST_PAUSE_S = 0.05
 MAX_PAUSE_S = 2.0
-PAUSE_RESET_S = 10.0  # after a run of this length without an error, the next pause is the first one again
+# After a run of this length without an error, the next pause is the first one again.
+PAUSE_RESET_S = 10.0
 REPORT_INTERVAL_S = 60.0  # the same error of one worker is printed at most once in this time
 REPORTED_LINE_COUNT = 6  # of a traceback: the last ones name the error and where it was raised
 MAX_ERROR_KEY_LENGTH = 200  # characters of an error, by which repetitions are recognized
@@ -91,7 +92,9 @@ def _run_with_restart(
         pause_s = min(2 * pause_s, MAX_PAUSE_S)
 
 
-def _call_error_handler(error: Exception, on_error: Callable[[Exception], None], reporter: "ErrorReporter") -> None:
+def _call_error_handler(
+    error: Exception, on_error: Callable[[Exception], None], reporter: "ErrorReporter"
+) -> None:
     """Call an error handler, and report an error that it raises itself."""
     try:
         on_error(error)

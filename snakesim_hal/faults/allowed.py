@@ -17,7 +17,9 @@ from snakesim_hal.network.streams import IncomingQuery
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Answer, Clock, LifecycleState, RobotDescription
 
-HOW_TO_ALLOW = "something real moves here; to allow it set `allow_fault_injection = true` in the scenario"
+HOW_TO_ALLOW = (
+    "something real moves here; to allow it set `allow_fault_injection = true` in the scenario"
+)
 
 
 class InjectedFaults(Protocol):
@@ -33,7 +35,9 @@ class InjectedFaults(Protocol):
         """Return the start and the end of each fault as texts, with the tick."""
         ...
 
-    def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
+    def update(
+        self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState, /
+    ) -> Sequence[str]:
         """Start and end the faults that are due at a tick, answer requests, and hang if a fault requires it.
 
         Args:
@@ -69,12 +73,15 @@ class NoFaults:
         """
         if any(injection.executing_part == part for injection in parse_planned_faults(config)):
             raise ConfigError(
-                f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out", code="injection/not-allowed"
+                f"`faults` are planned, and {HOW_TO_ALLOW}; otherwise leave them out",
+                code="injection/not-allowed",
             )
         self._lifecycle: LifecycleState = "disarmed"
         session.on_query(keys.fault_key(part), self._refuse_request)
 
-    def update(self, _timestamp_ns: int, _arm_session: int, lifecycle: LifecycleState, /) -> Sequence[str]:
+    def update(
+        self, _timestamp_ns: int, _arm_session: int, lifecycle: LifecycleState, /
+    ) -> Sequence[str]:
         self._lifecycle = lifecycle
         return ()
 
@@ -87,10 +94,14 @@ class NoFaults:
     def _refuse_request(self, query: IncomingQuery) -> None:
         """Refuse a request, in Zenoh's thread."""
         reason = f"fault injection is not allowed: {HOW_TO_ALLOW}"
-        query.reply(Answer(ok=False, reason=reason, refusal="not_allowed", lifecycle=self._lifecycle))
+        query.reply(
+            Answer(ok=False, reason=reason, refusal="not_allowed", lifecycle=self._lifecycle)
+        )
 
 
-def create_host_faults(config: RunConfig, backend: Backend, session: Session) -> tuple[Backend, InjectedFaults]:
+def create_host_faults(
+    config: RunConfig, backend: Backend, session: Session
+) -> tuple[Backend, InjectedFaults]:
     """Return the backend that the host should use, and the object that injects faults into the host.
 
     Args:

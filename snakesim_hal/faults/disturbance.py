@@ -25,8 +25,10 @@ class MessageDisturbance:
         """Create a disturbance without active faults, whose random numbers follow from a seed."""
         self._rng = random.Random(seed)
         self._amount_by_kind: dict[str, float] = {}  # amounts of the active faults
-        self._held_back_payload: bytes | None = None  # sent after the next message; None without reordering
-        self._delayed_payloads: deque[tuple[float, bytes]] = deque()  # time at which to send it, payload
+        # Sent after the next message; None without reordering.
+        self._held_back_payload: bytes | None = None
+        # Time at which to send it, payload.
+        self._delayed_payloads: deque[tuple[float, bytes]] = deque()
         self._newest_payload: bytes | None = None  # the writer's last message
         self._next_repeat_time_s = inf  # time of the next repeat of a flood
 
@@ -84,7 +86,9 @@ class MessageDisturbance:
         if self._next_repeat_time_s > now_s:
             return 0
         interval_s = 1.0 / self._amount_by_kind["flood"]
-        repeats = min(int((now_s - self._next_repeat_time_s) / interval_s) + 1, MAX_REPEATS_PER_CALL)
+        repeats = min(
+            int((now_s - self._next_repeat_time_s) / interval_s) + 1, MAX_REPEATS_PER_CALL
+        )
         self._next_repeat_time_s += repeats * interval_s
         if self._next_repeat_time_s <= now_s:
             self._next_repeat_time_s = now_s + interval_s

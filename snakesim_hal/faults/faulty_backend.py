@@ -31,8 +31,10 @@ class FaultyBackend(Backend):
         self._description = inner.describe()
         # Faults that are applied here: by joint index, then by kind.
         self._active_faults: dict[int, dict[str, FaultInjection]] = {}
-        self._last_state: JointState | None = None  # as returned, with the faults; None before the first sample
-        self._speed_ratio: float | None = None  # of real time, for a slowed simulator; None: not slowed
+        # As returned, with the faults; None before the first sample.
+        self._last_state: JointState | None = None
+        # Of real time, for a slowed simulator; None: not slowed.
+        self._speed_ratio: float | None = None
 
     def inject(self, injection: FaultInjection, *, begins: bool) -> bool:
         """Start or end a fault, in the wrapped backend if it supports the kind of fault, otherwise here.
@@ -146,12 +148,19 @@ class FaultyBackend(Backend):
                 age_ns[joint_index] = last_state.age_ns[joint_index] + elapsed_ns
             elif WRONG_ANGLE in faults_by_kind:
                 offset_rad = faults_by_kind[WRONG_ANGLE].amount
-                assert offset_rad is not None, "the injector has filled in the default of the amount"
+                assert offset_rad is not None, (
+                    "the injector has filled in the default of the amount"
+                )
                 angle_rad[joint_index] += offset_rad
             if MUTE in faults_by_kind:
                 valid[joint_index] = False
             if NAN_ANGLE in faults_by_kind:
                 angle_rad[joint_index] = math.nan
         return msgspec.structs.replace(
-            joints, angle_rad=angle_rad, velocity_rad_s=velocity_rad_s, torque_nm=torque_nm, valid=valid, age_ns=age_ns
+            joints,
+            angle_rad=angle_rad,
+            velocity_rad_s=velocity_rad_s,
+            torque_nm=torque_nm,
+            valid=valid,
+            age_ns=age_ns,
         )

@@ -23,7 +23,9 @@ class HostFaults(FaultInjector):
         self._tick = 0
         super().__init__(HAL, config, session, apply_fault=self.backend.inject)
 
-    def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
+    def update(
+        self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState
+    ) -> Sequence[str]:
         """Store the tick for `notes`, then update the faults as in every other part of a run."""
         self._tick = timestamp_ns // self._period_ns
         return super().update(timestamp_ns, arm_session, lifecycle)

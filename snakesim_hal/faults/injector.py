@@ -45,7 +45,8 @@ class ApplyFault(Protocol):
 def refuse_fault(injection: FaultInjection, *, begins: bool) -> None:
     """Refuse a fault, in a part that supports only message faults and `hang`."""
     raise ConfigError(
-        f"{injection.executing_part} cannot do {injection.kind} to {injection.target}", code="injection/not-supported"
+        f"{injection.executing_part} cannot do {injection.kind} to {injection.target}",
+        code="injection/not-supported",
     )
 
 
@@ -88,10 +89,14 @@ class FaultInjector:
         self.notes: list[str] = []  # starts and ends of faults; only the host fills it
         # Faults.
         self._plan = InjectionPlan(
-            injection for injection in parse_planned_faults(config) if injection.executing_part == part
+            injection
+            for injection in parse_planned_faults(config)
+            if injection.executing_part == part
         )
-        self._new_refusals: list[str] = []  # planned faults that are not possible; the next `update` returns them
-        self._scheduled_ends: list[tuple[float, FaultInjection]] = []  # end in robot time (s), and the requested fault
+        # Planned faults that are not possible; the next `update` returns them.
+        self._new_refusals: list[str] = []
+        # End in robot time (s), and the requested fault.
+        self._scheduled_ends: list[tuple[float, FaultInjection]] = []
         self._active_faults: dict[tuple[str, str], FaultInjection] = {}  # by kind and target
         # Requests.
         self._decoder = MessageDecoder(FaultRequest)
@@ -107,7 +112,9 @@ class FaultInjector:
         """Return the active injected faults as texts."""
         return [str(injection) for injection in self._active_faults.values()]
 
-    def update(self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState) -> Sequence[str]:
+    def update(
+        self, timestamp_ns: int, arm_session: int, lifecycle: LifecycleState
+    ) -> Sequence[str]:
         """Start and end the faults that are due at a tick, answer requests, and hang if a fault requires it.
 
         Args:
@@ -122,7 +129,9 @@ class FaultInjector:
         self._lifecycle = lifecycle
         if arm_session and self._first_armed_s is None:
             self._first_armed_s = now_s
-            if not self._has_ticked:  # this part was restarted while the robot was armed: the first arming is unknown
+            if (
+                not self._has_ticked
+            ):  # this part was restarted while the robot was armed: the first arming is unknown
                 self._plan = InjectionPlan()
         self._has_ticked = True
         self._apply_due_transitions(now_s)
@@ -166,10 +175,19 @@ class FaultInjector:
         latest_s = now_s + TIME_TOLERANCE_S  # sums of times are not exact
         if self._scheduled_ends:
             due = [injection for end_s, injection in self._scheduled_ends if end_s <= latest_s]
-            self._scheduled_ends = [(end_s, injection) for end_s, injection in self._scheduled_ends if end_s > latest_s]
-            self._apply_transitions([FaultTransition(injection.end_s, injection, False) for injection in due], now_s)
-        if self._first_armed_s is not None and self._plan.next_transition_s() <= latest_s - self._first_armed_s:
-            self._apply_transitions(self._plan.pop_due_transitions(latest_s - self._first_armed_s), now_s)
+            self._scheduled_ends = [
+                (end_s, injection) for end_s, injection in self._scheduled_ends if end_s > latest_s
+            ]
+            self._apply_transitions(
+                [FaultTransition(injection.end_s, injection, False) for injection in due], now_s
+            )
+        if (
+            self._first_armed_s is not None
+            and self._plan.next_transition_s() <= latest_s - self._first_armed_s
+        ):
+            self._apply_transitions(
+                self._plan.pop_due_transitions(latest_s - self._first_armed_s), now_s
+            )
 
     def _apply_transitions(self, transitions: list[FaultTransition], now_s: float) -> None:
         """Start or end faults. A fault that is refused is reported, and `update` returns it."""
@@ -223,11 +241,15 @@ class FaultInjector:
         start_s = self._compute_time_since_arming_s(now_s)
         duration_s = inf if request.for_s is None else request.for_s
         injection = validate_and_complete_injection(
-            FaultInjection(request.kind, request.target, start_s, start_s + duration_s, request.amount)
+            FaultInjection(
+                request.kind, request.target, start_s, start_s + duration_s, request.amount
+            )
         )
         fault_name = f"{injection.kind} of {injection.target}"
         if injection.executing_part != self.part:
-            return _make_refusal(f"{fault_name} is carried out by {injection.executing_part}", refusal="wrong_part")
+            return _make_refusal(
+                f"{fault_name} is carried out by {injection.executing_part}", refusal="wrong_part"
+            )
         if request.end:
             return self._end_requested_fault(injection, now_s)
         self._start_fault(injection, now_s)
@@ -241,7 +263,9 @@ class FaultInjector:
         active = self._active_faults.get((injection.kind, injection.target))
         if active is None:
             active_names = ", ".join(self.active) or "nothing"
-            return _make_refusal(f"{fault_name} is not active; active: {active_names}", refusal="wrong_state")
+            return _make_refusal(
+                f"{fault_name} is not active; active: {active_names}", refusal="wrong_state"
+            )
         self._end_fault(active, now_s)
         return Answer(ok=True, reason=f"{fault_name} has ended")
 
@@ -285,7 +309,11 @@ class FaultInjector:
         start_monotonic_s = time.monotonic()
         while self._should_hang():
             wall_time_s = start_s + time.monotonic() - start_monotonic_s
-            now_s = wall_time_s if self._read_newest_clock is None else self._read_newest_time_s(start_s)
+            now_s = (
+                wall_time_s
+                if self._read_newest_clock is None
+                else self._read_newest_time_s(start_s)
+            )
             self._apply_due_transitions(now_s)
 
 

@@ -43,7 +43,8 @@ class MessageFaults:
         self._seed = seed
         self._disturbed_by_key: dict[str, DisturbedKey] = {}
         self._changed = threading.Condition()
-        self._delay_thread: threading.Thread | None = None  # sends delayed messages; None: nothing is delayed
+        # Sends delayed messages; None: nothing is delayed.
+        self._delay_thread: threading.Thread | None = None
         self._closed = False
 
     def begin(self, injection: FaultInjection) -> None:
@@ -105,7 +106,10 @@ class MessageFaults:
 
     def _find_next_due_time_s(self) -> float:
         """Return the monotonic time of the next delayed message; inf if there is none."""
-        return min((disturbed.disturbance.next_due_s() for disturbed in self._disturbed_by_key.values()), default=inf)
+        return min(
+            (disturbed.disturbance.next_due_s() for disturbed in self._disturbed_by_key.values()),
+            default=inf,
+        )
 
     # --- the thread ------------------------------------------------------------------------------------------
 

@@ -22,7 +22,8 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import JointState, RobotDescription
 
 CABLE_FILENAME = "cables.json"
-MAX_DECLARATION_AGE_S = 3600.0  # maximum age of `cable_unwound` in a robot file, for a host that has no stored angle
+# Maximum age of `cable_unwound` in a robot file, for a host that has no stored angle.
+MAX_DECLARATION_AGE_S = 3600.0
 MAX_CLOCK_SKEW_S = 60.0  # by which the clock of the computer that declared it may be ahead
 MIN_END_STOP_RAD = 0.1  # minimum part of a revolution that end stops take
 WAY_OUT = (
@@ -47,7 +48,9 @@ class StoredCable(msgspec.Struct, frozen=True, kw_only=True):
 class CableFile:
     """The file of one robot. `cables` counts the angles."""
 
-    def __init__(self, folder: Path, joints: Sequence[Joint], robot: RobotDescription, now_s: float) -> None:
+    def __init__(
+        self, folder: Path, joints: Sequence[Joint], robot: RobotDescription, now_s: float
+    ) -> None:
         """Read the stored angles of the joints with cables, and start to count from them.
 
         Args:
@@ -68,18 +71,24 @@ class CableFile:
             if cable_turns is None:
                 if _lacks_end_stop_room(joint):
                     limits = joint.limits
-                    unknown_reasons[joint.name] = NO_END_STOPS_MESSAGE.format(limits.lower_rad, limits.upper_rad)
+                    unknown_reasons[joint.name] = NO_END_STOPS_MESSAGE.format(
+                        limits.lower_rad, limits.upper_rad
+                    )
                 continue
             described = robot.joints[i]
             cable_joints.append(
-                CableJoint(joint.name, i, described.angle_min_rad, described.angle_max_rad, cable_turns)
+                CableJoint(
+                    joint.name, i, described.angle_min_rad, described.angle_max_rad, cable_turns
+                )
             )
             drive = f"{described.serial} {joint.drive.sign:+d} {joint.drive.zero_rad:.6g}".strip()
             self._drive_by_joint[joint.name] = (drive, joint.limits.cable_unwound)
             angle_rad = _find_counted_angle(stored_cables, joint, drive, now_s)
             if isinstance(angle_rad, str):
                 reason = angle_rad
-                unknown_reasons[joint.name] = f"how far its cable is wound is not known: {reason}; {WAY_OUT}"
+                unknown_reasons[joint.name] = (
+                    f"how far its cable is wound is not known: {reason}; {WAY_OUT}"
+                )
             else:
                 last_angles_rad[joint.name] = angle_rad
         self.tracker = CableTracker(cable_joints, last_angles_rad, unknown_reasons)
@@ -105,13 +114,17 @@ class CableFile:
         for name, (drive, unwound) in self._drive_by_joint.items():
             angle_rad = angles_rad.get(name)
             if angle_rad is not None:
-                content[name] = StoredCable(angle_rad=round(angle_rad, 4), drive=drive, unwound=unwound)
+                content[name] = StoredCable(
+                    angle_rad=round(angle_rad, 4), drive=drive, unwound=unwound
+                )
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path, msgspec.json.encode(content), durable=True)
             self.tracker.save_problem = ""
         except OSError as error:
-            self.tracker.save_problem = f"{self._path}: {error.strerror}: the turns of its joints would be lost"
+            self.tracker.save_problem = (
+                f"{self._path}: {error.strerror}: the turns of its joints would be lost"
+            )
 
     def _read(self) -> Mapping[str, StoredCable] | str:
         """Return the stored joints by name, or the reason why there are none."""
@@ -123,9 +136,13 @@ class CableFile:
             return f"{self._path} cannot be read"
 
 
-def open_cable_file(folder: Path, joints: Sequence[Joint], robot: RobotDescription) -> CableFile | None:
+def open_cable_file(
+    folder: Path, joints: Sequence[Joint], robot: RobotDescription
+) -> CableFile | None:
     """Return the cable file of a robot; None if it is emulated, or if each of its joints has end stops."""
-    if robot.emulated or all(joint.limits.cable_turns is None and not _lacks_end_stop_room(joint) for joint in joints):
+    if robot.emulated or all(
+        joint.limits.cable_turns is None and not _lacks_end_stop_room(joint) for joint in joints
+    ):
         return None
     return CableFile(folder, joints, robot, time.time())
 
@@ -162,7 +179,9 @@ def _find_counted_angle(
         elif stored.drive == drive and stored.unwound == declaration_time:
             return stored.angle_rad
         else:
-            reason = f"the stored angle is of another drive, sign or zero ({stored.drive}, now {drive})"
+            reason = (
+                f"the stored angle is of another drive, sign or zero ({stored.drive}, now {drive})"
+            )
     if not declaration_time:
         return reason
     try:

@@ -81,7 +81,9 @@ class ControlCycle(Generic[SafetyCoreT]):
         if isinstance(power, Power):
             self.safety.observe_power(power, now_ns)
 
-    def compute_setpoints(self, now_ns: int, tick: int, newest_command_tick: int | None = None) -> TickOutput:
+    def compute_setpoints(
+        self, now_ns: int, tick: int, newest_command_tick: int | None = None
+    ) -> TickOutput:
         """Latch new faults, and return the setpoints of the next period.
 
         Args:

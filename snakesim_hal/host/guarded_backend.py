@@ -77,10 +77,14 @@ class GuardedBackend(Backend):
             for key, message in samples.by_key.items():
                 if key not in self._find_sensor_keys():
                     known = ", ".join(self._find_sensor_keys())
-                    raise WireError("unknown_key", f"not a sensor of its description, which has {known}")
+                    raise WireError(
+                        "unknown_key", f"not a sensor of its description, which has {known}"
+                    )
                 encoded[key] = encode_checked(key, message, self._custom_messages.get(key))
         except WireError as error:
-            raise BackendError(f"{self.name}.sample: {key} cannot be published: {error.detail}") from None
+            raise BackendError(
+                f"{self.name}.sample: {key} cannot be published: {error.detail}"
+            ) from None
         return Samples(samples.joints, samples.by_key, encoded)
 
     @_convert_exceptions

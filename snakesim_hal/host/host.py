@@ -58,15 +58,16 @@ from snakesim_hal.wire.messages import (
     RobotStatus,
 )
 
-STANDBY_PERIOD_NS = 20_000_000  # between two looks at the services, in lockstep before the first arming
+# Between two looks at the services, in lockstep before the first arming.
+STANDBY_PERIOD_NS = 20_000_000
 PAUSED_PERIOD_NS = 50_000_000  # between two clock messages while a simulator is paused
-SENDER_START_TIME_S = (
-    0.0001  # for the sending threads, so that the host judges a tick while it is on its way to the services
-)
+# For the sending threads, so that the host judges a tick while it is on its way to the services.
+SENDER_START_TIME_S = 0.0001
 MAX_INPUT_FRACTION = 0.25  # of a period, for late input: a flood must not take all of it
 WRITE_MARGIN_FACTOR = 1.5  # the backend's calls may take longer than they usually do
 WRITE_MARGIN_NS = 50_000
-RECORD_AFTER_ARMED_NS = 2_000_000_000  # in a host that stays, so that it does not fill memory while it waits
+# In a host that stays, so that it does not fill memory while it waits.
+RECORD_AFTER_ARMED_NS = 2_000_000_000
 MAX_PARTICIPANT_WAIT_S = 0.5  # between two looks at injected faults and the status
 
 
@@ -76,11 +77,11 @@ class HostOptions:
 
     # The end of the run.
     max_ticks: int | None = None  # end so many ticks after the first arming; None: on request only
-    end_after_fault_s: float | None = None  # robot time; None: stay, so that a person can reset the fault
+    # Robot time; None: stay, so that a person can reset the fault.
+    end_after_fault_s: float | None = None
     clock_mode_after_fault: ClockMode = "realtime"  # of ticks that wait for no service
-    stays_after_run: bool = (
-        False  # count only armed ticks, and record little in between; else count all from the first arming
-    )
+    # Count only armed ticks, and record little in between; else count all from the first arming.
+    stays_after_run: bool = False
 
     # What connects the host with its surroundings.
     latch: EstopLatch | None = None  # stores an emergency stop for later hosts
@@ -88,9 +89,8 @@ class HostOptions:
     realtime_warnings: Sequence[str] = ()  # real-time measures that the operating system refused
 
     # The robot.
-    faults: InjectedFaults | None = (
-        None  # injected ones, as `create_host_faults` returns them; None: requests are refused
-    )
+    # Injected ones, as `create_host_faults` returns them; None: requests are refused.
+    faults: InjectedFaults | None = None
     unchecked_reason: str = ""  # why only an explicit word arms it, as `why_unchecked` returns it
     cable_file: CableFile | None = None  # of joints without end stops
 
@@ -154,11 +154,18 @@ class Host:
 
         self._restore_estop()
         self._outbox = HostOutbox(
-            session, self.description, encode_config(config), lockstep=config.clock_mode == "lockstep"
+            session,
+            self.description,
+            encode_config(config),
+            lockstep=config.clock_mode == "lockstep",
         )
         readiness = ServiceReadiness(config, self._state.participants, session)
-        self._status = StatusReporter(self._state, readiness, self._outbox, starter, options.realtime_warnings)
-        self._requests = RequestHandler(self._state, readiness, self._status, self._latch, self._outbox)
+        self._status = StatusReporter(
+            self._state, readiness, self._outbox, starter, options.realtime_warnings
+        )
+        self._requests = RequestHandler(
+            self._state, readiness, self._status, self._latch, self._outbox
+        )
         self._inbox = HostInbox(session, self, config.services, self._outbox.send_answer)
         self._network_watch = NetworkWatch(self._state, session, self._outbox)
         starter.send(HostMessage(description=self.description))
@@ -280,9 +287,13 @@ class Host:
     def _inject_faults(self) -> None:
         """Begin and end the injected faults that are due, and log requests for faults that are refused."""
         state = self._state
-        refusals = state.faults.update(state.clock.timestamp_ns, state.authority.arm_session, state.authority.state)
+        refusals = state.faults.update(
+            state.clock.timestamp_ns, state.authority.arm_session, state.authority.state
+        )
         for refusal in refusals:
-            state.authority.log_fault(Fault(tick=state.clock.tick, what="injection_refused", cause=refusal))
+            state.authority.log_fault(
+                Fault(tick=state.clock.tick, what="injection_refused", cause=refusal)
+            )
 
     def _sample(self, last_samples: Samples | None) -> Samples | None:
         """Read the sensors, and return the samples of this tick. A tick that is repeated keeps its samples.
@@ -310,7 +321,9 @@ class Host:
     def _publish_samples(self, samples: Samples) -> None:
         """Publish all samples of this tick, and then the clock."""
         clock = self._state.clock
-        outgoing: list[Outgoing] = [(keys.JOINTS, self.authority.replace_non_finite_values(samples.joints), None)]
+        outgoing: list[Outgoing] = [
+            (keys.JOINTS, self.authority.replace_non_finite_values(samples.joints), None)
+        ]
         for key, message in samples.by_key.items():
             outgoing.append((key, message, samples.encoded_by_key[key]))
         for key, _, _ in outgoing:
@@ -376,7 +389,13 @@ class Host:
         started_ns = time.monotonic_ns()
         try:
             self._cycle.enact(tick_output)
-            self._outbox.publish((keys.APPLIED, make_applied_command(self.description, clock.tick, tick_output), None))
+            self._outbox.publish(
+                (
+                    keys.APPLIED,
+                    make_applied_command(self.description, clock.tick, tick_output),
+                    None,
+                )
+            )
             self._cycle.advance()
         except BackendError as error:
             self._on_backend_failure(error)
@@ -427,11 +446,16 @@ class Host:
     def _wait_while_paused(self) -> None:
         """Publish the last clock as a sign of life, and handle input. Physics and robot time do not advance."""
         if self._published.last_tick is not None:
-            self._outbox.publish((keys.CLOCK, self._make_clock_message(self._published.last_tick, paused=True), None))
+            self._outbox.publish(
+                (keys.CLOCK, self._make_clock_message(self._published.last_tick, paused=True), None)
+            )
         self._status.publish_if_due()
         self._tick_start_ns = None
         deadline_ns = time.monotonic_ns() + PAUSED_PERIOD_NS
-        while not self._requests.simulator_requests and (remaining_ns := deadline_ns - time.monotonic_ns()) > 0:
+        while (
+            not self._requests.simulator_requests
+            and (remaining_ns := deadline_ns - time.monotonic_ns()) > 0
+        ):
             self._inbox.handle_next_item(remaining_ns * 1e-9)
         self._status.publish_if_due()
 
@@ -481,7 +505,9 @@ class Host:
             if not late_services:
                 break
             remaining_ns = stall_deadline_ns - time.monotonic_ns()
-            if self._published_arm_session != self.authority.arm_session:  # armed in this tick: publish it
+            if (
+                self._published_arm_session != self.authority.arm_session
+            ):  # armed in this tick: publish it
                 self._publish_samples(samples)
             if remaining_ns > 0:
                 self._inbox.handle_next_item(min(remaining_ns * 1e-9, MAX_PARTICIPANT_WAIT_S))
@@ -533,7 +559,9 @@ class Host:
             monotonic_ns: Monotonic time at which the command arrived.
         """
         state = self._state
-        if command.lease_epoch == self.authority.lease.epoch and self.authority.matches_arm_session(command):
+        if command.lease_epoch == self.authority.lease.epoch and self.authority.matches_arm_session(
+            command
+        ):
             self.on_tick_done(self.authority.lease.holder, command.tick)
         published_safety_ns, published_ns = self._published.find_publish_times_ns(command.tick)
         now_ns = state.clock.safety_ns(monotonic_ns)
@@ -570,7 +598,9 @@ class Host:
         if self.authority.arm_session and not self._state.ending.requested:
             cause = f"{service} is gone: its process ended or its connection broke"
             fault = Fault(tick=self._state.clock.tick, what="service_lost", cause=cause)
-            self.authority.log_fault(fault, precedes_stop=self.authority.state == "armed" and is_holder)
+            self.authority.log_fault(
+                fault, precedes_stop=self.authority.state == "armed" and is_holder
+            )
         if is_holder:
             self.authority.handle_lease_holder_exit(f"{service} is gone")
 
@@ -586,7 +616,9 @@ class Host:
     def _on_backend_failure(self, error: BackendError) -> None:
         """Latch the failure of the backend as a fault, publish the status, and end the run."""
         cause = str(error)[:500]
-        self.authority.latch_fault(Fault(tick=self._state.clock.tick, what="backend_failed", cause=cause))
+        self.authority.latch_fault(
+            Fault(tick=self._state.clock.tick, what="backend_failed", cause=cause)
+        )
         self._status.publish_if_due(force=True)
         self._state.ending.request("failed", cause)
 
@@ -611,8 +643,14 @@ class Host:
         max_ticks = self._options.max_ticks
         if max_ticks is not None and self.statistics.ticks >= max_ticks:
             ending.request("complete")
-        elif max_ticks is not None and not self._options.stays_after_run and self.black_box.row_count >= max_ticks:
-            ending.request("failed", "the time was over before the requested armed time was reached")
+        elif (
+            max_ticks is not None
+            and not self._options.stays_after_run
+            and self.black_box.row_count >= max_ticks
+        ):
+            ending.request(
+                "failed", "the time was over before the requested armed time was reached"
+            )
         elif self._has_fault_time_passed():
             ending.request("failed", self.authority.reason)
         return ending.requested
@@ -622,7 +660,9 @@ class Host:
         if self._faulted_tick is None or self._options.end_after_fault_s is None:
             return False
         clock = self._state.clock
-        return (clock.tick - self._faulted_tick) * clock.period_ns > self._options.end_after_fault_s * 1e9
+        return (
+            clock.tick - self._faulted_tick
+        ) * clock.period_ns > self._options.end_after_fault_s * 1e9
 
     def _close(self) -> None:
         """Disarm the robot, send it safe setpoints, publish the last status, and release all resources."""

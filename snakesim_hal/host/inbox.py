@@ -166,10 +166,16 @@ class HostInbox:
 
         session.on_urgent_arrival(keys.JOINT_COMMAND, self._queue_command)
         session.on_urgent_arrival(keys.DONE_ALL, self._queue_done)
-        session.on_query(keys.ESTOP, partial(self._queue_stop_request, MessageDecoder(EstopRequest)))
+        session.on_query(
+            keys.ESTOP, partial(self._queue_stop_request, MessageDecoder(EstopRequest))
+        )
         session.on_query(keys.LEASE, partial(self._queue_request, MessageDecoder(LeaseRequest)))
-        session.on_query(keys.LIFECYCLE, partial(self._queue_request, MessageDecoder(LifecycleRequest)))
-        session.on_query(keys.SIMULATOR, partial(self._queue_request, MessageDecoder(SimulatorRequest)))
+        session.on_query(
+            keys.LIFECYCLE, partial(self._queue_request, MessageDecoder(LifecycleRequest))
+        )
+        session.on_query(
+            keys.SIMULATOR, partial(self._queue_request, MessageDecoder(SimulatorRequest))
+        )
         session.on_token_change(self._queue_presence)
 
     def waiting(self) -> int:
@@ -195,7 +201,9 @@ class HostInbox:
 
     def handle_until(self, monotonic_ns: int) -> None:
         """Handle items as they arrive, until a monotonic time."""
-        while (remaining_ns := monotonic_ns - time.monotonic_ns()) > 0 and self.handle_next_item(remaining_ns * 1e-9):
+        while (remaining_ns := monotonic_ns - time.monotonic_ns()) > 0 and self.handle_next_item(
+            remaining_ns * 1e-9
+        ):
             pass
 
     def handle_queued(self, limit_ns: float) -> None:
@@ -228,11 +236,14 @@ class HostInbox:
         self.dropped += self._queue.is_full(SAMPLES)
         self._queue.put(item, SAMPLES)
 
-    def _queue_stop_request(self, decoder: MessageDecoder[EstopRequest], query: IncomingQuery) -> None:
+    def _queue_stop_request(
+        self, decoder: MessageDecoder[EstopRequest], query: IncomingQuery
+    ) -> None:
         self._queue.put(_RemoteRequest(query, decoder, self._send_answer), STOP_LANE)
 
     def _queue_request(self, decoder: RequestDecoder, query: IncomingQuery) -> None:
-        self.dropped += self._queue.is_full(REQUESTS)  # the requester gets no answer, and may ask again
+        # The requester gets no answer, and may ask again.
+        self.dropped += self._queue.is_full(REQUESTS)
         self._queue.put(_RemoteRequest(query, decoder, self._send_answer), REQUESTS)
 
     def _queue_presence(self, key: str, present: bool) -> None:

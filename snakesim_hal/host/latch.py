@@ -44,10 +44,12 @@ class EstopLatch:
             folder: Folder of the file. None for a latch without a file, which ends with the host.
         """
         self._path = None if folder is None else folder / ESTOP
-        self.left_by_earlier_host = None if self._path is None else _read(self._path)  # left by an earlier host
+        # Left by an earlier host.
+        self.left_by_earlier_host = None if self._path is None else _read(self._path)
+        # False: the file cannot be read.
         self._is_stored = (
             self.left_by_earlier_host is not None and self.left_by_earlier_host.tick >= 0
-        )  # False: the file cannot be read
+        )
         # Queues of the two threads; None ends them.
         self._requests: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._unanswered: SimpleQueue[_OneTimeCallback | None] = SimpleQueue()
@@ -66,7 +68,9 @@ class EstopLatch:
         late = f"it is not stored yet, and may not outlive this host: {self._path}: the disk does not answer"
         once = _OneTimeCallback(on_finished, late)
         self._unanswered.put(once)
-        self._requests.put(lambda: self._store_stop(LatchedStop(requester=requester, tick=tick), once))
+        self._requests.put(
+            lambda: self._store_stop(LatchedStop(requester=requester, tick=tick), once)
+        )
 
     def release(self, on_finished: Callable[[str | None], None]) -> None:
         """Remove the stored stop in another thread. The callback is called as in `engage`."""
@@ -116,7 +120,9 @@ class EstopLatch:
             self._is_stored = False
             on_finished(None)
         except OSError as error:
-            on_finished(f"the next host will start in estop: {self._path}: {error.strerror}; remove it by hand")
+            on_finished(
+                f"the next host will start in estop: {self._path}: {error.strerror}; remove it by hand"
+            )
 
 
 def _read(path: Path) -> LatchedStop | None:
@@ -145,7 +151,9 @@ def remove_latched_stop(path: Path) -> str:
         path.unlink(missing_ok=True)
         sync_folder(path.parent)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; remove it by hand", code="file/not-writable") from error
+        raise ConfigError(
+            f"{path}: {error.strerror}; remove it by hand", code="file/not-writable"
+        ) from error
     return f"emergency stop by {'an unknown client' if latched is None else latched.requester}"
 
 
@@ -169,7 +177,9 @@ class _OneTimeCallback:
             self._callback(failure)
 
 
-def make_storage_callback(reply: Callable[[Answer], None], answer: Answer) -> Callable[[str | None], None]:
+def make_storage_callback(
+    reply: Callable[[Answer], None], answer: Answer
+) -> Callable[[str | None], None]:
     """Return an `on_finished` callback that sends an answer, with the reason if the stop is not stored."""
 
     def on_stored(failure: str | None) -> None:

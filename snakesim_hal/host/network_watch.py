@@ -22,14 +22,24 @@ class NetworkWatch:
 
     def report_new_problems(self) -> None:
         """Record each problem once, when it begins."""
-        is_held_up = self._can_be_blocked and self._outbox.blocked_duration_s() * 1e9 > self._state.config.lease_ns
+        is_held_up = (
+            self._can_be_blocked
+            and self._outbox.blocked_duration_s() * 1e9 > self._state.config.lease_ns
+        )
         if not (is_held_up or self._other_hosts or self._reported_causes):
             return
-        problems = {f"another HAL host has this robot's name: {host}": "second_host" for host in set(self._other_hosts)}
+        problems = {
+            f"another HAL host has this robot's name: {host}": "second_host"
+            for host in set(self._other_hosts)
+        }
         if is_held_up:
-            problems["the network accepts no message: it is congested, or under attack"] = "network_held_up"
+            problems["the network accepts no message: it is congested, or under attack"] = (
+                "network_held_up"
+            )
         for cause in problems.keys() - self._reported_causes:
-            self._state.authority.log_fault(Fault(tick=self._state.clock.tick, what=problems[cause], cause=cause))
+            self._state.authority.log_fault(
+                Fault(tick=self._state.clock.tick, what=problems[cause], cause=cause)
+            )
         self._reported_causes = set(problems)
 
     def _on_host_presence(self, key: str, present: bool) -> None:

@@ -19,13 +19,22 @@ from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import IncomingQuery, Publisher
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, EncodedMessage
-from snakesim_hal.wire.messages import MAX_CONFIG, Answer, Message, RobotDescription, RobotStatus, RunConfiguration
+from snakesim_hal.wire.messages import (
+    MAX_CONFIG,
+    Answer,
+    Message,
+    RobotDescription,
+    RobotStatus,
+    RunConfiguration,
+)
 
-MAX_QUEUED_ACTIONS = 64  # queued actions; each sends one message, or all messages of a tick; the oldest are dropped
+# Queued actions; each sends one message, or all messages of a tick; the oldest are dropped.
+MAX_QUEUED_ACTIONS = 64
 MAX_QUEUED_IMAGES = 8
 FLUSH_S = 1.0  # how long queued actions still run at the end: a network or a disk may hang
 
-Outgoing = tuple[str, Message, EncodedMessage | None]  # key and message; None: it has not been encoded yet
+# Key and message; None: it has not been encoded yet.
+Outgoing = tuple[str, Message, EncodedMessage | None]
 
 
 class SerialWorker:
@@ -38,11 +47,11 @@ class SerialWorker:
             name: Name of the thread.
             max_queued_actions: Number of actions that may wait. If there are more, the oldest are dropped.
         """
-        self._queued_actions: Mailbox[Callable[[], None] | None] = Mailbox(
-            (max_queued_actions,)
-        )  # None ends the thread
+        # None ends the thread.
+        self._queued_actions: Mailbox[Callable[[], None] | None] = Mailbox((max_queued_actions,))
         self._is_closing = False
-        self._action_start_ns = 0  # monotonic time at which the current action started; 0 while idle
+        # Monotonic time at which the current action started; 0 while idle.
+        self._action_start_ns = 0
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -77,7 +86,9 @@ class SerialWorker:
 class HostOutbox:
     """The output of one host. The host's threads put messages and answers into it."""
 
-    def __init__(self, session: Session, description: RobotDescription, config: bytes, *, lockstep: bool) -> None:
+    def __init__(
+        self, session: Session, description: RobotDescription, config: bytes, *, lockstep: bool
+    ) -> None:
         """Publish the description and the effective configuration, and declare the host's liveliness tokens.
 
         Args:
@@ -94,12 +105,16 @@ class HostOutbox:
         # Threads. Without a camera, images need no thread of their own.
         self._streams = SerialWorker("streams")
         self._answers = SerialWorker("answers")
-        has_camera = any(keys.find_message(sensor.key) in IMAGE_MESSAGE_TYPES for sensor in description.sensors)
+        has_camera = any(
+            keys.find_message(sensor.key) in IMAGE_MESSAGE_TYPES for sensor in description.sensors
+        )
         self._images = SerialWorker("images", MAX_QUEUED_IMAGES) if has_camera else self._streams
         # Latched messages and liveliness tokens.
         session.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(description)
         if len(config) <= MAX_CONFIG:
-            configuration = RunConfiguration(config_hash=description.config_hash, content=config.decode())
+            configuration = RunConfiguration(
+                config_hash=description.config_hash, content=config.decode()
+            )
             session.declare_latched_publisher(keys.CONFIG, RunConfiguration).put(configuration)
         session.declare_alive(HAL)
         if description.host is not None:
@@ -111,7 +126,9 @@ class HostOutbox:
             self._publish(messages)
             return
         if self._images is not self._streams:
-            images = [outgoing for outgoing in messages if isinstance(outgoing[1], IMAGE_MESSAGE_TYPES)]
+            images = [
+                outgoing for outgoing in messages if isinstance(outgoing[1], IMAGE_MESSAGE_TYPES)
+            ]
             if images:
                 self._images.submit(lambda: self._publish(images))
                 messages = tuple(outgoing for outgoing in messages if outgoing not in images)
@@ -135,7 +152,8 @@ class HostOutbox:
 
     def close(self) -> None:
         """Send queued messages for at most FLUSH_S."""
-        senders = dict.fromkeys((self._answers, self._images, self._streams))  # two of them may be the same
+        # Two of them may be the same.
+        senders = dict.fromkeys((self._answers, self._images, self._streams))
         for sender in senders:
             sender.close()
 

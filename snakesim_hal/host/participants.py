@@ -17,7 +17,8 @@ class LockstepParticipant:
 
     service: ServiceSchedule
     done_tick: int = NOT_ANSWERED  # the newest tick for which it has published all output
-    first_tick: int = 0  # that it receives: it cannot answer ticks that were published before it was connected
+    # That it receives: it cannot answer ticks that were published before it was connected.
+    first_tick: int = 0
     is_connected: bool = False
     is_abandoned: bool = False
 

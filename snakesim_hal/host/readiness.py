@@ -3,16 +3,24 @@
 from snakesim_hal.host.participants import LockstepParticipants
 from snakesim_hal.host.status_messages import describe_wait
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.network.process_entries import HOST, ProcessEntries, make_own_entry, publish_process_entry
+from snakesim_hal.network.process_entries import (
+    HOST,
+    ProcessEntries,
+    make_own_entry,
+    publish_process_entry,
+)
 from snakesim_hal.network.session import Session
 
 
 class ServiceReadiness:
     """Compares the services that are connected with those that the run needs."""
 
-    def __init__(self, config: RunConfig, participants: LockstepParticipants, session: Session) -> None:
+    def __init__(
+        self, config: RunConfig, participants: LockstepParticipants, session: Session
+    ) -> None:
         self._participants = participants
-        self._requires_answers = config.clock_mode == "lockstep"  # tick 0, without which lockstep cannot begin
+        # Tick 0, without which lockstep cannot begin.
+        self._requires_answers = config.clock_mode == "lockstep"
         self._own_entry = make_own_entry(HOST, config)
         publish_process_entry(session, self._own_entry)
         self._processes = ProcessEntries(session)

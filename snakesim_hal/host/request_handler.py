@@ -35,8 +35,10 @@ class RequestHandler:
         latch: EstopLatch,
         outbox: HostOutbox,
     ) -> None:
-        self.log: list[str] = []  # each request except those for the lease: from whom, and the result
-        self.simulator_requests: list[tuple[SimulatorRequest, Reply]] = []  # until the next tick begins
+        # Each request except those for the lease: from whom, and the result.
+        self.log: list[str] = []
+        # Until the next tick begins.
+        self.simulator_requests: list[tuple[SimulatorRequest, Reply]] = []
         self._state = state
         self._readiness = readiness
         self._status = status
@@ -80,9 +82,8 @@ class RequestHandler:
     def _handle_lease(self, request: LeaseRequest, reply: Reply) -> None:
         state = self._state
         now_ns = state.clock.safety_ns()
-        state.authority.latch_faults_and_expire_lease(
-            now_ns, state.clock.tick
-        )  # first, because an expired lease is a fault
+        # First, because an expired lease is a fault.
+        state.authority.latch_faults_and_expire_lease(now_ns, state.clock.tick)
         answer = state.authority.handle_lease_request(request, now_ns)
         self._status.publish_if_due()
         reply(self._add_host_id(answer))
@@ -100,7 +101,9 @@ class RequestHandler:
                 self._log_and_reply(request, refusal, reply)
                 return
 
-        answer = self._state.authority.handle_lifecycle_request(request, self._state.clock.safety_ns())
+        answer = self._state.authority.handle_lifecycle_request(
+            request, self._state.clock.safety_ns()
+        )
         match request.action:
             case "arm" if answer.ok:
                 self._state.reset_answered_ticks()
@@ -113,7 +116,9 @@ class RequestHandler:
                 pass
         self._log_and_reply(request, answer, reply)
 
-    def _log_and_reply(self, request: LifecycleRequest | SimulatorRequest, answer: Answer, reply: Reply) -> None:
+    def _log_and_reply(
+        self, request: LifecycleRequest | SimulatorRequest, answer: Answer, reply: Reply
+    ) -> None:
         """Log a request, publish the status, and reply. A reset is answered only after the stop is off the disk."""
         answer = self._add_host_id(answer)
         self._log_request(request, answer)
@@ -158,13 +163,17 @@ class RequestHandler:
             return self._state.make_answer(ok=False, reason=reason, refusal="not_ready")
         differing = self._readiness.describe_differing_processes()
         if differing:
-            return self._state.make_answer(ok=False, reason="; ".join(differing), refusal="settings_differ")
+            return self._state.make_answer(
+                ok=False, reason="; ".join(differing), refusal="settings_differ"
+            )
         return None
 
     def _add_host_id(self, answer: Answer) -> Answer:
         return msgspec.structs.replace(answer, host=self._state.description.host)
 
-    def _log_request(self, request: LifecycleRequest | EstopRequest | SimulatorRequest, answer: Answer) -> None:
+    def _log_request(
+        self, request: LifecycleRequest | EstopRequest | SimulatorRequest, answer: Answer
+    ) -> None:
         """Add a request and its result to the run's record and to the log of the process."""
         if len(self.log) >= MAX_LOGGED_REQUESTS:
             return

@@ -33,7 +33,8 @@ class DurationHistogram:
 
     def add(self, duration_us: float) -> None:
         """Add a duration to the histogram."""
-        index = round(math.log(max(duration_us, 1.0)) / self._step)  # from 0 on, because the logarithm is not negative
+        # From 0 on, because the logarithm is not negative.
+        index = round(math.log(max(duration_us, 1.0)) / self._step)
         self._bins[min(index, self._last_index)] += 1
         self.count += 1
 
@@ -57,14 +58,19 @@ class DurationHistogram:
             return None
         first_bin = bisect_left(cumulative, 1)  # the first bin that is not empty
         end_bin = bisect_left(cumulative, count) + 1  # the bin after the last one that is not empty
-        merged_count = -(-(end_bin - first_bin) // MAX_PUBLISHED_BINS)  # bins per published bin, rounded up
-        merged_bins = [sum(bins[i : i + merged_count]) for i in range(first_bin, end_bin, merged_count)]
+        # Bins per published bin, rounded up.
+        merged_count = -(-(end_bin - first_bin) // MAX_PUBLISHED_BINS)
+        merged_bins = [
+            sum(bins[i : i + merged_count]) for i in range(first_bin, end_bin, merged_count)
+        ]
         return TimingStatistics(
             count=count,
             median_us=self._find_percentile_us(cumulative, 50),
             p99_us=self._find_percentile_us(cumulative, 99),
             max_us=math.exp((end_bin - 1) * self._step),
-            low_us=math.exp((first_bin - 0.5) * self._step),  # lower end of the first bin, whose middle is at its index
+            low_us=math.exp(
+                (first_bin - 0.5) * self._step
+            ),  # lower end of the first bin, whose middle is at its index
             bin_decades=merged_count * self._step / math.log(10),
             bins=merged_bins,
         )
@@ -83,14 +89,13 @@ def _make_coarse_histogram() -> DurationHistogram:
 class TickTimes:
     """Durations of the parts of a tick, while the robot is armed."""
 
-    cycle: DurationHistogram = field(
-        default_factory=DurationHistogram
-    )  # from the start of a tick to the start of the next
-    late: DurationHistogram = field(default_factory=_make_coarse_histogram)  # start of a tick after its deadline
+    # From the start of a tick to the start of the next.
+    cycle: DurationHistogram = field(default_factory=DurationHistogram)
+    # Start of a tick after its deadline.
+    late: DurationHistogram = field(default_factory=_make_coarse_histogram)
     read: DurationHistogram = field(default_factory=_make_coarse_histogram)  # the backend's sample
-    write: DurationHistogram = field(
-        default_factory=_make_coarse_histogram
-    )  # the backend takes setpoints, and lets the tick pass
+    # The backend takes setpoints, and lets the tick pass.
+    write: DurationHistogram = field(default_factory=_make_coarse_histogram)
 
     def timings(self) -> dict[str, TimingStatistics]:
         """Return the timing of each part that was measured, by its name."""

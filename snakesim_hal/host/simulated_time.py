@@ -41,7 +41,10 @@ class SimulatedTime:
     """
 
     def __init__(
-        self, description: RobotDescription, clock_mode: ClockMode, read_monotonic_ns: Callable[[], int]
+        self,
+        description: RobotDescription,
+        clock_mode: ClockMode,
+        read_monotonic_ns: Callable[[], int],
     ) -> None:
         """Initialize the clock; simulated time runs in real time until a client changes its speed.
 
@@ -55,10 +58,13 @@ class SimulatedTime:
         self._read_monotonic_ns = read_monotonic_ns
         # Requested by clients.
         self.speed = 1.0  # simulated time per real time; used only in clock mode realtime
-        self.paused_by: str | None = None  # client that paused or single-steps the clock; None if time passes
-        self._remaining_ticks = 0  # single steps that are still to be made; used only if `paused_by` is set
+        # Client that paused or single-steps the clock; None if time passes.
+        self.paused_by: str | None = None
+        # Single steps that are still to be made; used only if `paused_by` is set.
+        self._remaining_ticks = 0
         # Measured.
-        self.real_time_factor: float | None = None  # simulated time per real time; None if not measured yet
+        # Simulated time per real time; None if not measured yet.
+        self.real_time_factor: float | None = None
         self._measurement_start = _TimeOrigin(safety_ns=0, monotonic_ns=read_monotonic_ns(), tick=0)
         # Start of the time with the current pause and speed, from which safety time is extrapolated.
         self._safety_time_origin = _TimeOrigin(safety_ns=0, monotonic_ns=0, tick=0)
@@ -126,12 +132,18 @@ class SimulatedTime:
                 reason = "the time of emulated modules is that of their bus"
             else:
                 reason = "it moves something real"
-            return SimulatorRefusal("not_simulated", f"backend {robot.backend!r} cannot {request.action}: {reason}")
+            return SimulatorRefusal(
+                "not_simulated", f"backend {robot.backend!r} cannot {request.action}: {reason}"
+            )
         if request.action == "resume" and self.paused_by is None:
             return SimulatorRefusal("wrong_state", "nothing to resume: it is not paused")
         if request.action == "speed" and self._clock_mode != "realtime":
-            explanation = "goes as fast as it can; for a speed start the run with --clock-mode realtime"
-            return SimulatorRefusal("wrong_clock_mode", f"the clock mode is {self._clock_mode}, which {explanation}")
+            explanation = (
+                "goes as fast as it can; for a speed start the run with --clock-mode realtime"
+            )
+            return SimulatorRefusal(
+                "wrong_clock_mode", f"the clock mode is {self._clock_mode}, which {explanation}"
+            )
         return None
 
     def on_tick_end(self, tick: int) -> None:
@@ -142,12 +154,17 @@ class SimulatedTime:
         """
         self._measure_real_time_factor(tick)
         if self._remaining_ticks == 1:
-            self._restart_safety_time(tick)  # before the pause starts, because safety time passes until now
+            # Before the pause starts, because safety time passes until now.
+            self._restart_safety_time(tick)
         self._remaining_ticks = max(self._remaining_ticks - 1, 0)
 
     def describe_slowness(self) -> list[str]:
         """Return one warning if the requested speed is not reached; an empty list if it is, or if it is 1."""
-        if self.speed == 1.0 or self.real_time_factor is None or self.real_time_factor >= MIN_SPEED_RATIO * self.speed:
+        if (
+            self.speed == 1.0
+            or self.real_time_factor is None
+            or self.real_time_factor >= MIN_SPEED_RATIO * self.speed
+        ):
             return []
         return [f"speed {self.speed:g} is requested, {self.real_time_factor:.2g} reached"]
 

@@ -7,10 +7,14 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, RobotDescription
 
 # How a run can do without a message, by its key.
-WAYS_OUT = {keys.POSE: "mission.localization=dead_reckoning does without, and so does a robot without [sensors.pose]"}
+WAYS_OUT = {
+    keys.POSE: "mission.localization=dead_reckoning does without, and so does a robot without [sensors.pose]"
+}
 
 
-def make_applied_command(description: RobotDescription, tick: int, tick_output: TickOutput) -> AppliedCommand:
+def make_applied_command(
+    description: RobotDescription, tick: int, tick_output: TickOutput
+) -> AppliedCommand:
     """Return the message with the applied setpoints of a tick."""
     setpoints = tick_output.setpoints
     return AppliedCommand(
@@ -20,7 +24,9 @@ def make_applied_command(description: RobotDescription, tick: int, tick_output: 
         mode=setpoints.mode,
         target=setpoints.target,
         torque_limit_nm=setpoints.torque_limit_nm,
-        limited={description.joints[i].name: word for i, word in tick_output.limit_by_joint.items()},
+        limited={
+            description.joints[i].name: word for i, word in tick_output.limit_by_joint.items()
+        },
     )
 
 

@@ -80,7 +80,9 @@ class StatusReporter:
         missing = self._readiness.find_missing_services()
         differing = self._readiness.describe_differing_processes()
         refusals = authority.list_unmet_conditions(clock.safety_ns())
-        slow_backend = state.backend_time.describe_slowness() if clock.clock_mode == "realtime" else []
+        slow_backend = (
+            state.backend_time.describe_slowness() if clock.clock_mode == "realtime" else []
+        )
 
         why = authority.reason
         if authority.state == "disarmed" and (refusals or missing or differing):
@@ -124,7 +126,11 @@ class StatusReporter:
             # Timing.
             overruns=state.statistics.overruns,
             tick_times=state.statistics.times.timings(),
-            realtime_warnings=[*self._realtime_warnings, *slow_backend, *simulated.describe_slowness()],
+            realtime_warnings=[
+                *self._realtime_warnings,
+                *slow_backend,
+                *simulated.describe_slowness(),
+            ],
         )
 
     def _make_trigger(self) -> _StatusTrigger:

@@ -6,7 +6,8 @@ The host's thread makes every call.
 import time
 from collections import deque
 
-REANCHOR_PERIODS = 1  # if later, all deadlines are shifted: ticks that catch up in a burst would break rate limits
+# If later, all deadlines are shifted: ticks that catch up in a burst would break rate limits.
+REANCHOR_PERIODS = 1
 MAX_STORED_TICKS = 4096  # whose publish times are known
 LONG_AGO_NS = -(2**60)  # publish time of a tick that is not known
 SMOOTHING = 0.1  # weight of the newest duration
@@ -104,9 +105,8 @@ class PublishTimes:
 
     def __init__(self) -> None:
         """Start without ticks."""
-        self._published_ticks: deque[tuple[int, int, int]] = deque(
-            maxlen=MAX_STORED_TICKS
-        )  # tick, safety ns, monotonic ns
+        # Tick, safety ns, monotonic ns.
+        self._published_ticks: deque[tuple[int, int, int]] = deque(maxlen=MAX_STORED_TICKS)
 
     @property
     def last_tick(self) -> int | None:

@@ -16,12 +16,12 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import MAX_JOINTS, from_zero
 
-START_CHECK_CONTROLLER = (
-    "joint_check"  # the controller of the start check; it may run on a robot that is not checked yet
-)
+# The controller of the start check; it may run on a robot that is not checked yet.
+START_CHECK_CONTROLLER = "joint_check"
 ShortText = Annotated[str, Meta(max_length=200)]
 JointProperty = Literal["drive", "order", "sign", "gear", "zero"]
-PROPERTIES: tuple[JointProperty, ...] = get_args(JointProperty)  # those that a start check confirms for every joint
+# Those that a start check confirms for every joint.
+PROPERTIES: tuple[JointProperty, ...] = get_args(JointProperty)
 JointNames = Annotated[list[ShortText], Meta(max_length=MAX_JOINTS)]
 
 REMEDY = "check it again (docs/hardware/calibration.md)"
@@ -77,7 +77,9 @@ def compute_mounting_digest(joints: Sequence[Joint]) -> str:
     return hashlib.sha256(encoded).hexdigest()[:16]
 
 
-def find_unchecked_reason(checked: StartCheckRecord | None, joints: Sequence[Joint], robot: RobotDescription) -> str:
+def find_unchecked_reason(
+    checked: StartCheckRecord | None, joints: Sequence[Joint], robot: RobotDescription
+) -> str:
     """Find the reason why a robot counts as not checked.
 
     Args:
@@ -104,7 +106,9 @@ def find_unchecked_reason(checked: StartCheckRecord | None, joints: Sequence[Joi
     return _describe_changed_drives(checked, robot)
 
 
-def find_change_since_check(checked: StartCheckRecord, joints: Sequence[Joint], robot: RobotDescription) -> str:
+def find_change_since_check(
+    checked: StartCheckRecord, joints: Sequence[Joint], robot: RobotDescription
+) -> str:
     """Find what has changed since a check, so that what it confirmed is not valid any more.
 
     Args:
@@ -151,5 +155,7 @@ def _describe_replaced_drives(checked: StartCheckRecord, robot: RobotDescription
     sentences: list[str] = []
     for joint, before in zip(robot.joints, checked_serials, strict=False):
         if joint.serial != before:
-            sentences.append(f"{joint.name} has drive {joint.serial or 'unknown'}, and had {before or 'unknown'}")
+            sentences.append(
+                f"{joint.name} has drive {joint.serial or 'unknown'}, and had {before or 'unknown'}"
+            )
     return sentences

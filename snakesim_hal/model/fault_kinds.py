@@ -17,7 +17,9 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire import keys
 
 TargetType = Literal["process", "key", "joint", "bus", "simulator", "clock"]
-FaultExecutor = Literal["supervisor", "process", "writer", "module", "samples", "driver", "host", "simulator"]
+FaultExecutor = Literal[
+    "supervisor", "process", "writer", "module", "samples", "driver", "host", "simulator"
+]
 EXECUTOR_DESCRIPTIONS: Mapping[FaultExecutor, str] = {
     "supervisor": "the supervisor, `snakesim run`",
     "process": "the process itself",
@@ -59,19 +61,27 @@ class FaultKind:
     """One kind of injected fault."""
 
     description: str
-    executors: tuple[FaultExecutor, ...]  # what can carry it out; of two, the first one if it supports the kind
+    # What can carry it out; of two, the first one if it supports the kind.
+    executors: tuple[FaultExecutor, ...]
     amount: FaultAmount | None = None  # None if the kind has no strength
     is_instantaneous: bool = False  # True if it happens at its start, and has no end
-    module_description: str = ""  # what it does in a joint module, where that is more than `description`
+    # What it does in a joint module, where that is more than `description`.
+    module_description: str = ""
 
 
 MESSAGE_FRACTION = FaultAmount("share of the messages", "1", 1.0, 0.0, 1.0)
 
 FAULT_KINDS: Mapping[TargetType, Mapping[str, FaultKind]] = {
     "process": {
-        "kill": FaultKind("SIGKILL: terminated immediately", ("supervisor",), is_instantaneous=True),
-        "stop": FaultKind("SIGTERM: ends in an orderly way", ("supervisor",), is_instantaneous=True),
-        "freeze": FaultKind("SIGSTOP until the end: the process exists and sends nothing", ("supervisor",)),
+        "kill": FaultKind(
+            "SIGKILL: terminated immediately", ("supervisor",), is_instantaneous=True
+        ),
+        "stop": FaultKind(
+            "SIGTERM: ends in an orderly way", ("supervisor",), is_instantaneous=True
+        ),
+        "freeze": FaultKind(
+            "SIGSTOP until the end: the process exists and sends nothing", ("supervisor",)
+        ),
         "hang": FaultKind(
             "its interpreter is busy until the end: connected, but does nothing",
             ("process",),
@@ -79,17 +89,25 @@ FAULT_KINDS: Mapping[TargetType, Mapping[str, FaultKind]] = {
     },
     "key": {
         "drop": FaultKind("messages are lost", ("writer",), MESSAGE_FRACTION),
-        "delay": FaultKind("messages arrive late", ("writer",), FaultAmount("delay", "s", 0.05, 0.0, 10.0)),
+        "delay": FaultKind(
+            "messages arrive late", ("writer",), FaultAmount("delay", "s", 0.05, 0.0, 10.0)
+        ),
         "duplicate": FaultKind("messages arrive twice", ("writer",), MESSAGE_FRACTION),
-        "reorder": FaultKind("a message arrives after the one that follows it", ("writer",), MESSAGE_FRACTION),
+        "reorder": FaultKind(
+            "a message arrives after the one that follows it", ("writer",), MESSAGE_FRACTION
+        ),
         "corrupt": FaultKind("bytes of messages are changed", ("writer",), MESSAGE_FRACTION),
         "flood": FaultKind(
-            "the newest message is sent repeatedly", ("writer",), FaultAmount("rate", "1/s", 5000.0, 1.0, 1e5)
+            "the newest message is sent repeatedly",
+            ("writer",),
+            FaultAmount("rate", "1/s", 5000.0, 1.0, 1e5),
         ),
     },
     "joint": {
         "mute": FaultKind(
-            "sends nothing", ("module", "samples"), module_description="sends nothing, but still follows its setpoints"
+            "sends nothing",
+            ("module", "samples"),
+            module_description="sends nothing, but still follows its setpoints",
         ),
         "freeze": FaultKind(
             "repeats its last sample, whose age grows",
@@ -98,7 +116,9 @@ FAULT_KINDS: Mapping[TargetType, Mapping[str, FaultKind]] = {
                 "its main loop hangs: repeats its last joint state, no heartbeat, passive after its watchdog"
             ),
         ),
-        "wrong": FaultKind("its angle is wrong", ("samples",), FaultAmount("offset", "rad", 0.5, -6.3, 6.3)),
+        "wrong": FaultKind(
+            "its angle is wrong", ("samples",), FaultAmount("offset", "rad", 0.5, -6.3, 6.3)
+        ),
         "nan": FaultKind("its angle is NaN", ("samples",)),
         "reboot": FaultKind("its module restarts", ("module",), is_instantaneous=True),
         "counter": FaultKind("joint states with a wrong count", ("module",)),
@@ -124,11 +144,15 @@ FAULT_KINDS: Mapping[TargetType, Mapping[str, FaultKind]] = {
         ),
         "overflow": FaultKind("received frames are lost", ("driver",), is_instantaneous=True),
         "full": FaultKind("the transmit queue is full", ("driver",)),
-        "slow": FaultKind("each reading of it takes longer", ("driver",), FaultAmount("by", "s", 0.02, 0.0, 1.0)),
+        "slow": FaultKind(
+            "each reading of it takes longer", ("driver",), FaultAmount("by", "s", 0.02, 0.0, 1.0)
+        ),
     },
     "simulator": {
         "slow": FaultKind(
-            "runs at a share of real time", ("host",), FaultAmount("share of real time", "1", 0.1, 0.001, 1.0)
+            "runs at a share of real time",
+            ("host",),
+            FaultAmount("share of real time", "1", 0.1, 0.001, 1.0),
         ),
         "diverge": FaultKind("its state becomes impossible", ("simulator",), is_instantaneous=True),
     },
@@ -256,7 +280,8 @@ def parse_injection(text: str) -> FaultInjection:
     match = _TEXT_PATTERN.fullmatch(text.strip())
     if match is None:
         raise ConfigError(
-            f"fault {text!r}: give {TEXT_FORMAT}. Kinds: {summarize_fault_kinds()}", code="injection/unknown-fault"
+            f"fault {text!r}: give {TEXT_FORMAT}. Kinds: {summarize_fault_kinds()}",
+            code="injection/unknown-fault",
         )
     amount: float | None = None
     try:
@@ -266,17 +291,22 @@ def parse_injection(text: str) -> FaultInjection:
             amount = float(match["amount"])
     except ValueError:
         raise ConfigError(
-            f"fault {text!r}: start, end and amount are numbers, such as @2.0-3.5=0.3", code="injection/unknown-fault"
+            f"fault {text!r}: start, end and amount are numbers, such as @2.0-3.5=0.3",
+            code="injection/unknown-fault",
         ) from None
     if end_s <= start_s:
         raise ConfigError(
             f"fault {text!r}: it ends at {end_s:g} s, which must be later than its start, {start_s:g} s",
             code="injection/unknown-fault",
         )
-    return validate_and_complete_injection(FaultInjection(match["kind"], match["target"], start_s, end_s, amount), text)
+    return validate_and_complete_injection(
+        FaultInjection(match["kind"], match["target"], start_s, end_s, amount), text
+    )
 
 
-def validate_and_complete_injection(injection: FaultInjection, given_text: str | None = None) -> FaultInjection:
+def validate_and_complete_injection(
+    injection: FaultInjection, given_text: str | None = None
+) -> FaultInjection:
     """Check that an injected fault is allowed, and return it with the default of its amount filled in.
 
     Args:
@@ -323,7 +353,11 @@ def _unknown_kind_error(injection: FaultInjection, text: str) -> ConfigError:
 
 
 def validate_injection_targets(
-    injections: Iterable[FaultInjection], *, services: Iterable[str], joint_count: int, bus_count: int
+    injections: Iterable[FaultInjection],
+    *,
+    services: Iterable[str],
+    joint_count: int,
+    bus_count: int,
 ) -> None:
     """Raise ConfigError unless a run has every target of its injected faults.
 
@@ -369,7 +403,9 @@ def _validate_target_process(injection: FaultInjection, processes: list[str]) ->
             code="injection/unknown-target",
         )
     if injection.target == ROUTER and injection.executing_part != RUN:
-        possible = [name for name, kind in FAULT_KINDS["process"].items() if "supervisor" in kind.executors]
+        possible = [
+            name for name, kind in FAULT_KINDS["process"].items() if "supervisor" in kind.executors
+        ]
         raise ConfigError(
             f"fault {str(injection)!r}: a router cannot {injection.kind}, only {', '.join(possible)}",
             code="injection/not-supported",
@@ -416,7 +452,9 @@ class InjectionPlan:
 
     def pop_due_transitions(self, now_s: float) -> list[FaultTransition]:
         """Remove the transitions that are due by now from the plan, and return them."""
-        due_transitions = [transition for transition in self._transitions if transition.time_s <= now_s]
+        due_transitions = [
+            transition for transition in self._transitions if transition.time_s <= now_s
+        ]
         self._transitions = self._transitions[len(due_transitions) :]
         return due_transitions
 

@@ -3,14 +3,22 @@
 from collections.abc import Collection
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.fault_kinds import HAL, RUN, FaultInjection, parse_injection, validate_injection_targets
+from snakesim_hal.model.fault_kinds import (
+    HAL,
+    RUN,
+    FaultInjection,
+    parse_injection,
+    validate_injection_targets,
+)
 from snakesim_hal.model.files import ConfigTable
 from snakesim_hal.model.scenario import RunConfig
 
 MAX_BUSES = 8
 
 
-def parse_planned_faults(config: RunConfig, table: ConfigTable | None = None) -> list[FaultInjection]:
+def parse_planned_faults(
+    config: RunConfig, table: ConfigTable | None = None
+) -> list[FaultInjection]:
     """Parse the injected faults that a run configuration plans.
 
     Args:
@@ -25,7 +33,9 @@ def parse_planned_faults(config: RunConfig, table: ConfigTable | None = None) ->
         try:
             injections.append(parse_injection(text))
         except ConfigError as error:
-            raise ConfigError(f"{_describe_location(config, i, table)}: {error}", code=error.code) from None
+            raise ConfigError(
+                f"{_describe_location(config, i, table)}: {error}", code=error.code
+            ) from None
     return injections
 
 
@@ -46,8 +56,13 @@ def validate_faults_for_backend(
         ConfigError: The backend cannot inject a planned fault, or the run does not have its target.
     """
     for i, injection in enumerate(parse_and_validate_planned_faults(config, bus_count=bus_count)):
-        is_backend_fault = injection.executing_part == HAL and injection.target_type not in ("process", "key")
-        can_host_inject = "host" in injection.kind_info.executors or "samples" in injection.kind_info.executors
+        is_backend_fault = injection.executing_part == HAL and injection.target_type not in (
+            "process",
+            "key",
+        )
+        can_host_inject = (
+            "host" in injection.kind_info.executors or "samples" in injection.kind_info.executors
+        )
         if is_backend_fault and not can_host_inject and injection.kind not in supported_kinds:
             raise ConfigError(
                 f"{_describe_location(config, i, None)}: backend {config.backend!r} cannot do {injection.kind} to "
@@ -100,7 +115,9 @@ def parse_and_validate_planned_faults(
                     code="injection/not-supported",
                 )
         except ConfigError as error:
-            raise ConfigError(f"{_describe_location(config, i, table)}: {error}", code=error.code) from None
+            raise ConfigError(
+                f"{_describe_location(config, i, table)}: {error}", code=error.code
+            ) from None
     return injections
 
 

@@ -14,7 +14,13 @@ from pathlib import Path
 import msgspec
 from msgspec import inspect
 
-from snakesim_hal.model.field_words import describe_default, describe_range, describe_type, find_unit, format_value
+from snakesim_hal.model.field_words import (
+    describe_default,
+    describe_range,
+    describe_type,
+    find_unit,
+    format_value,
+)
 from snakesim_hal.model.files import FileStruct
 
 
@@ -35,7 +41,9 @@ def document_fields(struct: type[msgspec.Struct]) -> list[FieldDoc]:
     """Return the documentation of all fields of a Struct in their order; the tag of a Struct comes first."""
     info = inspect_struct_type(struct)
     descriptions = collect_field_descriptions(struct)
-    docs = [_document_field(field, descriptions.get(field.encode_name, "")) for field in info.fields]
+    docs = [
+        _document_field(field, descriptions.get(field.encode_name, "")) for field in info.fields
+    ]
     if info.tag_field is None:
         return docs
     return [_document_tag(info), *docs]
@@ -122,7 +130,9 @@ def _read_field_docstrings(struct: type) -> dict[str, str]:
     for statement, next_statement in zip(definition.body, definition.body[1:], strict=False):
         if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
             continue
-        if not isinstance(next_statement, ast.Expr) or not isinstance(next_statement.value, ast.Constant):
+        if not isinstance(next_statement, ast.Expr) or not isinstance(
+            next_statement.value, ast.Constant
+        ):
             continue
         if isinstance(next_statement.value.value, str):
             docstrings[statement.target.id] = " ".join(next_statement.value.value.split())

@@ -21,7 +21,9 @@ class TypeViolation:
     known_fields: Sequence[str] = ()  # the allowed fields beside an unknown one
 
 
-def find_first_violation(value: Any, expected_type: Any, key_path: Sequence[str] = ()) -> TypeViolation | None:
+def find_first_violation(
+    value: Any, expected_type: Any, key_path: Sequence[str] = ()
+) -> TypeViolation | None:
     """Return the innermost part of a value that is wrong by itself, or None if the value has the expected type.
 
     Args:
@@ -50,7 +52,9 @@ def _find_section_violation(
     section: dict[str, Any], expected_type: Any, key_path: Sequence[str]
 ) -> TypeViolation | None:
     """Return a violation by the names of the section's fields or its tag, or None if they are allowed."""
-    structs = [option for option in _list_type_alternatives(expected_type) if _is_struct_type(option)]
+    structs = [
+        option for option in _list_type_alternatives(expected_type) if _is_struct_type(option)
+    ]
     if not structs:
         return None
     matching = [struct for struct in structs if _tag_matches(section, struct)]
@@ -74,7 +78,9 @@ def _find_field_violation(
                 return TypeViolation("unknown", [*key_path, name], known_fields=known)
     for field in fields:
         if field.required and field.encode_name not in section:
-            return TypeViolation("missing", [*key_path, field.encode_name], expected_type=field.type)
+            return TypeViolation(
+                "missing", [*key_path, field.encode_name], expected_type=field.type
+            )
     return None
 
 
@@ -87,7 +93,9 @@ def _make_tag_violation(
     allowed_tags = Literal[tags]
     if tag_field not in section:
         return TypeViolation("missing", [*key_path, tag_field], expected_type=allowed_tags)
-    return TypeViolation("wrong", [*key_path, tag_field], section[tag_field], allowed_tags, "there is no such kind")
+    return TypeViolation(
+        "wrong", [*key_path, tag_field], section[tag_field], allowed_tags, "there is no such kind"
+    )
 
 
 def _iterate_parts(value: Any, expected_type: Any) -> Iterator[tuple[str, Any, Any]]:
@@ -126,7 +134,9 @@ def _list_type_alternatives(expected_type: Any) -> list[Any]:
     if origin is Annotated:
         return _list_type_alternatives(get_args(expected_type)[0])
     if origin in (Union, UnionType):
-        return [leaf for option in get_args(expected_type) for leaf in _list_type_alternatives(option)]
+        return [
+            leaf for option in get_args(expected_type) for leaf in _list_type_alternatives(option)
+        ]
     return [expected_type]
 
 
@@ -194,7 +204,10 @@ def _describe_single_type(option: inspect.Type, unit: str) -> str | None:
         case inspect.StructType(fields=fields, tag_field=None):
             return "a section with " + ", ".join(field.encode_name for field in fields)
         case inspect.StructType(fields=fields):
-            names = [f"{option.tag_field} = {option.tag!r}", *(field.encode_name for field in fields)]
+            names = [
+                f"{option.tag_field} = {option.tag!r}",
+                *(field.encode_name for field in fields),
+            ]
             return "a section with " + ", ".join(names)
         case inspect.ListType():
             return f"a list, each {describe_type_in_words(option.item_type)}"

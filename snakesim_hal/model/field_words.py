@@ -103,7 +103,9 @@ def _describe_limits(option: inspect.Type) -> str:
     match option:
         case inspect.FloatType() | inspect.IntType():
             bounds = ((">=", option.ge), (">", option.gt), ("<=", option.le), ("<", option.lt))
-            return ", ".join(f"{sign} {_format_number(bound)}" for sign, bound in bounds if bound is not None)
+            return ", ".join(
+                f"{sign} {_format_number(bound)}" for sign, bound in bounds if bound is not None
+            )
         case inspect.LiteralType(values=values):
             return ", ".join(format_value(value) for value in values)
         case inspect.EnumType(cls=enum):
@@ -113,7 +115,9 @@ def _describe_limits(option: inspect.Type) -> str:
         case inspect.StrType():
             return _describe_length(option.min_length, option.max_length, "characters")
         case inspect.ListType():
-            return _join_limits(_describe_length(option.min_length, option.max_length, "entries"), option.item_type)
+            return _join_limits(
+                _describe_length(option.min_length, option.max_length, "entries"), option.item_type
+            )
         case inspect.DictType() if not isinstance(option.value_type, inspect.AnyType):
             return _join_limits("", option.value_type)
         case inspect.TupleType():
@@ -220,6 +224,10 @@ def format_value(value: Any) -> str:
         case list() | tuple():
             return "[" + ", ".join(format_value(entry) for entry in value) + "]"
         case dict():
-            return "{" + ", ".join(f"{key} = {format_value(entry)}" for key, entry in value.items()) + "}"
+            return (
+                "{"
+                + ", ".join(f"{key} = {format_value(entry)}" for key, entry in value.items())
+                + "}"
+            )
         case _:
             return json.dumps(value, ensure_ascii=False)

@@ -23,9 +23,15 @@ from snakesim_hal.model.textfiles import MAX_DEPTH, parse_json, parse_toml, read
 StructT = TypeVar("StructT", bound=msgspec.Struct)
 SHIPPED_FILES_DIR = Path(__file__).parents[1] / "shipped"
 ROUTER_CONFIG_PATH = SHIPPED_FILES_DIR / "router.json5"
-SCHEMAS_DIR = Path(__file__).parents[1] / "schemas"  # in the repository a link to the folder beside the packages
+# In the repository a link to the folder beside the packages.
+SCHEMAS_DIR = Path(__file__).parents[1] / "schemas"
 # Kinds of shipped files: the name of the folder, and of one file.
-SINGULAR_BY_KIND = {"robots": "robot", "scenes": "scene", "scenarios": "scenario", "suites": "suite"}
+SINGULAR_BY_KIND = {
+    "robots": "robot",
+    "scenes": "scene",
+    "scenarios": "scenario",
+    "suites": "suite",
+}
 MAX_LIST_INDEX_DIGITS = 9  # Python converts longer numbers slowly, and no list is that long
 MAX_SHOWN_TEXT = 40  # characters of a damaged text in an error
 
@@ -70,7 +76,11 @@ class ConfigTable:
         else:
             section[last_name] = value
         # The value replaces a whole section, so the origins of the former values below it are stale.
-        stale_keys = [key for key in self.origin_by_key if key == dotted_key or key.startswith(dotted_key + ".")]
+        stale_keys = [
+            key
+            for key in self.origin_by_key
+            if key == dotted_key or key.startswith(dotted_key + ".")
+        ]
         for key in stale_keys:
             del self.origin_by_key[key]
         self.origin_by_key.update(_collect_origins(value, origin, dotted_key))
@@ -170,7 +180,8 @@ def read_table(path: Path) -> ConfigTable:
     values = parse(text, str(path))
     if not isinstance(values, dict):
         raise ConfigError(
-            f"{path}: holds a {type(values).__name__}, not a table of settings", code="file/invalid-syntax"
+            f"{path}: holds a {type(values).__name__}, not a table of settings",
+            code="file/invalid-syntax",
         )
     return ConfigTable(values, str(path), _collect_origins(values, str(path)))
 
@@ -203,7 +214,8 @@ def _make_unknown_name_hint(name: str, kind: str) -> str:
     """Return the end of the error about an unknown name: what the user may have meant, and what to do."""
     if kind == "scenarios" and name.endswith(".py"):
         return (
-            f": it is Python. A controller of your own: --controller ./{shorten(name)}:CLASS, behind a scenario's name"
+            f": it is Python. A controller of your own: --controller ./{shorten(name)}:CLASS, "
+            "behind a scenario's name"
         )
     for other_kind in ("robots", "scenes"):
         if kind == "scenarios" and name in list_shipped_names(other_kind):
@@ -299,7 +311,9 @@ def decode_table(table: ConfigTable, struct_type: type[StructT], section_key: st
         raise ConfigError(
             _describe_violation(violation, table, section_key), code=_choose_error_code(violation)
         ) from None
-    except UnicodeEncodeError as error:  # JSON may escape, and a command line may hold, half of a character
+    except (
+        UnicodeEncodeError
+    ) as error:  # JSON may escape, and a command line may hold, half of a character
         invalid_text = ascii(error.object[error.start : error.end])[:MAX_SHOWN_TEXT]
         raise ConfigError(
             f"{table.source}: a key or a text holds {invalid_text}, which is not a character; write it again"
@@ -314,10 +328,11 @@ def _choose_error_code(violation: TypeViolation) -> str:
         case "missing":
             return "config/missing-key"
         case "wrong":
-            is_number = isinstance(violation.value, int | float) and not isinstance(violation.value, bool)
-            is_out_of_range = is_number and (
-                ">" in violation.reason or "<" in violation.reason
-            )  # as msgspec writes ranges
+            is_number = isinstance(violation.value, int | float) and not isinstance(
+                violation.value, bool
+            )
+            # As msgspec writes ranges.
+            is_out_of_range = is_number and (">" in violation.reason or "<" in violation.reason)
             return "config/out-of-range" if is_out_of_range else "config/invalid-value"
 
 
@@ -339,7 +354,9 @@ def _describe_violation(violation: TypeViolation, table: ConfigTable, section_ke
             return _describe_wrong_value(violation, table, display_key)
 
 
-def _describe_unknown_field(violation: TypeViolation, table: ConfigTable, display_key: str, full_key: str) -> str:
+def _describe_unknown_field(
+    violation: TypeViolation, table: ConfigTable, display_key: str, full_key: str
+) -> str:
     """Return the error text for an unknown field.
 
     It suggests a field of the same section with a similar name, or else the same name in another section.
@@ -354,7 +371,9 @@ def _describe_unknown_field(violation: TypeViolation, table: ConfigTable, displa
     suggestion = find_nearest_word(name, violation.known_fields)
     if not suggestion:
         same_name_keys = [
-            key for key in table.origin_by_key if key.endswith(f".{name}") and not key.startswith(full_key)
+            key
+            for key in table.origin_by_key
+            if key.endswith(f".{name}") and not key.startswith(full_key)
         ]
         if same_name_keys:
             suggestion = shorten(same_name_keys[0])
@@ -362,7 +381,9 @@ def _describe_unknown_field(violation: TypeViolation, table: ConfigTable, displa
     if suggestion:
         hint = f"did you mean `{suggestion}`?"
     origins = [
-        origin for key, origin in table.origin_by_key.items() if key == display_key or key.startswith(display_key + ".")
+        origin
+        for key, origin in table.origin_by_key.items()
+        if key == display_key or key.startswith(display_key + ".")
     ]
     origin = origins[0] if origins else table.find_source_file(display_key)
     return f"{origin}: unknown field `{display_key}`; {hint}"
@@ -385,7 +406,11 @@ def _describe_wrong_value(violation: TypeViolation, table: ConfigTable, display_
     # A section whose fields all have the right type can still fail the check of the section as a whole.
     section_check_failed = isinstance(value, dict) and not msgspec_reason.startswith("Expected")
     if section_check_failed:
-        return f"{origin}: `{display_key}`: {msgspec_reason}" if display_key else f"{origin}: {msgspec_reason}"
+        return (
+            f"{origin}: `{display_key}`: {msgspec_reason}"
+            if display_key
+            else f"{origin}: {msgspec_reason}"
+        )
 
     info = msgspec.inspect.type_info(violation.expected_type)
     unit = find_declared_unit(info)
@@ -393,7 +418,9 @@ def _describe_wrong_value(violation: TypeViolation, table: ConfigTable, display_
     if unit and isinstance(value, int | float):
         displayed_value += f" {unit}"
     reason = ""
-    if not msgspec_reason.startswith(("Expected `int", "Expected `float")):  # the expected range explains more
+    if not msgspec_reason.startswith(
+        ("Expected `int", "Expected `float")
+    ):  # the expected range explains more
         reason = f": {shorten(_lowercase_first_letter(msgspec_reason))}"
     expected = describe_type_in_words(info)
     return f"{origin}: `{display_key}` = {displayed_value} is not allowed{reason}; expected {expected}."

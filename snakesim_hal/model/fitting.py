@@ -67,5 +67,7 @@ def compute_scaled_scene_values(
         max_x, max_y = field.max_corner_m
         changed[f"random_field.{i}.min_corner_m"] = [min_x + route_extension_m, min_y]
         changed[f"random_field.{i}.max_corner_m"] = [max_x + route_extension_m, max_y]
-        changed[f"random_field.{i}.clearance_m"] = max(field.clearance_m + 2.0 * extra_radius_m, 0.0)
+        changed[f"random_field.{i}.clearance_m"] = max(
+            field.clearance_m + 2.0 * extra_radius_m, 0.0
+        )
     return {key: value for key, value in changed.items() if not is_set_by_flag(key)}

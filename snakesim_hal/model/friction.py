@@ -131,7 +131,9 @@ class PassiveWheels(FileStruct, frozen=True, kw_only=True):
     @property
     def rolling_friction(self) -> float:
         """Return the force that brakes a rolling link, divided by its load."""
-        return self.bearing_friction * self.bearing_radius_m / self.radius_m + self.rolling_resistance
+        return (
+            self.bearing_friction * self.bearing_radius_m / self.radius_m + self.rolling_resistance
+        )
 
 
 def compute_surface_friction(
@@ -176,15 +178,21 @@ def compute_link_factors(skin: Skin | None, link_count: int) -> list[Directional
     return factors
 
 
-def validate_skin(skin: Skin | None, wheels: PassiveWheels | None, link_names: Sequence[str]) -> None:
+def validate_skin(
+    skin: Skin | None, wheels: PassiveWheels | None, link_names: Sequence[str]
+) -> None:
     """Raise ValueError if a skin has exceptions for a link that does not exist, or a robot has a skin and wheels."""
     if skin is None:
         return
     if wheels is not None:
-        raise ValueError("it has [skin] and [wheels], and both describe how links slide; leave one out")
+        raise ValueError(
+            "it has [skin] and [wheels], and both describe how links slide; leave one out"
+        )
     for name in skin.links:
         if name not in link_names:
-            raise ValueError(f"[skin.links.{name}]: this robot has {link_names[0]} (tail) to {link_names[-1]} (head)")
+            raise ValueError(
+                f"[skin.links.{name}]: this robot has {link_names[0]} (tail) to {link_names[-1]} (head)"
+            )
 
 
 def _parse_link_index(name: str) -> int:

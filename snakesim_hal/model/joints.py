@@ -239,7 +239,9 @@ _exception_fields = [
     for field in msgspec.structs.fields(section)
     if field.name != "ambient_c"
 ]
-_exceptions_base: Any = msgspec.defstruct("_OfOne", _exception_fields, bases=(_DriveId,), frozen=True, kw_only=True)
+_exceptions_base: Any = msgspec.defstruct(
+    "_OfOne", _exception_fields, bases=(_DriveId,), frozen=True, kw_only=True
+)
 
 
 class JointExceptions(_exceptions_base):
@@ -297,7 +299,9 @@ def make_joints(
     names = [f"joint_{i + 1}" for i in range(len(axes))]
     for name in exceptions:
         if name not in names:
-            raise ValueError(f"[joints.{name}]: this robot has {names[0]} to {names[-1]}, by [chain]")
+            raise ValueError(
+                f"[joints.{name}]: this robot has {names[0]} to {names[-1]}, by [chain]"
+            )
     joints: list[Joint] = []
     for i, (name, axis) in enumerate(zip(names, axes, strict=True)):
         joint_exceptions = exceptions.get(name, JointExceptions())
@@ -321,7 +325,9 @@ def make_joints(
     return joints
 
 
-def _apply_limit_exceptions(common: MotionLimits, joint_exceptions: JointExceptions) -> MotionLimits:
+def _apply_limit_exceptions(
+    common: MotionLimits, joint_exceptions: JointExceptions
+) -> MotionLimits:
     """Return the limits of one joint. Its `angle_rad` replaces all angle limits of the section for all joints."""
     if joint_exceptions.angle_rad is not None:
         common = msgspec.structs.replace(

@@ -9,7 +9,12 @@ from msgspec import inspect
 
 from snakesim_hal.model.field_docs import collect_field_descriptions, inspect_struct_type
 from snakesim_hal.model.field_types import list_union_members
-from snakesim_hal.model.field_words import find_unit, find_unit_in_type, get_default, list_item_types
+from snakesim_hal.model.field_words import (
+    find_unit,
+    find_unit_in_type,
+    get_default,
+    list_item_types,
+)
 
 
 def make_schema(struct: type[msgspec.Struct]) -> dict[str, Any]:
@@ -17,11 +22,14 @@ def make_schema(struct: type[msgspec.Struct]) -> dict[str, Any]:
     schema = msgspec.json.schema(struct)
     definitions: dict[str, Any] = schema.get("$defs", {})
     for definition in definitions.values():
-        if "description" in definition:  # without its indentation, as Python itself removes it from 3.13 on
+        if (
+            "description" in definition
+        ):  # without its indentation, as Python itself removes it from 3.13 on
             definition["description"] = cleandoc(definition["description"])
     for part in list_structs(struct):
         full_name = re.sub(r"[^a-zA-Z0-9.\-_]", "_", f"{part.__module__}.{part.__qualname__}")
-        name = full_name if full_name in definitions else part.__name__  # msgspec uses full names if two are equal
+        # Msgspec uses full names if two are equal.
+        name = full_name if full_name in definitions else part.__name__
         _complete_definition(definitions[name], part)
     return schema
 
@@ -51,7 +59,11 @@ def list_structs(struct: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
             if option.cls in found:
                 continue
             found[option.cls] = None
-            waiting += [alternative for field in option.fields for alternative in list_union_members(field.type)]
+            waiting += [
+                alternative
+                for field in option.fields
+                for alternative in list_union_members(field.type)
+            ]
         for inner in list_item_types(option):
             waiting += list_union_members(inner)
     return list(found)

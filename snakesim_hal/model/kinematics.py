@@ -116,7 +116,10 @@ def compute_link_frames(
 
 
 def compute_body_points_w(
-    robot: RobotDescription, position_w: ArrayLike, wxyz: ArrayLike, angles_rad: Sequence[float] | Floats
+    robot: RobotDescription,
+    position_w: ArrayLike,
+    wxyz: ArrayLike,
+    angles_rad: Sequence[float] | Floats,
 ) -> Floats:
     """Compute tail end, joints and head end of one pose in the world, (n_joints + 2, 3) in m.
 
@@ -128,7 +131,9 @@ def compute_body_points_w(
     """
     lengths_m = [link.length_m for link in robot.links]
     axes = [joint.axis for joint in robot.joints]
-    origins, rotations = compute_link_frames(position_w, rotation_from_quaternion(wxyz), angles_rad, axes, lengths_m)
+    origins, rotations = compute_link_frames(
+        position_w, rotation_from_quaternion(wxyz), angles_rad, axes, lengths_m
+    )
     head_end_w = origins[-1] + lengths_m[-1] * rotations[-1][:, 0]
     return np.vstack([origins, head_end_w])
 
@@ -144,7 +149,9 @@ class ForwardKinematics:
         self._lengths_m = np.array([link.length_m for link in robot.links])
         self._axes = [joint.axis for joint in robot.joints]
 
-    def compute_body_points_w(self, positions_w: Floats, wxyz: Floats, angles_rad: Floats) -> Floats:
+    def compute_body_points_w(
+        self, positions_w: Floats, wxyz: Floats, angles_rad: Floats
+    ) -> Floats:
         """Compute tail end, joints and head end of every pose in the world, (n, n_joints + 2, 3) in m.
 
         Args:
@@ -170,7 +177,8 @@ class ForwardKinematics:
 
     def _compute_planar_link_axes(self, rotations: Floats, angles_rad: Floats) -> Floats:
         """Return the x axes of all links, (n, n_links, 3), of robots whose joints all yaw."""
-        yaw_rad = np.zeros((len(angles_rad), len(self._axes) + 1))  # of each link, relative to the base
+        # Of each link, relative to the base.
+        yaw_rad = np.zeros((len(angles_rad), len(self._axes) + 1))
         angles_rad.cumsum(axis=1, out=yaw_rad[:, 1:])
         cosine = np.cos(yaw_rad)[:, :, None]
         sine = np.sin(yaw_rad)[:, :, None]
@@ -179,7 +187,8 @@ class ForwardKinematics:
 
 # Each element of a rotation matrix, row by row, is twice a sum of two products of components of the quaternion.
 # On the diagonal that is subtracted from 1.
-FIRST_PRODUCT_INDEX = [10, 6, 7, 6, 5, 11, 7, 11, 5]  # index 4 i + j of the product of components i and j
+# Index 4 i + j of the product of components i and j.
+FIRST_PRODUCT_INDEX = [10, 6, 7, 6, 5, 11, 7, 11, 5]
 SECOND_PRODUCT_INDEX = [15, 3, 2, 3, 15, 1, 2, 1, 10]
 SECOND_SIGN = np.array([1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
 DIAGONAL = slice(0, 9, 4)
@@ -189,7 +198,9 @@ def _rotations_from_quaternions(wxyz: Floats) -> Floats:
     """Return the rotation matrices (n, 3, 3) of quaternions (n, 4), which are normalized first."""
     unit = wxyz / np.sqrt(np.vecdot(wxyz, wxyz))[:, None]
     products = (unit[:, :, None] * unit[:, None, :]).reshape(-1, 16)
-    elements = 2 * (products[:, FIRST_PRODUCT_INDEX] + SECOND_SIGN * products[:, SECOND_PRODUCT_INDEX])
+    elements = 2 * (
+        products[:, FIRST_PRODUCT_INDEX] + SECOND_SIGN * products[:, SECOND_PRODUCT_INDEX]
+    )
     elements[:, DIAGONAL] = 1 - elements[:, DIAGONAL]
     return elements.reshape(-1, 3, 3)
 

@@ -9,7 +9,8 @@ from snakesim_hal.wire.quantities import above, bounded
 
 Offset = Annotated[float, bounded(-10, 10, "m")]
 Moment = Annotated[float, bounded(-100, 100, "kg·m²")]
-ROUNDING_TOLERANCE = 1e-6  # relative; a thin plate has moments of which one is exactly the sum of the other two
+# Relative; a thin plate has moments of which one is exactly the sum of the other two.
+ROUNDING_TOLERANCE = 1e-6
 Inertia = tuple[Moment, Moment, Moment, Moment, Moment, Moment]
 
 

@@ -22,7 +22,9 @@ from snakesim_hal.wire.quantities import above, bounded, from_zero
 LINK_FRACTIONS = (np.arange(5) + 0.5) / 5
 
 # Corners and edge middles of a rectangle, in units of its half length and half width.
-UNIT_RIM_POINTS = np.array([(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64)
+UNIT_RIM_POINTS = np.array(
+    [(1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1)], dtype=np.float64
+)
 
 ROUNDING_ERROR_M = 1e-6  # more than that of any distance in a scene
 MIN_SEGMENT_M = 1e-12  # avoids a division by zero for a segment whose ends coincide
@@ -85,7 +87,10 @@ class ObstacleOutlines:
     def select(self, indices: NDArray[np.intp]) -> "ObstacleOutlines":
         """Return the outlines with these indices."""
         return ObstacleOutlines(
-            self.center_w[indices], self.direction[indices], self.half_m[indices], self.rounding_m[indices]
+            self.center_w[indices],
+            self.direction[indices],
+            self.half_m[indices],
+            self.rounding_m[indices],
         )
 
     def append(self, others: "ObstacleOutlines") -> "ObstacleOutlines":
@@ -152,7 +157,11 @@ class ObstacleOutlines:
         outside_x = np.maximum(over_x, 0.0)
         outside_y = np.maximum(over_y, 0.0)
         outside_distance = np.hypot(outside_x, outside_y)
-        distance = outside_distance + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m[outline_indices]
+        distance = (
+            outside_distance
+            + np.minimum(np.maximum(over_x, over_y), 0.0)
+            - self.rounding_m[outline_indices]
+        )
 
         is_outside = outside_distance > 0
         length = np.where(is_outside, outside_distance, 1.0)
@@ -160,7 +169,9 @@ class ObstacleOutlines:
         sign_y = np.where(local_y < 0, -1.0, 1.0)
         normal_x = np.where(is_outside, outside_x / length, over_x >= over_y) * sign_x
         normal_y = np.where(is_outside, outside_y / length, over_x < over_y) * sign_y
-        normal_w = np.stack([cosine * normal_x - sine * normal_y, sine * normal_x + cosine * normal_y], axis=-1)
+        normal_w = np.stack(
+            [cosine * normal_x - sine * normal_y, sine * normal_x + cosine * normal_y], axis=-1
+        )
         return distance, normal_w
 
     def _transform_to_local_frames(self, points_w: Floats) -> tuple[Floats, Floats]:

@@ -87,7 +87,9 @@ def _validate_start(pipe: Pipe, inner_radius_m: float, link: CapsuleOutline, con
     along_m = np.abs(points_m @ direction)
     across_m = np.abs(points_m @ np.array([-direction[1], direction[0]]))
     is_inside = across_m <= inner_radius_m - link.radius_m
-    is_outside = (across_m >= pipe.radius_m + link.radius_m) | (along_m >= pipe.length_m / 2 + link.radius_m)
+    is_outside = (across_m >= pipe.radius_m + link.radius_m) | (
+        along_m >= pipe.length_m / 2 + link.radius_m
+    )
     if np.all(is_inside | is_outside):
         return
     raise ConfigError(

@@ -21,8 +21,22 @@ from snakesim_hal.model.random_field import (
     sample_materials_and_leans,
 )
 from snakesim_hal.model.route import Route
-from snakesim_hal.model.scene import Box, Cylinder, PegsAlongRoute, SceneFile, Sphere, Wall, make_route
-from snakesim_hal.model.solids import SolidObstacle, UprightSolid, get_material_fields, make_block, make_peg
+from snakesim_hal.model.scene import (
+    Box,
+    Cylinder,
+    PegsAlongRoute,
+    SceneFile,
+    Sphere,
+    Wall,
+    make_route,
+)
+from snakesim_hal.model.solids import (
+    SolidObstacle,
+    UprightSolid,
+    get_material_fields,
+    make_block,
+    make_peg,
+)
 from snakesim_hal.wire.messages import KnownObstacle
 
 SAMPLES_PER_LINK = 24  # points along a link's axis at which the distance to obstacles is computed
@@ -34,10 +48,13 @@ class PlacedObstacle(UprightSolid, frozen=True, kw_only=True):
     """A placed obstacle, with parameters that only the simulator needs."""
 
     obstacle: KnownObstacle
-    walkable: bool = False  # a step or platform: part of the ground, so the snake does not push off from it
+    # A step or platform: part of the ground, so the snake does not push off from it.
+    walkable: bool = False
 
 
-def place_scene_obstacles(scene: SceneFile, keep_clear: list[CapsuleOutline] | None = None) -> list[PlacedObstacle]:
+def place_scene_obstacles(
+    scene: SceneFile, keep_clear: list[CapsuleOutline] | None = None
+) -> list[PlacedObstacle]:
     """Place all obstacles of a scene. Peg rows and random fields are expanded into single obstacles with unique names.
 
     Args:
@@ -67,7 +84,10 @@ def place_scene_obstacles(scene: SceneFile, keep_clear: list[CapsuleOutline] | N
 
 def outline_pipes(scene: SceneFile) -> list[PlacedObstacle]:
     """Return the pipes of a scene as blocks with their outlines from above, for drawings."""
-    return [PlacedObstacle(obstacle=make_pipe_block(i, pipe), walkable=True) for i, pipe in enumerate(scene.pipe)]
+    return [
+        PlacedObstacle(obstacle=make_pipe_block(i, pipe), walkable=True)
+        for i, pipe in enumerate(scene.pipe)
+    ]
 
 
 def _validate_obstacle_count(scene: SceneFile) -> None:
@@ -79,7 +99,8 @@ def _validate_obstacle_count(scene: SceneFile) -> None:
     count += sum(min(field.target_count, MAX_RANDOM_OBSTACLES) for field in scene.random_field)
     if count > MAX_OBSTACLES:
         raise ConfigError(
-            f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed", code="scene/invalid"
+            f"scene {scene.name!r}: has {count} obstacles; at most {MAX_OBSTACLES} are allowed",
+            code="scene/invalid",
         )
 
 
@@ -132,7 +153,8 @@ def _place_wall(scene: SceneFile, index: int, wall: Wall) -> PlacedObstacle:
     length_m = math.hypot(run_x, run_y)
     if length_m == 0:
         raise ConfigError(
-            f"scene {scene.name!r}: `wall.{index}`: `from_m` and `to_m` are the same point", code="scene/invalid"
+            f"scene {scene.name!r}: `wall.{index}`: `from_m` and `to_m` are the same point",
+            code="scene/invalid",
         )
     name = wall.name or f"wall_{index}"
     middle_m = ((from_x + to_x) / 2, (from_y + to_y) / 2)
@@ -168,7 +190,9 @@ def _place_pegs_along_route(
     """
     context = f"scene {scene.name!r}: `pegs_along_route.{index}`"
     if route is None:
-        raise ConfigError(f"{context}: the scene has no route; add a [route] section", code="scene/no-route")
+        raise ConfigError(
+            f"{context}: the scene has no route; add a [route] section", code="scene/no-route"
+        )
     inflections_s_m = route.find_inflections_s_m()
     used_s_m = inflections_s_m[row.first : row.first + row.count]
     if len(used_s_m) < row.count:
@@ -186,8 +210,11 @@ def _place_pegs_along_route(
         tangent = route.tangent_w(s_m)
         left_w = np.array([-tangent[1], tangent[0]])
         is_forward = left_w @ forward_w > 0
-        push_direction_w = left_w if is_forward else -left_w  # of the force from the peg on the body
-        center_w = route.compute_positions_w(s_m) - push_direction_w * (row.corridor_m + row.radius_m)
+        # Of the force from the peg on the body.
+        push_direction_w = left_w if is_forward else -left_w
+        center_w = route.compute_positions_w(s_m) - push_direction_w * (
+            row.corridor_m + row.radius_m
+        )
         center_m = (float(center_w[0]), float(center_w[1]))
         obstacle = make_peg(f"peg_{index}_{inflection}", center_m, row.radius_m, row.height_m)
         pegs.append(_add_material(obstacle, row))
@@ -207,10 +234,14 @@ def _place_random_field(
     existing_obstacles = [item.obstacle for item in placed if not item.walkable]
     obstacles = place_random_obstacles(field, context, index, route, existing_obstacles, keep_clear)
     solids = sample_materials_and_leans(field, index, len(obstacles))
-    return [_add_material(obstacle, solid) for obstacle, solid in zip(obstacles, solids, strict=True)]
+    return [
+        _add_material(obstacle, solid) for obstacle, solid in zip(obstacles, solids, strict=True)
+    ]
 
 
-def validate_start_clearance(scene: SceneFile, placed: list[PlacedObstacle], snake: list[CapsuleOutline]) -> None:
+def validate_start_clearance(
+    scene: SceneFile, placed: list[PlacedObstacle], snake: list[CapsuleOutline]
+) -> None:
     """Raise ConfigError if an obstacle overlaps the snake at its start.
 
     Args:
@@ -226,7 +257,8 @@ def validate_start_clearance(scene: SceneFile, placed: list[PlacedObstacle], sna
     obstacles = [_move_to_height(item, height_m) for item in placed if not item.walkable]
     overlaps_m = _compute_overlaps_m(snake, obstacles)
     # Transposed, so that the error is about the first obstacle in the order of the scene.
-    overlapping_pairs = np.argwhere(overlaps_m.T > OVERLAP_TOLERANCE_M)  # (k, 2) indices of obstacle and link
+    # (k, 2) indices of obstacle and link.
+    overlapping_pairs = np.argwhere(overlaps_m.T > OVERLAP_TOLERANCE_M)
     for obstacle_index, link_index in overlapping_pairs[:1]:
         overlap_mm = overlaps_m[link_index, obstacle_index] * 1000
         raise ConfigError(
@@ -248,10 +280,12 @@ def _compute_overlaps_m(snake: list[CapsuleOutline], obstacles: list[KnownObstac
     front_w = np.array([link.front_m for link in snake])
     radius_m = np.array([link.radius_m for link in snake])
     fractions = np.linspace(0.0, 1.0, SAMPLES_PER_LINK)[:, None]
-    points_w = rear_w[:, None] + fractions * (front_w - rear_w)[:, None]  # (links, SAMPLES_PER_LINK, 2)
+    # (links, SAMPLES_PER_LINK, 2).
+    points_w = rear_w[:, None] + fractions * (front_w - rear_w)[:, None]
     from_points_m = outlines.compute_distances_m(points_w).min(axis=1)
     from_axes_m = (
-        ObstacleOutlines.from_segments(rear_w, front_w).compute_distances_m(outlines.center_w).T - outlines.rounding_m
+        ObstacleOutlines.from_segments(rear_w, front_w).compute_distances_m(outlines.center_w).T
+        - outlines.rounding_m
     )
     gaps_m = np.minimum(from_points_m, from_axes_m)
     return radius_m[:, None] - gaps_m

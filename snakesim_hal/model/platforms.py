@@ -22,7 +22,11 @@ class Platform(NamedTuple):
 
 def count_platforms(scene: SceneFile) -> int:
     """Return how many blocks steps, stairs and gaps make."""
-    return len(scene.step) + sum(stairs.count for stairs in scene.stairs) + sum(row.count + 1 for row in scene.gaps)
+    return (
+        len(scene.step)
+        + sum(stairs.count for stairs in scene.stairs)
+        + sum(row.count + 1 for row in scene.gaps)
+    )
 
 
 def make_platforms(scene: SceneFile) -> list[Platform]:
@@ -62,7 +66,9 @@ def _make_stairs(scene: str, index: int, stairs: Stairs) -> list[Platform]:
         depth_m = stairs.landing_m if i == stairs.count - 1 else stairs.run_m
         middle_m = _move_along(stairs.position_m, stairs.yaw_rad, i * stairs.run_m + depth_m / 2)
         size_m = (depth_m, stairs.width_m, (i + 1) * stairs.rise_m)
-        platforms.append(Platform(make_block(f"{name}_{i}", middle_m, size_m, stairs.yaw_rad), stairs))
+        platforms.append(
+            Platform(make_block(f"{name}_{i}", middle_m, size_m, stairs.yaw_rad), stairs)
+        )
     return platforms
 
 
@@ -71,7 +77,9 @@ def _make_row_with_gaps(index: int, row: Gaps) -> list[Platform]:
     size_m = (row.platform_m, row.width_m, row.depth_m)
     platforms: list[Platform] = []
     for i in range(row.count + 1):
-        middle_m = _move_along(row.position_m, row.yaw_rad, i * (row.platform_m + row.gap_m) + row.platform_m / 2)
+        middle_m = _move_along(
+            row.position_m, row.yaw_rad, i * (row.platform_m + row.gap_m) + row.platform_m / 2
+        )
         platforms.append(Platform(make_block(f"{name}_{i}", middle_m, size_m, row.yaw_rad), row))
     return platforms
 

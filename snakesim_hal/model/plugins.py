@@ -69,7 +69,8 @@ def list_installed_plugins(group: str) -> list[str]:
 @cache
 def _read_entry_points(*_path: str) -> EntryPoints:
     """Return every entry point on a path. Reading them takes 7 ms, and a run looks up a dozen, so they are cached."""
-    all_entries: Any = entry_points()  # before Python 3.12 of another class, which has the same `select`
+    # Before Python 3.12 of another class, which has the same `select`.
+    all_entries: Any = entry_points()
     return all_entries
 
 
@@ -93,11 +94,13 @@ def load_plugin(group: str, name: str) -> Any:
         return entry.load()
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"{kind_name} {name!r} cannot be loaded: {error}.{_make_install_hint(entry)}", code="extra/not-installed"
+            f"{kind_name} {name!r} cannot be loaded: {error}.{_make_install_hint(entry)}",
+            code="extra/not-installed",
         ) from error
     except (ImportError, AttributeError) as error:
         raise ConfigError(
-            f"{kind_name} {name!r} ({entry.value}) cannot be loaded: {error}", code="plugin/not-loadable"
+            f"{kind_name} {name!r} ({entry.value}) cannot be loaded: {error}",
+            code="plugin/not-loadable",
         ) from error
 
 
@@ -157,7 +160,9 @@ def load_plugin_unless_file(group: str, name: str) -> Any | None:
     kind = _get_kind_name(group)
     _, attribute, tree = _parse_plugin_file(name, kind)
     defined_names = set(_iterate_defined_names(tree))
-    if attribute not in defined_names and "*" not in defined_names:  # `from x import *` may define any name
+    if (
+        attribute not in defined_names and "*" not in defined_names
+    ):  # `from x import *` may define any name
         raise _make_missing_class_error(name, kind, tree)
     return None
 
@@ -183,7 +188,9 @@ def _parse_plugin_file(name: str, kind: str) -> tuple[Path, str, ast.Module]:
         tree = ast.parse(read_bytes(path), str(path))
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         why = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{kind} {shorten(name)!r} cannot be loaded: {why}", code="plugin/not-loadable") from None
+        raise ConfigError(
+            f"{kind} {shorten(name)!r} cannot be loaded: {why}", code="plugin/not-loadable"
+        ) from None
     if not attribute:
         raise _make_missing_class_error(name, kind, tree)
     return path, attribute, tree
@@ -230,7 +237,9 @@ def _load_from_file(name: str, kind: str) -> Any:
     path, attribute, tree = _parse_plugin_file(name, kind)
     spec = importlib.util.spec_from_file_location(f"snakesim_plugin_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise ConfigError(f"{kind} {name!r}: {path} cannot be loaded as Python", code="plugin/not-loadable")
+        raise ConfigError(
+            f"{kind} {name!r}: {path} cannot be loaded as Python", code="plugin/not-loadable"
+        )
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     find_siblings_of(path)
@@ -238,7 +247,8 @@ def _load_from_file(name: str, kind: str) -> Any:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         raise ConfigError(
-            f"{kind} {shorten(name)!r} cannot be loaded: {type(error).__name__}: {error}", code="plugin/not-loadable"
+            f"{kind} {shorten(name)!r} cannot be loaded: {type(error).__name__}: {error}",
+            code="plugin/not-loadable",
         ) from error
     if not hasattr(module, attribute):
         raise _make_missing_class_error(name, kind, tree)
@@ -287,7 +297,11 @@ def describe_plugin(plugin: Any) -> str:
 
 
 def decode_plugin_settings(
-    plugin: Any, section: dict[str, Any], source: str, section_key: str, origin_by_key: dict[str, str] | None = None
+    plugin: Any,
+    section: dict[str, Any],
+    source: str,
+    section_key: str,
+    origin_by_key: dict[str, str] | None = None,
 ) -> Any:
     """Check the configuration section of a plugin, and convert it to the plugin's own Struct `Settings`.
 
@@ -307,4 +321,6 @@ def decode_plugin_settings(
             f"{plugin!r} has no `Settings` Struct; every plugin needs one, even if it is empty",
             code="plugin/not-loadable",
         )
-    return decode_table(ConfigTable(section, source, origin_by_key or {}), settings_type, section_key)
+    return decode_table(
+        ConfigTable(section, source, origin_by_key or {}), settings_type, section_key
+    )

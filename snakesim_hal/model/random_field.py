@@ -9,7 +9,14 @@ from msgspec import Meta
 from numpy.random import Generator
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.outlines import CapsuleOutline, Clearance, ObstacleOutlines, Point, Size, has_gap_below
+from snakesim_hal.model.outlines import (
+    CapsuleOutline,
+    Clearance,
+    ObstacleOutlines,
+    Point,
+    Size,
+    has_gap_below,
+)
 from snakesim_hal.model.route import Route
 from snakesim_hal.model.solids import (
     MAX_LEAN_RAD,
@@ -60,7 +67,9 @@ class RandomField(SolidObstacle, frozen=True, kw_only=True):
     height_m: Size = 0.2
     """Height of every obstacle."""
 
-    lean_up_to_rad: Annotated[float, Meta(ge=0, le=MAX_LEAN_RAD, extra_json_schema={"unit": "rad"})] = 0.0
+    lean_up_to_rad: Annotated[
+        float, Meta(ge=0, le=MAX_LEAN_RAD, extra_json_schema={"unit": "rad"})
+    ] = 0.0
     """Maximum angle by which an obstacle leans, in a random direction. 0: all are upright."""
 
     @property
@@ -146,7 +155,11 @@ def _make_exclusion_zones(
         radius_m = max(link.radius_m for link in snake)
         zones.append(ObstacleOutlines.from_segments(rear_w, front_w, radius_m + field.clearance_m))
     if route is not None and field.route_clearance_m is not None:
-        zones.append(ObstacleOutlines.from_segments(route.points_w[:-1], route.points_w[1:], field.route_clearance_m))
+        zones.append(
+            ObstacleOutlines.from_segments(
+                route.points_w[:-1], route.points_w[1:], field.route_clearance_m
+            )
+        )
     return zones
 
 
@@ -171,7 +184,9 @@ def _validate_field(field: RandomField, context: str, route: Route | None) -> No
         sizes = getattr(field, name)
         min_size, max_size = sizes
         if max_size < min_size:
-            raise ConfigError(f"{context}: `{name}` = {sizes}: smallest first, then largest", code="scene/invalid")
+            raise ConfigError(
+                f"{context}: `{name}` = {sizes}: smallest first, then largest", code="scene/invalid"
+            )
     if field.route_clearance_m is not None and route is None:
         raise ConfigError(
             f"{context}: `route_clearance_m` is set but the scene has no route; add a [route] section",

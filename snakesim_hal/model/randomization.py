@@ -28,9 +28,13 @@ class Randomization(FileStruct, frozen=True, kw_only=True):
         """Check the bounds. Raises ValueError, for the file reader."""
         are_finite = math.isfinite(self.low) and math.isfinite(self.high)
         if not are_finite or self.low > self.high:
-            raise ValueError(f"`low` = {self.low:g} must be at most `high` = {self.high:g}, and both finite")
+            raise ValueError(
+                f"`low` = {self.low:g} must be at most `high` = {self.high:g}, and both finite"
+            )
 
-    def sample_overrides(self, scene_number: int, origin: str = "[[randomize]]") -> list[KeyOverride]:
+    def sample_overrides(
+        self, scene_number: int, origin: str = "[[randomize]]"
+    ) -> list[KeyOverride]:
         """Sample the random value for one scene, and return an override with it for every key.
 
         Only the number of the scene and the first key seed the value, so that an additional `Randomization` does not

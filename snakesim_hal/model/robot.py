@@ -159,7 +159,9 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
         link = self.link_index(sensor.link)
         head = self.chain.modules
         if link > head:
-            raise ValueError(f"sensor {sensor.name!r} is on link {link}, and the links are 0 (tail) to {head} (head)")
+            raise ValueError(
+                f"sensor {sensor.name!r} is on link {link}, and the links are 0 (tail) to {head} (head)"
+            )
         if sensor.position_m is None and link != head:
             raise ValueError(
                 f"sensor {sensor.name!r} is on link {link}: give `position_m`; only the tip of the head is the default"
@@ -222,7 +224,9 @@ def _get_joint_table(robot: RobotFile) -> list[Joint]:
     cached = _cached_joint_table
     if cached is not None and cached[0] is robot:
         return cached[1]
-    joints = make_joints(robot.axes, robot.joints, robot.limits, robot.motor, robot.drive, robot.heat, robot.supply)
+    joints = make_joints(
+        robot.axes, robot.joints, robot.limits, robot.motor, robot.drive, robot.heat, robot.supply
+    )
     _cached_joint_table = (robot, joints)
     return joints
 
@@ -243,7 +247,9 @@ def _describe_joint(joint: Joint) -> JointDescription:
     limits = joint.limits
     motor = joint.motor
     drive_modes = [mode for mode in JointMode if mode.name.lower() in joint.drive.modes]
-    measures: list[Measurement] = [quantity for quantity in get_args(Measurement) if quantity in joint.drive.measures]
+    measures: list[Measurement] = [
+        quantity for quantity in get_args(Measurement) if quantity in joint.drive.measures
+    ]
     return JointDescription(
         name=joint.name,
         axis=joint.axis,
@@ -270,7 +276,9 @@ def _describe_joint(joint: Joint) -> JointDescription:
 
 def restrict_drive_modes(robot: RobotFile, modes: Collection[DriveMode]) -> RobotFile:
     """Return the robot with drives that have only those of their control modes that are in `modes`."""
-    all_drives = msgspec.structs.replace(robot.drive, modes=[mode for mode in robot.drive.modes if mode in modes])
+    all_drives = msgspec.structs.replace(
+        robot.drive, modes=[mode for mode in robot.drive.modes if mode in modes]
+    )
     joints: dict[str, JointExceptions] = {}
     for name, exceptions in robot.joints.items():
         if exceptions.modes is None:
@@ -291,7 +299,9 @@ def remove_measurements(robot: RobotFile, missing: Collection[Measurement]) -> R
         else:
             kept = [quantity for quantity in exceptions.measures if quantity not in missing]
             joints[name] = msgspec.structs.replace(exceptions, measures=kept)
-    return msgspec.structs.replace(robot, drive=msgspec.structs.replace(robot.drive, measures=measured), joints=joints)
+    return msgspec.structs.replace(
+        robot, drive=msgspec.structs.replace(robot.drive, measures=measured), joints=joints
+    )
 
 
 def describe_robot(
@@ -337,7 +347,10 @@ def describe_robot(
         joints=joints,
         links=_describe_links(robot),
         sensors=_describe_sensors(robot, period_ns),
-        custom={keys.custom_key(sensor.name): _make_custom_schema(sensor) for sensor in robot.sensors.custom},
+        custom={
+            keys.custom_key(sensor.name): _make_custom_schema(sensor)
+            for sensor in robot.sensors.custom
+        },
     )
 
 
@@ -345,25 +358,37 @@ def _describe_links(robot: RobotFile) -> list[LinkDescription]:
     """Return the descriptions of all links that the HAL publishes, tail to head."""
     radius_m = robot.module.radius_m
     links: list[LinkDescription] = []
-    for i, (length_m, mass_kg) in enumerate(zip(robot.link_lengths_m, robot.link_masses_kg, strict=True)):
-        links.append(LinkDescription(name=f"link_{i}", length_m=length_m, radius_m=radius_m, mass_kg=mass_kg))
+    for i, (length_m, mass_kg) in enumerate(
+        zip(robot.link_lengths_m, robot.link_masses_kg, strict=True)
+    ):
+        links.append(
+            LinkDescription(name=f"link_{i}", length_m=length_m, radius_m=radius_m, mass_kg=mass_kg)
+        )
     return links
 
 
 def _describe_sensors(robot: RobotFile, period_ns: int) -> list[SensorDescription]:
     """Return the descriptions of all sensors that the HAL publishes. No rate exceeds that of the control cycle."""
     cycle_rate_hz = 1e9 / period_ns
-    joint_sensor = SensorDescription(key=keys.JOINTS, rate_hz=cycle_rate_hz, delay_s=robot.sensors.joints.delay_s)
+    joint_sensor = SensorDescription(
+        key=keys.JOINTS, rate_hz=cycle_rate_hz, delay_s=robot.sensors.joints.delay_s
+    )
     sensors = [joint_sensor]
     for key, sensor in robot.sensors.iterate_published():
         delay_s = sensor.delay_s
-        if isinstance(sensor, MountedSensor):  # its sample arrives at least one period after the measurement
+        if isinstance(
+            sensor, MountedSensor
+        ):  # its sample arrives at least one period after the measurement
             delay_s = max(delay_s, period_ns * 1e-9)
-        sensors.append(SensorDescription(key=key, rate_hz=min(sensor.rate_hz, cycle_rate_hz), delay_s=delay_s))
+        sensors.append(
+            SensorDescription(key=key, rate_hz=min(sensor.rate_hz, cycle_rate_hz), delay_s=delay_s)
+        )
     return sensors
 
 
-def add_drive_identities(robot: RobotDescription, serials: Sequence[str], firmware: Sequence[str]) -> RobotDescription:
+def add_drive_identities(
+    robot: RobotDescription, serials: Sequence[str], firmware: Sequence[str]
+) -> RobotDescription:
     """Return a description with the serial number and the firmware version of every drive.
 
     Args:

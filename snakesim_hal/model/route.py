@@ -57,8 +57,12 @@ class Route:
 
         # The same as lists, for `point_at`: Python floats are faster for a single point.
         self._arc_length_list: list[float] = self._arc_lengths_m.tolist()
-        self._segment_start_list: list[tuple[float, float]] = [(x, y) for x, y in self.points_w.tolist()]
-        self._segment_direction_list: list[tuple[float, float]] = [(x, y) for x, y in self._segment_directions.tolist()]
+        self._segment_start_list: list[tuple[float, float]] = [
+            (x, y) for x, y in self.points_w.tolist()
+        ]
+        self._segment_direction_list: list[tuple[float, float]] = [
+            (x, y) for x, y in self._segment_directions.tolist()
+        ]
 
     @property
     def length_m(self) -> float:
@@ -95,7 +99,9 @@ class Route:
         heading = self.compute_heading_rad(s_m)
         return np.array([np.cos(heading), np.sin(heading)])
 
-    def project_point(self, point_w: Floats, near_s_m: float | None = None, window_m: float = 0.5) -> float:
+    def project_point(
+        self, point_w: Floats, near_s_m: float | None = None, window_m: float = 0.5
+    ) -> float:
         """Return the arc length of the route's point that is nearest to a point.
 
         Args:
@@ -133,7 +139,9 @@ class Route:
 
     def find_inflections_s_m(self) -> list[float]:
         """Return the arc lengths at which the curvature changes sign, strictly inside the route."""
-        heading = np.unwrap(np.arctan2(self._segment_directions[:, 1], self._segment_directions[:, 0]))
+        heading = np.unwrap(
+            np.arctan2(self._segment_directions[:, 1], self._segment_directions[:, 0])
+        )
         bend = np.diff(heading)
         bent_joints = np.flatnonzero(np.abs(bend) > MIN_BEND_RAD)
         inflections: list[float] = []
@@ -144,7 +152,9 @@ class Route:
         return inflections
 
 
-def sample_sine_curve(amplitude_m: float, wavelength_m: float, length_m: float, spacing_m: float = 0.01) -> Floats:
+def sample_sine_curve(
+    amplitude_m: float, wavelength_m: float, length_m: float, spacing_m: float = 0.01
+) -> Floats:
     """Return points of y = A sin(2 pi x / lambda) for x in [0, length_m], shape (n, 2).
 
     Args:
@@ -158,7 +168,9 @@ def sample_sine_curve(amplitude_m: float, wavelength_m: float, length_m: float, 
     return np.column_stack([x, amplitude_m * np.sin(2 * np.pi * x / wavelength_m)])
 
 
-def find_arc_length_at_distance(route: Route, from_w: tuple[float, float], from_s_m: float, distance_m: float) -> float:
+def find_arc_length_at_distance(
+    route: Route, from_w: tuple[float, float], from_s_m: float, distance_m: float
+) -> float:
     """Return the arc length of the next point of a route that is at a straight distance from a point on the route.
 
     The fixed-point iteration moves along the route by the straight distance that is still missing.
@@ -189,7 +201,9 @@ class ChainOnRoute:
     angles_rad: Floats  # (n_segments - 1,), tail to head, left turn positive
 
 
-def place_chain_on_route(route: Route, tail_s_m: float, segment_lengths_m: Sequence[float]) -> ChainOnRoute:
+def place_chain_on_route(
+    route: Route, tail_s_m: float, segment_lengths_m: Sequence[float]
+) -> ChainOnRoute:
     """Place a chain of straight segments on a route, with its tail end and every joint on the curve.
 
     Args:

@@ -292,4 +292,6 @@ def make_route(scene: SceneFile) -> Route | None:
             try:
                 return Route(np.asarray(points))
             except ValueError as error:
-                raise ConfigError(f"scene {scene.name!r}: `route.points_m`: {error}", code="scene/invalid") from None
+                raise ConfigError(
+                    f"scene {scene.name!r}: `route.points_m`: {error}", code="scene/invalid"
+                ) from None

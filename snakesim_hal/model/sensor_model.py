@@ -24,8 +24,10 @@ class SensorModel(ABC):
     exception of any call ends the run, and its message names the sensor.
     """
 
-    message: ClassVar[type[Message]] = Message  # what `read` returns: that of the sensor's key, or of its own
-    Settings: ClassVar[type[msgspec.Struct]] = NoSettings  # the sensor's `settings` in the robot file
+    # What `read` returns: that of the sensor's key, or of its own.
+    message: ClassVar[type[Message]] = Message
+    # The sensor's `settings` in the robot file.
+    Settings: ClassVar[type[msgspec.Struct]] = NoSettings
 
     def __init__(self, sensor: Any, scope: Any, settings: Any) -> None:
         """Prepare for reading.

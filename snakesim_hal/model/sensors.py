@@ -251,11 +251,17 @@ class SensorSections(FileStruct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         """Check that no two sensors of a kind have the same name. Raises ValueError, which the file reader explains."""
-        for kind, sensors in (("depth", self.depth), ("range", self.range), ("custom", self.custom)):
+        for kind, sensors in (
+            ("depth", self.depth),
+            ("range", self.range),
+            ("custom", self.custom),
+        ):
             names = [sensor.name for sensor in sensors]
             for name in names:
                 if names.count(name) > 1:
-                    raise ValueError(f"two entries of [[sensors.{kind}]] have the name {name!r}; give each its own")
+                    raise ValueError(
+                        f"two entries of [[sensors.{kind}]] have the name {name!r}; give each its own"
+                    )
 
     def iterate_published(self) -> Iterator[tuple[str, AnySensor]]:
         """Yield every sensor except for the joint sensor, with the key under which its samples are published."""

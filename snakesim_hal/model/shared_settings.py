@@ -67,7 +67,9 @@ def _collect_robot_settings(robot: RobotFile) -> dict[str, Any]:
     exceptions: dict[str, Any] = {}
     for joint, values in table["joints"].items():
         shared_values = {
-            key: value for key, value in values.items() if value is not None and key not in DRIVE_ABILITIES
+            key: value
+            for key, value in values.items()
+            if value is not None and key not in DRIVE_ABILITIES
         }
         if shared_values:
             exceptions[joint] = shared_values
@@ -88,7 +90,9 @@ def _add_settings(settings: dict[str, str], key: str, value: Any, levels: int) -
     """
     if isinstance(value, dict):
         children = {f"{key}.{name}": child for name, child in value.items()}
-        if key.count(".") + 1 < levels and all(len(child_key) <= MAX_KEY_LENGTH for child_key in children):
+        if key.count(".") + 1 < levels and all(
+            len(child_key) <= MAX_KEY_LENGTH for child_key in children
+        ):
             for child_key, child in children.items():
                 _add_settings(settings, child_key, child, levels)
             return

@@ -9,7 +9,8 @@ from snakesim_hal.model.outlines import Friction, Heading, Point
 from snakesim_hal.wire.messages import KnownObstacle
 
 GRAVITY_M_S2 = 9.81  # as in MuJoCo, unless the scene says otherwise
-PEG_FRICTION = 0.2  # plastic shell against plastic or metal: 0.13 to 0.32 in tables, see docs/how-to/scenes.md
+# Plastic shell against plastic or metal: 0.13 to 0.32 in tables, see docs/how-to/scenes.md.
+PEG_FRICTION = 0.2
 BASE_FRICTION = 0.4  # an obstacle on the ground on which it slides
 MAX_LEAN_RAD = 0.6
 
@@ -20,10 +21,14 @@ class SolidObstacle(Surface, frozen=True, kw_only=True):
     friction: Friction = PEG_FRICTION
     """Coulomb friction between the obstacle and the snake."""
 
-    stiffness_n_per_m: Annotated[float, Meta(ge=10, le=1e6, extra_json_schema={"unit": "N/m"})] | None = None
+    stiffness_n_per_m: (
+        Annotated[float, Meta(ge=10, le=1e6, extra_json_schema={"unit": "N/m"})] | None
+    ) = None
     """Stiffness of the spring that holds the obstacle at its position, or where it has slid to. None: it is rigid."""
 
-    mass_kg: Annotated[float, Meta(ge=0.01, le=1000, extra_json_schema={"unit": "kg"})] | None = None
+    mass_kg: Annotated[float, Meta(ge=0.01, le=1000, extra_json_schema={"unit": "kg"})] | None = (
+        None
+    )
     """Mass of an obstacle that slides on the ground when it is pushed. None: it is fixed to the ground."""
 
     base_friction: Friction = BASE_FRICTION
@@ -82,7 +87,9 @@ def make_peg(name: str, position_m: Point, radius_m: float, height_m: float) -> 
     )
 
 
-def make_block(name: str, position_m: Point, size_m: tuple[float, float, float], yaw_rad: float) -> KnownObstacle:
+def make_block(
+    name: str, position_m: Point, size_m: tuple[float, float, float], yaw_rad: float
+) -> KnownObstacle:
     """Return a box that stands on the ground.
 
     Args:

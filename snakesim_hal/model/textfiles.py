@@ -45,7 +45,9 @@ def read_text(path: Path) -> str:
     """Return a whole file as text, without a byte-order mark. Raises ConfigError if it is not UTF-8 text."""
     data = read_bytes(path)
     if data.startswith(_UTF16_BOMS) or b"\0" in data:
-        raise ConfigError(f"{path}: is UTF-16 text, or not text; save it as UTF-8", code="file/invalid-syntax")
+        raise ConfigError(
+            f"{path}: is UTF-16 text, or not text; save it as UTF-8", code="file/invalid-syntax"
+        )
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -72,15 +74,20 @@ def read_bytes(path: Path) -> bytes:
             with os.fdopen(descriptor, "rb") as file:
                 data = file.read(MAX_FILE_BYTES + 1)
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file{_make_missing_file_hint(path)}", code="file/not-found") from None
+        raise ConfigError(
+            f"{path}: no such file{_make_missing_file_hint(path)}", code="file/not-found"
+        ) from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}", code="file/not-readable") from None
+        raise ConfigError(
+            f"{path}: cannot be read: {error.strerror}", code="file/not-readable"
+        ) from None
     except ValueError as error:  # a NUL in the name
         raise ConfigError(f"{path}: cannot be read: {error}", code="file/not-readable") from None
     _require_regular_file(path, mode)
     if len(data) > MAX_FILE_BYTES:
         raise ConfigError(
-            f"{path}: is larger than {MAX_FILE_BYTES // MB} MB, the limit of a settings file", code="file/too-large"
+            f"{path}: is larger than {MAX_FILE_BYTES // MB} MB, the limit of a settings file",
+            code="file/too-large",
         )
     return data
 
@@ -108,7 +115,9 @@ def _require_regular_file(path: Path, mode: int) -> None:
     """Raise ConfigError if a path is a folder, a pipe, a device or a symbolic link."""
     if not stat.S_ISREG(mode):
         file_type = _FILE_TYPE_NAMES.get(stat.S_IFMT(mode), "something else")
-        raise ConfigError(f"{path}: is {file_type}, not a file; name a file", code="file/not-readable")
+        raise ConfigError(
+            f"{path}: is {file_type}, not a file; name a file", code="file/not-readable"
+        )
 
 
 def parse_json(text: str, source: str) -> Any:
@@ -126,7 +135,8 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
     deep_key = _TOO_DEEP_KEY_PATTERN.search(text)
     if deep_key:
         raise ConfigError(
-            f"{source}: key `{deep_key[0][:40]}...` has more than {MAX_DEPTH} parts", code="file/too-large"
+            f"{source}: key `{deep_key[0][:40]}...` has more than {MAX_DEPTH} parts",
+            code="file/too-large",
         )
     return _parse(text, source, tomllib.loads, "TOML")
 
@@ -137,10 +147,13 @@ def _parse(text: str, source: str, parse: Callable[[str], Any], language: str) -
         value = parse(text)
     except RecursionError:
         raise ConfigError(
-            f"{source}: not valid {language}: nested deeper than {MAX_DEPTH} levels", code="file/too-large"
+            f"{source}: not valid {language}: nested deeper than {MAX_DEPTH} levels",
+            code="file/too-large",
         ) from None
     except ValueError as error:  # the parser's own; or a number of thousands of digits
-        raise ConfigError(f"{source}: not valid {language}: {error}", code="file/invalid-syntax") from None
+        raise ConfigError(
+            f"{source}: not valid {language}: {error}", code="file/invalid-syntax"
+        ) from None
     _validate_value_depth(value, source)
     return value
 
@@ -155,7 +168,9 @@ def check_nesting_depth(text: str, source: str) -> None:
     for bracket in re.findall(r"[][{}]", text):
         depth += 1 if bracket in "[{" else -1
         if depth > MAX_DEPTH:
-            raise ConfigError(f"{source}: is nested deeper than {MAX_DEPTH} levels", code="file/too-large")
+            raise ConfigError(
+                f"{source}: is nested deeper than {MAX_DEPTH} levels", code="file/too-large"
+            )
 
 
 def _validate_value_depth(value: Any, source: str) -> None:
@@ -225,4 +240,6 @@ def write_text(path: Path, text: str, encoding: str = "utf-8") -> None:
         write_atomically(path, text.encode(encoding))
     except OSError as error:
         reason = "its folder is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise ConfigError(f"{path}: cannot be written: {reason}", code="file/not-writable") from None
+        raise ConfigError(
+            f"{path}: cannot be written: {reason}", code="file/not-writable"
+        ) from None

@@ -59,7 +59,12 @@ class HostClient:
     """
 
     def __init__(
-        self, session: Session, service: str, *, decimation: int = 1, clock_mode: ClockMode = "lockstep"
+        self,
+        session: Session,
+        service: str,
+        *,
+        decimation: int = 1,
+        clock_mode: ClockMode = "lockstep",
     ) -> None:
         """Subscribe to the robot's clock.
 
@@ -81,8 +86,10 @@ class HostClient:
         self._has_host_left = False
         self._clock_decoder = MessageDecoder(Clock)
         self._clock: Clock | None = None  # of the current tick
-        self._next_clock: Clock | None = None  # popped from the queue, but of a later tick than the one returned
-        self._has_restarted = False  # whether robot time has restarted since the last `fetch_changed_description`
+        # Popped from the queue, but of a later tick than the one returned.
+        self._next_clock: Clock | None = None
+        # Whether robot time has restarted since the last `fetch_changed_description`.
+        self._has_restarted = False
         # Inputs and outputs.
         self._feeds: dict[str, SampleFeed[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
@@ -106,7 +113,8 @@ class HostClient:
         robot = self._filter.robot or self._fetch_description(timeout_s)
         if robot is None:
             raise NotConnectedError(
-                f"no robot description within {timeout_s} s; is the robot's HAL host running?", code="network/no-robot"
+                f"no robot description within {timeout_s} s; is the robot's HAL host running?",
+                code="network/no-robot",
             )
         self._filter.robot = robot
         return robot
@@ -120,7 +128,9 @@ class HostClient:
         Returns:
             The new description, or None if the host is the same.
         """
-        is_host_replaced = self._has_host_left and self._clock is not None and self._clock.lifecycle != "armed"
+        is_host_replaced = (
+            self._has_host_left and self._clock is not None and self._clock.lifecycle != "armed"
+        )
         if not self._has_restarted and not is_host_replaced:
             return None
         self._has_restarted = False
@@ -138,7 +148,9 @@ class HostClient:
         def is_of_this_run(robot: RobotDescription) -> bool:
             return has_valid_proof(robot, run_key)
 
-        return self.session.wait_for_latched(keys.DESCRIPTION, RobotDescription, timeout_s, is_of_this_run)
+        return self.session.wait_for_latched(
+            keys.DESCRIPTION, RobotDescription, timeout_s, is_of_this_run
+        )
 
     def _on_host_token(self, key: str, present: bool) -> None:
         """Set a flag, in Zenoh's thread, if the liveliness token of the robot's host has vanished."""
@@ -172,7 +184,10 @@ class HostClient:
             try:
                 clock = self._pop_next_clock(silence_timeout_s)
             except Empty:
-                if silence_timeout_s is None or time.monotonic() - self._last_clock_s >= silence_timeout_s:
+                if (
+                    silence_timeout_s is None
+                    or time.monotonic() - self._last_clock_s >= silence_timeout_s
+                ):
                     yield None
                 continue
             if clock.paused:
@@ -208,7 +223,9 @@ class HostClient:
         self._next_clock = None
         while not self._clocks.empty():
             later_clock = self._clocks.get()
-            is_next_lockstep_tick = clock.clock_mode == "lockstep" and later_clock.tick != clock.tick
+            is_next_lockstep_tick = (
+                clock.clock_mode == "lockstep" and later_clock.tick != clock.tick
+            )
             if is_next_lockstep_tick or later_clock.paused != clock.paused:
                 self._next_clock = later_clock  # the next call returns it
                 break
@@ -303,7 +320,9 @@ class HostClient:
             sample = feed.get_at_tick(tick)
             if sample is not None:
                 return sample
-        raise StalledError(f"{feed.key} of tick {tick} was named by the clock of tick {clock.tick} and never came")
+        raise StalledError(
+            f"{feed.key} of tick {tick} was named by the clock of tick {clock.tick} and never came"
+        )
 
     # --- outputs ---------------------------------------------------------------------------------------------
 
@@ -330,7 +349,8 @@ class HostClient:
         if robot is None:
             return encode_checked(key, message, None)
         encoded = encode_checked(key, message, find_custom_message(key, robot))
-        mismatch = find_mismatch(encoded.decoded, robot)  # the message that readers in this process check, too
+        # The message that readers in this process check, too.
+        mismatch = find_mismatch(encoded.decoded, robot)
         if mismatch is not None:
             raise mismatch
         return encoded
@@ -400,7 +420,9 @@ class Commander:
         self._last_request_time_s = now_s
         request = LeaseRequest(action="acquire", holder=self._client.service)
         try:
-            answer: Answer = self._client.session.send_request(keys.LEASE, request, host=self._description.host)
+            answer: Answer = self._client.session.send_request(
+                keys.LEASE, request, host=self._description.host
+            )
         except NotConnectedError as error:
             self.lease_refusal = str(error)
             return False

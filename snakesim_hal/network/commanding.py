@@ -16,11 +16,20 @@ from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.network.client import Commander, HostClient, SampleFeed
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, ClockMode, Contacts, JointState, Message, Pose, RobotDescription
+from snakesim_hal.wire.messages import (
+    Clock,
+    ClockMode,
+    Contacts,
+    JointState,
+    Message,
+    Pose,
+    RobotDescription,
+)
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
 SILENCE_S = 2.0  # without a clock: the host has stalled
-LOCKSTEP_SILENCE_S = 15.0  # longer than a host waits for another service by default: `stall_limit_s` is 10 s
+# Longer than a host waits for another service by default: `stall_limit_s` is 10 s.
+LOCKSTEP_SILENCE_S = 15.0
 LEASE_TIMEOUT_S = 20.0  # to get the lease, after at most one wait of the host for another service
 READABLE_KEYS = {keys.JOINTS: JointState, keys.POSE: Pose, keys.CONTACTS: Contacts}
 
@@ -79,7 +88,9 @@ class CommandingClient:
             self._client.report_done(self.clock.tick)
         clock = next(self._ticks)
         if clock is None:
-            raise StalledError(f"no tick of the robot for {self._silence_s:g} s; is its HAL host running?")
+            raise StalledError(
+                f"no tick of the robot for {self._silence_s:g} s; is its HAL host running?"
+            )
         self.clock = clock
         self._holds_lease = self._commander.ensure_lease(clock)
         return clock

@@ -54,7 +54,8 @@ ROUTER_RECEIVING_THREADS = 16
 # A client reads one connection; with two threads each message would wake both. With Zenoh's `handover: app` no thread
 # is woken, but a full image link then ends the lease of control.
 CLIENT_RECEIVING_THREADS = 1
-ZENOH_RUNTIME_VARIABLE = "ZENOH_RUNTIME"  # environment variable that sets the number of Zenoh's threads
+# Environment variable that sets the number of Zenoh's threads.
+ZENOH_RUNTIME_VARIABLE = "ZENOH_RUNTIME"
 
 _environment_lock = threading.Lock()
 _requested_thread_counts: list[int] = []  # receiving threads of each session that is being opened
@@ -72,17 +73,23 @@ class ConnectionSettings:
     session: SessionFile | None = None  # how to connect; `endpoint` is then the first one in it
 
     @staticmethod
-    def from_session_file(session: SessionFile, namespace: str | None = None) -> "ConnectionSettings":
+    def from_session_file(
+        session: SessionFile, namespace: str | None = None
+    ) -> "ConnectionSettings":
         """Return the link that a session file describes.
 
         Raises:
             ConfigError: The file is for another namespace.
         """
-        return ConnectionSettings(session.endpoints[0], session.resolve_namespace(namespace), session=session)
+        return ConnectionSettings(
+            session.endpoints[0], session.resolve_namespace(namespace), session=session
+        )
 
 
 def open_zenoh(
-    connection: ConnectionSettings, connect_timeout_s: float, change: Callable[[zenoh.Config], None] | None = None
+    connection: ConnectionSettings,
+    connect_timeout_s: float,
+    change: Callable[[zenoh.Config], None] | None = None,
 ) -> zenoh.Session:
     """Open a session of Zenoh with the settings that SnakeSIM needs.
 
@@ -137,7 +144,9 @@ def _build_base_config(connection: ConnectionSettings) -> zenoh.Config:
     return config
 
 
-def _make_connection_error(connection: ConnectionSettings, error: zenoh.ZError) -> NotConnectedError:
+def _make_connection_error(
+    connection: ConnectionSettings, error: zenoh.ZError
+) -> NotConnectedError:
     """Return the error that explains to a user why Zenoh could not open the session."""
     if connection.listen:
         return NotConnectedError(
@@ -152,7 +161,8 @@ def _make_connection_error(connection: ConnectionSettings, error: zenoh.ZError) 
             code="certificate/rejected",
         )
     return NotConnectedError(
-        f"nothing listens on {connection.endpoint}; start a run or a router there first", code="network/nothing-listens"
+        f"nothing listens on {connection.endpoint}; start a run or a router there first",
+        code="network/nothing-listens",
     )
 
 

@@ -31,7 +31,8 @@ def check_endpoint(text: str, origin: str) -> str:
     parts = ENDPOINT_PATTERN.fullmatch(text)
     if parts is None:
         raise ConfigError(
-            f"{context}: this is not an endpoint; give one {VALID_ENDPOINT}", code="network/invalid-address"
+            f"{context}: this is not an endpoint; give one {VALID_ENDPOINT}",
+            code="network/invalid-address",
         )
     if parts["protocol"] not in PROTOCOLS:
         raise ConfigError(

@@ -20,7 +20,10 @@ class SampleFeed(Generic[MessageT]):
     """The newest samples of one key, by tick."""
 
     def __init__(
-        self, reader: SampleReader[MessageT], key: str, is_acceptable: Callable[[Message], bool] = lambda _message: True
+        self,
+        reader: SampleReader[MessageT],
+        key: str,
+        is_acceptable: Callable[[Message], bool] = lambda _message: True,
     ) -> None:
         """Start without samples.
 

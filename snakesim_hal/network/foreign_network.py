@@ -109,7 +109,9 @@ class ForeignNetwork:
         self._declared: list[Any] = []
         self.id = str(zenoh_session.zid())
 
-    def declare_publisher(self, key: str, *, latched: bool = False, background: bool = False) -> RawPublisher:
+    def declare_publisher(
+        self, key: str, *, latched: bool = False, background: bool = False
+    ) -> RawPublisher:
         """Declare a publisher.
 
         Samples are dropped if the network is too slow for them. `close` undeclares the publisher.
@@ -126,17 +128,25 @@ class ForeignNetwork:
         if latched:
             # Dropping is the default of an advanced publisher, which has no argument for it.
             publisher: Any = ext.declare_advanced_publisher(
-                self._zenoh, key, cache=ext.CacheConfig(1), publisher_detection=True, priority=priority
+                self._zenoh,
+                key,
+                cache=ext.CacheConfig(1),
+                publisher_detection=True,
+                priority=priority,
             )
         else:
             congestion_control = zenoh.CongestionControl.DROP
-            publisher = self._zenoh.declare_publisher(key, congestion_control=congestion_control, priority=priority)
+            publisher = self._zenoh.declare_publisher(
+                key, congestion_control=congestion_control, priority=priority
+            )
         self._declared.append(publisher)
         return RawPublisher(publisher)
 
     def declare_queryable(self, key: str) -> RawQueryable:
         """Declare a receiver of queries at a key. If more than MAX_WAITING_QUERIES wait, the oldest are dropped."""
-        queryable = self._zenoh.declare_queryable(key, handlers.RingChannel(MAX_WAITING_QUERIES), complete=True)
+        queryable = self._zenoh.declare_queryable(
+            key, handlers.RingChannel(MAX_WAITING_QUERIES), complete=True
+        )
         self._declared.append(queryable)
         return RawQueryable(queryable)
 

@@ -47,9 +47,8 @@ def find_free_port() -> int:
 def is_tcp_port_free(port: int) -> bool:
     """Return whether Zenoh can listen at this port of the loopback interface."""
     with socket.socket() as probe:
-        probe.setsockopt(
-            socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
-        )  # as Zenoh binds: an ended connection does not count
+        # As Zenoh binds: an ended connection does not count.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         return _can_bind(probe, port)
 
 

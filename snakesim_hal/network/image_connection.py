@@ -16,7 +16,9 @@ from snakesim_hal.network.endpoint import is_exposed
 from snakesim_hal.network.session_file import read_endpoints
 
 # A piece waits up to a second for the one before it. No other thread waits for the thread that sends images.
-WAIT_SETTINGS = {"transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 1_000_000}
+WAIT_SETTINGS = {
+    "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": 1_000_000
+}
 FRAGMENT_SETTINGS = {
     "transport/link/tx/batch_size": 1400,  # bytes of a piece: less than a packet
     # The least that Linux allows: it takes twice the number, for its own records too. With 4096 a state waited twice as

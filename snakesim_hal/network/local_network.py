@@ -27,7 +27,13 @@ from snakesim_hal.network.streams import (
     get_reader_depth,
 )
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import EncodedMessage, MessageDecoder, MessageT, encode, format_encoding
+from snakesim_hal.wire.codec import (
+    EncodedMessage,
+    MessageDecoder,
+    MessageT,
+    encode,
+    format_encoding,
+)
 from snakesim_hal.wire.messages import Answer, Message
 
 SampleHandler = Callable[[ReceivedSample], None]
@@ -77,7 +83,11 @@ class LocalNetwork:
         """Return the callbacks of all subscribers of a key."""
         handlers = self._handlers.get(key)
         if handlers is None:
-            handlers = [handler for pattern, handler in self.subscribers if key_expressions_intersect(pattern, key)]
+            handlers = [
+                handler
+                for pattern, handler in self.subscribers
+                if key_expressions_intersect(pattern, key)
+            ]
             self._handlers[key] = handlers
         return handlers
 
@@ -143,7 +153,11 @@ class LocalReader(SampleReader[MessageT]):
     """Reads the newest samples of one key from a queue that its subscription fills."""
 
     def __init__(
-        self, declared: ZenohDeclaration, arrivals: deque[ReceivedSample], message: type[MessageT], rejected: Any
+        self,
+        declared: ZenohDeclaration,
+        arrivals: deque[ReceivedSample],
+        message: type[MessageT],
+        rejected: Any,
     ) -> None:
         super().__init__(declared, message, rejected)
         self._arrivals = arrivals
@@ -164,7 +178,9 @@ class LocalQuery:
     """A query that waits for answers."""
 
     queryable_count: int  # queryables that have received it
-    answers: Mailbox[tuple[str, bytes, str]] = field(default_factory=Mailbox[tuple[str, bytes, str]])
+    answers: Mailbox[tuple[str, bytes, str]] = field(
+        default_factory=Mailbox[tuple[str, bytes, str]]
+    )
 
     def reply(self, key: str, payload: bytes, encoding: str) -> None:
         """Store an answer. May be called from any thread."""
@@ -188,14 +204,18 @@ class LocalSession(Session):
         super().__init__(None)
         self._network = network
 
-    def declare_publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
+    def declare_publisher(
+        self, key: str, message: type[MessageT], *, lossless: bool = False
+    ) -> Publisher[MessageT]:
         """Declare a publisher. It is lossless in any case."""
         return self._declare_publisher(key, message, latched=False)
 
     def declare_latched_publisher(self, key: str, message: type[MessageT]) -> Publisher[MessageT]:
         return self._declare_publisher(key, message, latched=True)
 
-    def _declare_publisher(self, key: str, message: type[MessageT], *, latched: bool) -> Publisher[MessageT]:
+    def _declare_publisher(
+        self, key: str, message: type[MessageT], *, latched: bool
+    ) -> Publisher[MessageT]:
         network = self._network
         encoding = format_encoding(message)
 
@@ -215,9 +235,13 @@ class LocalSession(Session):
         def has_subscribers() -> bool:
             return bool(network.find_handlers(key))
 
-        return self._register_publisher(key, LocalPublisher(message, send, send_encoded, has_subscribers))
+        return self._register_publisher(
+            key, LocalPublisher(message, send, send_encoded, has_subscribers)
+        )
 
-    def declare_reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> SampleReader[MessageT]:
+    def declare_reader(
+        self, key: str, message: type[MessageT], *, depth: int | None = None
+    ) -> SampleReader[MessageT]:
         arrivals: deque[ReceivedSample] = deque(maxlen=depth or get_reader_depth(message))
         declared = self._subscribe(key, arrivals.append)
         return LocalReader(declared, arrivals, message, self.rejected)
@@ -252,7 +276,9 @@ class LocalSession(Session):
         self._network.set_token(key, True)
         self._declare(lambda: self._network.set_token(key, False))
 
-    def on_token_change(self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
+    def on_token_change(
+        self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL
+    ) -> None:
         """Call `handler(key, present)` for every token that exists, appears or vanishes, in the declaring thread."""
         watcher = (key, handler)
         self._network.watchers.append(watcher)
@@ -278,14 +304,18 @@ class LocalSession(Session):
     def send_query(self, pattern: str, request: Message) -> LocalQuery:
         """Send a query to all matching keys, without waiting: the answering part may have to run a cycle first."""
         matching = [
-            (key, handler) for key, handler in self._network.queryables if key_expressions_intersect(pattern, key)
+            (key, handler)
+            for key, handler in self._network.queryables
+            if key_expressions_intersect(pattern, key)
         ]
         query = LocalQuery(len(matching))
         for key, handler in matching:
             handler(IncomingQuery(key, encode(request), format_encoding(type(request)), query))
         return query
 
-    def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
+    def _answers(
+        self, pattern: str, request: Message, timeout_s: float
+    ) -> Iterator[tuple[str, Answer | WireError]]:
         decoder = MessageDecoder(Answer)
         query = self.send_query(pattern, request)
         self._network.run_responders()

@@ -34,7 +34,11 @@ class LocalRobot:
 
     @staticmethod
     def from_connection(
-        connection: "ConnectionSettings", robot: str, backend: str, stop_port: socket.socket, config: str | None = None
+        connection: "ConnectionSettings",
+        robot: str,
+        backend: str,
+        stop_port: socket.socket,
+        config: str | None = None,
     ) -> "LocalRobot":
         """Return the entry of a robot for which this process is responsible."""
         stop_host, port = stop_port.getsockname()[:2]
@@ -62,7 +66,11 @@ def get_state_folder() -> Path:
 def get_robot_state_folder(robot: str, backend: str, hardware: str) -> Path:
     """Return the folder of one robot's state, such as its emergency stop. It is the same in every run."""
     name = "-".join(filter(None, (robot, backend, hardware)))
-    return get_state_folder() / "robots" / "".join(c if c.isalnum() or c in "-_+." else "_" for c in name)
+    return (
+        get_state_folder()
+        / "robots"
+        / "".join(c if c.isalnum() or c in "-_+." else "_" for c in name)
+    )
 
 
 @contextlib.contextmanager
@@ -124,7 +132,9 @@ def _decode_robot(text: bytes) -> LocalRobot:
         TypeError: A value is missing, or has a wrong type.
     """
     values = json.loads(text)
-    known_values = {field.name: values[field.name] for field in fields(LocalRobot) if field.name in values}
+    known_values = {
+        field.name: values[field.name] for field in fields(LocalRobot) if field.name in values
+    }
     robot = LocalRobot(**known_values)
     wrong_fields: list[str] = []
     for field in fields(robot):

@@ -29,7 +29,8 @@ class Mailbox(Generic[ItemT]):
             limits: Maximum number of items in each lane, the most urgent lane first. None means any number.
         """
         self._lanes: list[deque[ItemT]] = [deque(maxlen=limit) for limit in limits]
-        self._item_signal = threading.Lock()  # released by `put`, and acquired by the thread that waits for an item
+        # Released by `put`, and acquired by the thread that waits for an item.
+        self._item_signal = threading.Lock()
         self._item_signal.acquire()
 
     def put(self, item: ItemT, lane_index: int = 0) -> None:

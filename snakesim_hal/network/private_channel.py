@@ -52,7 +52,9 @@ class HostEnd:
             with contextlib.suppress(OSError):
                 self._socket.send(msgspec.msgpack.encode(message), socket.MSG_DONTWAIT)
 
-    def start_serving(self, handle: Callable[[LifecycleRequest, Callable[[Answer], None]], None]) -> None:
+    def start_serving(
+        self, handle: Callable[[LifecycleRequest, Callable[[Answer], None]], None]
+    ) -> None:
         """Start a thread that receives the requests of the starter. Does nothing if the host was started on its own.
 
         Args:
@@ -71,7 +73,10 @@ class HostEnd:
                     return
                 if not encoded_request:  # the starter has closed its end
                     return
-                handle(decoder.decode(encoded_request), lambda answer: self.send(HostMessage(answer=answer)))
+                handle(
+                    decoder.decode(encoded_request),
+                    lambda answer: self.send(HostMessage(answer=answer)),
+                )
 
         start_restarting_thread("private channel", receive_requests)
 

@@ -60,7 +60,9 @@ class NetworkProbe:
                 offset = sent_time - datetime.now(UTC)
                 offsets_s[str(sample.key_expr)].append(offset.total_seconds())
 
-        subscribers = [self._session.declare_subscriber(pattern, add_offset) for pattern in patterns]
+        subscribers = [
+            self._session.declare_subscriber(pattern, add_offset) for pattern in patterns
+        ]
         time.sleep(listen_s)
         for subscriber in subscribers:
             subscriber.undeclare()
@@ -81,6 +83,8 @@ def open_probe(settings: str) -> Iterator[NetworkProbe]:
     try:
         session = zenoh.open(zenoh.Config.from_json5(settings))
     except zenoh.ZError as error:
-        raise NotConnectedError(str(error).split(" at /")[0], code="network/nothing-listens") from None
+        raise NotConnectedError(
+            str(error).split(" at /")[0], code="network/nothing-listens"
+        ) from None
     with session:
         yield NetworkProbe(session)

@@ -77,7 +77,9 @@ def describe_differences(one: ProcessInfo, other: ProcessInfo) -> list[str]:
 
 def _find_differing_settings(one: ProcessInfo, other: ProcessInfo) -> list[tuple[str, str, str]]:
     """Return the keys whose values differ, each with both values. A process may use only some sections."""
-    sections = {_get_section(key) for key in one.settings} & {_get_section(key) for key in other.settings}
+    sections = {_get_section(key) for key in one.settings} & {
+        _get_section(key) for key in other.settings
+    }
     differing: list[tuple[str, str, str]] = []
     for key in dict.fromkeys((*one.settings, *other.settings)):
         value = one.settings.get(key, NOT_SET)
@@ -93,7 +95,11 @@ def _get_section(key: str) -> str:
 
 def _find_differing_messages(one: ProcessInfo, other: ProcessInfo) -> list[str]:
     """Return the messages that both processes know in different versions."""
-    return [name for name in one.messages if name in other.messages and one.messages[name] != other.messages[name]]
+    return [
+        name
+        for name in one.messages
+        if name in other.messages and one.messages[name] != other.messages[name]
+    ]
 
 
 def _describe_conflict(entry: ProcessInfo, own: ProcessInfo) -> str:
@@ -111,7 +117,9 @@ def _describe_conflict(entry: ProcessInfo, own: ProcessInfo) -> str:
         return ""
     listing = ", ".join(differences[:MAX_LISTED_DIFFERENCES])
     if len(differences) > MAX_LISTED_DIFFERENCES:
-        listing += f" and {len(differences) - MAX_LISTED_DIFFERENCES} more, which `snakesim status` lists"
+        listing += (
+            f" and {len(differences) - MAX_LISTED_DIFFERENCES} more, which `snakesim status` lists"
+        )
     return f"{describe_process(entry)} differs from this host in {listing}; {_describe_remedy(entry, own)}"
 
 
@@ -147,13 +155,16 @@ class ProcessEntries:
         self._decoder = MessageDecoder(ProcessInfo)
         self._entries: dict[str, ProcessInfo] = {}
         self._alive: set[str] = set()
-        self._comparisons: dict[str, _EntryComparison] = {}  # cache by key; only of known services, so there are few
+        # Cache by key; only of known services, so there are few.
+        self._comparisons: dict[str, _EntryComparison] = {}
         session.on_token_change(self._on_token, keys.PROCESS_ALL)
         session.on_latched_arrival(keys.PROCESS_ALL, self._store_entry)
 
     def find_problems(self, own: ProcessInfo, names: Collection[str]) -> list[str]:
         """Return the reasons, as texts, why a process cannot work together with the processes of these names."""
-        problems = [f"{process} has not published its settings yet" for process in self.unpublished(names)]
+        problems = [
+            f"{process} has not published its settings yet" for process in self.unpublished(names)
+        ]
         for key, entry in self._find_entries(names).items():
             conflict = self._find_conflict(key, entry, own) if entry is not None else ""
             if conflict:
@@ -170,7 +181,11 @@ class ProcessEntries:
 
     def unpublished(self, names: Collection[str]) -> list[str]:
         """Return the present processes of these names that have not published their entry yet."""
-        return [keys.parse_service(key) for key, entry in self._find_entries(names).items() if entry is None]
+        return [
+            keys.parse_service(key)
+            for key, entry in self._find_entries(names).items()
+            if entry is None
+        ]
 
     def _find_entries(self, names: Collection[str]) -> dict[str, ProcessInfo | None]:
         """Return the entry of each connected process of these names by its key; None for an unpublished entry."""
@@ -193,7 +208,8 @@ class ProcessEntries:
         if present and len(self._alive) < MAX_ENTRIES:
             self._alive.add(key)
         elif not present:
-            self._alive.discard(key)  # the entry stays: if only the link was cut, it is not sent again
+            # The entry stays: if only the link was cut, it is not sent again.
+            self._alive.discard(key)
 
     def _store_entry(self, arrival: ReceivedSample) -> None:
         """Store an entry, in Zenoh's thread. A full table first drops the entries of processes that have vanished."""

@@ -77,12 +77,16 @@ def _check_imu(imu: Imu, robot: RobotDescription) -> WireError | None:
 
 
 def _check_depth_image(image: DepthImage, robot: RobotDescription) -> WireError | None:
-    error = _find_wrong_length(image, ("depth",), 2 * image.width * image.height, "two bytes a pixel")
+    error = _find_wrong_length(
+        image, ("depth",), 2 * image.width * image.height, "two bytes a pixel"
+    )
     return error or _check_mount(image, robot)
 
 
 def _check_color_image(image: ColorImage, robot: RobotDescription) -> WireError | None:
-    error = _find_wrong_length(image, ("rgb",), 3 * image.width * image.height, "three bytes a pixel")
+    error = _find_wrong_length(
+        image, ("rgb",), 3 * image.width * image.height, "three bytes a pixel"
+    )
     return error or _check_mount(image, robot)
 
 
@@ -123,7 +127,9 @@ def _check_trajectory(trajectory: Trajectory) -> WireError | None:
     if _is_path(coordinates.reshape(-1, 2)):
         return None
     allowed = f"no two neighbors alike, no longer than {MAX_PATH_M:g} m, and no point further off"
-    return WireError("no_path", f"Trajectory.path_w of {len(trajectory.path_w)} points is no path: {allowed}")
+    return WireError(
+        "no_path", f"Trajectory.path_w of {len(trajectory.path_w)} points is no path: {allowed}"
+    )
 
 
 def _find_wrong_length(
@@ -134,7 +140,10 @@ def _find_wrong_length(
         length = len(getattr(message, field))
         if length != expected_length:
             label = f"{type(message).__name__}.{field}"
-            return WireError("wrong_length", f"{label} has length {length}, must have {expected_length}: {explanation}")
+            return WireError(
+                "wrong_length",
+                f"{label} has length {length}, must have {expected_length}: {explanation}",
+            )
     return None
 
 
@@ -154,7 +163,9 @@ def _find_wrong_link(label: str, link_index: int, robot: RobotDescription) -> Wi
     last_link = len(robot.links) - 1
     if link_index <= last_link:
         return None
-    return WireError("wrong_length", f"{label} is {link_index}, must be 0 (tail) to {last_link} (head)")
+    return WireError(
+        "wrong_length", f"{label} is {link_index}, must be 0 (tail) to {last_link} (head)"
+    )
 
 
 def _is_path(points_w: NDArray[np.float64]) -> bool:
@@ -171,7 +182,9 @@ def _find_wrong_rotation(label: str, wxyz: Sequence[float]) -> WireError | None:
     norm = math.hypot(*wxyz)
     if abs(norm - 1.0) <= MAX_NORM_ERROR:
         return None
-    return WireError("no_rotation", f"{label} is {tuple(wxyz)} of norm {norm:g}, must be a rotation, of norm 1")
+    return WireError(
+        "no_rotation", f"{label} is {tuple(wxyz)} of norm {norm:g}, must be a rotation, of norm 1"
+    )
 
 
 # The first class that a message belongs to has its check.

@@ -11,7 +11,11 @@ import zenoh
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.network.endpoint import require_safe_listening_endpoint
 from snakesim_hal.network.router_log import ZENOH_LEVELS, shortened_zenoh_log
-from snakesim_hal.network.session_file import make_zenoh_refusal_error, read_endpoints, read_zenoh_file
+from snakesim_hal.network.session_file import (
+    make_zenoh_refusal_error,
+    read_endpoints,
+    read_zenoh_file,
+)
 
 
 def read_router_settings(config: Path) -> zenoh.Config:
@@ -49,7 +53,10 @@ def open_router(config: Path, *, insecure: bool = False) -> Iterator[None]:
     for endpoint in read_endpoints(settings, "listen/endpoints", "router"):
         has_access_control = _is_denying_by_default(settings)
         require_safe_listening_endpoint(
-            endpoint, f"{config}: `listen.endpoints`:", access_control=has_access_control, insecure=insecure
+            endpoint,
+            f"{config}: `listen.endpoints`:",
+            access_control=has_access_control,
+            insecure=insecure,
         )
     with nullcontext() if "RUST_LOG" in os.environ else shortened_zenoh_log():
         zenoh.init_log_from_env_or(ZENOH_LEVELS)

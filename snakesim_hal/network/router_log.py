@@ -38,7 +38,9 @@ MAX_LINE_CHARACTERS = 300
 MAX_SESSIONS = 4000  # whose names are stored, as many as a host accepts
 
 COLOR_CODE = re.compile(r"\x1b\[[0-9;]*m")
-LOG_LINE = re.compile(r"\S+Z +(?P<level>[A-Z]+) +(?:\S+ )?ThreadId\((?P<thread>\d+)\) (?P<module>[\w:]+): (?P<text>.*)")
+LOG_LINE = re.compile(
+    r"\S+Z +(?P<level>[A-Z]+) +(?:\S+ )?ThreadId\((?P<thread>\d+)\) (?P<module>[\w:]+): (?P<text>.*)"
+)
 ALLOWED_MARKER = " is authorized to "
 LIST_START_MARKER = "caching permissions for"
 LIST_END_MARKER = "Declare Liveliness Subscriber ("
@@ -46,7 +48,9 @@ REFUSAL = re.compile(
     r"(?:Using cached result: )?(?P<session>[0-9a-f]+)(?: on (?P<subject>\S+))? is unauthorized to (?P<what>.*)"
 )
 CERTIFICATE_NAME = re.compile(r"CertCommonName\((.*?)\)")
-TLS_CONNECTION = re.compile(r"Accepted TLS connection on .*?: (?P<address>\S+)\. Common Name: (?P<name>.*)\.")
+TLS_CONNECTION = re.compile(
+    r"Accepted TLS connection on .*?: (?P<address>\S+)\. Common Name: (?P<name>.*)\."
+)
 UNMATCHED_SESSION = re.compile(r"(?P<session>[0-9a-f]+) did not match any configured ACL subject")
 NEW_CONNECTION = re.compile(
     r"New transport link accepted from (?P<session>[0-9a-f]+) to .*? dst: \w+/(?P<address>[^ ,]+)"
@@ -60,9 +64,11 @@ class RouterLog:
         """Write each relevant line with `write`."""
         self._write = write
         # Sessions.
-        self._names: dict[str, str] = {}  # names in certificates, by session, or by address until the session is known
+        # Names in certificates, by session, or by address until the session is known.
+        self._names: dict[str, str] = {}
         self._unmatched: dict[str, str] = {}  # ids of sessions that no rule names, as keys
-        self._listing_threads: set[str] = set()  # threads of Zenoh that are listing all permissions of a session
+        # Threads of Zenoh that are listing all permissions of a session.
+        self._listing_threads: set[str] = set()
         # Written lines.
         self._repetition_counts: Counter[str] = Counter()  # by line, since the last report
         self._remaining_line_count = MAX_BURST_LINES  # how many lines may still be written
@@ -104,13 +110,17 @@ class RouterLog:
         dropped = self._dropped_line_count
         self._repetition_counts = Counter()
         self._dropped_line_count = 0
-        self._remaining_line_count = min(self._remaining_line_count + LINES_PER_INTERVAL, MAX_BURST_LINES)
+        self._remaining_line_count = min(
+            self._remaining_line_count + LINES_PER_INTERVAL, MAX_BURST_LINES
+        )
         for line, times in repetitions.items():
             if times:
                 self._write_once(f"{times} times more: {line}")
         dropped += self._dropped_line_count  # the reports themselves may have been dropped
         if dropped:
-            self._write(f"{dropped} lines left out: more than {LINES_PER_INTERVAL} different ones a minute")
+            self._write(
+                f"{dropped} lines left out: more than {LINES_PER_INTERVAL} different ones a minute"
+            )
 
     def _process_access_decision(self, thread: str, text: str) -> None:
         """Process a line of the access control: write a refusal, skip a list, or store a session that no rule names."""
@@ -144,7 +154,9 @@ class RouterLog:
         if self._unmatched.pop(session, None) is None:
             self._write_once(f"let in: {name} from {address}")
         else:
-            self._write_once(f"refused: {name} from {address}: everything, because no rule is for it")
+            self._write_once(
+                f"refused: {name} from {address}: everything, because no rule is for it"
+            )
 
     def _write_once(self, line: str) -> None:
         """Write a line, unless it was written since the last report or there are too many lines."""

@@ -40,7 +40,13 @@ from snakesim_hal.network.streams import (
     get_reader_depth,
 )
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import IMAGE_MESSAGE_TYPES, MessageDecoder, MessageT, encode, format_encoding
+from snakesim_hal.wire.codec import (
+    IMAGE_MESSAGE_TYPES,
+    MessageDecoder,
+    MessageT,
+    encode,
+    format_encoding,
+)
 from snakesim_hal.wire.messages import Answer, ImagePreview, Message
 
 MAX_OPEN_FILES = 16384  # each connection takes one, and the default limit of a process is 1024
@@ -58,7 +64,9 @@ class Session:
                 print(joints.angle_rad)
     """
 
-    def __init__(self, zenoh_session: Any, open_for_images: Callable[[], Any] | None = None) -> None:
+    def __init__(
+        self, zenoh_session: Any, open_for_images: Callable[[], Any] | None = None
+    ) -> None:
         """Wrap an open Zenoh session.
 
         Args:
@@ -79,7 +87,9 @@ class Session:
 
     # --- publishing ------------------------------------------------------------------------------------------
 
-    def declare_publisher(self, key: str, message: type[MessageT], *, lossless: bool = False) -> Publisher[MessageT]:
+    def declare_publisher(
+        self, key: str, message: type[MessageT], *, lossless: bool = False
+    ) -> Publisher[MessageT]:
         """Declare a publisher for a stream.
 
         Args:
@@ -128,9 +138,13 @@ class Session:
         )
         return self._wrap_publisher(key, publisher, message)
 
-    def _wrap_publisher(self, key: str, publisher: Any, message: type[MessageT]) -> Publisher[MessageT]:
+    def _wrap_publisher(
+        self, key: str, publisher: Any, message: type[MessageT]
+    ) -> Publisher[MessageT]:
         self._declared.append(publisher)
-        wrapped = Publisher(message, publisher.put, lambda: bool(publisher.matching_status.matching))
+        wrapped = Publisher(
+            message, publisher.put, lambda: bool(publisher.matching_status.matching)
+        )
         return self._register_publisher(key, wrapped)
 
     def _register_publisher(self, key: str, publisher: Publisher[MessageT]) -> Publisher[MessageT]:
@@ -154,7 +168,9 @@ class Session:
 
     # --- reading ---------------------------------------------------------------------------------------------
 
-    def declare_reader(self, key: str, message: type[MessageT], *, depth: int | None = None) -> SampleReader[MessageT]:
+    def declare_reader(
+        self, key: str, message: type[MessageT], *, depth: int | None = None
+    ) -> SampleReader[MessageT]:
         """Subscribe to a stream. A slow reader loses old samples, and never blocks the publisher.
 
         Args:
@@ -162,7 +178,9 @@ class Session:
             message: Type of the messages.
             depth: Number of the newest samples that the reader keeps. None means the default for this type.
         """
-        subscriber = self._zenoh.declare_subscriber(key, handlers.RingChannel(depth or get_reader_depth(message)))
+        subscriber = self._zenoh.declare_subscriber(
+            key, handlers.RingChannel(depth or get_reader_depth(message))
+        )
         self._declared.append(subscriber)
         return SampleReader(subscriber, message, self.rejected)
 
@@ -221,7 +239,9 @@ class Session:
         The control loop waits for one thread less than with `on_arrival`. While `handler` runs, the session receives
         nothing else, so it must only store the sample.
         """
-        callback = handlers.Callback(_make_handler_with_thread_state(_make_arrival_handler(handler)), indirect=False)
+        callback = handlers.Callback(
+            _make_handler_with_thread_state(_make_arrival_handler(handler)), indirect=False
+        )
         self._declared.append(self._zenoh.declare_subscriber(key, callback))
 
     def on_latched_arrival(self, key: str, handler: Callable[[ReceivedSample], None]) -> None:
@@ -244,7 +264,9 @@ class Session:
 
     # --- queries ---------------------------------------------------------------------------------------------
 
-    def send_request(self, key: str, request: Message, timeout_s: float = 2.0, *, host: str | None = None) -> Answer:
+    def send_request(
+        self, key: str, request: Message, timeout_s: float = 2.0, *, host: str | None = None
+    ) -> Answer:
         """Send a request to the HAL host, and wait for the answer.
 
         Args:
@@ -264,7 +286,9 @@ class Session:
                 return answer
         if decoding_error is not None:
             raise NotConnectedError(f"the answer on {key} cannot be decoded: {decoding_error}")
-        raise NotConnectedError(f"no answer on {key} within {timeout_s} s; is the robot's HAL host running?")
+        raise NotConnectedError(
+            f"no answer on {key} within {timeout_s} s; is the robot's HAL host running?"
+        )
 
     def send_request_to_all(
         self, pattern: str, request: Message, timeout_s: float = 2.0
@@ -277,7 +301,9 @@ class Session:
         answers = self._answers(pattern, request, timeout_s)
         return ((key, answer) for key, answer in answers if isinstance(answer, Answer))
 
-    def _answers(self, pattern: str, request: Message, timeout_s: float) -> Iterator[tuple[str, Answer | WireError]]:
+    def _answers(
+        self, pattern: str, request: Message, timeout_s: float
+    ) -> Iterator[tuple[str, Answer | WireError]]:
         """Send a request to all hosts whose keys match a pattern, and yield their answers as they arrive.
 
         Args:
@@ -326,13 +352,17 @@ class Session:
         """Declare a liveliness token for as long as the session lives."""
         self._declared.append(self._zenoh.liveliness().declare_token(key))
 
-    def on_token_change(self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL) -> None:
+    def on_token_change(
+        self, handler: Callable[[str, bool], None], key: str = keys.ALIVE_ALL
+    ) -> None:
         """Call `handler(key, present)` when a token appears or vanishes, in Zenoh's thread."""
 
         def handle(sample: zenoh.Sample) -> None:
             handler(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        self._declared.append(self._zenoh.liveliness().declare_subscriber(key, handle, history=True))
+        self._declared.append(
+            self._zenoh.liveliness().declare_subscriber(key, handle, history=True)
+        )
 
     # --- the session itself ----------------------------------------------------------------------------------
 
@@ -345,7 +375,9 @@ class Session:
     def close(self) -> None:
         """Undeclare everything, then close the connections."""
         for declared in reversed(self._declared):
-            with suppress(RuntimeError):  # another thread is publishing with it: the session undeclares it
+            with suppress(
+                RuntimeError
+            ):  # another thread is publishing with it: the session undeclares it
                 declared.undeclare()
         self._declared.clear()
         if self._image_session is not None:
@@ -355,7 +387,9 @@ class Session:
 
 
 @contextmanager
-def open_session(connection: ConnectionSettings, connect_timeout_s: float = 5.0) -> Iterator[Session]:
+def open_session(
+    connection: ConnectionSettings, connect_timeout_s: float = 5.0
+) -> Iterator[Session]:
     """Connect to the network of a robot, or listen for its clients, and close the session when the context ends.
 
     Args:
@@ -368,7 +402,9 @@ def open_session(connection: ConnectionSettings, connect_timeout_s: float = 5.0)
         ConfigError: Listening there would let other machines command the robot.
     """
     if connection.listen:
-        require_safe_listening_endpoint(connection.endpoint, "endpoint", insecure=connection.insecure)
+        require_safe_listening_endpoint(
+            connection.endpoint, "endpoint", insecure=connection.insecure
+        )
         raise_open_file_limit(MAX_OPEN_FILES)
         receiving_threads = ROUTER_RECEIVING_THREADS
         open_for_images = None
@@ -417,7 +453,9 @@ def _make_last_value_history() -> ext.HistoryConfig:
     return ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
 
 
-def _make_arrival_handler(handler: Callable[[ReceivedSample], None]) -> Callable[[zenoh.Sample], None]:
+def _make_arrival_handler(
+    handler: Callable[[ReceivedSample], None],
+) -> Callable[[zenoh.Sample], None]:
     """Return a handler for Zenoh's thread that passes each sample to `handler` as an `ReceivedSample`."""
 
     def handle(sample: zenoh.Sample) -> None:
@@ -429,7 +467,9 @@ def _make_arrival_handler(handler: Callable[[ReceivedSample], None]) -> Callable
     return handle
 
 
-def _make_handler_with_thread_state(handle: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
+def _make_handler_with_thread_state(
+    handle: Callable[[zenoh.Sample], None],
+) -> Callable[[zenoh.Sample], None]:
     """Return a handler that keeps Python's state of Zenoh's thread from one sample to the next.
 
     Otherwise Python creates that state, and a stack, again for each sample, which in the kernel costs twice what a

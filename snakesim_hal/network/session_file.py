@@ -85,7 +85,8 @@ def _check_required_value(path: Path, key: str, value: Any, required: Any) -> No
     dotted_key = key.replace("/", ".")
     shown_value = "missing" if value is None else json.dumps(value)
     raise ConfigError(
-        f"{path}: `{dotted_key}` is {shown_value}, must be {json.dumps(required)}", code="network/session-file"
+        f"{path}: `{dotted_key}` is {shown_value}, must be {json.dumps(required)}",
+        code="network/session-file",
     )
 
 
@@ -93,7 +94,8 @@ def _read_router_endpoints(path: Path, settings: zenoh.Config) -> list[str]:
     """Return the valid endpoints of the routers that a file names. Raises ConfigError if there are none."""
     if read_endpoints(settings, "listen/endpoints", "client"):
         raise ConfigError(
-            f"{path}: `listen.endpoints`: a session only connects; leave it out", code="network/session-file"
+            f"{path}: `listen.endpoints`: a session only connects; leave it out",
+            code="network/session-file",
         )
     endpoints = read_endpoints(settings, "connect/endpoints", "client")
     if not endpoints:
@@ -128,7 +130,9 @@ def read_zenoh_file(path: Path) -> tuple[str, zenoh.Config]:
 def make_zenoh_refusal_error(path: Path, error: zenoh.ZError) -> ConfigError:
     """Return an error with Zenoh's own message about a file, shortened because it quotes the file."""
     message = " ".join(str(error).split())
-    return ConfigError(f"{path}: Zenoh refuses it: {shorten(message, 500)}", code="network/session-file")
+    return ConfigError(
+        f"{path}: Zenoh refuses it: {shorten(message, 500)}", code="network/session-file"
+    )
 
 
 def read_endpoints(settings: zenoh.Config, key: str, mode: str) -> list[str]:

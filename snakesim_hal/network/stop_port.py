@@ -35,7 +35,8 @@ MAX_REQUESTER_BYTES = 64
 MAX_ANSWER_BYTES = 1024
 UDP_HEADER_BYTES = 8  # bytes
 SO_ATTACH_FILTER = 26  # of Linux; Python has no name for it
-PAUSE_AFTER_REQUEST_S = 0.001  # between two requests: a flood of them must not block the interpreter
+# Between two requests: a flood of them must not block the interpreter.
+PAUSE_AFTER_REQUEST_S = 0.001
 MAX_REFUSAL_COUNT = 10  # answers of the kernel that the port is closed
 REPEAT_PERIOD_S = 0.02  # after which a sender repeats an unanswered request
 TEST_WAIT_S = 0.01  # for the kernel's answer that a port is closed; on loopback it comes at once
@@ -89,7 +90,9 @@ def open_stop_port(host: str, port: int) -> socket.socket:
     return stop_socket
 
 
-def start_stop_server(opened: socket.socket, robot: str, handle: Callable[[str, Reply], None]) -> None:
+def start_stop_server(
+    opened: socket.socket, robot: str, handle: Callable[[str, Reply], None]
+) -> None:
     """Start the thread `stop port`, which calls `handle(requester, reply)` for every stop request.
 
     A request consists of a constant header, a nonce that the answer repeats, and the name of the requester.
@@ -104,7 +107,9 @@ def start_stop_server(opened: socket.socket, robot: str, handle: Callable[[str, 
     def serve() -> None:
         while True:
             try:
-                datagram, sender = opened.recvfrom(UDP_HEADER_BYTES + header_bytes + MAX_REQUESTER_BYTES)
+                datagram, sender = opened.recvfrom(
+                    UDP_HEADER_BYTES + header_bytes + MAX_REQUESTER_BYTES
+                )
             except OSError:  # the socket is closed
                 return
             if not datagram.startswith(REQUEST_HEADER) or len(datagram) < header_bytes:
@@ -185,7 +190,8 @@ class StopRequester:
         opened = self._sockets.get(address)
         if opened is None:
             raise NotConnectedError(
-                f"no socket is prepared for udp/{address[0]}:{address[1]}", code="network/nothing-listens"
+                f"no socket is prepared for udp/{address[0]}:{address[1]}",
+                code="network/nothing-listens",
             )
         try:
             opened.connect(address)
@@ -197,9 +203,13 @@ class StopRequester:
         except OSError as error:
             code = error.errno or errno.EIO
         if code == errno.ECONNREFUSED:
-            raise NotConnectedError(f"no host takes emergency stops on udp/{address[0]}:{address[1]}")
+            raise NotConnectedError(
+                f"no host takes emergency stops on udp/{address[0]}:{address[1]}"
+            )
         if code:
-            raise NotConnectedError(f"udp/{address[0]}:{address[1]} cannot be reached: {os.strerror(code)}")
+            raise NotConnectedError(
+                f"udp/{address[0]}:{address[1]} cannot be reached: {os.strerror(code)}"
+            )
 
     def close(self) -> None:
         """Close all sockets."""
@@ -257,7 +267,9 @@ def _repeat_stop_request(
         except ConnectionRefusedError:
             refused_count += 1
             if refused_count > MAX_REFUSAL_COUNT:
-                raise NotConnectedError(f"no host takes emergency stops on udp/{address[0]}:{address[1]}") from None
+                raise NotConnectedError(
+                    f"no host takes emergency stops on udp/{address[0]}:{address[1]}"
+                ) from None
             time.sleep(REPEAT_PERIOD_S)
         except OSError:  # the network is unreachable at present
             time.sleep(REPEAT_PERIOD_S)
@@ -304,7 +316,8 @@ def _attach_request_filter(opened: socket.socket) -> None:
     Args:
         opened: Bound UDP socket.
     """
-    first_word, second_word = struct.unpack(">II", REQUEST_HEADER)  # the 8 bytes of the header, as BPF compares them
+    # The 8 bytes of the header, as BPF compares them.
+    first_word, second_word = struct.unpack(">II", REQUEST_HEADER)
     max_bytes = UDP_HEADER_BYTES + len(REQUEST_HEADER) + NONCE_BYTES + MAX_REQUESTER_BYTES
     instructions = [  # (code, jump if true, jump if false, constant)
         (0x20, 0, 0, UDP_HEADER_BYTES),  # load the first word of the payload
@@ -316,7 +329,8 @@ def _attach_request_filter(opened: socket.socket) -> None:
     ]
     program = b"".join(struct.pack("HBBI", *instruction) for instruction in instructions)
     buffer = ctypes.create_string_buffer(program)  # must live until the kernel has copied it
-    program_description = struct.pack("HL", len(instructions), ctypes.addressof(buffer))  # `struct sock_fprog`
+    # `struct sock_fprog`.
+    program_description = struct.pack("HL", len(instructions), ctypes.addressof(buffer))
     try:
         opened.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, program_description)
     except OSError:

@@ -39,7 +39,10 @@ class Publisher(Generic[MessageT]):
     """Publishes messages of one type on one key."""
 
     def __init__(
-        self, message: type[MessageT], send: Callable[[bytes], None], has_subscriber: Callable[[], bool]
+        self,
+        message: type[MessageT],
+        send: Callable[[bytes], None],
+        has_subscriber: Callable[[], bool],
     ) -> None:
         """Wrap the two functions of a network's publisher.
 

@@ -10,7 +10,9 @@ CONNECT_ATTEMPT_S = 2.0  # for one attempt to connect: `keeps_waiting` is called
 
 
 @contextmanager
-def open_session_when_ready(connection: ConnectionSettings, keeps_waiting: Callable[[], bool]) -> Iterator[Session]:
+def open_session_when_ready(
+    connection: ConnectionSettings, keeps_waiting: Callable[[], bool]
+) -> Iterator[Session]:
     """Connect as soon as the robot's network accepts connections, and close the session when the context ends.
 
     After each failed attempt the caller decides whether to try again, so that a waiting process can be ended in order.
@@ -28,7 +30,9 @@ def open_session_when_ready(connection: ConnectionSettings, keeps_waiting: Calla
     with ExitStack() as stack:
         while True:
             try:
-                session = stack.enter_context(open_session(connection, connect_timeout_s=CONNECT_ATTEMPT_S))
+                session = stack.enter_context(
+                    open_session(connection, connect_timeout_s=CONNECT_ATTEMPT_S)
+                )
                 break
             except NotConnectedError:
                 if not keeps_waiting():

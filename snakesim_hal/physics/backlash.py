@@ -19,7 +19,8 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
 from snakesim_hal.wire.messages import Imu, Pose
 
-TOOTH_STIFFNESS_NM_PER_RAD = 300.0  # softer than most gears; an explicit step of 1 ms integrates it on a light link
+# Softer than most gears; an explicit step of 1 ms integrates it on a light link.
+TOOTH_STIFFNESS_NM_PER_RAD = 300.0
 TOOTH_DAMPING_NM_S_PER_RAD = 0.3  # teeth hardly rebound
 LINK_SIDE_INERTIA_RATIO = 0.1  # of the rotor's inertia: the gear's output stage stays on the link
 MIN_ROTOR_INERTIA_KG_M2 = 1e-4  # a rotor without inertia could not be integrated
@@ -47,14 +48,20 @@ def move_rotor_inertia_to_motor_side(
             friction_nm=0.0,
             viscous_nm_s_per_rad=0.0,
         )
-    return msgspec.structs.replace(config, robot=msgspec.structs.replace(config.robot, joints=exceptions))
+    return msgspec.structs.replace(
+        config, robot=msgspec.structs.replace(config.robot, joints=exceptions)
+    )
 
 
 class BacklashModel(PhysicsModel):
     """Wraps another physics model. Its joint angles are those that encoders on the rotors measure."""
 
     def __init__(
-        self, physics_model: PhysicsModel, joints: Sequence[Joint], backlash_rad: Mapping[str, float], seed: int
+        self,
+        physics_model: PhysicsModel,
+        joints: Sequence[Joint],
+        backlash_rad: Mapping[str, float],
+        seed: int,
     ) -> None:
         """Place every rotor at a random angle within its backlash, at rest.
 
@@ -72,13 +79,17 @@ class BacklashModel(PhysicsModel):
         backlash_joints = [i for i, joint in enumerate(joints) if joint.name in backlash_rad]
         motors = [joints[i].motor for i in backlash_joints]
         self._backlash_joints = np.array(backlash_joints, dtype=np.intp)
-        self._half_backlash_rad: Floats = np.array([backlash_rad[joints[i].name] / 2 for i in backlash_joints])
+        self._half_backlash_rad: Floats = np.array(
+            [backlash_rad[joints[i].name] / 2 for i in backlash_joints]
+        )
         # MuJoCo calls the reflected rotor inertia "armature".
         self._rotor_inertia_kg_m2: Floats = np.array(
             [max(motor.armature_kg_m2, MIN_ROTOR_INERTIA_KG_M2) for motor in motors]
         )
         self._friction_nm: Floats = np.array([motor.friction_nm for motor in motors])
-        self._viscous_damping_nm_s_per_rad: Floats = np.array([motor.viscous_nm_s_per_rad for motor in motors])
+        self._viscous_damping_nm_s_per_rad: Floats = np.array(
+            [motor.viscous_nm_s_per_rad for motor in motors]
+        )
 
         # State of the rotors, in units of the joint: behind the gear reduction.
         rng = np.random.default_rng(seed)
@@ -109,19 +120,31 @@ class BacklashModel(PhysicsModel):
 
         # The teeth touch where the angle between rotor and link is larger than half of the backlash.
         separation_rad = self._rotor_angle_rad - link_angle_rad
-        penetration_rad = separation_rad - np.clip(separation_rad, -self._half_backlash_rad, self._half_backlash_rad)
+        penetration_rad = separation_rad - np.clip(
+            separation_rad, -self._half_backlash_rad, self._half_backlash_rad
+        )
         is_touching = penetration_rad != 0.0
         stiffness = np.where(is_touching, TOOTH_STIFFNESS_NM_PER_RAD, 0.0)
         damping = np.where(is_touching, TOOTH_DAMPING_NM_S_PER_RAD, 0.0)
 
         # Velocity: (inertia + step (viscous + damping) + step² stiffness) * change = step * net torque.
         slip_rad_s = self._rotor_velocity_rad_s - link_velocity_rad_s
-        net_torque_nm = motor_torque_nm - self._viscous_damping_nm_s_per_rad * self._rotor_velocity_rad_s
-        net_torque_nm = net_torque_nm - stiffness * (penetration_rad + step_s * slip_rad_s) - damping * slip_rad_s
-        effective_inertia = (
-            self._rotor_inertia_kg_m2 + step_s * (self._viscous_damping_nm_s_per_rad + damping) + step_s**2 * stiffness
+        net_torque_nm = (
+            motor_torque_nm - self._viscous_damping_nm_s_per_rad * self._rotor_velocity_rad_s
         )
-        self._rotor_velocity_rad_s = self._rotor_velocity_rad_s + step_s * net_torque_nm / effective_inertia
+        net_torque_nm = (
+            net_torque_nm
+            - stiffness * (penetration_rad + step_s * slip_rad_s)
+            - damping * slip_rad_s
+        )
+        effective_inertia = (
+            self._rotor_inertia_kg_m2
+            + step_s * (self._viscous_damping_nm_s_per_rad + damping)
+            + step_s**2 * stiffness
+        )
+        self._rotor_velocity_rad_s = (
+            self._rotor_velocity_rad_s + step_s * net_torque_nm / effective_inertia
+        )
         max_friction_change_rad_s = step_s * self._friction_nm / effective_inertia
         self._rotor_velocity_rad_s = self._rotor_velocity_rad_s - np.clip(
             self._rotor_velocity_rad_s, -max_friction_change_rad_s, max_friction_change_rad_s

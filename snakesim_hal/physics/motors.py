@@ -37,7 +37,9 @@ class PowerStages:
 
         # Parameters, (n_joints,).
         self.full_torque_nm: Floats = np.array([joint.limits.torque_nm for joint in joints])
-        self._lag_decay = np.array([_compute_lag_decay(joint.motor.response_time_s, step_s) for joint in joints])
+        self._lag_decay = np.array(
+            [_compute_lag_decay(joint.motor.response_time_s, step_s) for joint in joints]
+        )
         self._roll_off_slope = self._compute_roll_off_slopes(robot, step_s)  # N·m·s/rad
 
         # State.
@@ -55,7 +57,8 @@ class PowerStages:
 
         # Speed-dependent limit of the demand: stall torque - slope * speed, and its mirror image.
         self._slope = np.zeros(count)  # N·m·s/rad
-        self._stall_torque = np.full(count, np.inf)  # N·m, extrapolated to speed 0: above full torque
+        # N·m, extrapolated to speed 0: above full torque.
+        self._stall_torque = np.full(count, np.inf)
 
         # Limits of the torque, N·m: of the setpoint, of derating, and the smaller of both.
         self._setpoint_limit = self.full_torque_nm.copy()
@@ -71,7 +74,9 @@ class PowerStages:
         """Return how much torque each motor loses per rad/s near its speed limit, (n_joints,), N·m·s/rad."""
         joints = robot.joint_table
         speed_limits_rad_s = np.array([joint.limits.speed_rad_s for joint in joints])
-        steepness = np.array([compute_torque_roll_off(joint, robot.module, step_s) for joint in joints])
+        steepness = np.array(
+            [compute_torque_roll_off(joint, robot.module, step_s) for joint in joints]
+        )
         return steepness * self.full_torque_nm / speed_limits_rad_s
 
     def set_demand(
@@ -119,7 +124,9 @@ class PowerStages:
             self._slope[joint_index] = self._roll_off_slope[joint_index]
             self._stall_torque[joint_index] = self._roll_off_slope[joint_index] * speed_limit_rad_s
         self._setpoint_limit[joint_index] = min(torque_limit_nm, self.full_torque_nm[joint_index])
-        self._limit[joint_index] = min(self._setpoint_limit[joint_index], self._derated_limit[joint_index])
+        self._limit[joint_index] = min(
+            self._setpoint_limit[joint_index], self._derated_limit[joint_index]
+        )
 
     def apply_derating(self, remaining_fraction: Floats) -> None:
         """Limit every torque to a fraction of full torque, (n_joints,), from 0 to 1; lower demands are not reduced."""

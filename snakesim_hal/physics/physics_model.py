@@ -32,7 +32,8 @@ class PhysicsModel(ABC):
     emulated drives makes all calls, and no two overlap.
     """
 
-    Settings: ClassVar[type[msgspec.Struct]]  # the `physics_model_settings` of a backend; may be an empty Struct
+    # The `physics_model_settings` of a backend; may be an empty Struct.
+    Settings: ClassVar[type[msgspec.Struct]]
     step_s: float  # the longest time for which torques may be held constant
 
     def __init__(self, config: RunConfig, settings: Any) -> None:

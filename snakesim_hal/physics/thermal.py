@@ -36,7 +36,9 @@ class HeatLimits:
 
         It is 1 up to `derate_from_c`, `MIN_TORQUE_FRACTION` from `stop_at_c` on, and falls linearly in between.
         """
-        derating_progress = (winding_temperature_c - self.derate_from_c) / (self.stop_at_c - self.derate_from_c)
+        derating_progress = (winding_temperature_c - self.derate_from_c) / (
+            self.stop_at_c - self.derate_from_c
+        )
         return 1.0 - (1.0 - MIN_TORQUE_FRACTION) * min(max(derating_progress, 0.0), 1.0)
 
 
@@ -46,7 +48,9 @@ class ThermalModel:
     def __init__(self, joints: Sequence[Joint]) -> None:
         """Start with every winding at the ambient temperature."""
         # Limits of each winding, (n_joints,).
-        self.limits = [HeatLimits(joint.limits.derate_from_c, joint.limits.stop_at_c) for joint in joints]
+        self.limits = [
+            HeatLimits(joint.limits.derate_from_c, joint.limits.stop_at_c) for joint in joints
+        ]
         self.stop_at_c: Floats = np.array([limits.stop_at_c for limits in self.limits])
         self._derate_from_c = np.array([limits.derate_from_c for limits in self.limits])
 
@@ -88,7 +92,11 @@ class ThermalModel:
             final_temperature_c - self.winding_temperature_c
         ) * self._cached_settling_fraction
         if self._is_any_kept_hot:
-            np.copyto(self.winding_temperature_c, self.stop_at_c + INJECTED_ABOVE_STOP_K, where=self._is_kept_hot)
+            np.copyto(
+                self.winding_temperature_c,
+                self.stop_at_c + INJECTED_ABOVE_STOP_K,
+                where=self._is_kept_hot,
+            )
 
     def inject_heat(self, motor_index: int, *, heat: bool, hold: bool) -> None:
         """Inject an overheating fault into one winding, or remove it.
@@ -99,7 +107,9 @@ class ThermalModel:
             hold: If True, it keeps that temperature until a call with False. If False, it cools down.
         """
         if heat:
-            self.winding_temperature_c[motor_index] = self.stop_at_c[motor_index] + INJECTED_ABOVE_STOP_K
+            self.winding_temperature_c[motor_index] = (
+                self.stop_at_c[motor_index] + INJECTED_ABOVE_STOP_K
+            )
         self._is_kept_hot[motor_index] = hold
         self._is_any_kept_hot = bool(self._is_kept_hot.any())
 
@@ -115,13 +125,17 @@ class ThermalModel:
             return None
         fractions = [
             limits.compute_remaining_fraction(winding_c)
-            for limits, winding_c in zip(self.limits, self.winding_temperature_c.tolist(), strict=True)
+            for limits, winding_c in zip(
+                self.limits, self.winding_temperature_c.tolist(), strict=True
+            )
         ]
         return np.array(fractions)
 
     def compute_board_temperatures_c(self) -> Floats:
         """Return the temperatures of the electronics beside the windings, (n_joints,)."""
-        return self._ambient_c + self._board_fraction * (self.winding_temperature_c - self._ambient_c)
+        return self._ambient_c + self._board_fraction * (
+            self.winding_temperature_c - self._ambient_c
+        )
 
     def compute_power_w(self, torque_nm: Floats, speed_rad_s: Floats) -> Floats:
         """Return the power that each motor draws, (n_joints,): mechanical power and copper losses.

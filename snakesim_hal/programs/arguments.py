@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from snakesim_hal.network.session import ConnectionSettings
     from snakesim_hal.network.session_file import SessionFile
 
-SESSION_VARIABLE = "SNAKESIM_SESSION"  # environment variable: the session file of an operator's tools
+# Environment variable: the session file of an operator's tools.
+SESSION_VARIABLE = "SNAKESIM_SESSION"
 
 
-def make_number_parser(min_value: float, max_value: float, unit: str = "") -> Callable[[str], float]:
+def make_number_parser(
+    min_value: float, max_value: float, unit: str = ""
+) -> Callable[[str], float]:
     """Make a function for the `type` of an argparse option, which parses a number within bounds.
 
     Args:
@@ -53,9 +56,13 @@ def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the argument SCENARIO, and the options that change values of the scenario."""
     add_scenario_name_argument(parser)
     parser.add_argument("--backend", metavar="NAME", help="backend, such as sim, can or odrive")
-    parser.add_argument("--controller", metavar="NAME", help="installed controller, or ./file.py:Class")
     parser.add_argument(
-        "--clock-mode", choices=["realtime", "lockstep", "free"], help="how robot time follows the wall clock"
+        "--controller", metavar="NAME", help="installed controller, or ./file.py:Class"
+    )
+    parser.add_argument(
+        "--clock-mode",
+        choices=["realtime", "lockstep", "free"],
+        help="how robot time follows the wall clock",
     )
     add_duration_argument(parser, "seconds of robot time")
     add_seed_argument(parser, "default: the scenario's")
@@ -78,25 +85,40 @@ def add_scenario_name_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_set_argument(parser: argparse.ArgumentParser, about: str = "change any value of the configuration") -> None:
+def add_set_argument(
+    parser: argparse.ArgumentParser, about: str = "change any value of the configuration"
+) -> None:
     """Add the option --set, with a text for the help."""
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about} (may be repeated)")
-
-
-def add_seed_argument(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
-    """Add the option --seed, which fixes every random number, with more text for the help."""
     parser.add_argument(
-        "--seed", type=int, default=default, metavar="SEED", help=f"seed of all random numbers ({about})"
+        "--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about} (may be repeated)"
     )
 
 
-def add_output_argument(parser: argparse.ArgumentParser, about: str, *, required: bool = False) -> None:
+def add_seed_argument(
+    parser: argparse.ArgumentParser, about: str, default: int | None = None
+) -> None:
+    """Add the option --seed, which fixes every random number, with more text for the help."""
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=default,
+        metavar="SEED",
+        help=f"seed of all random numbers ({about})",
+    )
+
+
+def add_output_argument(
+    parser: argparse.ArgumentParser, about: str, *, required: bool = False
+) -> None:
     """Add the option --out, the file or folder that a command writes, with a text for the help."""
     parser.add_argument("--out", type=Path, required=required, metavar="PATH", help=about)
 
 
 def add_duration_argument(
-    parser: argparse.ArgumentParser, about: str, parse: Callable[[str], float] = float, default: float | None = None
+    parser: argparse.ArgumentParser,
+    about: str,
+    parse: Callable[[str], float] = float,
+    default: float | None = None,
 ) -> None:
     """Add `--duration`, in seconds.
 
@@ -109,7 +131,9 @@ def add_duration_argument(
     parser.add_argument("--duration", type=parse, default=default, metavar="S", help=about)
 
 
-def add_fields_argument(parser: argparse.ArgumentParser, about: str, default: int | None = None) -> None:
+def add_fields_argument(
+    parser: argparse.ArgumentParser, about: str, default: int | None = None
+) -> None:
     """Add the option --fields, the number of random fields, with more text for the help."""
     parser.add_argument(
         "--fields",
@@ -128,7 +152,9 @@ def add_resume_argument(parser: argparse.ArgumentParser) -> None:
 def add_workers_argument(parser: argparse.ArgumentParser) -> None:
     """Add the options --cluster and --workers, which select the processors for runs."""
     parser.add_argument(
-        "--cluster", metavar="tcp://HOST:PORT", help="scheduler of a Dask cluster (default: this computer)"
+        "--cluster",
+        metavar="tcp://HOST:PORT",
+        help="scheduler of a Dask cluster (default: this computer)",
     )
     parser.add_argument(
         "--workers",
@@ -173,17 +199,25 @@ def load_scenario_from_arguments(arguments: argparse.Namespace) -> "LoadedScenar
             overrides.append(KeyOverride(key, value, flag))
     faults = getattr(arguments, "fault", None)
     if faults:
-        overrides.append(KeyOverride("faults", faults, " ".join(f"--fault {text}" for text in faults)))
+        overrides.append(
+            KeyOverride("faults", faults, " ".join(f"--fault {text}" for text in faults))
+        )
     return load_scenario(arguments.scenario, overrides)
 
 
-def add_network_arguments(parser: argparse.ArgumentParser, session: str = f"(default: ${SESSION_VARIABLE})") -> None:
+def add_network_arguments(
+    parser: argparse.ArgumentParser, session: str = f"(default: ${SESSION_VARIABLE})"
+) -> None:
     """Add the options that select the network, with a text about the default of --session for the help."""
     parser.add_argument(
-        "--endpoint", metavar="ENDPOINT", help=f"Zenoh endpoint of the robot (default: {DEFAULT_ENDPOINT})"
+        "--endpoint",
+        metavar="ENDPOINT",
+        help=f"Zenoh endpoint of the robot (default: {DEFAULT_ENDPOINT})",
     )
     parser.add_argument(
-        "--router", metavar="ENDPOINT", help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447"
+        "--router",
+        metavar="ENDPOINT",
+        help="connect to a lab's Zenoh router instead, such as tcp/10.0.0.1:7447",
     )
     parser.add_argument(
         "--session",
@@ -196,24 +230,31 @@ def add_network_arguments(parser: argparse.ArgumentParser, session: str = f"(def
 
 def add_namespace_argument(parser: argparse.ArgumentParser) -> None:
     """Add the option that selects a robot among those on a network."""
-    parser.add_argument("--namespace", metavar="NAME", help="namespace of the robot (default: the robot's name)")
+    parser.add_argument(
+        "--namespace", metavar="NAME", help="namespace of the robot (default: the robot's name)"
+    )
 
 
 def add_json_argument(parser: argparse.ArgumentParser) -> None:
     """Add the option for output that scripts read."""
-    parser.add_argument("--json", action="store_true", help="print one line of JSON instead, for scripts")
+    parser.add_argument(
+        "--json", action="store_true", help="print one line of JSON instead, for scripts"
+    )
 
 
 def add_insecure_argument(parser: argparse.ArgumentParser) -> None:
     """Add the option that allows to listen without access control."""
     parser.add_argument(
-        "--insecure", action="store_true", help="listen even where anybody on the network can command the robot"
+        "--insecure",
+        action="store_true",
+        help="listen even where anybody on the network can command the robot",
     )
 
 
 def add_parent_argument(parser: argparse.ArgumentParser) -> None:
     """Add the hidden option of the processes that `snakesim run` starts."""
-    parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)  # process id: this process dies with it
+    # Process id: this process dies with it.
+    parser.add_argument("--parent", type=int, help=argparse.SUPPRESS)
 
 
 def add_unchecked_argument(parser: argparse.ArgumentParser) -> None:
@@ -239,9 +280,13 @@ def add_host_arguments(parser: argparse.ArgumentParser) -> None:
     add_insecure_argument(parser)
     add_output_argument(parser, "folder for the record: black box, description, statistics")
     parser.add_argument(
-        "--end-after-duration", action="store_true", help="end when the robot was armed for the scenario's duration"
+        "--end-after-duration",
+        action="store_true",
+        help="end when the robot was armed for the scenario's duration",
     )
-    parser.add_argument("--end-after-fault", type=float, metavar="S", help="end so many seconds after a fault, too")
+    parser.add_argument(
+        "--end-after-fault", type=float, metavar="S", help="end so many seconds after a fault, too"
+    )
     add_parent_argument(parser)
     for flag, kind in (("--memory", str), ("--parent-socket", int), ("--stop-port", int)):
         parser.add_argument(flag, type=kind, help=argparse.SUPPRESS)
@@ -249,7 +294,9 @@ def add_host_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_service_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a service."""
-    parser.add_argument("name", metavar="NAME", help="guidance, navigation, control, or another one of the scenario")
+    parser.add_argument(
+        "name", metavar="NAME", help="guidance, navigation, control, or another one of the scenario"
+    )
     add_scenario_arguments(parser)
     add_network_arguments(parser, "")
     add_parent_argument(parser)
@@ -269,7 +316,9 @@ def check_network(arguments: argparse.Namespace) -> None:
         check_namespace(arguments.namespace, "--namespace")
 
 
-def read_session_option(arguments: argparse.Namespace, *, or_environment: bool = False) -> "SessionFile | None":
+def read_session_option(
+    arguments: argparse.Namespace, *, or_environment: bool = False
+) -> "SessionFile | None":
     """Read the Zenoh session file that the command line or the environment names.
 
     Args:
@@ -296,7 +345,9 @@ def read_session_option(arguments: argparse.Namespace, *, or_environment: bool =
     return read_session(path.expanduser())
 
 
-def create_link(arguments: argparse.Namespace, config: "RunConfig", *, is_host: bool = False) -> "ConnectionSettings":
+def create_link(
+    arguments: argparse.Namespace, config: "RunConfig", *, is_host: bool = False
+) -> "ConnectionSettings":
     """Create the description of how a process of a robot connects to its network.
 
     Args:
@@ -316,7 +367,9 @@ def create_link(arguments: argparse.Namespace, config: "RunConfig", *, is_host: 
     max_bytes = max(MAX_PAYLOAD_BYTES, config.robot.sensors.max_image_bytes)
     if session_file is not None:
         namespace = session_file.resolve_namespace(arguments.namespace) or config.robot.name
-        return ConnectionSettings(session_file.endpoints[0], namespace, max_bytes=max_bytes, session=session_file)
+        return ConnectionSettings(
+            session_file.endpoints[0], namespace, max_bytes=max_bytes, session=session_file
+        )
     return ConnectionSettings(
         endpoint=arguments.router or arguments.endpoint or DEFAULT_ENDPOINT,
         namespace=arguments.namespace or config.robot.name,

@@ -36,13 +36,22 @@ from snakesim_hal.network.private_channel import HostEnd
 from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.stop_port import find_stop_address, open_stop_port, start_stop_server
 from snakesim_hal.programs.arguments import add_host_arguments
-from snakesim_hal.programs.preflight import decode_backend_settings, load_backend_class, validate_backend_config
-from snakesim_hal.programs.service_program import ProcessOptions, connect_process, read_process_options
+from snakesim_hal.programs.preflight import (
+    decode_backend_settings,
+    load_backend_class,
+    validate_backend_config,
+)
+from snakesim_hal.programs.service_program import (
+    ProcessOptions,
+    connect_process,
+    read_process_options,
+)
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
 from snakesim_hal.wire import keys
 
-TOKEN_EXPIRY_TIMEOUT_S = 3.0  # until the token of a dead host has vanished: longer than the lease of its connection
+# Until the token of a dead host has vanished: longer than the lease of its connection.
+TOKEN_EXPIRY_TIMEOUT_S = 3.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,7 +61,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     add_host_arguments(parser)
     arguments = parser.parse_args(argv)
-    return run_tool("snakesim start host", lambda: run_host_program(read_process_options(arguments, hosts=True)))
+    return run_tool(
+        "snakesim start host", lambda: run_host_program(read_process_options(arguments, hosts=True))
+    )
 
 
 def run_host_program(options: ProcessOptions, on_network: Callable[[], None] = lambda: None) -> int:
@@ -72,14 +83,18 @@ def run_host_program(options: ProcessOptions, on_network: Callable[[], None] = l
     """
     if options.arguments.parent_socket is None:
         validate_faults_without_supervisor(options.config, options.loaded.table)
-    host = _run_until_end(options, validate_backend_config(options.config, options.loaded.table), on_network)
+    host = _run_until_end(
+        options, validate_backend_config(options.config, options.loaded.table), on_network
+    )
     if host.ending_status == "reset":
         restart_process()
     has_stopped = any(fault.reach == "robot" for fault in host.authority.faults_since_start.faults)
     return 1 if has_stopped or host.ending_status != "complete" else 0
 
 
-def _run_until_end(options: ProcessOptions, config: RunConfig, on_network: Callable[[], None]) -> Host:
+def _run_until_end(
+    options: ProcessOptions, config: RunConfig, on_network: Callable[[], None]
+) -> Host:
     """Open stop port, backend and network, run the host until it ends, and close everything.
 
     Args:
@@ -96,17 +111,27 @@ def _run_until_end(options: ProcessOptions, config: RunConfig, on_network: Calla
         backend = open_backend(load_backend_class(config.backend), config)
         opened.callback(backend.close)
         realtime_warnings = enter_realtime(HOST_PRIORITY) if config.clock_mode == "realtime" else []
-        connection = open_session(options.link) if options.link.listen else connect_process(options.link, "host")
+        connection = (
+            open_session(options.link)
+            if options.link.listen
+            else connect_process(options.link, "host")
+        )
         session = opened.enter_context(connection)
         refuse_second_host(session, options.link)
         on_network()
         host = _create_host(arguments, config, backend, session, realtime_warnings)
-        start_stop_server(stop_port, options.link.namespace or host.description.robot, host.request_estop)
+        start_stop_server(
+            stop_port, options.link.namespace or host.description.robot, host.request_estop
+        )
         call_on_stop_signals(host.request_stop)
         tune_garbage_collector()
         memory_fd = arguments.memory and os.open(arguments.memory, os.O_WRONLY)
         with HostRecordWriter(
-            host.black_box, host.description, partial(create_host_record, host), arguments.out, memory_fd
+            host.black_box,
+            host.description,
+            partial(create_host_record, host),
+            arguments.out,
+            memory_fd,
         ):
             if config.in_host_services:  # imported only for runs with such services
                 from snakesim_hal.programs.in_host_service import InHostServices
@@ -116,14 +141,21 @@ def _run_until_end(options: ProcessOptions, config: RunConfig, on_network: Calla
     return host
 
 
-def _open_stop_port(options: ProcessOptions, config: RunConfig, opened: contextlib.ExitStack) -> socket.socket:
+def _open_stop_port(
+    options: ProcessOptions, config: RunConfig, opened: contextlib.ExitStack
+) -> socket.socket:
     """Use the stop port that the parent process has passed on, or open one and register the robot on this computer."""
     inherited = options.arguments.stop_port
     if inherited is not None:
-        stop_port = socket.socket(fileno=os.dup(inherited))  # the original stays open for another host
+        # The original stays open for another host.
+        stop_port = socket.socket(fileno=os.dup(inherited))
     else:
-        stop_port = open_stop_port(*find_stop_address(options.link.endpoint, listens=options.link.listen))
-        robot = LocalRobot.from_connection(options.link, config.robot.name, config.backend, stop_port)
+        stop_port = open_stop_port(
+            *find_stop_address(options.link.endpoint, listens=options.link.listen)
+        )
+        robot = LocalRobot.from_connection(
+            options.link, config.robot.name, config.backend, stop_port
+        )
         opened.enter_context(register_robot(robot))
     opened.callback(stop_port.close)
     return stop_port
@@ -149,12 +181,16 @@ def _create_host(
     print_stderr(f"host: {describe_what_moves(description)}")  # for a lab's journal too
     unchecked_reason = ""
     if config.controller != START_CHECK_CONTROLLER:
-        unchecked_reason = find_unchecked_reason(config.robot.checked, config.robot.joint_table, description)
+        unchecked_reason = find_unchecked_reason(
+            config.robot.checked, config.robot.joint_table, description
+        )
     folder = get_robot_state_folder(description.robot, description.backend, description.hardware)
     backend_with_faults, faults = create_host_faults(config, backend, session)
     options = HostOptions(
         # The end of the run.
-        max_ticks=round(config.duration_s * config.rate_hz) if arguments.end_after_duration else None,
+        max_ticks=round(config.duration_s * config.rate_hz)
+        if arguments.end_after_duration
+        else None,
         end_after_fault_s=arguments.end_after_fault,
         stays_after_run=arguments.end_after_fault is None,
         # What connects the host with its surroundings.
@@ -190,7 +226,9 @@ def open_backend(backend_type: type[Backend], config: RunConfig) -> GuardedBacke
     except SnakesimError:
         raise
     except (Exception, SystemExit) as error:  # a backend may be third-party code
-        raise BackendError(f"backend {config.backend!r} does not open: {type(error).__name__}: {error}") from error
+        raise BackendError(
+            f"backend {config.backend!r} does not open: {type(error).__name__}: {error}"
+        ) from error
 
 
 def create_host_record(host: Host, *, lost_ticks: int = 0, failure: str = "") -> HostRecord:
@@ -212,7 +250,9 @@ def create_host_record(host: Host, *, lost_ticks: int = 0, failure: str = "") ->
         answered_ticks=statistics.answered_ticks,
         armed_ticks=statistics.ticks,
         command_digest=host.black_box.command_digest,
-        state_to_command_us={f"p{p}": statistics.state_to_command.percentile_us(p) for p in (50, 99)},
+        state_to_command_us={
+            f"p{p}": statistics.state_to_command.percentile_us(p) for p in (50, 99)
+        },
         tick_times=statistics.times.timings(),
         rejected_commands=dict(authority.rejected_counts),
         limited_commands=dict(authority.limited_counts),

@@ -42,7 +42,8 @@ class InHostServices:
 
     def __enter__(self) -> Self:
         if self._threads:
-            threadpool_limits(1)  # as in a process of its own: sums of several threads are rounded otherwise
+            # As in a process of its own: sums of several threads are rounded otherwise.
+            threadpool_limits(1)
         for thread in self._threads:
             thread.start()
         return self
@@ -67,7 +68,9 @@ class InHostServices:
         try:
             with closing(self._session.create_subsession()) as part:
                 service_type = load_service_class(self._config, name)
-                with closing(ServiceLoop(service_type, self._config, part, self._is_host_running)) as loop:
+                with closing(
+                    ServiceLoop(service_type, self._config, part, self._is_host_running)
+                ) as loop:
                     loop.connect()
                     loop.run(self._closing.is_set)
         except SnakesimError as error:

@@ -60,7 +60,9 @@ def validate_and_complete_config(
     if controller_plugin is not None:
         label = f"controller {shorten(config.controller)!r}"
         controller_class = require_base_class(controller_plugin, Controller, label)
-        config = _validate_controller_and_leave_out_services(config, controller_class, source, table)
+        config = _validate_controller_and_leave_out_services(
+            config, controller_class, source, table
+        )
     for service_name in config.internal_services:
         plugin_name = _get_service_plugin_name(config, service_name)
         service_plugin = load(SERVICES, plugin_name)
@@ -183,7 +185,9 @@ def find_missing_capability(
     for joint in joints:
         for mode in controller.required_modes:
             if not joint.supports_mode(mode):
-                available = [mode.name.lower() for mode in joint.modes if mode is not JointMode.PASSIVE]
+                available = [
+                    mode.name.lower() for mode in joint.modes if mode is not JointMode.PASSIVE
+                ]
                 return (
                     f"controller {name!r} needs {mode.name.lower()} mode of every joint, and {joint.name} has "
                     f"{', '.join(available)}. Choose another controller; or correct `modes` in [drive] or "
@@ -214,7 +218,9 @@ def _leave_out_pose_services(config: RunConfig, controller: type[Controller[Any]
         return config
     if controller.needs_world:
         return config
-    remaining = {name: service for name, service in config.services.items() if name not in POSE_SERVICES}
+    remaining = {
+        name: service for name, service in config.services.items() if name not in POSE_SERVICES
+    }
     return msgspec.structs.replace(config, services=remaining)
 
 
@@ -226,11 +232,15 @@ def apply_backend_modes(config: RunConfig, backend: type[Backend]) -> RunConfig:
     return msgspec.structs.replace(config, robot=robot)
 
 
-def decode_backend_settings(config: RunConfig, backend: type[Backend], table: ConfigTable | None = None) -> Any:
+def decode_backend_settings(
+    config: RunConfig, backend: type[Backend], table: ConfigTable | None = None
+) -> Any:
     """Return the scenario's [backends.<name>] section, checked by the backend's own Struct. Raises ConfigError."""
     source = f"scenario {config.name!r}" if table is None else table.source
     origin = None if table is None else table.origin_by_key
-    return decode_plugin_settings(backend, config.backend_settings, source, config.backend_section, origin)
+    return decode_plugin_settings(
+        backend, config.backend_settings, source, config.backend_section, origin
+    )
 
 
 def validate_backend_config(

@@ -33,7 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_insecure_argument(parser)
     add_parent_argument(parser)
     arguments = parser.parse_args(argv)
-    return run_tool("snakesim start router", lambda: _run_router(read_process_options(arguments, hosts=True)))
+    return run_tool(
+        "snakesim start router", lambda: _run_router(read_process_options(arguments, hosts=True))
+    )
 
 
 def _run_router(options: ProcessOptions) -> int:

@@ -26,7 +26,11 @@ from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.scenario import LoadedScenario, RunConfig
 from snakesim_hal.network.session import ConnectionSettings, Session
 from snakesim_hal.network.waiting import open_session_when_ready
-from snakesim_hal.programs.arguments import add_service_arguments, create_link, load_scenario_from_arguments
+from snakesim_hal.programs.arguments import (
+    add_service_arguments,
+    create_link,
+    load_scenario_from_arguments,
+)
 from snakesim_hal.programs.preflight import load_service_class
 from snakesim_hal.service import SERVICE_START_LIMIT_S, Service, ServiceLoop
 
@@ -65,7 +69,9 @@ def read_process_options(arguments: argparse.Namespace, *, hosts: bool = False) 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a service. Returns the exit code: 0 stopped by a signal, 1 it could not continue, 2 wrong input."""
-    parser = argparse.ArgumentParser(prog="snakesim start service", description="Run one service of a robot.")
+    parser = argparse.ArgumentParser(
+        prog="snakesim start service", description="Run one service of a robot."
+    )
     add_service_arguments(parser)
     return run(parser.parse_args(argv))
 
@@ -92,7 +98,9 @@ def run_service(service_type: type[Service], options: ProcessOptions) -> None:
         enter_realtime(SERVICE_PRIORITY)
         drop_priority_after(config.lease_ns * 1e-9)
     with connect_process(options.link, name) as session:
-        waiting = StartupWait(name, f"a HAL host of {options.link.namespace} on {options.link.endpoint}")
+        waiting = StartupWait(
+            name, f"a HAL host of {options.link.namespace} on {options.link.endpoint}"
+        )
         with closing(ServiceLoop(service_type, config, session, waiting.keeps_waiting)) as loop:
             loop.connect()
             tune_garbage_collector()
@@ -133,7 +141,9 @@ def connect_process(connection: ConnectionSettings, name: str) -> AbstractContex
     Raises:
         NotConnectedError: There was no network within SERVICE_START_LIMIT_S.
     """
-    return open_session_when_ready(connection, StartupWait(name, f"the network: {connection.endpoint}").keeps_waiting)
+    return open_session_when_ready(
+        connection, StartupWait(name, f"the network: {connection.endpoint}").keeps_waiting
+    )
 
 
 if __name__ == "__main__":

@@ -20,7 +20,12 @@ from typing import Self
 from threadpoolctl import threadpool_limits
 
 from snakesim_hal.base.errors import ConfigError, RefusedError, ServiceError, SnakesimError
-from snakesim_hal.base.step_limit import SharedStepTimes, StepTooLongError, StepWatchdog, describe_interrupted_line
+from snakesim_hal.base.step_limit import (
+    SharedStepTimes,
+    StepTooLongError,
+    StepWatchdog,
+    describe_interrupted_line,
+)
 from snakesim_hal.base.terminal import report_error
 from snakesim_hal.faults.allowed import create_host_faults
 from snakesim_hal.host.host import Host, HostOptions
@@ -35,7 +40,8 @@ from snakesim_hal.wire.messages import make_arm_request
 END_AFTER_FAULT_S = 1.5
 ARM_TIMEOUT_S = 10.0  # the run gives up after this time and this number of turns:
 MIN_TURNS_BEFORE_ARM_TIMEOUT = 100  # planning, or a busy computer, may need long for one turn
-TURN_TIMEOUT_S = 60.0  # of one part in one turn; a part that needs longer is assumed to compute without end
+# Of one part in one turn; a part that needs longer is assumed to compute without end.
+TURN_TIMEOUT_S = 60.0
 INTERRUPT_GRACE_PERIOD_S = 1.0  # of the present turn of a part, after Ctrl-C
 HOST_ENDED = object()  # the host has no further turn
 REQUESTER = "run in one process"  # of the arming
@@ -57,12 +63,14 @@ def validate_single_process_config(config: RunConfig) -> None:
     for name, service in config.services.items():
         if service.external:
             raise ConfigError(
-                f"{context}: services.{name} is external, and there is no network to meet it", code="config/conflict"
+                f"{context}: services.{name} is external, and there is no network to meet it",
+                code="config/conflict",
             )
     for injection in parse_planned_faults(config):
         if injection.target_type in ("process", "clock"):
             raise ConfigError(
-                f"{context}: fault {str(injection)!r} needs processes of their own", code="injection/not-supported"
+                f"{context}: fault {str(injection)!r} needs processes of their own",
+                code="injection/not-supported",
             )
 
 
@@ -70,7 +78,10 @@ class InProcessRun:
     """One run in this process. Its `with` opens and closes the backend and all services."""
 
     def __init__(
-        self, config: RunConfig, step_times: SharedStepTimes | None = None, turn_limit_s: float | None = None
+        self,
+        config: RunConfig,
+        step_times: SharedStepTimes | None = None,
+        turn_limit_s: float | None = None,
     ) -> None:
         """Check the configuration. The `with` block opens the backend and all services.
 
@@ -103,7 +114,8 @@ class InProcessRun:
                     self._open(opening)
             except StepTooLongError as error:
                 raise RefusedError(
-                    f"the run did not begin: {self._explain_interruption(error)}", code="backend/step-timeout"
+                    f"the run did not begin: {self._explain_interruption(error)}",
+                    code="backend/step-timeout",
                 ) from error
             self._exit_stack = opening.pop_all()
         self._watchdog.step_timeout_s = self._turn_timeout_s
@@ -185,7 +197,9 @@ class InProcessRun:
         arm_deadline_s = time.monotonic() + arm_timeout_s
         with closing(self.host.iterate_ticks()) as host_turns:
             for turn in itertools.count():
-                with self._watchdog:  # the backend may be third-party code, and turns this into an error of its own
+                with (
+                    self._watchdog
+                ):  # the backend may be third-party code, and turns this into an error of its own
                     if next(host_turns, HOST_ENDED) is HOST_ENDED:
                         return
                 if turn == 0:
@@ -195,7 +209,9 @@ class InProcessRun:
                     yield
                 self._step_services()
                 if not self.host.authority.arm_session and not self.failed_services:
-                    is_too_late = turn > MIN_TURNS_BEFORE_ARM_TIMEOUT and time.monotonic() > arm_deadline_s
+                    is_too_late = (
+                        turn > MIN_TURNS_BEFORE_ARM_TIMEOUT and time.monotonic() > arm_deadline_s
+                    )
                     self._arm_when_ready(is_too_late, arm_timeout_s)
                 if not before_services:
                     yield
@@ -204,9 +220,13 @@ class InProcessRun:
         """Request the arming if the robot is ready. Raises RefusedError if it is too late for that."""
         status = self.host.build_status()
         if is_too_late:
-            raise RefusedError(f"not ready to arm within {timeout_s:g} s: {status.reason}", code="robot/not-ready")
+            raise RefusedError(
+                f"not ready to arm within {timeout_s:g} s: {status.reason}", code="robot/not-ready"
+            )
         if status.ready_to_arm:
-            self.host.submit_request(make_arm_request(self.host.description, REQUESTER), lambda _answer: None)
+            self.host.submit_request(
+                make_arm_request(self.host.description, REQUESTER), lambda _answer: None
+            )
 
     def stop(self) -> None:
         """End the run in order."""
@@ -252,7 +272,9 @@ class InProcessRun:
                 loop.step()
         except StepTooLongError as error:
             traceback.print_exc()
-            raise ServiceError(self._explain_interruption(error), code="backend/step-timeout") from None
+            raise ServiceError(
+                self._explain_interruption(error), code="backend/step-timeout"
+            ) from None
 
     def _explain_interruption(self, error: StepTooLongError) -> str:
         """Return why a part was interrupted, and what the user can do about it."""

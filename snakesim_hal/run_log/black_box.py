@@ -92,7 +92,12 @@ class RowLayout(msgspec.Struct, frozen=True, kw_only=True):
         used_bytes = sum(column.bytes for column in columns)
         padding_bytes = -used_bytes % ROW_ALIGNMENT_BYTES
         joint_names = [joint.name for joint in description.joints]
-        return cls(robot=description.robot, joints=joint_names, row_bytes=used_bytes + padding_bytes, columns=columns)
+        return cls(
+            robot=description.robot,
+            joints=joint_names,
+            row_bytes=used_bytes + padding_bytes,
+            columns=columns,
+        )
 
     def encode_header(self) -> bytes:
         """Return the first line of the file, padded so that the rows are aligned."""
@@ -137,7 +142,9 @@ class BlackBox:
         self._last_contact_peak_n = 0.0
         self._last_contact_count = 0
 
-    def record_tick(self, tick: int, timestamp_ns: int, samples: Samples, decision: TickOutput) -> None:
+    def record_tick(
+        self, tick: int, timestamp_ns: int, samples: Samples, decision: TickOutput
+    ) -> None:
         """Append the row of one tick to the ring buffer, and update the digest of the setpoints.
 
         Args:
@@ -173,7 +180,9 @@ class BlackBox:
             *setpoints.mode,
         )
         # The order of the arguments is that of `compute_digest`.
-        packed = self._pack_setpoints(tick, *setpoints.mode, *setpoints.target, *setpoints.torque_limit_nm)
+        packed = self._pack_setpoints(
+            tick, *setpoints.mode, *setpoints.target, *setpoints.torque_limit_nm
+        )
         self._digest.update(packed)
         # Last, because the writer's thread, which calls `read_rows`, reads all rows that are counted.
         self._rows_written += 1
@@ -203,11 +212,18 @@ class BlackBox:
         row_bytes = self.layout.row_bytes
         while True:
             end = self._rows_written
-            first_row = max(start_row, end - self._capacity + 1)  # the oldest row may be overwritten right now
+            # The oldest row may be overwritten right now.
+            first_row = max(start_row, end - self._capacity + 1)
             position = first_row % self._capacity  # in the ring buffer
-            count = min(end - first_row, self._capacity - position, max(MAX_COPIED_BYTES // row_bytes, 1))
-            rows = bytes(memoryview(self._buffer)[position * row_bytes : (position + count) * row_bytes])
-            if self._rows_written - first_row < self._capacity:  # otherwise the host has overwritten them meanwhile
+            count = min(
+                end - first_row, self._capacity - position, max(MAX_COPIED_BYTES // row_bytes, 1)
+            )
+            rows = bytes(
+                memoryview(self._buffer)[position * row_bytes : (position + count) * row_bytes]
+            )
+            if (
+                self._rows_written - first_row < self._capacity
+            ):  # otherwise the host has overwritten them meanwhile
                 return first_row, rows
 
 
@@ -246,7 +262,8 @@ def read_black_box(path: Path) -> tuple[RowLayout, dict[str, NDArray[Any]]]:
             return layout, layout.decode_rows(file.read())
     except (OSError, ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
         raise ConfigError(
-            f"{path} cannot be read as the black box of a run: {str(error)[:200]}", code="recording/not-readable"
+            f"{path} cannot be read as the black box of a run: {str(error)[:200]}",
+            code="recording/not-readable",
         ) from None
 
 

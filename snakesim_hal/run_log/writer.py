@@ -72,7 +72,8 @@ class HostRecordWriter:
         self._first_row_offset_bytes = 0  # in the file
         self._next_row = 0  # the first row that is not in the file yet
         self._skipped_row_count = 0  # rows that were overwritten before they were written to disk
-        self._failure = ""  # which file could not be written, and why; empty after a successful write
+        # Which file could not be written, and why; empty after a successful write.
+        self._failure = ""
         # The thread.
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -80,7 +81,9 @@ class HostRecordWriter:
     def __enter__(self) -> Self:
         if self._memory_fd is not None:
             os.ftruncate(self._memory_fd, 0)  # of an earlier host
-        self._thread = start_restarting_thread("recorder", self._write_periodically, should_stop=self._closing.is_set)
+        self._thread = start_restarting_thread(
+            "recorder", self._write_periodically, should_stop=self._closing.is_set
+        )
         return self
 
     def __exit__(self, *_error: object) -> None:
@@ -89,7 +92,9 @@ class HostRecordWriter:
         assert self._thread is not None
         self._thread.join(CLOSE_TIMEOUT_S)
         if self._thread.is_alive():
-            self._set_failure(f"{self._folder}: the disk has not answered for {CLOSE_TIMEOUT_S:g} s")
+            self._set_failure(
+                f"{self._folder}: the disk has not answered for {CLOSE_TIMEOUT_S:g} s"
+            )
             self._write_statistics_to_memory()
 
     def _write_periodically(self) -> None:
@@ -120,7 +125,9 @@ class HostRecordWriter:
 
     def _write_statistics(self, folder: Path, failure: str) -> None:
         """Write the statistics, with this failure in them, to a file of the folder. Raises OSError."""
-        if self._black_box_fd is None:  # the file in the folder is an earlier host's, and must not be overwritten
+        if (
+            self._black_box_fd is None
+        ):  # the file in the folder is an earlier host's, and must not be overwritten
             return
         content = msgspec.json.encode(self._collect_statistics(failure))
         write_atomically(folder / HOST_RECORD, msgspec.json.format(content))
@@ -163,9 +170,13 @@ class HostRecordWriter:
             first_row, rows = self._black_box.read_rows(self._next_row)
             self._skipped_row_count += first_row - self._next_row
             self._next_row = first_row
-            offset = self._first_row_offset_bytes + (self._next_row - self._skipped_row_count) * row_bytes
+            offset = (
+                self._first_row_offset_bytes
+                + (self._next_row - self._skipped_row_count) * row_bytes
+            )
             written_bytes = os.pwrite(self._black_box_fd, rows, offset)
-            self._next_row += written_bytes // row_bytes  # an incomplete row is written again next time
+            # An incomplete row is written again next time.
+            self._next_row += written_bytes // row_bytes
             if written_bytes < len(rows):  # a disk that runs full stores a part first
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

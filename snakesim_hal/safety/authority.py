@@ -21,7 +21,11 @@ from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, Join
 from snakesim_hal.safety.lease import CommandLease, decide_lease_request, free_lease, renew_lease
 from snakesim_hal.safety.lifecycle import UnmetCondition
 from snakesim_hal.safety.limit_names import find_active_limits
-from snakesim_hal.safety.plausibility import ImplausibleState, PlausibilityChecker, replace_non_finite_values
+from snakesim_hal.safety.plausibility import (
+    ImplausibleState,
+    PlausibilityChecker,
+    replace_non_finite_values,
+)
 from snakesim_hal.safety.stop_ramp import StopReaction, make_uniform_setpoints
 from snakesim_hal.wire.messages import (
     Answer,
@@ -37,7 +41,8 @@ from snakesim_hal.wire.messages import (
     RobotDescription,
 )
 
-RECENT_COMMAND_COUNT = 1024  # accepted commands that are stored: in lockstep a tick may need an older one
+# Accepted commands that are stored: in lockstep a tick may need an older one.
+RECENT_COMMAND_COUNT = 1024
 MAX_REASON_LENGTH = 500  # characters, as `quantities.Reason` allows
 
 
@@ -46,7 +51,8 @@ class TickOutput:
     """The setpoints of one tick, with the command that they come from."""
 
     setpoints: SafeSetpoints
-    command_sequence: int | None  # sequence number of the applied command; None if no command is applied
+    # Sequence number of the applied command; None if no command is applied.
+    command_sequence: int | None
     limit_by_joint: dict[int, str]  # joint index -> name of the limit that changed its target
 
 
@@ -86,8 +92,10 @@ class CommandAuthority:
         self.arm_session = 0
         self.lease = CommandLease(epoch=first_epoch)
         self._newest_state_tick = 0
-        self._last_arming_tick = -1  # tick of the joint state that was the newest at the last arming
-        self._is_stop_sent = True  # whether the motors have received setpoints since the robot stopped being armed
+        # Tick of the joint state that was the newest at the last arming.
+        self._last_arming_tick = -1
+        # Whether the motors have received setpoints since the robot stopped being armed.
+        self._is_stop_sent = True
 
         # Faults and counters.
         self.faults_since_reset = FaultLog()
@@ -100,7 +108,9 @@ class CommandAuthority:
         # Checks of what is measured.
         self._plausibility_checker = PlausibilityChecker(self.limits)
         self._measured_state = self._plausibility_checker.measured
-        self._implausible_state: ImplausibleState | None = self._make_unknown_state("no joint state yet")
+        self._implausible_state: ImplausibleState | None = self._make_unknown_state(
+            "no joint state yet"
+        )
         self._backend_obstacles: list[str] = []  # reasons of the backend against arming now
         self._isolation = JointIsolation(description)
         self._health_monitor = HealthMonitor(description, awaits_reports=awaits_reports)
@@ -114,7 +124,9 @@ class CommandAuthority:
         self._last_sequence = -1
 
         # Setpoints.
-        self._last_setpoints = AppliedSetpoints(np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm)
+        self._last_setpoints = AppliedSetpoints(
+            np.zeros(count, dtype=np.int64), np.zeros(count), self.limits.torque_nm
+        )
         self._angles_at_arming_rad = np.zeros(count)
         self._stop_reaction = StopReaction(self.limits, description.stop_mode)
 
@@ -172,7 +184,9 @@ class CommandAuthority:
 
     # --- inputs: commands and requests -----------------------------------------------------------------------
 
-    def process_command(self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int) -> str | None:
+    def process_command(
+        self, command: JointCommand, *, now_ns: int, tick: int, age_ns: int
+    ) -> str | None:
         """Accept a command and renew the lease, or reject the command and count why.
 
         Args:
@@ -230,7 +244,9 @@ class CommandAuthority:
         if decision.has_holder_changed:
             self._forget_commands()
             if self.state == "armed":
-                self._transition("disarm", f"lease passed to {decision.lease.holder or 'no client'}")
+                self._transition(
+                    "disarm", f"lease passed to {decision.lease.holder or 'no client'}"
+                )
         return self._make_answer(decision.refusal, decision.refusal_code)
 
     def handle_lifecycle_request(self, request: LifecycleRequest, now_ns: int) -> Answer:
@@ -325,7 +341,10 @@ class CommandAuthority:
         """
         implausible_state = self._implausible_state
         if self.state == "armed" and implausible_state is not None:
-            self.latch_fault(msgspec.structs.replace(implausible_state.fault, tick=tick), implausible_state.joints)
+            self.latch_fault(
+                msgspec.structs.replace(implausible_state.fault, tick=tick),
+                implausible_state.joints,
+            )
         new_faults, silence_fault = self._health_monitor.evaluate(now_ns, tick)
         for fault in new_faults:
             self.latch_fault(fault)
@@ -353,12 +372,16 @@ class CommandAuthority:
         sequence: int | None = None
         limited: dict[int, str] = {}
         if self.state != "armed":
-            applied = self._stop_reaction.make_setpoints(self.state, self._compute_derated_torque_nm())
+            applied = self._stop_reaction.make_setpoints(
+                self.state, self._compute_derated_torque_nm()
+            )
             self._is_stop_sent = True
         elif command is None:
             # Just armed: hold the pose until the first command.
             pose_rad = self.limits.clip_angles(self._angles_at_arming_rad)
-            applied = make_uniform_setpoints(JointMode.POSITION, pose_rad, self._compute_derated_torque_nm())
+            applied = make_uniform_setpoints(
+                JointMode.POSITION, pose_rad, self._compute_derated_torque_nm()
+            )
         else:
             applied = limiter.limit_command(
                 command,
@@ -372,7 +395,9 @@ class CommandAuthority:
             self._last_used_command = command
         applied = self._isolation.make_passive(applied)
         self._last_setpoints = applied
-        return TickOutput(limiter.make_safe_setpoints(applied, self._isolation.indices), sequence, limited)
+        return TickOutput(
+            limiter.make_safe_setpoints(applied, self._isolation.indices), sequence, limited
+        )
 
     # --- commands and setpoints ------------------------------------------------------------------------------
 
@@ -396,14 +421,20 @@ class CommandAuthority:
                 return command
         return self._last_used_command
 
-    def _find_and_count_active_limits(self, command: JointCommand, applied: AppliedSetpoints) -> dict[int, str]:
+    def _find_and_count_active_limits(
+        self, command: JointCommand, applied: AppliedSetpoints
+    ) -> dict[int, str]:
         """Return the name of the limit that changed the command of each limited joint, by joint index, and count it."""
         limit_by_joint: dict[int, str] = {}
         torque_fraction = self._health_monitor.torque_fraction
         # Most commands pass unchanged, so that the limits are named only when a target or a torque limit differs.
         if applied.target.tolist() != command.target or min(torque_fraction.tolist()) < 1.0:
             limit_by_joint = find_active_limits(
-                command, applied, measured=self._measured_state, limits=self.limits, torque_fraction=torque_fraction
+                command,
+                applied,
+                measured=self._measured_state,
+                limits=self.limits,
+                torque_fraction=torque_fraction,
             )
         limit_by_joint |= self._isolation.find_overruled_joints(command)
         if limit_by_joint:
@@ -429,7 +460,10 @@ class CommandAuthority:
             most_important = min(refusal_codes, key=lifecycle.REFUSAL_ORDER.index)
             return self._make_answer(reasons, most_important)
         unchecked_suffix = ", unchecked" if self.unchecked_reason else ""
-        self._transition("arm", f"armed by {request.requester}{unchecked_suffix}, commanded by {self.lease.holder}")
+        self._transition(
+            "arm",
+            f"armed by {request.requester}{unchecked_suffix}, commanded by {self.lease.holder}",
+        )
         self.arm_session += 1
         self._last_arming_tick = self._newest_state_tick
         self._newest_command = None
@@ -440,7 +474,9 @@ class CommandAuthority:
 
     def _handle_disarm_request(self, request: LifecycleRequest) -> Answer:
         if not self._transition("disarm", f"disarmed by {request.requester}"):
-            return self._make_answer(f"cannot disarm in state {self.state}; reset it first", "wrong_state")
+            return self._make_answer(
+                f"cannot disarm in state {self.state}; reset it first", "wrong_state"
+            )
         return self._make_answer(None)
 
     def _handle_reset_request(self, request: LifecycleRequest) -> Answer:
@@ -485,9 +521,17 @@ class CommandAuthority:
         """Return every condition of the robot, its lease and its commands for arming that is not met."""
         unmet: list[UnmetCondition] = []
         if self.state != "disarmed":
-            reset_first = "; first `snakesim robot reset`" if self.state in ("fault", "estop") else ""
-            unmet.append(UnmetCondition("wrong_state", f"state is {self.state}, must be disarmed{reset_first}"))
-        unmet += [UnmetCondition("cable", reason) for reason in self._cables.list_arming_obstacles()]
+            reset_first = (
+                "; first `snakesim robot reset`" if self.state in ("fault", "estop") else ""
+            )
+            unmet.append(
+                UnmetCondition(
+                    "wrong_state", f"state is {self.state}, must be disarmed{reset_first}"
+                )
+            )
+        unmet += [
+            UnmetCondition("cable", reason) for reason in self._cables.list_arming_obstacles()
+        ]
         not_ready = self._find_unready_robot(now_ns) + self._find_unready_commands(now_ns)
         unmet += [UnmetCondition("not_ready", reason) for reason in not_ready]
         return unmet
@@ -517,7 +561,10 @@ class CommandAuthority:
         if now_ns - self._newest_command_ns > self.description.lease_ns:
             return [f"no commands from {self.lease.holder} any more"]
         return lifecycle.find_far_targets(
-            self._newest_command, self._measured_state.angle_rad, self.description, self._isolation.joints
+            self._newest_command,
+            self._measured_state.angle_rad,
+            self.description,
+            self._isolation.joints,
         )
 
     # --- faults and isolation --------------------------------------------------------------------------------
@@ -548,7 +595,9 @@ class CommandAuthority:
         if self.state != "armed" or not self._isolation.try_isolate(joints):
             return False
         self._add_to_fault_logs(fault, stops_robot=False)
-        self.reason = f"armed, without {', '.join(self.isolated_joints)}: {fault.cause}"[:MAX_REASON_LENGTH]
+        self.reason = f"armed, without {', '.join(self.isolated_joints)}: {fault.cause}"[
+            :MAX_REASON_LENGTH
+        ]
         return True
 
     def _end_isolation(self) -> None:

@@ -32,7 +32,10 @@ class CableTracker:
     """The joints that have such a cable."""
 
     def __init__(
-        self, joints: Sequence[CableJoint], last_angles_rad: Mapping[str, float], unknown_reasons: Mapping[str, str]
+        self,
+        joints: Sequence[CableJoint],
+        last_angles_rad: Mapping[str, float],
+        unknown_reasons: Mapping[str, str],
     ) -> None:
         """Start to track the angles of the joints.
 
@@ -46,7 +49,8 @@ class CableTracker:
         self._angles_rad = dict(last_angles_rad)  # counted over restarts
         self._drive_angles_rad: dict[str, float] = {}  # as the drive measures it
         self._saved_angles_rad: dict[str, float] = {}
-        self.save_problem = ""  # why the counted angles would be lost with this host; empty if they are saved
+        # Why the counted angles would be lost with this host; empty if they are saved.
+        self.save_problem = ""
 
     def update_angles(self, joints: JointState) -> None:
         """Update the counted angles from a joint state. A joint turns at most half a revolution between two samples."""
@@ -68,7 +72,11 @@ class CableTracker:
         Returns:
             The angle in rad of each measured joint by name, or None if nothing should be saved.
         """
-        angles_rad = {name: angle for name, angle in self._angles_rad.items() if name in self._drive_angles_rad}
+        angles_rad = {
+            name: angle
+            for name, angle in self._angles_rad.items()
+            if name in self._drive_angles_rad
+        }
         if not angles_rad:
             return None
         if not should_force and not self._have_angles_changed(angles_rad):
@@ -105,7 +113,9 @@ class CableTracker:
 def _find_winding_problem(joint: CableJoint, drive_rad: float, angle_rad: float) -> str | None:
     """Return the problem and the remedy if a joint could wind its cable too far within its limits; otherwise None."""
     turns = round((angle_rad - drive_rad) / REVOLUTION_RAD)
-    max_turns = max(abs(joint.lower_rad / REVOLUTION_RAD + turns), abs(joint.upper_rad / REVOLUTION_RAD + turns))
+    max_turns = max(
+        abs(joint.lower_rad / REVOLUTION_RAD + turns), abs(joint.upper_rad / REVOLUTION_RAD + turns)
+    )
     if max_turns <= joint.cable_turns:
         return None
     plural = "s" if abs(turns) > 1 else ""

@@ -19,7 +19,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, JointDescription, Power, RobotDescription
 
 UNDERVOLTAGE_DELAY_NS = 50_000_000  # shorter dips, as when motors start, stop nothing
-REPORT_TIMEOUT_NS = 3_000_000_000  # values of an older report are unknown; modules report about twice a second
+# Values of an older report are unknown; modules report about twice a second.
+REPORT_TIMEOUT_NS = 3_000_000_000
 MAX_CAUSE_LENGTH = 400  # characters; a fault's cause has at most 500
 MIN_VOLTAGE_FIELD = "`min_voltage_v` under [limits] in the robot file"
 
@@ -41,7 +42,8 @@ class HealthMonitor:
         self._module_healths = [_LastReport(joint) for joint in description.joints]
         self._first_evaluation_ns: int | None = None
         self._next_evaluation_ns = -math.inf  # before this time nothing changes without a sample
-        self._last_faults: set[tuple[str, str | None]] = set()  # of the last evaluation: name and joint of each
+        # Of the last evaluation: name and joint of each.
+        self._last_faults: set[tuple[str, str | None]] = set()
         self._silent_joints: set[str] = set()  # names of joints whose reports are overdue
         # (n_joints,), fraction of each torque limit that derating leaves.
         self.torque_fraction: Floats = np.ones(len(self._module_healths))
@@ -81,15 +83,24 @@ class HealthMonitor:
             self._first_evaluation_ns = now_ns
         first_evaluation_ns = self._first_evaluation_ns
         # `update` resets this time, so that a new sample is evaluated at once.
-        next_change_ns = min(health.find_next_change_ns(now_ns, first_evaluation_ns) for health in self._module_healths)
+        next_change_ns = min(
+            health.find_next_change_ns(now_ns, first_evaluation_ns)
+            for health in self._module_healths
+        )
         self._next_evaluation_ns = min(next_change_ns, now_ns + REPORT_TIMEOUT_NS)
-        self.torque_fraction = np.array([health.compute_torque_fraction(now_ns) for health in self._module_healths])
+        self.torque_fraction = np.array(
+            [health.compute_torque_fraction(now_ns) for health in self._module_healths]
+        )
         self.current_faults = []
         for health in self._module_healths:
             self.current_faults += health.find_faults(now_ns, tick)
         previous_faults = self._last_faults
         self._last_faults = {(fault.what, fault.joint) for fault in self.current_faults}
-        new_faults = [fault for fault in self.current_faults if (fault.what, fault.joint) not in previous_faults]
+        new_faults = [
+            fault
+            for fault in self.current_faults
+            if (fault.what, fault.joint) not in previous_faults
+        ]
         return new_faults, self._make_silence_fault(now_ns, tick, first_evaluation_ns)
 
     def find_supply_problems(self, now_ns: int) -> list[str]:
@@ -109,7 +120,9 @@ class HealthMonitor:
         if self._awaits_reports and self._has_power_sensor:
             missing = self._find_unreported_joints()
             if missing:
-                problems.append(f"{missing[0]} has not reported its supply yet{_format_others(len(missing) - 1)}")
+                problems.append(
+                    f"{missing[0]} has not reported its supply yet{_format_others(len(missing) - 1)}"
+                )
         return problems
 
     def derated_joints(self) -> dict[str, float]:
@@ -119,7 +132,9 @@ class HealthMonitor:
 
     def _find_unreported_joints(self) -> list[str]:
         """Return the names of joints that have never reported, unless a fault has named them already."""
-        names = [health.joint.name for health in self._module_healths if health.last_report_ns is None]
+        names = [
+            health.joint.name for health in self._module_healths if health.last_report_ns is None
+        ]
         return [name for name in names if name not in self._silent_joints]
 
     def _make_silence_fault(self, now_ns: int, tick: int, first_evaluation_ns: int) -> Fault | None:
@@ -127,13 +142,19 @@ class HealthMonitor:
         expected_since_ns = None
         if self._has_power_sensor:
             expected_since_ns = first_evaluation_ns
-        silent = [health.joint.name for health in self._module_healths if health.is_silent(now_ns, expected_since_ns)]
+        silent = [
+            health.joint.name
+            for health in self._module_healths
+            if health.is_silent(now_ns, expected_since_ns)
+        ]
         previously_silent = self._silent_joints
         self._silent_joints = set(silent)
         newly_silent = [name for name in silent if name not in previously_silent]
         if not newly_silent:
             return None
-        cause = f"supply and heat are unknown, and ignored, for {', '.join(newly_silent)}"[:MAX_CAUSE_LENGTH]
+        cause = f"supply and heat are unknown, and ignored, for {', '.join(newly_silent)}"[
+            :MAX_CAUSE_LENGTH
+        ]
         joint = None
         if len(newly_silent) == 1:
             joint = newly_silent[0]
@@ -153,13 +174,17 @@ class _LastReport:
     winding_temperature_c: float = 0.0
     voltage_v: float = 0.0
     has_leak: bool = False
-    undervoltage_since_ns: int | None = None  # start of the time with a too low voltage; None if the voltage is high
+    # Start of the time with a too low voltage; None if the voltage is high.
+    undervoltage_since_ns: int | None = None
     is_overheated: bool = False  # the winding was too hot, and has not cooled down yet
 
-    def update(self, voltage_v: float, winding_temperature_c: float, has_leak: bool, now_ns: int) -> None:
+    def update(
+        self, voltage_v: float, winding_temperature_c: float, has_leak: bool, now_ns: int
+    ) -> None:
         """Store a valid entry of a power sample."""
         if "temperature" not in self.joint.measures:
-            winding_temperature_c = -math.inf  # the value is meaningless, and must never count as hot
+            # The value is meaningless, and must never count as hot.
+            winding_temperature_c = -math.inf
         self.last_report_ns = now_ns
         self.voltage_v = voltage_v
         self.winding_temperature_c = winding_temperature_c
@@ -200,9 +225,9 @@ class _LastReport:
         """Return the fraction of the torque limit that is left after derating, from 0 to 1."""
         if not self.is_known(now_ns):
             return 1.0
-        return HeatLimits(self.joint.derate_from_c, self.joint.stop_at_c).compute_remaining_fraction(
-            self.winding_temperature_c
-        )
+        return HeatLimits(
+            self.joint.derate_from_c, self.joint.stop_at_c
+        ).compute_remaining_fraction(self.winding_temperature_c)
 
     def find_faults(self, now_ns: int, tick: int) -> list[Fault]:
         """Return the current faults of the module: overheating of the joint, a leak, and undervoltage.
@@ -217,15 +242,26 @@ class _LastReport:
         faults: list[Fault] = []
         if self.is_overheated:
             limits = f"the limit is {joint.stop_at_c:g} °C, and it must cool below {joint.derate_from_c:g} °C"
-            cause = f"the winding of {joint.name} is at {self.winding_temperature_c:.1f} °C; {limits}"
-            faults.append(Fault(tick=tick, what="overheated", cause=cause, joint=joint.name, reach="joint"))
+            cause = (
+                f"the winding of {joint.name} is at {self.winding_temperature_c:.1f} °C; {limits}"
+            )
+            faults.append(
+                Fault(tick=tick, what="overheated", cause=cause, joint=joint.name, reach="joint")
+            )
         if not self.is_known(now_ns):
             return faults
         if self.has_leak:
             cause = f"{joint.name} reports water inside"
-            faults.append(Fault(tick=tick, what="leak", cause=cause, joint=joint.name, reach="robot"))
-        if self.undervoltage_since_ns is not None and now_ns - self.undervoltage_since_ns >= UNDERVOLTAGE_DELAY_NS:
+            faults.append(
+                Fault(tick=tick, what="leak", cause=cause, joint=joint.name, reach="robot")
+            )
+        if (
+            self.undervoltage_since_ns is not None
+            and now_ns - self.undervoltage_since_ns >= UNDERVOLTAGE_DELAY_NS
+        ):
             requirement = f"it needs {joint.min_voltage_v:g} V: {MIN_VOLTAGE_FIELD}"
             cause = f"the supply of {joint.name} is at {self.voltage_v:.1f} V, {requirement}"
-            faults.append(Fault(tick=tick, what="undervoltage", cause=cause, joint=joint.name, reach="robot"))
+            faults.append(
+                Fault(tick=tick, what="undervoltage", cause=cause, joint=joint.name, reach="robot")
+            )
         return faults

@@ -3,7 +3,8 @@
 from snakesim_hal.wire.messages import Fault
 
 MAX_FAULTS = 32
-FIRST_FAULT_COUNT = MAX_FAULTS // 2  # the first faults usually show the cause, so the report lists as many
+# The first faults usually show the cause, so the report lists as many.
+FIRST_FAULT_COUNT = MAX_FAULTS // 2
 
 
 class FaultLog:

@@ -67,7 +67,9 @@ class JointIsolation:
 
     def find_overruled_joints(self, command: JointCommand) -> dict[int, str]:
         """Return the limit name "isolated" by the index of each isolated joint that a command would move."""
-        return {i: "isolated" for i in sorted(self.indices) if command.mode[i] is not JointMode.PASSIVE}
+        return {
+            i: "isolated" for i in sorted(self.indices) if command.mode[i] is not JointMode.PASSIVE
+        }
 
     def _set_joints(self, joints: JointMask) -> None:
         self.joints = joints

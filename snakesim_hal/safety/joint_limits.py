@@ -58,7 +58,9 @@ class JointLimits:
             max_state_age_ns=max_state_age_ns(description),
             layout=description.layout,
             joints=tuple(joints),
-            has_velocity_mode=np.array([joint.supports_mode(JointMode.VELOCITY) for joint in joints]),
+            has_velocity_mode=np.array(
+                [joint.supports_mode(JointMode.VELOCITY) for joint in joints]
+            ),
             has_all_modes=all(joint.supports_mode(mode) for joint in joints for mode in JointMode),
         )
 

@@ -43,7 +43,9 @@ def decide_lease_request(
         now_ns: Safety time in ns.
         lease_duration_ns: Duration of a lease without a renewal, in ns.
     """
-    is_holder = lease.is_held(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
+    is_holder = (
+        lease.is_held(now_ns) and lease.holder == request.holder and lease.epoch == request.epoch
+    )
     match request.action:
         case "acquire":
             if lease.is_held(now_ns) and request.priority <= lease.priority:
@@ -54,7 +56,9 @@ def decide_lease_request(
                     f"{remaining_ms:.0f} ms; stop it, or ask with a priority above {lease.priority}",
                     refusal_code="lease_held",
                 )
-            acquired = CommandLease(request.holder, lease.epoch + 1, request.priority, now_ns + lease_duration_ns)
+            acquired = CommandLease(
+                request.holder, lease.epoch + 1, request.priority, now_ns + lease_duration_ns
+            )
             return LeaseDecision(acquired, has_holder_changed=True)
         case "renew":
             if not is_holder:
@@ -66,10 +70,14 @@ def decide_lease_request(
             return LeaseDecision(free_lease(lease), has_holder_changed=True)
 
 
-def _make_not_holder_refusal(lease: CommandLease, request: LeaseRequest, advice: str) -> LeaseDecision:
+def _make_not_holder_refusal(
+    lease: CommandLease, request: LeaseRequest, advice: str
+) -> LeaseDecision:
     """Return the refusal of a request of a client that does not hold the lease."""
     return LeaseDecision(
-        lease, f"{request.holder} does not hold epoch {request.epoch}; {advice}", refusal_code="not_holder"
+        lease,
+        f"{request.holder} does not hold epoch {request.epoch}; {advice}",
+        refusal_code="not_holder",
     )
 
 

@@ -12,7 +12,13 @@ from typing import Literal, NamedTuple
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.safety.joint_limits import JointMask
-from snakesim_hal.wire.messages import JointCommand, JointMode, LifecycleRequest, LifecycleState, RobotDescription
+from snakesim_hal.wire.messages import (
+    JointCommand,
+    JointMode,
+    LifecycleRequest,
+    LifecycleState,
+    RobotDescription,
+)
 
 LifecycleEvent = Literal["arm", "disarm", "fault", "estop", "reset"]
 
@@ -60,7 +66,9 @@ class UnmetCondition(NamedTuple):
     reason: str  # for people
 
 
-def find_address_mismatches(request: LifecycleRequest, description: RobotDescription) -> list[UnmetCondition]:
+def find_address_mismatches(
+    request: LifecycleRequest, description: RobotDescription
+) -> list[UnmetCondition]:
     """Return an unmet condition for each name in a request to arm that does not match this robot.
 
     The request must name the robot, its backend, and the hash of its configuration.
@@ -101,7 +109,12 @@ def find_far_targets(
     reasons: list[str] = []
     max_step_rad = description.max_step_rad
     for joint, mode, target, measured_rad, is_isolated in zip(
-        description.joints, command.mode, command.target, angle_rad.tolist(), isolated.tolist(), strict=True
+        description.joints,
+        command.mode,
+        command.target,
+        angle_rad.tolist(),
+        isolated.tolist(),
+        strict=True,
     ):
         if is_isolated:
             continue

@@ -48,7 +48,9 @@ def find_active_limits(
     return names
 
 
-def find_derated_joints(command: JointCommand, limits: JointLimits, torque_fraction: Floats) -> JointMask:
+def find_derated_joints(
+    command: JointCommand, limits: JointLimits, torque_fraction: Floats
+) -> JointMask:
     """Return a mask of the joints that get a lower torque limit than commanded because they are hot, (n_joints,)."""
     requested_nm = limits.torque_nm
     if command.torque_limit_nm is not None:

@@ -78,7 +78,9 @@ def find_rejection_reason(
         return "replayed"
     if command.tick > tick:
         return "from_the_future"
-    if age_ns > min(command.valid_for_ns, limits.lease_ns):  # a sender may set less than a lease term, not more
+    if age_ns > min(
+        command.valid_for_ns, limits.lease_ns
+    ):  # a sender may set less than a lease term, not more
         return "stale"
     if command.layout != limits.layout:
         return "wrong_layout"
@@ -87,7 +89,9 @@ def find_rejection_reason(
         return "wrong_length"
     if command.torque_limit_nm is not None and len(command.torque_limit_nm) != joint_count:
         return "wrong_length"
-    if not limits.has_all_modes and not all(map(JointDescription.supports_mode, limits.joints, command.mode)):
+    if not limits.has_all_modes and not all(
+        map(JointDescription.supports_mode, limits.joints, command.mode)
+    ):
         return "wrong_mode"
     if not all(map(math.isfinite, command.target)):
         return "not_finite"
@@ -120,7 +124,17 @@ def limit_command(
     """
     torque_limits = _limit_torque_limits(command, last, limits, torque_fraction)
     targets: list[float] = []
-    for joint, mode, requested, torque_limit, last_mode, last_target, angle, velocity, torque in zip(
+    for (
+        joint,
+        mode,
+        requested,
+        torque_limit,
+        last_mode,
+        last_target,
+        angle,
+        velocity,
+        torque,
+    ) in zip(
         limits.joints,
         command.mode,
         command.target,
@@ -141,11 +155,15 @@ def limit_command(
             case JointMode.VELOCITY:
                 target = _limit_velocity_target(joint, requested, start, angle, limits.period_s)
             case JointMode.TORQUE:
-                target = _limit_torque_target(joint, requested, start, torque_limit, angle, velocity, limits.period_s)
+                target = _limit_torque_target(
+                    joint, requested, start, torque_limit, angle, velocity, limits.period_s
+                )
             case _:  # passive
                 target = 0.0
         targets.append(target)
-    return AppliedSetpoints(np.array(command.mode, dtype=np.int64), np.array(targets), np.array(torque_limits))
+    return AppliedSetpoints(
+        np.array(command.mode, dtype=np.int64), np.array(targets), np.array(torque_limits)
+    )
 
 
 def _limit_torque_limits(
@@ -177,7 +195,11 @@ def _limit_torque_limits(
 
 
 def _limit_angle_target(
-    joint: JointDescription, requested_rad: float, start_rad: float, angle_rad: float, limits: JointLimits
+    joint: JointDescription,
+    requested_rad: float,
+    start_rad: float,
+    angle_rad: float,
+    limits: JointLimits,
 ) -> float:
     """Return the angle target in rad that is nearest to the requested one within all limits.
 
@@ -193,7 +215,11 @@ def _limit_angle_target(
 
 
 def _limit_velocity_target(
-    joint: JointDescription, requested_rad_s: float, start_rad_s: float, angle_rad: float, period_s: float
+    joint: JointDescription,
+    requested_rad_s: float,
+    start_rad_s: float,
+    angle_rad: float,
+    period_s: float,
 ) -> float:
     """Return the velocity target in rad/s that is nearest to the requested one within all limits."""
     max_speed = joint.speed_limit_rad_s
@@ -232,7 +258,9 @@ def _clamp(value: float, low: float, high: float) -> float:
 # --- ends of a joint -------------------------------------------------------------------------------------------
 
 
-def compute_velocity_bounds(joint: JointDescription, angle_rad: float, period_s: float) -> tuple[float, float]:
+def compute_velocity_bounds(
+    joint: JointDescription, angle_rad: float, period_s: float
+) -> tuple[float, float]:
     """Return the minimum and maximum velocity in rad/s from which a joint can stop before its ends."""
     speed_to_lower_end = compute_stoppable_speed(
         angle_rad - joint.angle_min_rad, joint.acceleration_limit_rad_s2, period_s
@@ -271,7 +299,9 @@ def compute_torque_bounds(
     return low, max(low, high)
 
 
-def compute_stoppable_speed(distance_rad: float, acceleration_rad_s2: float, period_s: float) -> float:
+def compute_stoppable_speed(
+    distance_rad: float, acceleration_rad_s2: float, period_s: float
+) -> float:
     """Return the maximum speed in rad/s from which a joint can stop within a distance d.
 
     The joint continues at its speed v for a reaction time t of REACTION_PERIODS, and then brakes with its acceleration
@@ -281,11 +311,17 @@ def compute_stoppable_speed(distance_rad: float, acceleration_rad_s2: float, per
     if distance_rad <= 0.0:
         return 0.0
     reaction_s = REACTION_PERIODS * period_s
-    return acceleration_rad_s2 * (math.sqrt(reaction_s**2 + 2.0 * distance_rad / acceleration_rad_s2) - reaction_s)
+    return acceleration_rad_s2 * (
+        math.sqrt(reaction_s**2 + 2.0 * distance_rad / acceleration_rad_s2) - reaction_s
+    )
 
 
 def compute_bumpless_target(
-    joint: JointDescription, mode: JointMode, angle_rad: float, velocity_rad_s: float, torque_nm: float
+    joint: JointDescription,
+    mode: JointMode,
+    angle_rad: float,
+    velocity_rad_s: float,
+    torque_nm: float,
 ) -> float:
     """Return the target with which a motor that changes to another mode keeps its current torque.
 
@@ -305,7 +341,9 @@ def compute_bumpless_target(
     match mode:
         case JointMode.POSITION:
             spring_torque_nm = torque_nm + joint.damping_nm_s_per_rad * velocity_rad_s
-            return angle_rad + spring_torque_nm / max(joint.stiffness_nm_per_rad, MIN_STIFFNESS_NM_PER_RAD)
+            return angle_rad + spring_torque_nm / max(
+                joint.stiffness_nm_per_rad, MIN_STIFFNESS_NM_PER_RAD
+            )
         case JointMode.VELOCITY:
             return velocity_rad_s + torque_nm / joint.velocity_gain_nm_s_per_rad
         case JointMode.TORQUE:

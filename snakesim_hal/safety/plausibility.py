@@ -28,7 +28,8 @@ ANGLE_NOISE_MARGIN_RAD = 0.05  # noise of an angle
 SETTLED_SAMPLE_COUNT = 5  # samples in a row at a new place, until it is accepted
 # Fraction of max_step_rad: a target that moves this far changes the torque of a joint that does not follow.
 FROZEN_TARGET_FRACTION = 0.25
-SATURATED_TORQUE_FRACTION = 0.95  # of the torque limit: from there on a constant torque proves nothing
+# Of the torque limit: from there on a constant torque proves nothing.
+SATURATED_TORQUE_FRACTION = 0.95
 MAX_CAUSE_LENGTH = 400  # characters; a fault's cause has at most 500
 
 
@@ -49,8 +50,10 @@ class PlausibilityChecker:
 
         # The last good state of every joint.
         self._last_good_columns = np.zeros((3, count))  # angle, velocity, torque
-        self._last_good_times_s = np.zeros((2, count))  # times of measurement, by timestamp and by safety time
-        self._has_good_state: JointMask = np.zeros(count, dtype=np.bool_)  # whether a good state was ever measured
+        # Times of measurement, by timestamp and by safety time.
+        self._last_good_times_s = np.zeros((2, count))
+        # Whether a good state was ever measured.
+        self._has_good_state: JointMask = np.zeros(count, dtype=np.bool_)
 
         # The shortcut for ordinary states, which cannot fail any check.
         # The last state if all joints were plausible and none had jumped; otherwise None.
@@ -67,7 +70,12 @@ class PlausibilityChecker:
         return MeasuredState(*self._last_good_columns)
 
     def check(
-        self, joints: JointState, *, now_ns: int, applied: AppliedSetpoints | None, isolated: JointMask
+        self,
+        joints: JointState,
+        *,
+        now_ns: int,
+        applied: AppliedSetpoints | None,
+        isolated: JointMask,
     ) -> ImplausibleState | None:
         """Check a joint state, and store its plausible values as the last good ones.
 
@@ -82,7 +90,9 @@ class PlausibilityChecker:
         """
         count = len(self._has_good_state)
         if not joints.has_joint_count(count):
-            fault = Fault(tick=joints.tick, what="state_invalid", cause=f"no joint state of {count} joints")
+            fault = Fault(
+                tick=joints.tick, what="state_invalid", cause=f"no joint state of {count} joints"
+            )
             return ImplausibleState(fault, np.ones_like(self._has_good_state))
         if self._is_ordinary(joints):
             newest: Columns = (joints.angle_rad, joints.velocity_rad_s, joints.torque_nm)
@@ -94,7 +104,12 @@ class PlausibilityChecker:
         return self._check_joints(joints, now_ns=now_ns, applied=applied, isolated=isolated)
 
     def _check_joints(
-        self, joints: JointState, *, now_ns: int, applied: AppliedSetpoints | None, isolated: JointMask
+        self,
+        joints: JointState,
+        *,
+        now_ns: int,
+        applied: AppliedSetpoints | None,
+        isolated: JointMask,
     ) -> ImplausibleState | None:
         """Check each joint of a state for missing values, jumps and frozen values, and store the good values.
 
@@ -169,11 +184,17 @@ class PlausibilityChecker:
         ):
             return False
         for angle, velocity, torque, last_angle, last_velocity, last_torque in zip(
-            joints.angle_rad, joints.velocity_rad_s, joints.torque_nm, *self._last_ordinary_columns, strict=True
+            joints.angle_rad,
+            joints.velocity_rad_s,
+            joints.torque_nm,
+            *self._last_ordinary_columns,
+            strict=True,
         ):
             # Written so that NaN is not ordinary.
             if not (
-                abs(angle - last_angle) <= ANGLE_NOISE_MARGIN_RAD and math.isfinite(velocity) and math.isfinite(torque)
+                abs(angle - last_angle) <= ANGLE_NOISE_MARGIN_RAD
+                and math.isfinite(velocity)
+                and math.isfinite(torque)
             ):
                 return False
             if angle == last_angle and velocity == last_velocity and torque == last_torque:
@@ -188,9 +209,13 @@ class PlausibilityChecker:
 
     def _make_unknown_state(self, tick: int, joints: JointMask) -> ImplausibleState:
         names = self._get_joint_names(joints)
-        return _make_implausible_state(tick, "state_invalid", "no valid and fresh state of ", joints, names, names)
+        return _make_implausible_state(
+            tick, "state_invalid", "no valid and fresh state of ", joints, names, names
+        )
 
-    def _make_jumped_state(self, tick: int, joints: JointMask, jump_rad: Floats, elapsed_s: Floats) -> ImplausibleState:
+    def _make_jumped_state(
+        self, tick: int, joints: JointMask, jump_rad: Floats, elapsed_s: Floats
+    ) -> ImplausibleState:
         names = self._get_joint_names(joints)
         labels: list[str] = []
         for name, i in zip(names, np.flatnonzero(joints).tolist(), strict=True):
@@ -215,7 +240,9 @@ def _make_implausible_state(
     joint = None
     if len(names) == 1:
         joint = names[0]
-    return ImplausibleState(Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), joints)
+    return ImplausibleState(
+        Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), joints
+    )
 
 
 def _compute_measurement_times_s(joints: JointState, now_ns: int) -> Floats:
@@ -289,9 +316,9 @@ class _JumpDetector:
             return jumped
         newest_rad = np.where(jumped, angle_rad, 0.0)
         elapsed_s = measured_s - self._last_rejected_times_s
-        is_near_last = np.abs(newest_rad - self._last_rejected_rad) <= self.compute_max_rotation_rad(
-            elapsed_s.max(axis=0)
-        )
+        is_near_last = np.abs(
+            newest_rad - self._last_rejected_rad
+        ) <= self.compute_max_rotation_rad(elapsed_s.max(axis=0))
         is_repeated = is_near_last & (elapsed_s[0] <= 0)  # a repeated sample is not new information
         sample_count = np.where(is_near_last, self._consecutive_count + ~is_repeated, 1)
         self._consecutive_count = np.where(jumped, sample_count, 0)
@@ -331,7 +358,9 @@ class _FrozenDetector:
         self._highest_target_rad = applied.target
         self._wide_range_since_s = self._never_times_s
 
-    def find_frozen(self, columns: Floats, measured_s: Floats, applied: AppliedSetpoints | None) -> JointMask:
+    def find_frozen(
+        self, columns: Floats, measured_s: Floats, applied: AppliedSetpoints | None
+    ) -> JointMask:
         """Store the newest states, and find the joints whose measurements are frozen.
 
         A joint is frozen if it repeats the same state to the bit for more than a lease after its position target has
@@ -349,7 +378,11 @@ class _FrozenDetector:
             self.restart(columns, None)
             return np.zeros_like(self._had_position_target)
         is_in_position_mode = applied.mode == JointMode.POSITION
-        is_repeated = (columns == self._last_columns).all(axis=0) & is_in_position_mode & self._had_position_target
+        is_repeated = (
+            (columns == self._last_columns).all(axis=0)
+            & is_in_position_mode
+            & self._had_position_target
+        )
         if not np.count_nonzero(is_repeated):
             self.restart(columns, applied)
             return is_repeated
@@ -358,8 +391,12 @@ class _FrozenDetector:
         target_rad = applied.target
         self._last_columns = columns
         self._had_position_target = is_in_position_mode
-        self._lowest_target_rad = np.where(is_repeated, np.minimum(self._lowest_target_rad, target_rad), target_rad)
-        self._highest_target_rad = np.where(is_repeated, np.maximum(self._highest_target_rad, target_rad), target_rad)
+        self._lowest_target_rad = np.where(
+            is_repeated, np.minimum(self._lowest_target_rad, target_rad), target_rad
+        )
+        self._highest_target_rad = np.where(
+            is_repeated, np.maximum(self._highest_target_rad, target_rad), target_rad
+        )
 
         has_wide_target_range = is_repeated & (
             self._highest_target_rad - self._lowest_target_rad > self._min_target_range_rad
@@ -367,5 +404,7 @@ class _FrozenDetector:
         earliest_s = np.minimum(self._wide_range_since_s, measured_s)
         self._wide_range_since_s = np.where(has_wide_target_range, earliest_s, self._never_times_s)
         is_longer_than_lease = measured_s - self._wide_range_since_s > self._lease_s
-        is_torque_unsaturated = np.abs(columns[2]) < SATURATED_TORQUE_FRACTION * applied.torque_limit_nm
+        is_torque_unsaturated = (
+            np.abs(columns[2]) < SATURATED_TORQUE_FRACTION * applied.torque_limit_nm
+        )
         return has_wide_target_range & is_longer_than_lease & is_torque_unsaturated

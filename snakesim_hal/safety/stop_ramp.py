@@ -69,7 +69,9 @@ class StopRamp:
         The reference brakes from v0 to v1 = sign(v0) max(|v0| - a T, 0), and moves by (v0 + v1) T / 2.
         """
         period_s = limits.period_s
-        next_velocity_rad_s = np.maximum(np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s, 0.0)
+        next_velocity_rad_s = np.maximum(
+            np.abs(self.velocity_rad_s) - limits.acceleration_rad_s2 * period_s, 0.0
+        )
         next_velocity_rad_s *= np.sign(self.velocity_rad_s)
         mean_velocity_rad_s = 0.5 * (self.velocity_rad_s + next_velocity_rad_s)
         reference_rad = limits.clip_angles(self.reference_rad + mean_velocity_rad_s * period_s)
@@ -84,7 +86,8 @@ class StopReaction:
     def __init__(self, limits: JointLimits, stop_mode: StopMode) -> None:
         self._limits = limits
         self._stop_mode: StopMode = stop_mode
-        self._ramp: StopRamp | None = None  # None unless the robot was armed when the current fault was latched
+        # None unless the robot was armed when the current fault was latched.
+        self._ramp: StopRamp | None = None
 
     def start_ramp(self, measured: MeasuredState, last: AppliedSetpoints) -> None:
         """Start the ramp that brings a moving robot to rest. Call this when its lifecycle leaves `armed`."""
@@ -124,7 +127,9 @@ class StopReaction:
         self._ramp = ramp
         at_rest = ramp.velocity_rad_s == 0.0
         modes = np.select(
-            [has_velocity_mode, at_rest], [int(JointMode.VELOCITY), int(JointMode.PASSIVE)], int(JointMode.POSITION)
+            [has_velocity_mode, at_rest],
+            [int(JointMode.VELOCITY), int(JointMode.PASSIVE)],
+            int(JointMode.POSITION),
         )
         target = np.where(modes == int(JointMode.POSITION), ramp.target_rad, 0.0)
         return AppliedSetpoints(modes.astype(np.int64), target, torque_nm)

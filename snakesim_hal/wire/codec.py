@@ -13,7 +13,8 @@ from snakesim_hal.wire.messages import VERSIONS, ColorImage, CustomSample, Depth
 MessageT = TypeVar("MessageT", bound=Message)
 
 ENCODING_PREFIX = "application/msgpack;snakesim."
-MAX_PAYLOAD_BYTES = 1024 * 1024  # a world of 4096 obstacles fits; a longer payload is rejected before it is decoded
+# A world of 4096 obstacles fits; a longer payload is rejected before it is decoded.
+MAX_PAYLOAD_BYTES = 1024 * 1024
 MAX_IMAGE_BYTES = 4 * 1024 * 1024  # a color image of MAX_PIXELS fits
 IMAGE_MESSAGE_TYPES: tuple[type[Message], ...] = (DepthImage, ColorImage)
 MAX_DETAIL_LENGTH = 300  # characters of the reason why a payload is malformed
@@ -32,14 +33,16 @@ class EncodedMessage(msgspec.Struct, frozen=True):
     """
 
     payload: bytes  # as it is sent
-    decoded: Message  # of its own, not the message that was encoded, which its author might still change
+    # Of its own, not the message that was encoded, which its author might still change.
+    decoded: Message
 
 
 def format_encoding(message: type[Message]) -> str:
     """Return the Zenoh encoding of a message type, such as `application/msgpack;snakesim.Clock/1`."""
     known = message
     if issubclass(message, CustomSample):
-        known = CustomSample  # the further fields of a custom message are in the robot's description
+        # The further fields of a custom message are in the robot's description.
+        known = CustomSample
     return f"{ENCODING_PREFIX}{known.__name__}/{VERSIONS[known]}"
 
 

@@ -24,7 +24,8 @@ from snakesim_hal.wire.quantities import MAX_BEAMS, MAX_CUSTOM_SCHEMA
 MAX_FIELDS = 32
 MAX_TEXT_LENGTH = 200  # characters of a text field, and of the description of a message
 MAX_UNIT_LENGTH = 20  # characters
-SCHEMAS_CACHED = 128  # more than a robot may have custom sensors, for programs that watch several robots
+# More than a robot may have custom sensors, for programs that watch several robots.
+SCHEMAS_CACHED = 128
 SHARED_FIELDS = frozenset(CustomSample.__struct_fields__)
 EXAMPLE = 'Annotated[float, bounded(-1.6, 1.6, "rad")], or q.Angle, of snakesim_hal.wire.quantities'
 # What msgspec raises for a schema or a class that cannot become a message.
@@ -75,7 +76,11 @@ def make_message_schema(message: Any, whose: str) -> str:
     Raises:
         ConfigError: The class cannot be a message.
     """
-    if not (isinstance(message, type) and issubclass(message, CustomSample) and message is not CustomSample):
+    if not (
+        isinstance(message, type)
+        and issubclass(message, CustomSample)
+        and message is not CustomSample
+    ):
         raise ConfigError(
             f"{whose}: `message` is {shorten(repr(message))}, must be a class derived from CustomSample of "
             "snakesim_hal.wire.messages, frozen and keyword-only",
@@ -87,9 +92,13 @@ def make_message_schema(message: Any, whose: str) -> str:
         text = msgspec.json.encode(schema).decode()
         parse_custom_message(text)
     except WireError as error:
-        raise ConfigError(f"{whose}: {message.__name__}{error.detail}", code="plugin/not-loadable") from None
+        raise ConfigError(
+            f"{whose}: {message.__name__}{error.detail}", code="plugin/not-loadable"
+        ) from None
     except SCHEMA_ERRORS as error:
-        raise ConfigError(f"{whose}: {message.__name__} is no message: {error}", code="plugin/not-loadable") from None
+        raise ConfigError(
+            f"{whose}: {message.__name__} is no message: {error}", code="plugin/not-loadable"
+        ) from None
     return text
 
 
@@ -104,13 +113,17 @@ def parse_custom_message(schema: str) -> CustomMessage:
         WireError: The schema does not describe an allowed message. The error's detail starts with the field.
     """
     if len(schema) > MAX_CUSTOM_SCHEMA:
-        raise WireError("malformed", f" has a schema of {len(schema)} characters, at most {MAX_CUSTOM_SCHEMA}")
+        raise WireError(
+            "malformed", f" has a schema of {len(schema)} characters, at most {MAX_CUSTOM_SCHEMA}"
+        )
     try:
         return _build_custom_message(schema)
     except WireError:
         raise
     except (*SCHEMA_ERRORS, KeyError, AttributeError, msgspec.DecodeError) as error:
-        raise WireError("malformed", f" has a schema that cannot be used: {shorten(str(error))}") from None
+        raise WireError(
+            "malformed", f" has a schema that cannot be used: {shorten(str(error))}"
+        ) from None
 
 
 def _build_custom_message(schema: str) -> CustomMessage:
@@ -124,26 +137,38 @@ def _build_custom_message(schema: str) -> CustomMessage:
         KeyError, AttributeError, msgspec.DecodeError, or one of SCHEMA_ERRORS: the text is no schema of a message.
     """
     content = msgspec.json.decode(schema, type=dict[str, Any])
-    fields = {name: field for name, field in content["properties"].items() if name not in SHARED_FIELDS}
+    fields = {
+        name: field for name, field in content["properties"].items() if name not in SHARED_FIELDS
+    }
     if not 0 < len(fields) <= MAX_FIELDS or not str(content["title"]).isidentifier():
-        raise WireError("malformed", f" has {len(fields)} fields of its own, must have 1 to {MAX_FIELDS}")
+        raise WireError(
+            "malformed", f" has {len(fields)} fields of its own, must have 1 to {MAX_FIELDS}"
+        )
     required = content.get("required", ())
-    definitions: list[Any] = []  # as `msgspec.defstruct` wants them: (name, type), or (name, type, default)
+    # As `msgspec.defstruct` wants them: (name, type), or (name, type, default).
+    definitions: list[Any] = []
     units: dict[str, str] = {}
     for name, field in fields.items():
         if not _FIELD_NAME.fullmatch(name) or hasattr(CustomSample, name):
-            raise WireError("malformed", f".{shorten(name)} is no name of a field: lower case, at most 40 characters")
+            raise WireError(
+                "malformed",
+                f".{shorten(name)} is no name of a field: lower case, at most 40 characters",
+            )
         field_type = _make_field_type(field, name, units)
         if name in required:
             definitions.append((name, field_type))
         else:
             definitions.append((name, field_type | None, None))
-    message: Any = msgspec.defstruct(content["title"], definitions, bases=(CustomSample,), frozen=True, kw_only=True)
+    message: Any = msgspec.defstruct(
+        content["title"], definitions, bases=(CustomSample,), frozen=True, kw_only=True
+    )
     msgspec.msgpack.Decoder(message)  # raises for bounds that msgspec cannot check
     return CustomMessage(message, units, schema)
 
 
-def _make_field_type(field: dict[str, Any], name: str, units: dict[str, str], *, in_list: bool = False) -> Any:
+def _make_field_type(
+    field: dict[str, Any], name: str, units: dict[str, str], *, in_list: bool = False
+) -> Any:
     """Return the Python type of a field, and add the unit of a numeric field to `units`.
 
     Args:
@@ -168,7 +193,9 @@ def _make_field_type(field: dict[str, Any], name: str, units: dict[str, str], *,
         ):
             entry_type: Any = _make_field_type(entry, name, units, in_list=True)
             return Annotated[list[entry_type], Meta(max_length=max_length)]
-        case {"type": "array", "prefixItems": [*entries]} if not in_list and 0 < len(entries) <= MAX_BEAMS:
+        case {"type": "array", "prefixItems": [*entries]} if (
+            not in_list and 0 < len(entries) <= MAX_BEAMS
+        ):
             entry_types = [_make_field_type(entry, name, units, in_list=True) for entry in entries]
             return tuple[tuple(entry_types)]
         case {"type": "string", "maxLength": int(max_length)} if not in_list:
@@ -184,12 +211,20 @@ def _make_field_type(field: dict[str, Any], name: str, units: dict[str, str], *,
 
 def _make_number_type(field: dict[str, Any], name: str, units: dict[str, str]) -> Any:
     """Return the type of a number with its bounds, and add its unit to `units`."""
-    bounds = {msgspec_name: field[json_name] for json_name, msgspec_name in _BOUNDS.items() if json_name in field}
+    bounds = {
+        msgspec_name: field[json_name]
+        for json_name, msgspec_name in _BOUNDS.items()
+        if json_name in field
+    }
     if len(bounds) != 2 or not bounds.keys() & {"ge", "gt"}:
-        raise WireError("malformed", f".{name} has no bounds on both sides; give it a type such as {EXAMPLE}")
+        raise WireError(
+            "malformed", f".{name} has no bounds on both sides; give it a type such as {EXAMPLE}"
+        )
     is_float = field["type"] == "number"
     if is_float and not isinstance(field.get("unit"), str):
-        raise WireError("malformed", f'.{name} has no unit ("1" for a ratio); give it a type such as {EXAMPLE}')
+        raise WireError(
+            "malformed", f'.{name} has no unit ("1" for a ratio); give it a type such as {EXAMPLE}'
+        )
     units[name] = field.get("unit", "1")[:MAX_UNIT_LENGTH]
     plain = float if is_float else int
     return Annotated[plain, Meta(**bounds)]

@@ -25,7 +25,9 @@ ANY_KEY = "[...]"  # in such a path: an entry of a table, without its key
 _make_decoder = cache(MessageDecoder[Any])
 
 
-def encode_checked(key: str, message: Message, custom: CustomMessage | None = None) -> EncodedMessage:
+def encode_checked(
+    key: str, message: Message, custom: CustomMessage | None = None
+) -> EncodedMessage:
     """Encode a message, and check that readers of its key accept it.
 
     Args:
@@ -53,11 +55,15 @@ def _find_message_type(key: str, message: Message, custom: CustomMessage | None)
     expected = keys.find_message(key)
     if expected is None:
         known = suggest_word(key, keys.ROW_AT)
-        raise WireError("unknown_key", f"there is no such key; {known}`snakesim topic echo` lists them")
+        raise WireError(
+            "unknown_key", f"there is no such key; {known}`snakesim topic echo` lists them"
+        )
     if expected is CustomSample and isinstance(message, CustomSample):
         return type(message) if custom is None else custom.message
     if type(message) is not expected:
-        raise WireError("unknown_message", f"a {type(message).__name__}, must be a {expected.__name__}")
+        raise WireError(
+            "unknown_message", f"a {type(message).__name__}, must be a {expected.__name__}"
+        )
     return expected
 
 
@@ -68,7 +74,9 @@ def encode_unchecked(message: Message) -> bytes:
     try:
         return encode(message)
     except ENCODING_ERRORS as error:
-        raise WireError("malformed", describe_invalid_field(message) or f"{type(error).__name__}: {error}") from None
+        raise WireError(
+            "malformed", describe_invalid_field(message) or f"{type(error).__name__}: {error}"
+        ) from None
 
 
 def describe_invalid_field(message: Message, message_label: str = "") -> str:

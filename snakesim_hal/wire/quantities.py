@@ -88,13 +88,21 @@ Microseconds = Annotated[float, from_zero(1e8, "µs")]
 Speed = Annotated[float, bounded(0.1, 10.0, "1")]  # of robot time, beside the wall clock
 Fraction = Annotated[float, bounded(0.0, 1.0, "1")]
 
-Target = Annotated[float, bounded(-MAX_TARGET, MAX_TARGET, "rad, rad/s or N·m, depending on the joint's mode")]
+Target = Annotated[
+    float, bounded(-MAX_TARGET, MAX_TARGET, "rad, rad/s or N·m, depending on the joint's mode")
+]
 TorqueLimit = Annotated[float, bounded(0.0, MAX_TARGET, "N·m")]
 
 Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
-Tick = Annotated[int, Meta(ge=0, le=MAX_COUNT), about("number of a control period, from 0 at the start of the host")]
+Tick = Annotated[
+    int,
+    Meta(ge=0, le=MAX_COUNT),
+    about("number of a control period, from 0 at the start of the host"),
+]
 Nanoseconds = Annotated[int, Meta(ge=0, le=MAX_COUNT, extra_json_schema={"unit": "ns"})]
-Stamp = Annotated[Nanoseconds, about("robot time: as in hal/clock, from 0 at the start of the host")]
+Stamp = Annotated[
+    Nanoseconds, about("robot time: as in hal/clock, from 0 at the start of the host")
+]
 LinkIndex = Annotated[int, Meta(ge=0, le=MAX_JOINTS)]
 Name = Annotated[str, Meta(min_length=1, max_length=64)]
 Reason = Annotated[str, Meta(max_length=500)]

@@ -135,7 +135,11 @@ ZENOH_MESSAGES_BY_ACTION: dict[str, tuple[tuple[str, str, str], ...]] = {
     "publish": (("ingress", "put", ""), ("egress", "declare_subscriber", "")),
     "read": (("ingress", "declare_subscriber", ""), ("egress", "put", "")),
     "ask": (("ingress", "query", ""), ("egress", "declare_queryable", ""), ("egress", "reply", "")),
-    "answer": (("ingress", "declare_queryable", ""), ("egress", "query", ""), ("ingress", "reply", "")),
+    "answer": (
+        ("ingress", "declare_queryable", ""),
+        ("egress", "query", ""),
+        ("ingress", "reply", ""),
+    ),
     "declare": (("ingress", "liveliness_token", ""),),
     "watch": (
         ("ingress", "liveliness_query", ""),
@@ -220,5 +224,8 @@ def _make_key_exprs_of_names(key: str, names: list[str]) -> list[str]:
 def _list_zenoh_messages(rule: AccessRule, action: str) -> tuple[tuple[str, str, str], ...]:
     """Return the messages of Zenoh that an action at a key needs, each as (flow, message, suffix of the key)."""
     if rule.kind == "latched":
-        return (*ZENOH_MESSAGES_BY_ACTION[action], *LATCHED_ZENOH_MESSAGES_BY_ACTION.get(action, ()))
+        return (
+            *ZENOH_MESSAGES_BY_ACTION[action],
+            *LATCHED_ZENOH_MESSAGES_BY_ACTION.get(action, ()),
+        )
     return ZENOH_MESSAGES_BY_ACTION[action]

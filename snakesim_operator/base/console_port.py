@@ -56,7 +56,9 @@ def open_console_ports(port: int | None) -> Iterator[ConsolePorts]:
     """
     with contextlib.ExitStack() as exit_stack:
         browsers = exit_stack.enter_context(open_port(port))
-        folder = Path(exit_stack.enter_context(tempfile.TemporaryDirectory(prefix="snakesim-console-")))
+        folder = Path(
+            exit_stack.enter_context(tempfile.TemporaryDirectory(prefix="snakesim-console-"))
+        )
         pages = exit_stack.enter_context(socket.socket(socket.AF_UNIX))
         pages_path = folder / "pages"
         pages.bind(str(pages_path))
@@ -78,7 +80,8 @@ def open_port(port: int | None) -> socket.socket:
         with contextlib.suppress(OSError):
             return socket.create_server((LOOPBACK, candidate))
     raise NotConnectedError(
-        f"--port {port}: another program listens there; choose another, or leave --port out", code="network/port-in-use"
+        f"--port {port}: another program listens there; choose another, or leave --port out",
+        code="network/port-in-use",
     )
 
 

@@ -20,7 +20,8 @@ def validate_address(address: str | None) -> None:
     """
     if address is not None and not re.fullmatch(r"(tcp|tls)://[^\s/]+:\d{1,5}", address):
         raise ConfigError(
-            f"--cluster {shorten(address)}: give the scheduler as tcp://HOST:PORT", code="network/invalid-address"
+            f"--cluster {shorten(address)}: give the scheduler as tcp://HOST:PORT",
+            code="network/invalid-address",
         )
 
 

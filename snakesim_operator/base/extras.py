@@ -12,7 +12,15 @@ PACKAGES_BY_EXTRA = {  # import names; messages about a package mention the firs
     "sim": ("mujoco",),
     "can": ("bitstruct", "can", "cantools"),
     "serial": ("serial",),
-    "record": ("foxglove_schemas_protobuf", "google", "jinja2", "lz4", "markupsafe", "mcap", "zstandard"),
+    "record": (
+        "foxglove_schemas_protobuf",
+        "google",
+        "jinja2",
+        "lz4",
+        "markupsafe",
+        "mcap",
+        "zstandard",
+    ),
     "console": ("foxglove", "PIL", "viser", "websockets"),
     "report": ("imageio_ffmpeg", "matplotlib", "PIL", "pyarrow"),
     "lab": ("cryptography", "jinja2", "tomlkit"),
@@ -50,7 +58,8 @@ def explain_missing_package(error: ModuleNotFoundError) -> ConfigError | None:
     for extra, packages in PACKAGES_BY_EXTRA.items():
         if package in packages:
             return ConfigError(
-                f"this command needs {package}: {make_pip_install_command(extra)}", code="extra/not-installed"
+                f"this command needs {package}: {make_pip_install_command(extra)}",
+                code="extra/not-installed",
             )
     return None
 

@@ -27,7 +27,9 @@ def encode_png(width: int, height: int, pixels: bytes, *, bits: int, color: bool
     rows = [pixels[i * row_bytes : (i + 1) * row_bytes] for i in range(height)]
     filtered = b"".join(NO_FILTER + row for row in rows)
     compression = filtering = interlacing = 0  # the only standard methods; not interlaced
-    header = struct.pack(">IIBBBBB", width, height, bits, RGB if color else GREY, compression, filtering, interlacing)
+    header = struct.pack(
+        ">IIBBBBB", width, height, bits, RGB if color else GREY, compression, filtering, interlacing
+    )
     return b"".join(
         [
             SIGNATURE,

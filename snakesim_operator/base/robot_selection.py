@@ -19,9 +19,11 @@ if TYPE_CHECKING:
 class RobotSelection:
     """The robots that a command addresses: those on an endpoint, or all that run on this computer."""
 
-    endpoint: str | None = None  # None for all networks of robots on this computer, and the default endpoint
+    # None for all networks of robots on this computer, and the default endpoint.
+    endpoint: str | None = None
     namespace: str | None = None  # None for all robots there
-    session: "SessionFile | None" = None  # credentials for `endpoint`, which is the first endpoint of the session then
+    # Credentials for `endpoint`, which is the first endpoint of the session then.
+    session: "SessionFile | None" = None
 
     def list_local_robots(self) -> list[LocalRobot]:
         """List the addressed robots that run on this computer."""
@@ -41,7 +43,9 @@ class RobotSelection:
 
         if self.endpoint is not None:
             return [ConnectionSettings(self.endpoint, self.namespace, session=self.session)]
-        links = {robot.endpoint: _make_link(robot, self.namespace) for robot in self.list_local_robots()}
+        links = {
+            robot.endpoint: _make_link(robot, self.namespace) for robot in self.list_local_robots()
+        }
         if DEFAULT_ENDPOINT not in links:
             links[DEFAULT_ENDPOINT] = ConnectionSettings(namespace=self.namespace)
         return list(links.values())
@@ -52,7 +56,9 @@ def select_robots(arguments: argparse.Namespace) -> RobotSelection:
     check_network(arguments)
     session = read_session_option(arguments, or_environment=True)
     if session is not None:
-        return RobotSelection(session.endpoints[0], session.resolve_namespace(arguments.namespace), session)
+        return RobotSelection(
+            session.endpoints[0], session.resolve_namespace(arguments.namespace), session
+        )
     return RobotSelection(arguments.router or arguments.endpoint, arguments.namespace)
 
 
@@ -63,7 +69,9 @@ def _make_link(robot: LocalRobot, namespace: str | None) -> "ConnectionSettings"
 
     if robot.session:
         try:
-            return ConnectionSettings.from_session_file(read_session(Path(robot.session)), namespace)
+            return ConnectionSettings.from_session_file(
+                read_session(Path(robot.session)), namespace
+            )
         except ConfigError:
             pass
     return ConnectionSettings(robot.endpoint, namespace)

@@ -76,7 +76,9 @@ def open_sessions(
     for link in selection.list_networks():
         with contextlib.suppress(NotConnectedError):
             unlimited_link = replace(link, max_bytes=MAX_IMAGE_BYTES)
-            sessions.append((link, exit_stack.enter_context(open_session(unlimited_link, CONNECT_TIMEOUT_S))))
+            sessions.append(
+                (link, exit_stack.enter_context(open_session(unlimited_link, CONNECT_TIMEOUT_S)))
+            )
     if not sessions:
         raise NotConnectedError(
             f"nothing listens on {', '.join(selection.list_endpoints())}; start a run or a router there first",
@@ -108,5 +110,7 @@ def find_single_robot(selection: RobotSelection, command: str) -> ConnectionSett
         )
     if len(links) > 1:
         choices = [f"  snakesim {command}{make_robot_flags(link, None)}" for link in links]
-        raise RefusedError("several robots found; choose one:", *choices, code="network/several-robots")
+        raise RefusedError(
+            "several robots found; choose one:", *choices, code="network/several-robots"
+        )
     return links[0]

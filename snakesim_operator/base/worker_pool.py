@@ -27,10 +27,15 @@ from tempfile import gettempdir, mkdtemp
 from typing import Any, Self
 
 from snakesim_hal.base import arithmetic
-from snakesim_hal.base.process import make_child_environment, make_python_command, set_parent_death_signal
+from snakesim_hal.base.process import (
+    make_child_environment,
+    make_python_command,
+    set_parent_death_signal,
+)
 
 MAX_WORKER_DEATHS = 5  # workers that may die while they run a call, before the call fails
-MAX_FAILED_ATTEMPTS = 3  # attempts of a call that raises an exception: the cause may have been the worker
+# Attempts of a call that raises an exception: the cause may have been the worker.
+MAX_FAILED_ATTEMPTS = 3
 NICENESS = 10  # robots and consoles on the same computer have priority
 TEMPORARY_FOLDER_VARIABLE = "TMPDIR"  # of the environment
 # With `-m`, the classes of this module would be those of `__main__`, and would not be equal to the command's.
@@ -105,7 +110,10 @@ class WorkerPool:
             os.close(self._lock)
 
     def run_calls(
-        self, function: Callable[..., Any], calls: Sequence[Sequence[Any]], timeout_s: float | None = None
+        self,
+        function: Callable[..., Any],
+        calls: Sequence[Sequence[Any]],
+        timeout_s: float | None = None,
     ) -> Iterator[tuple[int, Outcome]]:
         """Call a function once for each tuple of arguments.
 
@@ -140,7 +148,9 @@ class WorkerPool:
             for worker in running:
                 self._kill_and_remove(worker)
 
-    def run_and_collect(self, function: Callable[..., Any], calls: Sequence[Sequence[Any]]) -> list[Any]:
+    def run_and_collect(
+        self, function: Callable[..., Any], calls: Sequence[Sequence[Any]]
+    ) -> list[Any]:
         """Run calls and return their values in the order of the calls. Raises the exception of a call that fails."""
         values: dict[int, Any] = {}
         for number, outcome in self.run_calls(function, calls):
@@ -162,13 +172,19 @@ class WorkerPool:
         self._workers.append(worker)
         return worker
 
-    def _wait_for_workers(self, running: "dict[_WorkerProcess, _PendingCall]") -> "list[_WorkerProcess]":
+    def _wait_for_workers(
+        self, running: "dict[_WorkerProcess, _PendingCall]"
+    ) -> "list[_WorkerProcess]":
         """Wait until calls are done, have failed, or take too long, and return their workers."""
         remaining_s = min(call.deadline_s for call in running.values()) - time.monotonic()
         timeout_s = None if remaining_s == float("inf") else max(remaining_s, 0.0)
         readable = wait([worker.connection for worker in running], timeout_s)
         now_s = time.monotonic()
-        return [worker for worker, call in running.items() if worker.connection in readable or now_s >= call.deadline_s]
+        return [
+            worker
+            for worker, call in running.items()
+            if worker.connection in readable or now_s >= call.deadline_s
+        ]
 
     def _receive_outcome(self, worker: "_WorkerProcess", call: _PendingCall) -> Outcome | None:
         """Receive the outcome of a call; None if the call has to be retried.
@@ -213,7 +229,8 @@ def _remove_abandoned_folders() -> None:
                 continue
             handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises for a folder that is in use
+                # Raises for a folder that is in use.
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(folder, ignore_errors=True)
             finally:
                 os.close(handle)
@@ -230,7 +247,9 @@ class _WorkerProcess:
         command_end, worker_end = socket.socketpair()
         with worker_end:
             self._process = subprocess.Popen(
-                make_python_command("-c", WORKER_PROGRAM, str(worker_end.fileno()), str(os.getpid())),
+                make_python_command(
+                    "-c", WORKER_PROGRAM, str(worker_end.fileno()), str(os.getpid())
+                ),
                 env=make_child_environment(
                     arithmetic.make_common_arithmetic_env(),
                     arithmetic.SINGLE_THREAD_ENV,
@@ -265,7 +284,8 @@ def main(argv: Sequence[str]) -> int:
     """
     connection_fd, parent_pid = map(int, argv)
     set_parent_death_signal(parent_pid)
-    os.nice(max(NICENESS - os.nice(0), 0))  # a command that was started with `nice` keeps its priority
+    # A command that was started with `nice` keeps its priority.
+    os.nice(max(NICENESS - os.nice(0), 0))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with Connection(connection_fd) as connection:
         while True:

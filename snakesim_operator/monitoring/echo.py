@@ -15,7 +15,11 @@ import msgspec
 from snakesim_hal.base.errors import ConfigError, WireError, shorten, suggest_word
 from snakesim_hal.base.terminal import print_json, print_line, print_stderr
 from snakesim_hal.network.mailbox import Mailbox
-from snakesim_hal.network.session import Session, key_expressions_intersect, normalize_key_expression
+from snakesim_hal.network.session import (
+    Session,
+    key_expressions_intersect,
+    normalize_key_expression,
+)
 from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import CustomSample
@@ -37,7 +41,9 @@ def print_topics(*, as_json: bool) -> int:
         return 0
     for line in _format_key_list():
         print_line(line)
-    print_stderr("`snakesim topic echo KEY` prints the messages; `snakesim topic rate` shows the rates of all keys")
+    print_stderr(
+        "`snakesim topic echo KEY` prints the messages; `snakesim topic rate` shows the rates of all keys"
+    )
     return 0
 
 
@@ -94,17 +100,25 @@ def _subscribe_to_key(key: str, selection: RobotSelection) -> Iterator["OutputQu
         ConfigError: There is no such key.
     """
     relative_key = normalize_key_expression(key.strip("/"))
-    topics = [topic for topic in _list_published_topics() if key_expressions_intersect(relative_key, topic.key)]
+    topics = [
+        topic
+        for topic in _list_published_topics()
+        if key_expressions_intersect(relative_key, topic.key)
+    ]
     if not topics:
         hint = suggest_word(key, [topic.key for topic in _list_published_topics()]).strip()
         lines = [*_format_key_list(), hint] if hint else _format_key_list()
-        raise ConfigError(f"there is no key {shorten(key)!r}; available keys:", *lines, code="network/unknown-key")
+        raise ConfigError(
+            f"there is no key {shorten(key)!r}; available keys:", *lines, code="network/unknown-key"
+        )
     # A session with a namespace adds it to keys. Without one, `**/` stands for the namespace of any robot.
     prefix = "" if selection.namespace is not None else "**/"
     queue = OutputQueue()
     with contextlib.ExitStack() as stack:
         for _namespace, session in open_sessions(selection, stack):
-            _subscribe_to_topics(session, queue, normalize_key_expression(f"{prefix}{relative_key}"), prefix, topics)
+            _subscribe_to_topics(
+                session, queue, normalize_key_expression(f"{prefix}{relative_key}"), prefix, topics
+            )
         yield queue
 
 
@@ -125,13 +139,18 @@ def _subscribe_to_topics(
     latched_keys = [f"{prefix}{topic.key}" for topic in topics if topic.kind == "latched"]
     for latched_key in latched_keys:
         session.on_latched_arrival(
-            latched_key, queue.make_filtered_add(lambda key: key_expressions_intersect(pattern, key))
+            latched_key,
+            queue.make_filtered_add(lambda key: key_expressions_intersect(pattern, key)),
         )
     if len(latched_keys) < len(topics):
         session.on_arrival(
             pattern,
             queue.make_filtered_add(
-                lambda key: not any(key_expressions_intersect(latched_key, key) for latched_key in latched_keys)
+                lambda key: (
+                    not any(
+                        key_expressions_intersect(latched_key, key) for latched_key in latched_keys
+                    )
+                )
             ),
         )
 
@@ -183,7 +202,9 @@ class OutputQueue:
             self._queued_bytes += len(arrival.payload)
         self._arrivals.put(arrival)
 
-    def make_filtered_add(self, is_selected: Callable[[str], bool]) -> Callable[[ReceivedSample], None]:
+    def make_filtered_add(
+        self, is_selected: Callable[[str], bool]
+    ) -> Callable[[ReceivedSample], None]:
         """Return a function that adds a message if `is_selected` returns true for its key."""
 
         def add_if_selected(arrival: ReceivedSample) -> None:
@@ -195,7 +216,9 @@ class OutputQueue:
     def get(self, timeout: float | None = None) -> ReceivedSample:
         """Return the oldest sample. Raises queue.Empty after `timeout` in s; None waits without a limit."""
         if self._dropped_count and self._arrivals.empty():
-            print_stderr(f"{self._dropped_count} messages were dropped: they came faster than they could be printed")
+            print_stderr(
+                f"{self._dropped_count} messages were dropped: they came faster than they could be printed"
+            )
             self._dropped_count = 0
         arrival = self._arrivals.get(timeout)
         with self._lock:
@@ -228,7 +251,9 @@ def _decode_content(arrival: ReceivedSample) -> dict[str, Any]:
         decoded = get_decoder(message).decode(arrival.payload, arrival.encoding)
     except WireError as error:
         return {"error": str(error)}
-    if message is CustomSample:  # as it was sent, because only its robot describes some of the fields
+    if (
+        message is CustomSample
+    ):  # as it was sent, because only its robot describes some of the fields
         return {"message": msgspec.msgpack.decode(arrival.payload)}
     return {"message": msgspec.to_builtins(decoded)}
 
@@ -248,7 +273,9 @@ def _print_rate_lines(queue: OutputQueue, count: int | None, *, as_json: bool) -
     for _ in _count_up_to(count):
         times_ns_by_key = _collect_arrival_times(queue)
         rates = [
-            rate for key in sorted(times_ns_by_key) if (rate := _measure_rate(key, times_ns_by_key[key])) is not None
+            rate
+            for key in sorted(times_ns_by_key)
+            if (rate := _measure_rate(key, times_ns_by_key[key])) is not None
         ]
         exit_code = 0 if times_ns_by_key else 1
         if as_json:

@@ -49,18 +49,21 @@ def publish_previews(selection: RobotSelection, rate_hz: float, max_width_px: in
     extras.require_extra("console", "`snakesim start preview`")
     if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
         raise ConfigError(
-            f"--hz {rate_hz:g}: give from {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} Hz", code="command/invalid-option"
+            f"--hz {rate_hz:g}: give from {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} Hz",
+            code="command/invalid-option",
         )
     if not MIN_WIDTH_PX <= max_width_px <= MAX_WIDTH_PX:
         raise ConfigError(
-            f"--width {max_width_px}: give from {MIN_WIDTH_PX} to {MAX_WIDTH_PX} pixels", code="command/invalid-option"
+            f"--width {max_width_px}: give from {MIN_WIDTH_PX} to {MAX_WIDTH_PX} pixels",
+            code="command/invalid-option",
         )
     link = find_single_robot(selection, "start preview")
     with open_session(replace(link, max_bytes=MAX_IMAGE_BYTES)) as session:
         robot = session.wait_for_latched(keys.DESCRIPTION, RobotDescription, DESCRIPTION_TIMEOUT_S)
         if robot is None:
             raise NotConnectedError(
-                f"{link.namespace} does not describe itself within {DESCRIPTION_TIMEOUT_S:g} s", code="network/no-robot"
+                f"{link.namespace} does not describe itself within {DESCRIPTION_TIMEOUT_S:g} s",
+                code="network/no-robot",
             )
         cameras = find_cameras(session, robot, max_width_px)
         if not cameras:
@@ -68,7 +71,9 @@ def publish_previews(selection: RobotSelection, rate_hz: float, max_width_px: in
                 f"{link.namespace} has no camera: nothing at {keys.DEPTH_ALL} or {keys.COLOR_ALL}",
                 code="network/unknown-key",
             )
-        print_line(f"{link.namespace}: previews of {', '.join(camera.key for camera in cameras)}; Ctrl-C ends it")
+        print_line(
+            f"{link.namespace}: previews of {', '.join(camera.key for camera in cameras)}; Ctrl-C ends it"
+        )
         while True:
             for camera in cameras:
                 problem = camera.publish_preview()
@@ -77,7 +82,9 @@ def publish_previews(selection: RobotSelection, rate_hz: float, max_width_px: in
             time.sleep(1.0 / rate_hz)
 
 
-def find_cameras(session: Session, robot: RobotDescription, max_width_px: int) -> list["CameraPreviewPublisher"]:
+def find_cameras(
+    session: Session, robot: RobotDescription, max_width_px: int
+) -> list["CameraPreviewPublisher"]:
     """Return a publisher of previews for each stream of images in the description of the robot.
 
     Args:
@@ -89,7 +96,9 @@ def find_cameras(session: Session, robot: RobotDescription, max_width_px: int) -
     for sensor in robot.sensors:
         message = keys.find_message(sensor.key)
         if message in (DepthImage, ColorImage) and sensor.key not in cameras:
-            cameras[sensor.key] = CameraPreviewPublisher(session, robot, sensor.key, message, max_width_px)
+            cameras[sensor.key] = CameraPreviewPublisher(
+                session, robot, sensor.key, message, max_width_px
+            )
     return list(cameras.values())
 
 
@@ -97,7 +106,12 @@ class CameraPreviewPublisher:
     """Reads the images of one key, and publishes their previews."""
 
     def __init__(
-        self, session: Session, robot: RobotDescription, key: str, image_type: type[Any], max_width_px: int
+        self,
+        session: Session,
+        robot: RobotDescription,
+        key: str,
+        image_type: type[Any],
+        max_width_px: int,
     ) -> None:
         """Declare the publisher of the previews. Images are not read before the previews have a subscriber.
 
@@ -113,7 +127,9 @@ class CameraPreviewPublisher:
         self._robot = robot
         self._image_type = image_type
         self._max_width_px = max_width_px
-        self._publisher: Publisher[ImagePreview] = session.declare_publisher(keys.preview_key(key), ImagePreview)
+        self._publisher: Publisher[ImagePreview] = session.declare_publisher(
+            keys.preview_key(key), ImagePreview
+        )
         self._reader: SampleReader[Any] | None = None
 
     def publish_preview(self) -> str | None:
@@ -128,7 +144,9 @@ class CameraPreviewPublisher:
                 self._reader = None
             return None
         if self._reader is None:
-            self._reader = self._session.declare_reader(self.key, self._image_type, depth=MAX_QUEUED_IMAGES)
+            self._reader = self._session.declare_reader(
+                self.key, self._image_type, depth=MAX_QUEUED_IMAGES
+            )
         image = self._reader.pop_newest(lambda image: find_mismatch(image, self._robot) is None)
         if image is None:
             return None

@@ -20,15 +20,19 @@ from snakesim_operator.monitoring.traffic import CommandLatency, KeyTraffic, Net
 PERIOD_S = 1.0
 SINGLE_MEASUREMENT_S = 2.0  # long enough for two samples of the slowest key that repeats itself
 KEY_COLUMNS = (
-    f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} {'age':>8} {'received':>8}"
+    f"{'key':<29} {'writer':<17} {'Hz':>7} {'jitter':>9} {'max gap':>9} {'bytes':>8} "
+    f"{'age':>8} {'received':>8}"
 )
 TICK_TIME_COLUMNS = (
-    f"{'while armed, ms':<47} {'median':>9} {'99 %':>9} {'most':>9}  {'histogram, from the shortest to the longest'}"
+    f"{'while armed, ms':<47} {'median':>9} {'99 %':>9} {'most':>9}  "
+    f"{'histogram, from the shortest to the longest'}"
 )
 HISTOGRAM_BARS = "▁▂▃▄▅▆▇█"
 
 
-def show_traffic(selection: RobotSelection, print_text: PrintLine = print_line, *, once: bool, as_json: bool) -> int:
+def show_traffic(
+    selection: RobotSelection, print_text: PrintLine = print_line, *, once: bool, as_json: bool
+) -> int:
     """Measure the traffic of all selected robots, and print it every second until Ctrl-C.
 
     Args:
@@ -44,7 +48,10 @@ def show_traffic(selection: RobotSelection, print_text: PrintLine = print_line, 
         NotConnectedError: No robot is reachable.
     """
     with contextlib.ExitStack() as stack:
-        traffics = [_subscribe_to_traffic(link.namespace, session) for link, session in open_sessions(selection, stack)]
+        traffics = [
+            _subscribe_to_traffic(link.namespace, session)
+            for link, session in open_sessions(selection, stack)
+        ]
         drawn_line_count = 0
         while True:
             time.sleep(SINGLE_MEASUREMENT_S if once else PERIOD_S)
@@ -90,7 +97,8 @@ class TrafficSnapshot:
 
     lines: Sequence[KeyTraffic]
     latencies: Sequence[CommandLatency]
-    tick_times: Mapping[str, Mapping[str, TimingStatistics]]  # by robot; without those that have no times yet
+    # By robot; without those that have no times yet.
+    tick_times: Mapping[str, Mapping[str, TimingStatistics]]
     descriptions: Mapping[str, RobotDescription]  # by robot
     left_out: int  # messages on more keys than are counted
 
@@ -104,7 +112,9 @@ class TrafficSnapshot:
                 table.append("")
             table += self._format_robot(robot)
         if self.left_out:
-            table.append(f"and {self.left_out} messages on still more keys: a client floods this network")
+            table.append(
+                f"and {self.left_out} messages on still more keys: a client floods this network"
+            )
         return table
 
     def _format_robot(self, robot: str) -> list[str]:
@@ -119,7 +129,9 @@ class TrafficSnapshot:
         table += [_format_latency(latency) for latency in self.latencies if latency.robot == robot]
         if robot in self.tick_times:
             table.append(TICK_TIME_COLUMNS)
-            table += [_format_timing(name, timing) for name, timing in self.tick_times[robot].items()]
+            table += [
+                _format_timing(name, timing) for name, timing in self.tick_times[robot].items()
+            ]
         return table
 
 
@@ -161,7 +173,9 @@ def _format_timing(name: str, timing: TimingStatistics) -> str:
     for count in timing.bins:
         bars += HISTOGRAM_BARS[(len(HISTOGRAM_BARS) - 1) * count // max_count] if count else " "
     description = TICK_TIMES.get(name, "")
-    numbers = "".join(f" {time_us * 1e-3:>9.3f}" for time_us in (timing.median_us, timing.p99_us, timing.max_us))
+    numbers = "".join(
+        f" {time_us * 1e-3:>9.3f}" for time_us in (timing.median_us, timing.p99_us, timing.max_us)
+    )
     return f"{name:<10} {description:<36}{numbers}  {timing.low_us * 1e-3:>9.3f} |{bars}|"
 
 

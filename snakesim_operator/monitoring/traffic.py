@@ -65,7 +65,8 @@ class CommandLatency(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     arrival_median_ms: float  # from the state's arrival here to the command's
     arrival_p99_ms: float
-    motors_median_ms: float | None  # from the state's timestamp to the first tick that applied the command; robot time
+    # From the state's timestamp to the first tick that applied the command; robot time.
+    motors_median_ms: float | None
     motors_p99_ms: float | None
     count: int
 
@@ -84,9 +85,8 @@ class NetworkTraffic:
         self._lock = threading.Lock()
         self._newest_by_key: dict[str, ReceivedSample] = {}  # by key
         self._arrival_times_ns_by_key: dict[str, deque[int]] = {}  # by key
-        self._latency_arrivals: dict[
-            tuple[str, type[Message]], deque[ReceivedSample]
-        ] = {}  # by prefix of the key and message
+        # By prefix of the key and message.
+        self._latency_arrivals: dict[tuple[str, type[Message]], deque[ReceivedSample]] = {}
 
     def add(self, arrival: ReceivedSample) -> None:
         """Add an arrival. This runs in Zenoh's threads, so no message is decoded here."""
@@ -95,9 +95,9 @@ class NetworkTraffic:
                 self.keys_left_out += 1
                 return
             self._newest_by_key[arrival.key] = arrival
-            self._arrival_times_ns_by_key.setdefault(arrival.key, deque(maxlen=MAX_ARRIVAL_TIMES)).append(
-                arrival.monotonic_ns
-            )
+            self._arrival_times_ns_by_key.setdefault(
+                arrival.key, deque(maxlen=MAX_ARRIVAL_TIMES)
+            ).append(arrival.monotonic_ns)
             if len(arrival.payload) <= MAX_LATENCY_MESSAGE_BYTES:
                 self._keep_latency_arrival(arrival)
 
@@ -106,7 +106,9 @@ class NetworkTraffic:
         for suffix, message in LATENCY_MESSAGE_TYPES.items():
             if f"/{arrival.key}".endswith(f"/{suffix}"):
                 prefix = arrival.key.removesuffix(suffix)
-                self._latency_arrivals.setdefault((prefix, message), deque(maxlen=MAX_LATENCY_MESSAGES)).append(arrival)
+                self._latency_arrivals.setdefault(
+                    (prefix, message), deque(maxlen=MAX_LATENCY_MESSAGES)
+                ).append(arrival)
 
     def measure_keys(self, now_ns: int) -> list[KeyTraffic]:
         """Return the traffic of every key, sorted by robot and key; unknown keys are last.
@@ -118,9 +120,12 @@ class NetworkTraffic:
             newest = dict(self._newest_by_key)
             recent_times_ns_by_key: dict[str, list[int]] = {}
             for key, times_ns in self._arrival_times_ns_by_key.items():
-                recent_times_ns_by_key[key] = [time_ns for time_ns in times_ns if now_ns - time_ns <= RATE_WINDOW_NS]
+                recent_times_ns_by_key[key] = [
+                    time_ns for time_ns in times_ns if now_ns - time_ns <= RATE_WINDOW_NS
+                ]
         content_by_key = {
-            key: _decode_or_explain(self._split_namespace(key)[1], arrival) for key, arrival in newest.items()
+            key: _decode_or_explain(self._split_namespace(key)[1], arrival)
+            for key, arrival in newest.items()
         }
         clock_ns_by_robot = self._find_robot_clocks_ns(content_by_key)
         lease_holder_by_robot = self._find_lease_holders(content_by_key)
@@ -169,15 +174,23 @@ class NetworkTraffic:
     def measure_latencies(self) -> list[CommandLatency]:
         """Return the latency of every robot whose commands answer known joint states."""
         with self._lock:
-            arrivals_by_source = {source: list(arrivals) for source, arrivals in self._latency_arrivals.items()}
+            arrivals_by_source = {
+                source: list(arrivals) for source, arrivals in self._latency_arrivals.items()
+            }
         latencies: list[CommandLatency] = []
-        prefixes = sorted(prefix for prefix, message_type in arrivals_by_source if message_type is JointCommand)
+        prefixes = sorted(
+            prefix for prefix, message_type in arrivals_by_source if message_type is JointCommand
+        )
         for prefix in prefixes:
             latency = self._measure_latency(
                 prefix,
-                states=_decode_readable(arrivals_by_source.get((prefix, JointState), []), JointState),
+                states=_decode_readable(
+                    arrivals_by_source.get((prefix, JointState), []), JointState
+                ),
                 commands=_decode_readable(arrivals_by_source[prefix, JointCommand], JointCommand),
-                applied_commands=_decode_readable(arrivals_by_source.get((prefix, AppliedCommand), []), AppliedCommand),
+                applied_commands=_decode_readable(
+                    arrivals_by_source.get((prefix, AppliedCommand), []), AppliedCommand
+                ),
             )
             if latency is not None:
                 latencies.append(latency)
@@ -211,7 +224,9 @@ class NetworkTraffic:
             # A command is applied again in each tick until its successor; the first time counts. The sequence number is
             # None in ticks in which the host applied no command.
             if applied_command.sequence is not None:
-                applied_time_ns_by_sequence.setdefault(applied_command.sequence, applied_command.timestamp_ns)
+                applied_time_ns_by_sequence.setdefault(
+                    applied_command.sequence, applied_command.timestamp_ns
+                )
         response_latencies_ms: list[float] = []
         actuation_latencies_ms: list[float] = []
         for command, command_arrival_ns in commands:
@@ -238,12 +253,20 @@ class NetworkTraffic:
     def read_tick_times(self) -> dict[str, dict[str, TimingStatistics]]:
         """Return the tick times of every robot from its newest status; empty for one that was not armed yet."""
         statuses = self._decode_newest(keys.STATUS)
-        return {robot: status.tick_times for robot, status in statuses.items() if isinstance(status, RobotStatus)}
+        return {
+            robot: status.tick_times
+            for robot, status in statuses.items()
+            if isinstance(status, RobotStatus)
+        }
 
     def read_descriptions(self) -> dict[str, RobotDescription]:
         """Return the newest description by robot, of every robot that publishes one."""
         contents = self._decode_newest(keys.DESCRIPTION)
-        return {robot: content for robot, content in contents.items() if isinstance(content, RobotDescription)}
+        return {
+            robot: content
+            for robot, content in contents.items()
+            if isinstance(content, RobotDescription)
+        }
 
     def _decode_newest(self, relative_key: str) -> dict[str, Any]:
         """Return the newest message at a key by robot; a text in its place is the reason why it is unreadable."""
@@ -331,7 +354,9 @@ def _decode_or_explain(relative_key: str, arrival: ReceivedSample) -> Any:
         return error.reason
 
 
-def _decode_readable(arrivals: list[ReceivedSample], message_type: type[MessageT]) -> list[tuple[MessageT, int]]:
+def _decode_readable(
+    arrivals: list[ReceivedSample], message_type: type[MessageT]
+) -> list[tuple[MessageT, int]]:
     """Return the messages that can be decoded, each with the monotonic time of its arrival in ns."""
     decoded: list[tuple[MessageT, int]] = []
     for arrival in arrivals:

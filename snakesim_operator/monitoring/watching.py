@@ -31,14 +31,22 @@ def _add_topic_list(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_echo(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("key", metavar="KEY", help="such as sensor/joints or sensor/* (`snakesim topic list` has all)")
+    parser.add_argument(
+        "key",
+        metavar="KEY",
+        help="such as sensor/joints or sensor/* (`snakesim topic list` has all)",
+    )
     _add_count(parser, "end after this many messages")
     add_network_arguments(parser)
 
 
 def _add_rate(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("key", nargs="?", metavar="KEY", help="only this key, such as sensor/joints or sensor/*")
-    parser.add_argument("--once", action="store_true", help="listen for two seconds, print one table, and end")
+    parser.add_argument(
+        "key", nargs="?", metavar="KEY", help="only this key, such as sensor/joints or sensor/*"
+    )
+    parser.add_argument(
+        "--once", action="store_true", help="listen for two seconds, print one table, and end"
+    )
     _add_count(parser, "end after this many seconds, with KEY")
     add_network_arguments(parser)
     add_json_argument(parser)
@@ -58,8 +66,12 @@ def _add_record(parser: argparse.ArgumentParser) -> None:
         help="record demonstrations into this folder, one after the other, begun and ended by Enter",
     )
     add_task_argument(parser, "with --episodes: what is demonstrated, in words")
-    add_duration_argument(parser, "end after this time by the wall clock", make_number_parser(0.0, 1e9, "s"))
-    parser.add_argument("--stamps", choices=LOG_TIME_CLOCKS, help=f"{LOG_TIME_CLOCK_HELP} (default: robot)")
+    add_duration_argument(
+        parser, "end after this time by the wall clock", make_number_parser(0.0, 1e9, "s")
+    )
+    parser.add_argument(
+        "--stamps", choices=LOG_TIME_CLOCKS, help=f"{LOG_TIME_CLOCK_HELP} (default: robot)"
+    )
     viewers = parser.add_mutually_exclusive_group()
     viewers.add_argument("--raw-only", action="store_true", help=RAW_ONLY_HELP)
     viewers.add_argument(
@@ -82,10 +94,18 @@ def _add_record(parser: argparse.ArgumentParser) -> None:
 
 def _add_preview(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--hz", type=float, default=2.0, metavar="HZ", help="maximum previews a second of a camera (default: 2)"
+        "--hz",
+        type=float,
+        default=2.0,
+        metavar="HZ",
+        help="maximum previews a second of a camera (default: 2)",
     )
     parser.add_argument(
-        "--width", type=int, default=320, metavar="PIXELS", help="maximum width of a preview (default: 320)"
+        "--width",
+        type=int,
+        default=320,
+        metavar="PIXELS",
+        help="maximum width of a preview (default: 320)",
     )
     add_network_arguments(parser)
 
@@ -136,7 +156,8 @@ def _record_robot_or_demonstrations(arguments: argparse.Namespace) -> int:
         return _record_demonstrations(arguments)
     if arguments.task is not None:
         raise ConfigError(
-            "--task is for --episodes DIR; add it, or leave --task out", code="command/conflicting-options"
+            "--task is for --episodes DIR; add it, or leave --task out",
+            code="command/conflicting-options",
         )
     if arguments.foxglove is not None:
         extras.require_extra("console", "--foxglove")
@@ -149,7 +170,8 @@ def _record_robot_or_demonstrations(arguments: argparse.Namespace) -> int:
         foxglove_port=arguments.foxglove,
         foxglove_origins=arguments.foxglove_origin,
         raw_only=arguments.raw_only,
-        stamps=arguments.stamps or "robot",  # no default in argparse: None tells that --stamps was not given
+        stamps=arguments.stamps
+        or "robot",  # no default in argparse: None tells that --stamps was not given
     )
 
 
@@ -177,7 +199,9 @@ def _record_demonstrations(arguments: argparse.Namespace) -> int:
         )
     from snakesim_operator.playback.demonstrations import record_demonstrations
 
-    return record_demonstrations(select_robots(arguments), arguments.episodes, task, iter(sys.stdin))
+    return record_demonstrations(
+        select_robots(arguments), arguments.episodes, task, iter(sys.stdin)
+    )
 
 
 def _publish_previews(arguments: argparse.Namespace) -> int:
@@ -193,7 +217,10 @@ COMMANDS: Commands = (
         help="Record everything that a robot publishes into an MCAP file.",
         add=_add_record,
         run=_record_robot_or_demonstrations,
-        examples=("record --out test.mcap --duration 30", "record --episodes demos --task 'through the pegs'"),
+        examples=(
+            "record --out test.mcap --duration 30",
+            "record --episodes demos --task 'through the pegs'",
+        ),
     ),
     Command(
         name="status",
@@ -204,7 +231,11 @@ COMMANDS: Commands = (
         details="Exit code: 0 every robot is armed or disarmed without a fault, 1 otherwise or without a robot.",
         examples=("status", "status --json --endpoint tcp/127.0.0.1:7447"),
     ),
-    CommandGroup(name="topic", heading="robot", help="List keys, print their messages, and measure their rates."),
+    CommandGroup(
+        name="topic",
+        heading="robot",
+        help="List keys, print their messages, and measure their rates.",
+    ),
     Command(
         name="topic list",
         help="List the keys on which a robot publishes.",

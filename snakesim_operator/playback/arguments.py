@@ -23,16 +23,26 @@ from snakesim_operator.recording.stamps import LOG_TIME_CLOCK_HELP, LOG_TIME_CLO
 
 def add_span_options(parser: argparse.ArgumentParser) -> None:
     """Add `--from` and `--to`, which select a part of a run."""
-    for flag, name, default, verb in (("--from", "from_s", 0.0, "begin"), ("--to", "to_s", inf, "end")):
+    for flag, name, default, verb in (
+        ("--from", "from_s", 0.0, "begin"),
+        ("--to", "to_s", inf, "end"),
+    ):
         about = f"{verb} S seconds in"
         parser.add_argument(
-            flag, dest=name, type=make_number_parser(0.0, inf, "s"), default=default, metavar="S", help=about
+            flag,
+            dest=name,
+            type=make_number_parser(0.0, inf, "s"),
+            default=default,
+            metavar="S",
+            help=about,
         )
 
 
 def add_recording_argument(parser: argparse.ArgumentParser) -> None:
     """Add the run that a command reads."""
-    parser.add_argument("recording", type=Path, metavar="RUN", help="folder of a run, or an MCAP file")
+    parser.add_argument(
+        "recording", type=Path, metavar="RUN", help="folder of a run, or an MCAP file"
+    )
 
 
 def _add_speed_option(parser: argparse.ArgumentParser, limits: tuple[float, float]) -> None:
@@ -46,7 +56,10 @@ def _add_speed_option(parser: argparse.ArgumentParser, limits: tuple[float, floa
 
 
 def _add_fps_option(
-    parser: argparse.ArgumentParser, parse: Callable[[str], float], default: float | None, about: str
+    parser: argparse.ArgumentParser,
+    parse: Callable[[str], float],
+    default: float | None,
+    about: str,
 ) -> None:
     parser.add_argument("--fps", type=parse, default=default, metavar="HZ", help=about)
 
@@ -62,13 +75,21 @@ def _add_report_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_compare_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run_a", type=Path, metavar="RUN_A", help="folder of the run that percentages refer to")
     parser.add_argument(
-        "run_b", type=Path, metavar="RUN_B", help="folder of the other run, of a robot with the same joints"
+        "run_a", type=Path, metavar="RUN_A", help="folder of the run that percentages refer to"
+    )
+    parser.add_argument(
+        "run_b",
+        type=Path,
+        metavar="RUN_B",
+        help="folder of the other run, of a robot with the same joints",
     )
     add_output_argument(parser, "the page, an HTML file (default: RUN_B/compare.html)")
     parser.add_argument(
-        "--within", type=float, metavar="PERCENT", help="exit with 1 when the distances moved differ by more"
+        "--within",
+        type=float,
+        metavar="PERCENT",
+        help="exit with 1 when the distances moved differ by more",
     )
     add_json_argument(parser)
 
@@ -79,35 +100,59 @@ def _add_replay_options(parser: argparse.ArgumentParser) -> None:
     _add_speed_option(parser, (0.001, 1e6))
     parser.add_argument("--step", action="store_true", help="play one tick at each Enter")
     parser.add_argument(
-        "--endpoint", metavar="ENDPOINT", help="Zenoh endpoint to listen on (default: tcp/127.0.0.1:7447)"
+        "--endpoint",
+        metavar="ENDPOINT",
+        help="Zenoh endpoint to listen on (default: tcp/127.0.0.1:7447)",
     )
     add_namespace_argument(parser)
     parser.add_argument(
-        "--control", action="store_true", help="run the services on the recorded sensors, and compare their commands"
+        "--control",
+        action="store_true",
+        help="run the services on the recorded sensors, and compare their commands",
     )
     add_set_argument(parser, "with --control: change any value of the configuration")
-    parser.add_argument("--controller", metavar="NAME", help="with --control: another controller, as of `snakesim run`")
+    parser.add_argument(
+        "--controller",
+        metavar="NAME",
+        help="with --control: another controller, as of `snakesim run`",
+    )
     parser.add_argument(
         "--run-recorded-code",
         action="store_true",
         help="with --control: run Python files that the recording names, as they are on this computer now",
     )
-    add_output_argument(parser, "with --control: folder for a run that `snakesim study compare` reads")
+    add_output_argument(
+        parser, "with --control: folder for a run that `snakesim study compare` reads"
+    )
 
 
 def _add_export_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recordings", type=Path, nargs="+", metavar="RUN", help="folders of runs, or MCAP files")
     parser.add_argument(
-        "--format", required=True, choices=["csv", "parquet", "npz", "lerobot", "mcap"], help="what to write"
+        "recordings", type=Path, nargs="+", metavar="RUN", help="folders of runs, or MCAP files"
+    )
+    parser.add_argument(
+        "--format",
+        required=True,
+        choices=["csv", "parquet", "npz", "lerobot", "mcap"],
+        help="what to write",
     )
     add_output_argument(parser, "file or folder (default: beside the recording)")
     parser.add_argument(
-        "--images", action="store_true", help="lerobot: with the images of the cameras, in the recordings"
+        "--images",
+        action="store_true",
+        help="lerobot: with the images of the cameras, in the recordings",
     )
     add_task_argument(parser, "lerobot: the task, in words (default: the scenario's name)")
-    parser.add_argument("--stamps", choices=LOG_TIME_CLOCKS, help=f"mcap: {LOG_TIME_CLOCK_HELP} (default: as recorded)")
+    parser.add_argument(
+        "--stamps",
+        choices=LOG_TIME_CLOCKS,
+        help=f"mcap: {LOG_TIME_CLOCK_HELP} (default: as recorded)",
+    )
     _add_fps_option(
-        parser, make_number_parser(1.0, 1000.0, "Hz"), None, "lerobot: frames a second (default: the robot's rate)"
+        parser,
+        make_number_parser(1.0, 1000.0, "Hz"),
+        None,
+        "lerobot: frames a second (default: the robot's rate)",
     )
 
 
@@ -129,7 +174,9 @@ def _add_video_options(parser: argparse.ArgumentParser) -> None:
         metavar="PIXELS",
         help="height of the picture, an even number (default: 720)",
     )
-    _add_fps_option(parser, make_number_parser(1.0, 240.0, "Hz"), 30.0, "frames a second (default: 30)")
+    _add_fps_option(
+        parser, make_number_parser(1.0, 240.0, "Hz"), 30.0, "frames a second (default: 30)"
+    )
     _add_speed_option(parser, (0.01, 100.0))
     add_span_options(parser)
 
@@ -159,7 +206,9 @@ def _write_report(arguments: argparse.Namespace) -> int:
 def _compare_runs(arguments: argparse.Namespace) -> int:
     from snakesim_operator.results.compare import compare_runs
 
-    return compare_runs(arguments.run_a, arguments.run_b, arguments.out, arguments.within, as_json=arguments.json)
+    return compare_runs(
+        arguments.run_a, arguments.run_b, arguments.out, arguments.within, as_json=arguments.json
+    )
 
 
 def _film_run(arguments: argparse.Namespace) -> int:
@@ -168,11 +217,17 @@ def _film_run(arguments: argparse.Namespace) -> int:
     size = (arguments.width, arguments.height)
     if any(pixels % 2 for pixels in size):
         raise ConfigError(
-            f"--width {size[0]} --height {size[1]}: give even numbers of pixels", code="command/invalid-option"
+            f"--width {size[0]} --height {size[1]}: give even numbers of pixels",
+            code="command/invalid-option",
         )
     span_s = (arguments.from_s, arguments.to_s)
     return film_run(
-        arguments.recording, arguments.out, size=size, fps=arguments.fps, speed=arguments.speed, span_s=span_s
+        arguments.recording,
+        arguments.out,
+        size=size,
+        fps=arguments.fps,
+        speed=arguments.speed,
+        span_s=span_s,
     )
 
 
@@ -185,7 +240,8 @@ def _export_runs(arguments: argparse.Namespace) -> int:
 
     if arguments.stamps is not None and arguments.format != "mcap":
         raise ConfigError(
-            f"--stamps is for --format mcap, not {arguments.format}; leave it out", code="command/conflicting-options"
+            f"--stamps is for --format mcap, not {arguments.format}; leave it out",
+            code="command/conflicting-options",
         )
     if arguments.format == "lerobot":
         choice = {"images": arguments.images, "task": arguments.task, "fps": arguments.fps}
@@ -195,7 +251,9 @@ def _export_runs(arguments: argparse.Namespace) -> int:
             f"--images, --task and --fps are for --format lerobot, not {arguments.format}; leave them out",
             code="command/conflicting-options",
         )
-    return export_run(arguments.recordings, arguments.format, arguments.out, print_line, arguments.stamps)
+    return export_run(
+        arguments.recordings, arguments.format, arguments.out, print_line, arguments.stamps
+    )
 
 
 def _replay_recording(arguments: argparse.Namespace) -> int:
@@ -221,10 +279,16 @@ def _replay_recording(arguments: argparse.Namespace) -> int:
         if arguments.controller is not None:
             overrides.append(KeyOverride("controller", arguments.controller, "--controller"))
         return replay_and_compare_commands(
-            path, overrides, arguments.out, print_line, run_recorded_code=arguments.run_recorded_code
+            path,
+            overrides,
+            arguments.out,
+            print_line,
+            run_recorded_code=arguments.run_recorded_code,
         )
 
-    has_control_option = arguments.set or arguments.out or arguments.controller or arguments.run_recorded_code
+    has_control_option = (
+        arguments.set or arguments.out or arguments.controller or arguments.run_recorded_code
+    )
     if has_control_option:
         raise ConfigError(
             "--set, --controller, --run-recorded-code and --out are for --control, which runs the services; add it, or "
@@ -263,7 +327,11 @@ COMMANDS: Commands = (
             "replay runs/demo --control --set control.speed_kp_s=0.3 --out runs/again",
         ),
     ),
-    CommandGroup(name="recording", heading="runs and studies", help="Inspect, convert and draw recorded runs."),
+    CommandGroup(
+        name="recording",
+        heading="runs and studies",
+        help="Inspect, convert and draw recorded runs.",
+    ),
     Command(
         name="recording info",
         help="Print what a recording holds: keys, rates, sizes, gaps.",
@@ -298,7 +366,9 @@ COMMANDS: Commands = (
             "recording video runs/demo --out demo.gif --speed 4 --from 2 --to 10",
         ),
     ),
-    CommandGroup(name="study", heading="runs and studies", help="Evaluate, sweep, optimize and compare runs."),
+    CommandGroup(
+        name="study", heading="runs and studies", help="Evaluate, sweep, optimize and compare runs."
+    ),
     Command(
         name="study compare",
         help="Compare two runs, as a table and as a page with plots.",

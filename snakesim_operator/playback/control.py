@@ -75,7 +75,9 @@ class CommandComparison:
     def differing_ticks(self) -> list[int]:
         """Ticks whose commands differ, or that have a command in only one of recording and replay."""
         unequal = {
-            tick for tick in self.common_ticks if not are_same_commands(self.recorded[tick], self.replayed[tick])
+            tick
+            for tick in self.common_ticks
+            if not are_same_commands(self.recorded[tick], self.replayed[tick])
         }
         in_only_one = self.recorded.keys() ^ self.replayed.keys()
         return sorted(unequal | in_only_one)
@@ -87,7 +89,9 @@ class CommandComparison:
 
     def ignore_after(self, last_tick: int) -> None:
         """Ignore the recorded commands after a tick, at which the replay ended."""
-        self.recorded = {tick: command for tick, command in self.recorded.items() if tick <= last_tick}
+        self.recorded = {
+            tick: command for tick, command in self.recorded.items() if tick <= last_tick
+        }
 
     def find_largest_difference(self) -> tuple[int, int, float] | None:
         """Find the largest difference of a target: tick, joint index and magnitude. Returns None if there is none."""
@@ -105,7 +109,12 @@ def are_same_commands(a: JointCommand, b: JointCommand) -> bool:
 
     The sequence numbers depend on how often the service ran at tick 0, which does not affect the motors.
     """
-    return (a.arm_session, a.mode, a.target, a.torque_limit_nm) == (b.arm_session, b.mode, b.target, b.torque_limit_nm)
+    return (a.arm_session, a.mode, a.target, a.torque_limit_nm) == (
+        b.arm_session,
+        b.mode,
+        b.target,
+        b.torque_limit_nm,
+    )
 
 
 def load_recorded_config(
@@ -172,7 +181,12 @@ class ControlReplay:
     """Runs services on the recorded sensor data of a run, in place of the services of that run."""
 
     def __init__(
-        self, path: Path, overrides: list[KeyOverride], out: Path | None = None, *, run_recorded_code: bool = False
+        self,
+        path: Path,
+        overrides: list[KeyOverride],
+        out: Path | None = None,
+        *,
+        run_recorded_code: bool = False,
     ) -> None:
         """Read the configuration of a recording, and prepare its replay.
 
@@ -195,7 +209,8 @@ class ControlReplay:
             raise ConfigError(f"{path}: holds no hal/description", code="recording/missing-data")
         self.robot: RobotDescription = contents.description
         self.clock_mode = self.config.clock_mode
-        self.stop_reason = ""  # why the replay did not reach the end of an incomplete recording; empty if it did
+        # Why the replay did not reach the end of an incomplete recording; empty if it did.
+        self.stop_reason = ""
         self.comparison = CommandComparison()
 
         # What is replayed.
@@ -228,7 +243,8 @@ class ControlReplay:
             for override in overrides
             if override.key.startswith(CHOSEN_PREFIXES[0])
         }
-        self._pending_changes: list[tuple[ControlParameters, LocalQuery]] = []  # requests without a response yet
+        # Requests without a response yet.
+        self._pending_changes: list[tuple[ControlParameters, LocalQuery]] = []
 
     def run(self) -> CommandComparison:
         """Replay the whole recording through the services, and return how their commands compare.
@@ -250,7 +266,9 @@ class ControlReplay:
             self._publish_description()
             for name in self._services:
                 service_loop = ServiceLoop(
-                    load_service_class(self.config, name), self.config, self._network.create_session()
+                    load_service_class(self.config, name),
+                    self.config,
+                    self._network.create_session(),
                 )
                 stack.callback(service_loop.close)
                 self._service_loops.append(service_loop)
@@ -267,7 +285,9 @@ class ControlReplay:
 
     def _publish_description(self) -> None:
         """Publish the configuration and the description, as a host does at its start."""
-        effective = RunConfiguration(config_hash=self.robot.config_hash, content=encode_config(self.config).decode())
+        effective = RunConfiguration(
+            config_hash=self.robot.config_hash, content=encode_config(self.config).decode()
+        )
         self._session.declare_latched_publisher(keys.CONFIG, RunConfiguration).put(effective)
         self._session.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(self.robot)
 
@@ -436,7 +456,8 @@ def replay_and_compare_commands(
         replay = ControlReplay(path, overrides, recording_path, run_recorded_code=run_recorded_code)
     except FileExistsError:
         raise ConfigError(
-            f"--out {out}: holds a recording already; choose another folder", code="file/already-exists"
+            f"--out {out}: holds a recording already; choose another folder",
+            code="file/already-exists",
         ) from None
     comparison = replay.run()
     if out is not None:
@@ -447,21 +468,27 @@ def replay_and_compare_commands(
         last_tick = max(comparison.replayed, default=0)
         print_text(f"replayed up to tick {last_tick} only: {replay.stop_reason}")
     elif not comparison.recorded:
-        raise ConfigError(f"{path}: holds no commands, on {keys.JOINT_COMMAND}", code="recording/missing-data")
+        raise ConfigError(
+            f"{path}: holds no commands, on {keys.JOINT_COMMAND}", code="recording/missing-data"
+        )
     are_same = _print_comparison(comparison, replay, print_text)
     if are_same or replay.has_changed_settings or replay.missing:
         return report_missing_data(path, replay.missing)
     return report_missing_data(path, replay.missing, 1)
 
 
-def _print_comparison(comparison: CommandComparison, replay: ControlReplay, print_text: PrintLine) -> bool:
+def _print_comparison(
+    comparison: CommandComparison, replay: ControlReplay, print_text: PrintLine
+) -> bool:
     """Print how the commands differ, and return whether they are the same."""
     different = comparison.differing_ticks
     count = len(comparison.recorded.keys() | comparison.replayed.keys())
     if not different:
         print_text(f"{count} commands, the same to the bit")
         return True
-    print_text(f"{len(different)} of {count} commands differ, the first answers tick {different[0]}")
+    print_text(
+        f"{len(different)} of {count} commands differ, the first answers tick {different[0]}"
+    )
     largest_difference = comparison.find_largest_difference()
     if largest_difference is not None:
         tick, joint_index, magnitude = largest_difference

@@ -25,7 +25,9 @@ from snakesim_operator.recording.recorder_process import record_to_file
 
 LABELS_FILENAME = "episodes.jsonl"
 SUCCESS_BY_KEY = {"s": True, "f": False, "d": None}  # None: the episode is dropped
-KEY_HELP = "Enter begins an episode and ends it; then s: it succeeded, f: it failed, d: drop it. q ends"
+KEY_HELP = (
+    "Enter begins an episode and ends it; then s: it succeeded, f: it failed, d: drop it. q ends"
+)
 
 
 class EpisodeLabel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -75,7 +77,9 @@ class _LineReader:
         return True
 
 
-def record_demonstrations(selection: RobotSelection, folder: Path, task: str, lines: Iterator[str]) -> int:
+def record_demonstrations(
+    selection: RobotSelection, folder: Path, task: str, lines: Iterator[str]
+) -> int:
     """Record episodes that an operator demonstrates, until the operator types q or the input ends.
 
     A full disk ends the command as well. A stop signal counts as the end of the input.
@@ -117,7 +121,9 @@ def record_demonstrations(selection: RobotSelection, folder: Path, task: str, li
 class _DemonstrationRecorder:
     """Records episodes one after another into a folder, each with its label."""
 
-    def __init__(self, connection: ConnectionSettings, folder: Path, task: str, keyboard: _LineReader) -> None:
+    def __init__(
+        self, connection: ConnectionSettings, folder: Path, task: str, keyboard: _LineReader
+    ) -> None:
         self._link = connection
         self._folder = folder
         self._task = task
@@ -138,7 +144,9 @@ class _DemonstrationRecorder:
         print_line(f"{path.name}: recording; Enter ends it")
         success = None  # as judged by the operator; None: drop the episode
         try:
-            recorder = record_to_file(self._link, path, lambda: not self._keyboard.pop_line_if_any())
+            recorder = record_to_file(
+                self._link, path, lambda: not self._keyboard.pop_line_if_any()
+            )
             self.failure = recorder.writer.failure
             if not self.failure:
                 message_count = recorder.writer.counts.total()
@@ -150,7 +158,11 @@ class _DemonstrationRecorder:
                 print_line(f"{path.name}: dropped")
         if success is not None:
             label = EpisodeLabel(
-                file=path.name, task=self._task, success=success, who=get_user_name(), began=start_time_utc
+                file=path.name,
+                task=self._task,
+                success=success,
+                who=get_user_name(),
+                began=start_time_utc,
             )
             self._append_label(label)
 

@@ -33,12 +33,13 @@ class RecordedEpisode:
     record: RunRecord
     task: str
     success: bool | None  # None if unknown
-    reward_m: Floats | None  # (n,) advance from each row of the record to the next; None if the pose is unknown
+    # (n,) advance from each row of the record to the next; None if the pose is unknown.
+    reward_m: Floats | None
     rows: NDArray[np.int64]  # indices into the record, without a gap between them
-    pictures: dict[str, CameraImages] = field(
-        default_factory=dict[str, CameraImages]
-    )  # images of the whole run, by camera
-    pictures_after_tick: int = -1  # images up to this tick were taken before the gap in front of the episode
+    # Images of the whole run, by camera.
+    pictures: dict[str, CameraImages] = field(default_factory=dict[str, CameraImages])
+    # Images up to this tick were taken before the gap in front of the episode.
+    pictures_after_tick: int = -1
 
 
 def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> list[RecordedEpisode]:
@@ -65,7 +66,9 @@ def read_episodes(runs: Sequence[Path], task: str | None, *, images: bool) -> li
             continue
         for label in read_labels(labels_path):
             recording = run / label.file
-            episodes += _read_run_episodes(recording, task or label.task, label.success, images=images)
+            episodes += _read_run_episodes(
+                recording, task or label.task, label.success, images=images
+            )
     return episodes
 
 
@@ -91,11 +94,14 @@ def read_labels(path: Path) -> list[EpisodeLabel]:
         return [msgspec.json.decode(line, type=EpisodeLabel) for line in lines if line.strip()]
     except (msgspec.DecodeError, OSError) as error:
         raise ConfigError(
-            f"{path}: {str(error)[:200]}; it has a line of JSON for each episode", code="recording/not-readable"
+            f"{path}: {str(error)[:200]}; it has a line of JSON for each episode",
+            code="recording/not-readable",
         ) from None
 
 
-def _read_run_episodes(run: Path, task: str | None, success: bool | None, *, images: bool) -> list[RecordedEpisode]:
+def _read_run_episodes(
+    run: Path, task: str | None, success: bool | None, *, images: bool
+) -> list[RecordedEpisode]:
     """Read the episodes of one run. A gap in the record ends an episode and begins the next one.
 
     Args:

@@ -24,13 +24,22 @@ from snakesim_operator.recording.stamps import LogTimeClock
 from snakesim_operator.results.missing_data import report_missing_data
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import find_recording_path
-from snakesim_operator.results.signals import PARQUET_UNIT, compute_signals, find_unit, make_signal_columns
+from snakesim_operator.results.signals import (
+    PARQUET_UNIT,
+    compute_signals,
+    find_unit,
+    make_signal_columns,
+)
 
 MISSING_METADATA_KEY = b"snakesim.missing"  # metadata of a Parquet file: JSON
 
 
 def export_run(
-    runs: Sequence[Path], form: str, out: Path | None, print_text: PrintLine, stamps: LogTimeClock | None = None
+    runs: Sequence[Path],
+    form: str,
+    out: Path | None,
+    print_text: PrintLine,
+    stamps: LogTimeClock | None = None,
 ) -> int:
     """Export one run as a file in another format.
 
@@ -68,7 +77,9 @@ def export_run(
             case "csv":
                 _write_csv(make_signal_columns(record), partial, record.missing)
             case _:
-                columns = {name: values.tolist() for name, values in make_signal_columns(record).items()}
+                columns = {
+                    name: values.tolist() for name, values in make_signal_columns(record).items()
+                }
                 units = {name: find_unit(name, record) for name in columns}
                 metadata = None
                 if record.missing:
@@ -79,7 +90,13 @@ def export_run(
 
 
 def export_dataset(
-    runs: Sequence[Path], out: Path | None, print_text: PrintLine, *, images: bool, task: str | None, fps: float | None
+    runs: Sequence[Path],
+    out: Path | None,
+    print_text: PrintLine,
+    *,
+    images: bool,
+    task: str | None,
+    fps: float | None,
 ) -> int:
     """Export runs as a LeRobot dataset: an episode for each run or demonstration, and one more for each gap in it.
 
@@ -104,7 +121,9 @@ def export_dataset(
     for sentence in describe_gaps(episodes):
         print_text(sentence)
     print_text(f"{size.episodes} episodes, {size.frames} frames: {path}")
-    codes = [report_missing_data(episode.record.path, episode.record.missing) for episode in episodes]
+    codes = [
+        report_missing_data(episode.record.path, episode.record.missing) for episode in episodes
+    ]
     return max(codes)
 
 
@@ -112,16 +131,19 @@ def _check_output_path(path: Path) -> Path:
     """Check that a path can be written and does not exist yet, and return it. Raises ConfigError otherwise."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch(exist_ok=False)  # checked before minutes of work; does not follow a symbolic link
+        # Checked before minutes of work; does not follow a symbolic link.
+        path.touch(exist_ok=False)
         path.unlink()
     except FileExistsError:
         what = "a symbolic link" if path.is_symlink() else "such a file"
         raise ConfigError(
-            f"{path}: there is {what} already; choose another one with --out", code="file/already-exists"
+            f"{path}: there is {what} already; choose another one with --out",
+            code="file/already-exists",
         ) from None
     except OSError as error:
         raise ConfigError(
-            f"{path}: cannot be written: {error.strerror}; choose another one with --out", code="file/not-writable"
+            f"{path}: cannot be written: {error.strerror}; choose another one with --out",
+            code="file/not-writable",
         ) from None
     return path
 
@@ -149,7 +171,8 @@ def _write_csv(columns: dict[str, NDArray[Any]], path: Path, missing: Sequence[s
         writer = csv.writer(file)
         writer.writerow(columns)
         for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-            writer.writerow(["" if value != value else value for value in row])  # NaN is not equal to itself
+            # NaN is not equal to itself.
+            writer.writerow(["" if value != value else value for value in row])
 
 
 def write_parquet(
@@ -173,6 +196,8 @@ def write_parquet(
     table_of_columns = pyarrow.table(columns)
     fields = list(table_of_columns.schema)
     if units is not None:
-        fields = [field.with_metadata({PARQUET_UNIT: units[field.name].encode()}) for field in fields]
+        fields = [
+            field.with_metadata({PARQUET_UNIT: units[field.name].encode()}) for field in fields
+        ]
     schema = pyarrow.schema(fields, metadata=metadata)
     pyarrow.parquet.write_table(table_of_columns.cast(schema), path)

@@ -21,7 +21,10 @@ from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.messages import ControlParameters, RobotStatus
 from snakesim_operator.recording.losses import LossGap
 from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.results.missing_data import describe_undecodable_messages, report_missing_data
+from snakesim_operator.results.missing_data import (
+    describe_undecodable_messages,
+    report_missing_data,
+)
 from snakesim_operator.results.recording_contents import RUN_KEYS, RecordingContents
 from snakesim_operator.results.run_reader import find_recording_path
 from snakesim_operator.robot_commands.parameters import PREFIX, find_changed_parameters
@@ -93,14 +96,20 @@ def inspect_recording(path: Path) -> RecordingInfo:
             contents.add_message(recorded)
         if recorded.key == keys.PARAMETERS_IN_FORCE:
             with contextlib.suppress(WireError):
-                parameters_in_force.append(parameters_decoder.decode(recorded.payload, recorded.encoding))
+                parameters_in_force.append(
+                    parameters_decoder.decode(recorded.payload, recorded.encoding)
+                )
 
     robot = contents.description
     status = contents.status
-    config: dict[str, Any] = json.loads(contents.config.content) if contents.config is not None else {}
+    config: dict[str, Any] = (
+        json.loads(contents.config.content) if contents.config is not None else {}
+    )
     duration_s = _measure_duration_s(by_key)
     irregular: list[str] = [*IRREGULAR_KEYS]
-    if robot is not None and robot.backend == "can":  # joint modules on a bus send their IMUs by turns
+    if (
+        robot is not None and robot.backend == "can"
+    ):  # joint modules on a bus send their IMUs by turns
         irregular.append(keys.IMU)
     host = None
     if robot is not None and status is not None:
@@ -153,9 +162,14 @@ def _find_parameter_changes(in_force: Sequence[ControlParameters]) -> list[Param
     for previous, current in pairwise(in_force):
         if current.requester is None or current.changes == previous.changes:
             continue
-        changed = {PREFIX + new.name: (old.value, new.value) for old, new in find_changed_parameters(previous, current)}
+        changed = {
+            PREFIX + new.name: (old.value, new.value)
+            for old, new in find_changed_parameters(previous, current)
+        }
         changes.append(
-            ParameterChange(time_s=current.timestamp_ns * 1e-9, requester=current.requester, changed=changed)
+            ParameterChange(
+                time_s=current.timestamp_ns * 1e-9, requester=current.requester, changed=changed
+            )
         )
     return changes
 
@@ -197,11 +211,15 @@ def print_recording_info(path: Path, print_text: PrintLine, *, as_json: bool = F
         print_text(msgspec.json.encode(info).decode())
         return report_missing_data(path, info.missing)
 
-    print_text(f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time")
+    print_text(
+        f"{info.file}: {info.size_bytes / 1e6:.2f} MB, {info.duration_s:.2f} s of robot time"
+    )
     robot = info.robot or "unknown"
     backend = info.backend or "unknown"
     print_text(f"  robot     {robot}, backend {backend}, {info.clock_mode or 'unknown'}")
-    print_text(f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}")
+    print_text(
+        f"  scenario  {info.scenario or 'unknown'}, controller {info.controller or 'none'}, seed {info.seed}"
+    )
     print_text(f"  ended     {info.lifecycle or 'unknown'}")
     digest = "none"
     if info.command_digest:
@@ -210,8 +228,12 @@ def print_recording_info(path: Path, print_text: PrintLine, *, as_json: bool = F
     print_text(f"  commands  {info.ticks} ticks applied, digest {digest}{digest_note}")
 
     for change in info.parameter_changes:
-        changes = [f"{name}: {before} -> {after}" for name, (before, after) in change.changed.items()]
-        print_text(f"  set       at {change.time_s:.2f} s by {change.requester}: {', '.join(changes)}")
+        changes = [
+            f"{name}: {before} -> {after}" for name, (before, after) in change.changed.items()
+        ]
+        print_text(
+            f"  set       at {change.time_s:.2f} s by {change.requester}: {', '.join(changes)}"
+        )
 
     print_text(f"  {'key':<26}{'messages':>9}{'rate':>11}{'mean size':>12}{'gaps':>7}")
     for key, metrics in info.keys.items():
@@ -223,7 +245,9 @@ def print_recording_info(path: Path, print_text: PrintLine, *, as_json: bool = F
     return report_missing_data(path, info.missing)
 
 
-def _describe_skipped(by_key: dict[str, KeyInfo], lost_by_key: Counter[str], irregular: Sequence[str]) -> list[str]:
+def _describe_skipped(
+    by_key: dict[str, KeyInfo], lost_by_key: Counter[str], irregular: Sequence[str]
+) -> list[str]:
     """Describe by sentences the messages that did not reach the recorder, at keys with regular messages."""
     sentences: list[str] = []
     for key, key_info in sorted(by_key.items()):

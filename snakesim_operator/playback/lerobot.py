@@ -56,7 +56,10 @@ class DatasetSize:
 
 
 def write_lerobot(
-    episodes: Sequence[RecordedEpisode], folder: Path, write_table: WriteTable, fps: float | None = None
+    episodes: Sequence[RecordedEpisode],
+    folder: Path,
+    write_table: WriteTable,
+    fps: float | None = None,
 ) -> DatasetSize:
     """Write episodes as a dataset in the format of LeRobot.
 
@@ -75,9 +78,13 @@ def write_lerobot(
     robot_hz = _find_common_rate_hz([episode.record for episode in episodes])
     ticks_per_frame = _compute_ticks_per_frame(robot_hz, fps)
     content = _DatasetContent.from_episodes(episodes)
-    dataset = _DatasetWriter(folder, write_table, content, seconds_per_frame=ticks_per_frame / robot_hz)
+    dataset = _DatasetWriter(
+        folder, write_table, content, seconds_per_frame=ticks_per_frame / robot_hz
+    )
 
-    frames_by_episode = [_select_frame_rows(episode, content, ticks_per_frame) for episode in episodes]
+    frames_by_episode = [
+        _select_frame_rows(episode, content, ticks_per_frame) for episode in episodes
+    ]
     folders_with_frames: set[Path] = set()
     for episode, (rows, _) in zip(episodes, frames_by_episode, strict=True):
         if len(rows):
@@ -100,7 +107,12 @@ class _DatasetWriter:
     """Writes the files of a dataset: first episode by episode, then the files about the whole dataset."""
 
     def __init__(
-        self, folder: Path, write_table: WriteTable, content: "_DatasetContent", *, seconds_per_frame: float
+        self,
+        folder: Path,
+        write_table: WriteTable,
+        content: "_DatasetContent",
+        *,
+        seconds_per_frame: float,
     ) -> None:
         self._folder = folder
         self._write_table = write_table
@@ -108,13 +120,18 @@ class _DatasetWriter:
         self._seconds_per_frame = seconds_per_frame
         self._tasks: list[str] = []
         self._frames_by_episode: list[Frames] = []  # of each episode
-        self._image_statistics: dict[str, list[Statistics]] = {camera: [] for camera in content.size_by_camera}
+        self._image_statistics: dict[str, list[Statistics]] = {
+            camera: [] for camera in content.size_by_camera
+        }
         self._records: list[RunRecord] = []  # of each episode
         self.episode_rows: list[dict[str, Any]] = []  # of meta/episodes, one for each episode
         self.frame_count = 0
 
     def add_episode(
-        self, episode: RecordedEpisode, rows: NDArray[np.int64], image_indices_by_camera: dict[str, NDArray[np.int64]]
+        self,
+        episode: RecordedEpisode,
+        rows: NDArray[np.int64],
+        image_indices_by_camera: dict[str, NDArray[np.int64]],
     ) -> None:
         """Write the frames of an episode as a file, and add the episode to the metadata.
 
@@ -157,7 +174,9 @@ class _DatasetWriter:
             statistics = compute_image_statistics(pictures, image_indices)
             self._image_statistics[camera].append(statistics)
             row |= _make_statistics_columns(IMAGE_PREFIX + camera, statistics)
-        self._write_table(columns, self._folder / DATA_PATTERN.format(chunk_index=chunk, file_index=file), None)
+        self._write_table(
+            columns, self._folder / DATA_PATTERN.format(chunk_index=chunk, file_index=file), None
+        )
         self._frames_by_episode.append(frames)
         self._records.append(episode.record)
         self.episode_rows.append(row)
@@ -184,7 +203,9 @@ class _DatasetWriter:
 
     def _write_episodes_and_tasks(self) -> None:
         """Write the tables of all episodes and of all tasks."""
-        episode_columns = {name: [row[name] for row in self.episode_rows] for name in self.episode_rows[0]}
+        episode_columns = {
+            name: [row[name] for row in self.episode_rows] for name in self.episode_rows[0]
+        }
         self._write_table(episode_columns, self._folder / EPISODES_PATH, None)
 
         task_columns = {"task_index": list(range(len(self._tasks))), TASK_COLUMN: self._tasks}
@@ -259,7 +280,8 @@ def _compute_ticks_per_frame(robot_hz: int, fps: float | None) -> int:
     if fps != round(fps) or robot_hz != ticks_per_frame * fps:
         allowed = ", ".join(str(hz) for hz in range(1, robot_hz + 1) if robot_hz % hz == 0)
         raise ConfigError(
-            f"--fps {fps:g}: of a robot at {robot_hz} Hz give one of {allowed}", code="command/invalid-option"
+            f"--fps {fps:g}: of a robot at {robot_hz} Hz give one of {allowed}",
+            code="command/invalid-option",
         )
     return ticks_per_frame
 
@@ -293,14 +315,17 @@ def _select_frame_rows(
     if not has_all_images.any():
         return episode.rows[:0], {}
     first = int(np.argmax(has_all_images))
-    image_indices = {camera: newest[first::ticks_per_frame] for camera, newest in newest_images.items()}
+    image_indices = {
+        camera: newest[first::ticks_per_frame] for camera, newest in newest_images.items()
+    }
     return episode.rows[first::ticks_per_frame], image_indices
 
 
 def _find_common_rate_hz(records: Sequence[RunRecord]) -> int:
     if any(one.description.layout != records[0].description.layout for one in records):
         raise ConfigError(
-            "the runs are of robots with different joints; a dataset is of one", code="recording/not-comparable"
+            "the runs are of robots with different joints; a dataset is of one",
+            code="recording/not-comparable",
         )
     rate_hz = records[0].config.rate_hz
     if any(one.config.rate_hz != rate_hz for one in records) or rate_hz != round(rate_hz):
@@ -311,12 +336,15 @@ def _find_common_rate_hz(records: Sequence[RunRecord]) -> int:
     empty = [one.path for one in records if not len(one.time_s)]
     if empty:
         raise ConfigError(
-            f"{empty[0]} has no tick after arming, so no frame; leave it out", code="recording/missing-data"
+            f"{empty[0]} has no tick after arming, so no frame; leave it out",
+            code="recording/missing-data",
         )
     return round(rate_hz)
 
 
-def _make_dataset_info(episode: RecordedEpisode, content: _DatasetContent, fps: int) -> dict[str, Any]:
+def _make_dataset_info(
+    episode: RecordedEpisode, content: _DatasetContent, fps: int
+) -> dict[str, Any]:
     """Make the content of `meta/info.json` in a LeRobot dataset, without the totals.
 
     Args:
@@ -360,15 +388,24 @@ def _make_dataset_info(episode: RecordedEpisode, content: _DatasetContent, fps: 
 
 def _list_feature_names(record: RunRecord, *, has_pose: bool) -> dict[str, list[str]]:
     joints = [joint.name for joint in record.description.joints]
-    state = [f"{name}.{joint}" for name in ("angle_rad", "velocity_rad_s", "torque_nm") for joint in joints]
-    pose = [*(f"position_w_m.{axis}" for axis in "xyz"), *(f"orientation.{part}" for part in "wxyz")]
+    state = [
+        f"{name}.{joint}"
+        for name in ("angle_rad", "velocity_rad_s", "torque_nm")
+        for joint in joints
+    ]
+    pose = [
+        *(f"position_w_m.{axis}" for axis in "xyz"),
+        *(f"orientation.{part}" for part in "wxyz"),
+    ]
     return {
         "observation.state": [*state, *(pose if has_pose else [])],
         "action": [f"{name}.{joint}" for name in ("target", "mode") for joint in joints],
     }
 
 
-def _make_frames(episode: RecordedEpisode, content: _DatasetContent, rows: NDArray[np.int64]) -> Frames:
+def _make_frames(
+    episode: RecordedEpisode, content: _DatasetContent, rows: NDArray[np.int64]
+) -> Frames:
     """Make the values of the features of an episode, (n, width) or (n,), except indices and images."""
     record = episode.record
     state = [record.angle_rad, record.velocity_rad_s, record.torque_nm]
@@ -380,7 +417,8 @@ def _make_frames(episode: RecordedEpisode, content: _DatasetContent, rows: NDArr
         "next.done": is_last_frame,
     }
     if content.has_reward and episode.reward_m is not None:
-        reward_m = episode.reward_m[: episode.rows[-1] + 1]  # the last frame earns nothing beyond its episode
+        # The last frame earns nothing beyond its episode.
+        reward_m = episode.reward_m[: episode.rows[-1] + 1]
         frames["next.reward"] = np.add.reduceat(reward_m, rows).astype(np.float32)
     if content.has_success:
         frames["next.success"] = is_last_frame & bool(episode.success)
@@ -390,7 +428,13 @@ def _make_frames(episode: RecordedEpisode, content: _DatasetContent, rows: NDArr
 _PANDAS_METADATA = {  # what pandas needs to read an index: https://pandas.pydata.org/docs/development/developer.html
     "index_columns": [TASK_COLUMN],
     "column_indexes": [
-        {"name": None, "field_name": None, "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+        {
+            "name": None,
+            "field_name": None,
+            "pandas_type": "unicode",
+            "numpy_type": "object",
+            "metadata": None,
+        }
     ],
     "columns": [
         {
@@ -400,7 +444,13 @@ _PANDAS_METADATA = {  # what pandas needs to read an index: https://pandas.pydat
             "numpy_type": "int64",
             "metadata": None,
         },
-        {"name": None, "field_name": TASK_COLUMN, "pandas_type": "unicode", "numpy_type": "object", "metadata": None},
+        {
+            "name": None,
+            "field_name": TASK_COLUMN,
+            "pandas_type": "unicode",
+            "numpy_type": "object",
+            "metadata": None,
+        },
     ],
     "pandas_version": "2.0.0",
 }

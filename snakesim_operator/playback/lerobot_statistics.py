@@ -47,7 +47,9 @@ def compute_image_statistics(images: CameraImages, image_indices: NDArray[np.int
     """
     mean = np.array(images.channel_means)[image_indices].mean(axis=0)
     mean_of_squares = np.array(images.channel_squares)[image_indices].mean(axis=0)
-    return _format_channels(images.channel_min, images.channel_max, mean, mean_of_squares, len(image_indices))
+    return _format_channels(
+        images.channel_min, images.channel_max, mean, mean_of_squares, len(image_indices)
+    )
 
 
 def merge_image_statistics(parts: Sequence[Statistics]) -> Statistics:
@@ -60,7 +62,9 @@ def merge_image_statistics(parts: Sequence[Statistics]) -> Statistics:
     mean = np.average(means, axis=0, weights=counts)
     squares = np.square(deviations) + np.square(means)
     mean_of_squares = np.average(squares, axis=0, weights=counts)
-    return _format_channels(minima.min(axis=0), maxima.max(axis=0), mean, mean_of_squares, int(counts.sum()))
+    return _format_channels(
+        minima.min(axis=0), maxima.max(axis=0), mean, mean_of_squares, int(counts.sum())
+    )
 
 
 def _stack_channels(parts: Sequence[Statistics], name: str) -> Floats:
@@ -68,7 +72,9 @@ def _stack_channels(parts: Sequence[Statistics], name: str) -> Floats:
     return np.array([part[name] for part in parts]).reshape(-1, CHANNELS)
 
 
-def _format_channels(minimum: Floats, maximum: Floats, mean: Floats, mean_of_squares: Floats, count: int) -> Statistics:
+def _format_channels(
+    minimum: Floats, maximum: Floats, mean: Floats, mean_of_squares: Floats, count: int
+) -> Statistics:
     """Format statistics as LeRobot expects them, (3, 1, 1) each, from arrays of shape (3,)."""
     variance = np.maximum(mean_of_squares - np.square(mean), 0.0)
     array_by_name = {"min": minimum, "max": maximum, "mean": mean, "std": np.sqrt(variance)}

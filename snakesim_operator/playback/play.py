@@ -22,7 +22,8 @@ from snakesim_operator.results.missing_data import report_missing_data
 from snakesim_operator.results.recording_contents import read_recording
 
 MAX_PAUSE_S = 10.0  # between two messages, whatever their times are
-REORDER_WINDOW_NS = 1_000_000_000  # an image may arrive this long after the clock message that names it
+# An image may arrive this long after the clock message that names it.
+REORDER_WINDOW_NS = 1_000_000_000
 ORDER_WITHIN_TICK = {keys.CLOCK: 1, keys.APPLIED: 2}  # samples come first
 
 
@@ -76,12 +77,16 @@ def play_recording(
     robot = read_recording(path, (keys.DESCRIPTION,)).description
     default_namespace = robot.robot if robot is not None else "recording"
     namespace = namespace or default_namespace
-    link = ConnectionSettings(endpoint or DEFAULT_ENDPOINT, namespace, listen=True, max_bytes=MAX_IMAGE_BYTES)
+    link = ConnectionSettings(
+        endpoint or DEFAULT_ENDPOINT, namespace, listen=True, max_bytes=MAX_IMAGE_BYTES
+    )
     reader = RecordingReader(path)
     messages = iterate_in_robot_time_order(reader)
     with open_session(link) as session:
         playback_mode = "Enter plays a tick" if step else f"{rate:g} x real time"
-        print_text(f"playing {path} on {link.endpoint}, namespace {namespace}: {playback_mode}; Ctrl-C ends it")
+        print_text(
+            f"playing {path} on {link.endpoint}, namespace {namespace}: {playback_mode}; Ctrl-C ends it"
+        )
         player = _MessagePlayer(session)
         playback_clock = _PlaybackClock(rate)
         for time_ns, simultaneous in groupby(messages, lambda recorded: recorded.robot_time_ns):
@@ -131,7 +136,9 @@ class _MessagePlayer:
         publisher = self._publishers.get(recorded.key)
         if publisher is None:
             declare = (
-                self._session.declare_latched_publisher if row.kind == "latched" else self._session.declare_publisher
+                self._session.declare_latched_publisher
+                if row.kind == "latched"
+                else self._session.declare_publisher
             )
             publisher = declare(recorded.key, row.message)
             self._publishers[recorded.key] = publisher

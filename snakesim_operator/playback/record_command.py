@@ -44,7 +44,8 @@ def record_robot(
     link = replace(find_single_robot(selection, "record"), max_bytes=MAX_IMAGE_BYTES)
     path = out or Path(f"{link.namespace}-{datetime.now():%Y%m%d-%H%M%S}.mcap")
     path.parent.mkdir(parents=True, exist_ok=True)
-    stop_requests: list[bool] = []  # a list, because the signal handler cannot assign a local variable
+    # A list, because the signal handler cannot assign a local variable.
+    stop_requests: list[bool] = []
     call_on_stop_signals(lambda: stop_requests.append(True))
     start_s = time.monotonic()
 
@@ -55,7 +56,9 @@ def record_robot(
         with (
             nullcontext()
             if foxglove_port is None
-            else FoxgloveLiveServer(link.namespace or "robot", foxglove_port, foxglove_origins, print_line) as live
+            else FoxgloveLiveServer(
+                link.namespace or "robot", foxglove_port, foxglove_origins, print_line
+            ) as live
         ):
             end_hint = "" if duration_s else "; Ctrl-C ends it"
             print_line(f"recording {link.namespace} on {link.endpoint} into {path}{end_hint}")
@@ -71,5 +74,7 @@ def record_robot(
             signal.signal(number, signal.SIG_DFL)
     message_count = recorder.writer.counts.total()
     size_bytes = path.stat().st_size
-    print_line(f"{message_count} messages in {time.monotonic() - start_s:.1f} s, {size_bytes / 1e6:.1f} MB: {path}")
+    print_line(
+        f"{message_count} messages in {time.monotonic() - start_s:.1f} s, {size_bytes / 1e6:.1f} MB: {path}"
+    )
     return 1 if recorder.writer.failure else 0

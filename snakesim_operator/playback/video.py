@@ -34,7 +34,12 @@ class FilmCamera(Protocol):
     """A camera that renders a robot, from a plugin in the group `snakesim.films`."""
 
     def render_picture(
-        self, position_w: Floats, wxyz: Floats, angles_rad: Floats, look_at_w: Floats, arrows_w: list[Floats]
+        self,
+        position_w: Floats,
+        wxyz: Floats,
+        angles_rad: Floats,
+        look_at_w: Floats,
+        arrows_w: list[Floats],
     ) -> Picture:
         """Render the robot at a pose, with arrows (2, 3) from tail to tip. Returns pixels (height, width, 3)."""
         ...
@@ -47,7 +52,9 @@ class FilmCamera(Protocol):
 Span = tuple[float, float]  # from and to in seconds, since the first tick
 
 
-def film_run(run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span) -> int:
+def film_run(
+    run: Path, out: Path, *, size: tuple[int, int], fps: float, speed: float, span_s: Span
+) -> int:
     """Film a run from its folder or recording, and return the exit code. Arguments are as of `film_record`."""
     record = RunRecord.load(run)
     film_record(record, out, size=size, fps=fps, speed=speed, span_s=span_s, print_text=print_line)
@@ -79,7 +86,9 @@ def film_record(
         ConfigError: The record has no pose, `out` is not a film, or a package for films is not installed.
     """
     if out.suffix not in (".mp4", ".gif"):
-        raise ConfigError(f"--out {out}: give a file that ends in .mp4 or .gif", code="command/invalid-option")
+        raise ConfigError(
+            f"--out {out}: give a file that ends in .mp4 or .gif", code="command/invalid-option"
+        )
     extras.require_extra("report", "a film")
     times_s = choose_frame_times_s(record, fps, speed, span_s)
     frame_period_s = speed / fps
@@ -152,7 +161,8 @@ def choose_frame_times_s(record: RunRecord, fps: float, speed: float, span_s: Sp
             code="command/invalid-option",
         )
     frame_times_s = np.arange(start_s, end_s, speed / fps)
-    half_tick_s = 0.5 * record.config.period_ns * 1e-9  # keeps rounding from selecting the tick before
+    # Keeps rounding from selecting the tick before.
+    half_tick_s = 0.5 * record.config.period_ns * 1e-9
     newest = np.searchsorted(pose_times_s, frame_times_s + half_tick_s, side="right") - 1
     return pose_times_s[newest]
 
@@ -176,7 +186,11 @@ def describe_frozen_spans(times_s: Floats, frame_period_s: float, period_s: floa
 
 def _make_force_arrows(record: RunRecord, time_s: float) -> list[Floats]:
     """Make an arrow for each contact force at a robot time: tail and tip in the world, (2, 3)."""
-    recent = [world for world in record.worlds if 0 <= time_s - world.timestamp_ns * 1e-9 < MAX_WORLD_AGE_S]
+    recent = [
+        world
+        for world in record.worlds
+        if 0 <= time_s - world.timestamp_ns * 1e-9 < MAX_WORLD_AGE_S
+    ]
     if not recent:
         return []
     arrows: list[Floats] = []
@@ -200,11 +214,15 @@ def _check_frame_count(path: Path, pictures: int) -> None:
     except RuntimeError:
         written = 0
     if written != pictures:
-        raise OSError(f"the encoder has failed, after {written} of {pictures} pictures; the disk may be full")
+        raise OSError(
+            f"the encoder has failed, after {written} of {pictures} pictures; the disk may be full"
+        )
 
 
 @contextlib.contextmanager
-def _open_film_writer(out: Path, size: tuple[int, int], fps: float, missing: Sequence[str]) -> Iterator[WriteFrame]:
+def _open_film_writer(
+    out: Path, size: tuple[int, int], fps: float, missing: Sequence[str]
+) -> Iterator[WriteFrame]:
     """Open a film for writing: yield a function that appends a frame. The comment of the film lists missing data."""
     comment = f"incomplete: {'; '.join(missing)}" if missing else ""
     if out.suffix == ".mp4":
@@ -272,7 +290,9 @@ def _open_gif(out: Path, fps: float, comment: str) -> Iterator[WriteFrame]:
         nonlocal palette
         image = Image.fromarray(picture)
         if palette is None:
-            palette = image.quantize(GIF_COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+            palette = image.quantize(
+                GIF_COLORS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE
+            )
         pictures.append(image.quantize(palette=palette, dither=Image.Dither.NONE))
 
     yield append_frame

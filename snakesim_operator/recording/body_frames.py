@@ -79,9 +79,13 @@ class BodyMessageEncoder:
         link_frames: list[FrameTransform] = []
         for parent, child in pairwise(robot.links):
             rear_end = (parent.length_m, 0.0, 0.0)
-            link_frames.append(shapes.make_frame_transform(0, parent.name, child.name, rear_end, _NO_ROTATION))
+            link_frames.append(
+                shapes.make_frame_transform(0, parent.name, child.name, rear_end, _NO_ROTATION)
+            )
         tail_name = robot.links[0].name
-        base_frame = shapes.make_frame_transform(0, shapes.WORLD_FRAME, tail_name, (0.0, 0.0, 0.0), _NO_ROTATION)
+        base_frame = shapes.make_frame_transform(
+            0, shapes.WORLD_FRAME, tail_name, (0.0, 0.0, 0.0), _NO_ROTATION
+        )
         self._link_transforms = FrameTransforms(transforms=link_frames)
         self._link_transforms_in_world = FrameTransforms(transforms=[base_frame, *link_frames])
         self._is_pitch_joint = [joint.axis == "pitch" for joint in robot.joints]
@@ -95,13 +99,20 @@ class BodyMessageEncoder:
         for i, joint in enumerate(robot.joints):
             placeholder = 3 * i + 1.0
             measured_joints.append(
-                NamedJoint(name=joint.name, position=placeholder, velocity=placeholder + 1.0, effort=placeholder + 2.0)
+                NamedJoint(
+                    name=joint.name,
+                    position=placeholder,
+                    velocity=placeholder + 1.0,
+                    effort=placeholder + 2.0,
+                )
             )
             reference_joints.append(NamedJoint(name=joint.name, position=i + 1.0))
         self._measured_template = _JointStatesTemplate(JointStates(joints=measured_joints))
         self._reference_template = _JointStatesTemplate(JointStates(joints=reference_joints))
 
-    def fill_transforms(self, angles_rad: Sequence[float], base: BasePose | None, time_ns: int) -> FrameTransforms:
+    def fill_transforms(
+        self, angles_rad: Sequence[float], base: BasePose | None, time_ns: int
+    ) -> FrameTransforms:
         """Fill and return the transform of each link relative to its parent, and of the tail link in the world.
 
         The next call reuses the returned message, so the caller must encode it before that.
@@ -125,7 +136,9 @@ class BodyMessageEncoder:
             rotation = base_frame.rotation
             translation.x, translation.y, translation.z = position_w
             rotation.w, rotation.x, rotation.y, rotation.z = orientation_wxyz
-        for frame, angle_rad, is_pitch in zip(frames, angles_rad, self._is_pitch_joint, strict=True):
+        for frame, angle_rad, is_pitch in zip(
+            frames, angles_rad, self._is_pitch_joint, strict=True
+        ):
             half_angle_rad = 0.5 * angle_rad
             rotation = frame.rotation
             rotation.w = math.cos(half_angle_rad)

@@ -15,10 +15,12 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Header, McapRecord, Message, Metadata, Schema, Statistics
 
-MAX_RECORD_BYTES = 64 * 1024 * 1024  # of a record, and of an unpacked chunk: a recorder writes 1 MB, and an image
+# Of a record, and of an unpacked chunk: a recorder writes 1 MB, and an image.
+MAX_RECORD_BYTES = 64 * 1024 * 1024
 DECOMPRESSION_STEP_BYTES = 1024 * 1024  # memory grows with what is really unpacked
 RECORD_HEADER = struct.Struct("<BQ")  # opcode and length of every record
-_CHUNK_HEADER = struct.Struct("<QQQII")  # begin, end, unpacked size, its CRC, length of the compression's name
+# Begin, end, unpacked size, its CRC, length of the compression's name.
+_CHUNK_HEADER = struct.Struct("<QQQII")
 _COMPRESSED_LENGTH = struct.Struct("<Q")  # behind the compression's name
 _MESSAGE_HEADER = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
 _RECORD_TYPES: dict[int, type[Channel | Header | Metadata | Schema | Statistics]] = {
@@ -48,7 +50,9 @@ def read_chunk_length(content_prefix: bytes) -> int:
     """
     try:
         *_, name_bytes = _CHUNK_HEADER.unpack_from(content_prefix)
-        (compressed_bytes,) = _COMPRESSED_LENGTH.unpack_from(content_prefix, _CHUNK_HEADER.size + name_bytes)
+        (compressed_bytes,) = _COMPRESSED_LENGTH.unpack_from(
+            content_prefix, _CHUNK_HEADER.size + name_bytes
+        )
     except struct.error:
         raise CorruptFileError("a chunk whose lengths cannot be") from None
     return _CHUNK_HEADER.size + name_bytes + _COMPRESSED_LENGTH.size + compressed_bytes
@@ -73,7 +77,9 @@ def unpack_chunk(content: bytes) -> bytearray:
     compression = content[_CHUNK_HEADER.size : name_end]
     compressed = content[name_end + _COMPRESSED_LENGTH.size :]
     if unpacked_bytes > MAX_RECORD_BYTES:
-        raise CorruptFileError(f"a chunk of {unpacked_bytes / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB")
+        raise CorruptFileError(
+            f"a chunk of {unpacked_bytes / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB"
+        )
     try:
         data = _decompress(compression, compressed, unpacked_bytes)
     except _UNPACKING_ERRORS as error:
@@ -90,7 +96,9 @@ def _decompress(compression: bytes, compressed: bytes, max_bytes: int) -> bytear
     """Return the unpacked bytes, but at most `max_bytes`. Raises CorruptFileError for an unknown compression."""
     match compression:
         case b"zstd":
-            with zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).stream_reader(compressed) as stream:
+            with zstandard.ZstdDecompressor(max_window_size=MAX_RECORD_BYTES).stream_reader(
+                compressed
+            ) as stream:
                 return _read_in_steps(stream.read, max_bytes)
         case b"lz4":
             return _decompress_lz4(compressed, max_bytes)

@@ -23,13 +23,16 @@ class DecoderFactory(McapDecoderFactory):
     """
 
     def __init__(self) -> None:
-        self._decoder_by_schema_name: dict[str, msgspec.msgpack.Decoder[Any]] = {}  # by name of the schema
+        # By name of the schema.
+        self._decoder_by_schema_name: dict[str, msgspec.msgpack.Decoder[Any]] = {}
         for message_type in VERSIONS:
-            self._decoder_by_schema_name[f"{SCHEMA_PREFIX}{message_type.__name__}"] = msgspec.msgpack.Decoder(
-                message_type
+            self._decoder_by_schema_name[f"{SCHEMA_PREFIX}{message_type.__name__}"] = (
+                msgspec.msgpack.Decoder(message_type)
             )
 
-    def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any] | None:
+    def decoder_for(
+        self, message_encoding: str, schema: Schema | None
+    ) -> Callable[[bytes], Any] | None:
         """Return the function that decodes the messages of a channel, or None if they are not the robot's messages.
 
         Args:

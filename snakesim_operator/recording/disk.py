@@ -11,7 +11,9 @@ class GrowingFile:
 
     def __init__(self, path: Path) -> None:
         """Create the file. Raises OSError; FileExistsError if the file exists."""
-        self._file_descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._file_descriptor = os.open(
+            path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644
+        )
         self._flushed_bytes = 0
         self._buffer = bytearray()
 

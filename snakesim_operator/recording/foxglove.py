@@ -39,20 +39,34 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_operator.recording import shapes
 from snakesim_operator.recording.body_frames import BodyMessageEncoder
-from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, JsonMessage, make_name_part, make_topic
+from snakesim_operator.recording.foxglove_topics import (
+    FoxgloveMessage,
+    JsonMessage,
+    make_name_part,
+    make_topic,
+)
 from snakesim_operator.recording.state_messages import ContactForcesMessage, StateMessages
 
 # Periods at which messages for viewers are made, in robot time.
 MOTION_PERIOD_NS = 100_000_000  # 10 Hz: viewers interpolate transforms
 IMAGE_PERIOD_NS = 200_000_000  # 5 Hz: all images are in the raw channels
-SCENE_PERIOD_NS = 1_000_000_000  # what seldom changes is repeated, so that it is found wherever a viewer starts
+# What seldom changes is repeated, so that it is found wherever a viewer starts.
+SCENE_PERIOD_NS = 1_000_000_000
 MAX_MESSAGE_AGE_NS = 5_000_000_000  # older messages are not shown as if they were current
 
 DEPTH_PREFIX = "sensor/depth/"
 COLOR_PREFIX = "sensor/color/"
-_CACHED_KEYS = (keys.JOINTS, keys.POSE, keys.WORLD, keys.TRAJECTORY, keys.STATUS, keys.CONTROL_STATE)
+_CACHED_KEYS = (
+    keys.JOINTS,
+    keys.POSE,
+    keys.WORLD,
+    keys.TRAJECTORY,
+    keys.STATUS,
+    keys.CONTROL_STATE,
+)
 
-BasePose = tuple[Sequence[float], Sequence[float]]  # position (3,) in m and orientation wxyz (4,) of link 0
+# Position (3,) in m and orientation wxyz (4,) of link 0.
+BasePose = tuple[Sequence[float], Sequence[float]]
 
 _get_decoder: Any = cache(msgspec.msgpack.Decoder)  # by message type
 
@@ -77,14 +91,17 @@ class FoxgloveConverter:
         self._robot_name = robot_name
 
         # What the robot has published.
-        self._newest_by_key: dict[str, tuple[bytes, int]] = {}  # by key: payload, and its robot time in ns
+        # By key: payload, and its robot time in ns.
+        self._newest_by_key: dict[str, tuple[bytes, int]] = {}
         self._robot: RobotDescription | None = None
         self._body_encoder: BodyMessageEncoder | None = None
-        self._custom_message_by_key: dict[str, CustomMessage] = {}  # messages of the robot's custom sensors, by key
+        # Messages of the robot's custom sensors, by key.
+        self._custom_message_by_key: dict[str, CustomMessage] = {}
         self._true_obstacles = shapes.draw_obstacles([], "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
 
         # When messages for viewers are made next.
-        self._due_ns_by_subject: dict[str, int] = {}  # robot time at which a drawing or an image is made next
+        # Robot time at which a drawing or an image is made next.
+        self._due_ns_by_subject: dict[str, int] = {}
         self._state_due_ns = 0
         self._state_messages = StateMessages()
 
@@ -145,9 +162,12 @@ class FoxgloveConverter:
         with suppress(SnakesimError, *UNDECODABLE):
             content = _get_decoder(RunConfiguration).decode(payload).content
             config = msgspec.json.decode(content, type=RunConfig)
-            placed = place_scene_obstacles(config.scene, make_start_capsules(config))  # checked when the run began
+            # Checked when the run began.
+            placed = place_scene_obstacles(config.scene, make_start_capsules(config))
             obstacles = [body.obstacle for body in placed]
-            self._true_obstacles = shapes.draw_obstacles(obstacles, "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0)
+            self._true_obstacles = shapes.draw_obstacles(
+                obstacles, "obstacles", shapes.TRUE_OBSTACLE_COLOR, 0
+            )
 
     # --- when something is due
 
@@ -204,7 +224,9 @@ class FoxgloveConverter:
         forces = ContactForcesMessage.sum_contacts(contacts, len(self._robot.links))
         return [self._encode_json("contact_forces", forces)]
 
-    def _make_state_messages(self, time_ns: int, *, with_reference: bool = False) -> list[FoxgloveMessage]:
+    def _make_state_messages(
+        self, time_ns: int, *, with_reference: bool = False
+    ) -> list[FoxgloveMessage]:
         """Make the messages about the state of host and controller.
 
         Args:
@@ -222,13 +244,19 @@ class FoxgloveConverter:
         for log in update.new_logs:
             messages.append(self._encode_protobuf("log", log))
         frames = self._body_encoder
-        if with_reference and frames is not None and len(update.reference_rad) == frames.joint_count:
+        if (
+            with_reference
+            and frames is not None
+            and len(update.reference_rad) == frames.joint_count
+        ):
             encoded = frames.encode_references(update.reference_rad, time_ns)
             topic = make_topic(self._robot_name, "joint_references")
             messages.append(FoxgloveMessage(topic, JointStates, encoded))
         return messages
 
-    def _convert_custom_sample(self, key: str, payload: bytes, time_ns: int) -> list[FoxgloveMessage]:
+    def _convert_custom_sample(
+        self, key: str, payload: bytes, time_ns: int
+    ) -> list[FoxgloveMessage]:
         """Convert a custom sensor's sample into JSON with its own schema, which viewers plot, and add its frame if due.
 
         Args:
@@ -248,7 +276,9 @@ class FoxgloveConverter:
         if self._check_due_and_reschedule(key, time_ns, MOTION_PERIOD_NS):
             link = robot.links[sample.link].name
             frame_id = f"{name}_frame"
-            mount = shapes.make_frame_transform(time_ns, link, frame_id, sample.position_l, sample.orientation_l_wxyz)
+            mount = shapes.make_frame_transform(
+                time_ns, link, frame_id, sample.position_l, sample.orientation_l_wxyz
+            )
             messages.append(self._encode_frame(mount))
         messages.append(self._encode_json(f"custom/{name}", sample))
         return messages
@@ -280,7 +310,9 @@ class FoxgloveConverter:
         frame_id = f"{camera_name}_{kind}_optical_frame"
         link_name = robot.links[image.link].name
         orientation = shapes.compute_optical_orientation(image.orientation_l_wxyz)
-        camera_frame = shapes.make_frame_transform(time_ns, link_name, frame_id, image.position_l, orientation)
+        camera_frame = shapes.make_frame_transform(
+            time_ns, link_name, frame_id, image.position_l, orientation
+        )
         raw_image = shapes.make_raw_image(image, frame_id, time_ns)
         calibration = shapes.make_calibration(image, frame_id, time_ns)
         return [
@@ -322,7 +354,9 @@ class FoxgloveConverter:
         messages += self._make_due_scene_messages(robot, time_ns)
         return messages
 
-    def _make_due_scene_messages(self, robot: RobotDescription, time_ns: int) -> list[FoxgloveMessage]:
+    def _make_due_scene_messages(
+        self, robot: RobotDescription, time_ns: int
+    ) -> list[FoxgloveMessage]:
         """Make the drawings that seldom change: body, obstacles, map and path, each if it is due."""
         messages: list[FoxgloveMessage] = []
         if self._check_due_and_reschedule("body", time_ns, SCENE_PERIOD_NS):
@@ -334,7 +368,9 @@ class FoxgloveConverter:
         if world is not None:
             obstacles = shapes.draw_obstacles(world.obstacles, "map", shapes.MAP_COLOR, time_ns)
             messages.append(self._encode_scene("map", [obstacles]))
-        trajectory: Trajectory | None = self._decode_if_scene_due(keys.TRAJECTORY, Trajectory, time_ns)
+        trajectory: Trajectory | None = self._decode_if_scene_due(
+            keys.TRAJECTORY, Trajectory, time_ns
+        )
         if trajectory is not None:
             path = shapes.draw_path(trajectory.path_w, time_ns)
             messages.append(self._encode_scene("path", [path]))

@@ -24,9 +24,13 @@ from snakesim_hal.wire.messages import CustomSample
 from snakesim_operator.recording.state_messages import ContactForcesMessage, RobotStateMessage
 
 JsonMessage = RobotStateMessage | ContactForcesMessage | CustomSample
-MessageType = type[Protobuf] | type[RobotStateMessage] | type[ContactForcesMessage] | type[CustomSample]
+MessageType = (
+    type[Protobuf] | type[RobotStateMessage] | type[ContactForcesMessage] | type[CustomSample]
+)
 
-COMMON_TOPICS: dict[str, MessageType] = {  # below the robot's name; every robot may have them, unlike cameras
+COMMON_TOPICS: dict[
+    str, MessageType
+] = {  # below the robot's name; every robot may have them, unlike cameras
     "tf": FrameTransforms,
     "joint_states": JointStates,
     "joint_references": JointStates,
@@ -86,7 +90,9 @@ def make_schema(message_type: MessageType) -> FoxgloveSchema:
 def _make_json_schema(message_type: type[JsonMessage]) -> FoxgloveSchema:
     name = message_type.__name__
     schema = msgspec.json.schema(message_type)["$defs"][name]
-    return FoxgloveSchema(f"snakesim.shown.{name}", "json", "jsonschema", msgspec.json.encode(schema))
+    return FoxgloveSchema(
+        f"snakesim.shown.{name}", "json", "jsonschema", msgspec.json.encode(schema)
+    )
 
 
 def _make_protobuf_schema(message_type: type[Protobuf]) -> FoxgloveSchema:

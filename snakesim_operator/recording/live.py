@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 class FoxgloveLiveServer:
     """Sends messages to every viewer that has subscribed to their topic; a slow viewer loses the oldest."""
 
-    def __init__(self, robot: str, port: int, origins: Collection[str], report: Callable[[str], None]) -> None:
+    def __init__(
+        self, robot: str, port: int, origins: Collection[str], report: Callable[[str], None]
+    ) -> None:
         """Start the server with the topics that every robot has.
 
         Args:
@@ -47,9 +49,13 @@ class FoxgloveLiveServer:
             self._add_channel(make_topic(robot, name), message_type)
         hidden_host = choose_random_loopback_host()
         try:
-            self._server = foxglove.start_server(name=robot, host=hidden_host, port=0, context=self._context)
+            self._server = foxglove.start_server(
+                name=robot, host=hidden_host, port=0, context=self._context
+            )
         except RuntimeError as error:
-            raise NotConnectedError(f"cannot serve Foxglove: {error}", code="network/port-in-use") from error
+            raise NotConnectedError(
+                f"cannot serve Foxglove: {error}", code="network/port-in-use"
+            ) from error
         self._relay = OriginRelay(port, (hidden_host, self._server.port), origins, report)
         self.address = f"ws://{HOST}:{self._relay.port}"
 
@@ -64,7 +70,9 @@ class FoxgloveLiveServer:
         schema = make_schema(message_type)
         channel = self._channel_type(
             topic,
-            schema=self._schema_type(name=schema.name, encoding=schema.schema_encoding, data=schema.data),
+            schema=self._schema_type(
+                name=schema.name, encoding=schema.schema_encoding, data=schema.data
+            ),
             message_encoding=schema.message_encoding,
             context=self._context,
         )

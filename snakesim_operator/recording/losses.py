@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 MAX_KEYS_SHOWN = 8
 MAX_GAPS_SHOWN = 3
 MAX_GAPS = 1000  # that are counted separately; later losses are counted with the last one
-VIEWER_PREFIXES = ("/", "foxglove/")  # topics made from other messages; `foxglove/` is that of older recordings
+# Topics made from other messages; `foxglove/` is that of older recordings.
+VIEWER_PREFIXES = "/", "foxglove/"
 UNKNOWN_KEYS = "keys that are not known"  # of messages whose channel is lost too
 
 
@@ -25,12 +26,15 @@ class RecordingLosses:
     """Everything that one file has lost."""
 
     gaps: list[LossGap] = field(default_factory=list[LossGap])
-    damage_descriptions: list[str] = field(default_factory=list[str])  # position and kind of the first damages
+    # Position and kind of the first damages.
+    damage_descriptions: list[str] = field(default_factory=list[str])
     damage_count: int = 0  # number of all damages
     truncated_at_ns: int | None = None  # the file has no end; robot time of its newest message
     misplaced_count: int = 0  # messages behind later ones of their key
-    earlier_losses: list[str] = field(default_factory=list[str])  # losses of the file that this one was copied from
-    dropped_count_by_key: dict[str, int] = field(default_factory=dict[str, int])  # by key: the disk was too slow
+    # Losses of the file that this one was copied from.
+    earlier_losses: list[str] = field(default_factory=list[str])
+    # By key: the disk was too slow.
+    dropped_count_by_key: dict[str, int] = field(default_factory=dict[str, int])
 
     @property
     def lost_by_key(self) -> Counter[str]:
@@ -84,8 +88,12 @@ class RecordingLosses:
         dropped_count = sum(self.dropped_count_by_key.values())
         if dropped_count:
             dropped = _format_count(dropped_count, "message")
-            texts.append(f"{dropped}, dropped because the disk was too slow: {_list_keys(self.dropped_count_by_key)}")
-        earlier_texts = [f"before it was copied: {text}" for text in self.earlier_losses if text not in texts]
+            texts.append(
+                f"{dropped}, dropped because the disk was too slow: {_list_keys(self.dropped_count_by_key)}"
+            )
+        earlier_texts = [
+            f"before it was copied: {text}" for text in self.earlier_losses if text not in texts
+        ]
         return texts + earlier_texts
 
     def _describe_damages(self) -> str:

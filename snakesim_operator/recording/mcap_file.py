@@ -33,13 +33,17 @@ from snakesim_operator.recording.disk import GrowingFile
 SNAKESIM_PROFILE = "snakesim"
 CHUNK_BYTES = 1024 * 1024
 COMPRESSION = "zstd"
-ZSTD_LEVEL = 2  # two thirds of the time of the default, 3, for files as small; with depth images 4 % larger
+# Two thirds of the time of the default, 3, for files as small; with depth images 4 % larger.
+ZSTD_LEVEL = 2
 
-_MESSAGE_HEADER = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time; then the data
+# Opcode, length, channel, sequence, log time, publish time; then the data.
+_MESSAGE_HEADER = struct.Struct("<BQHIQQ")
 _MESSAGE_FIELD_BYTES = 22  # of the length: channel, sequence and both times
-_MESSAGE_INDEX_HEADER = struct.Struct("<BQHI")  # opcode, length, channel, bytes; then time and offset of each message
+# Opcode, length, channel, bytes; then time and offset of each message.
+_MESSAGE_INDEX_HEADER = struct.Struct("<BQHI")
 _MESSAGE_INDEX_FIELD_BYTES = 6  # of the length: channel and bytes
-_FOOTER_WITHOUT_CRC = struct.Struct("<BQQQ")  # opcode, length, position of summary and of summary offsets
+# Opcode, length, position of summary and of summary offsets.
+_FOOTER_WITHOUT_CRC = struct.Struct("<BQQQ")
 _FOOTER_CONTENT_BYTES = 8 + 8 + 4  # two positions and the CRC
 _SEQUENCE_MASK = 0xFFFFFFFF  # a sequence number has 32 bits
 
@@ -61,9 +65,8 @@ class McapFileWriter:
 
         # The chunk that is being filled.
         self._chunk = bytearray()
-        self._message_index_by_channel: dict[
-            int, list[int]
-        ] = {}  # by channel: time, offset in the chunk, time, offset ...
+        # By channel: time, offset in the chunk, time, offset ...
+        self._message_index_by_channel: dict[int, list[int]] = {}
 
         # For the summary at the end of the file.
         self._schemas: list[McapRecord] = []
@@ -73,7 +76,8 @@ class McapFileWriter:
         self._message_count_by_channel: Counter[int] = Counter()  # by channel
         self._chunk_count = 0
         self._metadata_count = 0
-        self._time_range_ns: list[int] = []  # the earliest and the latest time so far; empty without messages
+        # The earliest and the latest time so far; empty without messages.
+        self._time_range_ns: list[int] = []
 
         file.write(MCAP0_MAGIC)
         file.write(_encode_records([Header(SNAKESIM_PROFILE, LIBRARY_IDENTIFIER)]))
@@ -92,7 +96,9 @@ class McapFileWriter:
         self._chunk += _encode_records([schema])
         return schema_id
 
-    def add_channel(self, topic: str, encoding: str, schema_id: int, metadata: dict[str, str] | None = None) -> int:
+    def add_channel(
+        self, topic: str, encoding: str, schema_id: int, metadata: dict[str, str] | None = None
+    ) -> int:
         """Add a channel, and return its id in the file.
 
         Args:
@@ -103,14 +109,20 @@ class McapFileWriter:
         """
         channel_id = len(self._channels) + 1
         channel = Channel(
-            id=channel_id, topic=topic, message_encoding=encoding, metadata=metadata or {}, schema_id=schema_id
+            id=channel_id,
+            topic=topic,
+            message_encoding=encoding,
+            metadata=metadata or {},
+            schema_id=schema_id,
         )
         self._channels.append(channel)
         self._chunk += _encode_records([channel])
         self._message_index_by_channel[channel_id] = []
         return channel_id
 
-    def add_message(self, channel_id: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes) -> None:
+    def add_message(
+        self, channel_id: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes
+    ) -> None:
         """Add a message to the current chunk, and write the chunk once it is large enough.
 
         Args:
@@ -124,7 +136,12 @@ class McapFileWriter:
         self._message_index_by_channel[channel_id] += (log_time_ns, len(chunk))
         length = _MESSAGE_FIELD_BYTES + len(data)
         chunk += _MESSAGE_HEADER.pack(
-            Opcode.MESSAGE, length, channel_id, sequence & _SEQUENCE_MASK, log_time_ns, publish_time_ns
+            Opcode.MESSAGE,
+            length,
+            channel_id,
+            sequence & _SEQUENCE_MASK,
+            log_time_ns,
+            publish_time_ns,
         )
         chunk += data
         if len(chunk) > CHUNK_BYTES:
@@ -136,7 +153,9 @@ class McapFileWriter:
         position = self._file.tell()
         record = _encode_records([Metadata(name=name, metadata=content)])
         self._file.write(record)
-        MetadataIndex(offset=position, length=len(record), name=name).write(self._metadata_index_records)
+        MetadataIndex(offset=position, length=len(record), name=name).write(
+            self._metadata_index_records
+        )
         self._metadata_count += 1
 
     def flush(self) -> None:
@@ -212,7 +231,9 @@ class McapFileWriter:
         A chunk without messages is not written. For the summary at the end of the file, the messages are counted, and
         the position of the chunk is stored.
         """
-        index_by_channel = {channel: index for channel, index in self._message_index_by_channel.items() if index}
+        index_by_channel = {
+            channel: index for channel, index in self._message_index_by_channel.items() if index
+        }
         if not index_by_channel:
             return
 

@@ -27,15 +27,21 @@ TRUNCATED = "the file ends in the middle of a record"
 
 _FIRST_PRIVATE_OPCODE = 0x80
 _FIRST_UNDEFINED_OPCODE = 0x10
-_MESSAGE_INDEX_HEADER_BYTES = 6  # channel number (2 bytes), then the length of the entries (4 bytes)
+# Channel number (2 bytes), then the length of the entries (4 bytes).
+_MESSAGE_INDEX_HEADER_BYTES = 6
 _MESSAGE_INDEX_ENTRY_BYTES = 16
 
 # Searching behind damage.
 _SEARCH_BLOCK_BYTES = 1024 * 1024  # read at once
-_MAX_PATTERN_BYTES = 64  # the longest match of _RECORD_START_PATTERN, and enough of a chunk for its lengths
-_RECORD_START_PATTERN = re.compile(  # a chunk of a known compression, a recorder's metadata, or the end of the messages
-    rb"\x06[\s\S]{4}\0{4}[\s\S]{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4})[\s\S]{4}\0{4}"
-    rb"|\x0c[\s\S]{4}\0{4}\x08\0{3}" + METADATA_NAME.encode() + rb"|\x0f\x04\0{7}[\s\S]{4}[\x01-\x0f]"
+# The longest match of _RECORD_START_PATTERN, and enough of a chunk for its lengths.
+_MAX_PATTERN_BYTES = 64
+_RECORD_START_PATTERN = (
+    re.compile(  # a chunk of a known compression, a recorder's metadata, or the end of the messages
+        rb"\x06[\s\S]{4}\0{4}[\s\S]{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4})[\s\S]{4}\0{4}"
+        rb"|\x0c[\s\S]{4}\0{4}\x08\0{3}"
+        + METADATA_NAME.encode()
+        + rb"|\x0f\x04\0{7}[\s\S]{4}[\x01-\x0f]"
+    )
 )
 
 # The end of a file: DATA_END, the summary, the footer, the magic bytes.
@@ -89,7 +95,9 @@ def read_record(file: BinaryIO, position: int, file_size: int) -> RawRecord:
     if not is_needed:
         return RawRecord(opcode, b"", record_end)
     if content_length > MAX_RECORD_BYTES:
-        raise CorruptFileError(f"a record of {content_length / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB")
+        raise CorruptFileError(
+            f"a record of {content_length / 1e6:.0f} MB, more than {MAX_RECORD_BYTES / 1e6:.0f} MB"
+        )
     file.seek(content_start)
     content = file.read(content_length)
     if len(content) != content_length:
@@ -97,7 +105,9 @@ def read_record(file: BinaryIO, position: int, file_size: int) -> RawRecord:
     return RawRecord(opcode, content, record_end)
 
 
-def _validate_content_length(file: BinaryIO, content_start: int, opcode: int, stated_length: int) -> None:
+def _validate_content_length(
+    file: BinaryIO, content_start: int, opcode: int, stated_length: int
+) -> None:
     """Check the content length in a record's header against the lengths that the content itself states.
 
     The content of chunks and message indexes states its length, and the content of DATA_END has a fixed length. Other

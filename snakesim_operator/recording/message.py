@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 RECORDING_FILENAME = "recording.mcap"  # name of the file in the folder of a run
-RAW_ONLY_HELP = (
-    "record messages as on the wire alone, without topics for Foxglove and PlotJuggler"  # help of the option
-)
+# Help of the option.
+RAW_ONLY_HELP = "record messages as on the wire alone, without topics for Foxglove and PlotJuggler"
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,11 @@ class OriginRelay:
     """Listens on loopback, and connects each viewer that may read the robot with the server behind the relay."""
 
     def __init__(
-        self, port: int, server: tuple[str, int], origins: Collection[str], report: Callable[[str], None]
+        self,
+        port: int,
+        server: tuple[str, int],
+        origins: Collection[str],
+        report: Callable[[str], None],
     ) -> None:
         """Start to listen for viewers, in a thread. Those of unknown web pages are refused.
 
@@ -51,15 +55,20 @@ class OriginRelay:
         self._connections: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
         try:
-            listening = asyncio.start_server(self._serve_connection, HOST, port, limit=MAX_HEADER_BYTES)
+            listening = asyncio.start_server(
+                self._serve_connection, HOST, port, limit=MAX_HEADER_BYTES
+            )
             self._listener = self._loop.run_until_complete(listening)
         except OSError as error:
             self._loop.close()
             raise NotConnectedError(
-                f"cannot serve Foxglove on port {port}: {error.strerror}; choose another", code="network/port-in-use"
+                f"cannot serve Foxglove on port {port}: {error.strerror}; choose another",
+                code="network/port-in-use",
             ) from error
         self.port: int = self._listener.sockets[0].getsockname()[1]
-        self._thread = threading.Thread(target=self._loop.run_forever, name="origin relay", daemon=True)
+        self._thread = threading.Thread(
+            target=self._loop.run_forever, name="origin relay", daemon=True
+        )
         self._thread.start()
 
     def close(self) -> None:
@@ -75,7 +84,9 @@ class OriginRelay:
             task.cancel()
         await asyncio.gather(*self._connections, return_exceptions=True)
 
-    async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve_connection(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         """Serve one connection until either side closes it."""
         task = asyncio.current_task()
         assert task is not None
@@ -89,7 +100,9 @@ class OriginRelay:
             self._connections.discard(task)
             writer.close()
 
-    async def _check_and_relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _check_and_relay(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         request_header = await asyncio.wait_for(reader.readuntil(END_OF_HEADER), HEADER_TIMEOUT_S)
         refusal = explain_request_refusal(request_header, self._origins)
         if refusal is not None:
@@ -101,9 +114,14 @@ class OriginRelay:
 
     def _report_refusal(self, reason: str) -> None:
         """Report each reason once."""
-        if reason not in self._reported_reasons and len(self._reported_reasons) < MAX_REASONS_REPORTED:
+        if (
+            reason not in self._reported_reasons
+            and len(self._reported_reasons) < MAX_REASONS_REPORTED
+        ):
             self._reported_reasons.add(reason)
-            self._report(f"Foxglove: refused a viewer: {reason}; if you trust it: --foxglove-origin ORIGIN")
+            self._report(
+                f"Foxglove: refused a viewer: {reason}; if you trust it: --foxglove-origin ORIGIN"
+            )
 
     async def _relay_connection(
         self, request_header: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter

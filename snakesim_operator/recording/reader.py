@@ -17,7 +17,12 @@ from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.keys import find_row_key
-from snakesim_operator.recording.chunks import CorruptFileError, parse_chunk, parse_record, unpack_chunk
+from snakesim_operator.recording.chunks import (
+    CorruptFileError,
+    parse_chunk,
+    parse_record,
+    unpack_chunk,
+)
 from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, RecordingLosses
 from snakesim_operator.recording.mcap_file import SNAKESIM_PROFILE
 from snakesim_operator.recording.mcap_records import (
@@ -60,7 +65,8 @@ class RecordingReader:
     """Reads one recording. Its metadata and its losses are known once its messages have been read."""
 
     path: Path
-    is_complete: bool = False  # else its recorder was killed, the disk was full, or the file was cut
+    # Else its recorder was killed, the disk was full, or the file was cut.
+    is_complete: bool = False
     losses: RecordingLosses = field(default_factory=RecordingLosses)
     metadata: dict[str, Any] = field(default_factory=dict[str, Any])
 
@@ -71,8 +77,11 @@ class RecordingReader:
     _unpacked_bytes: int = 0
 
     # For the losses.
-    _last_position_by_channel: dict[int, _ChannelPosition] = field(default_factory=dict[int, _ChannelPosition])
-    _has_sequence_numbers: bool = True  # they count up for each channel, as a recorder of this program writes them
+    _last_position_by_channel: dict[int, _ChannelPosition] = field(
+        default_factory=dict[int, _ChannelPosition]
+    )
+    # They count up for each channel, as a recorder of this program writes them.
+    _has_sequence_numbers: bool = True
 
     # The end of the file.
     _file: BinaryIO | None = None
@@ -100,11 +109,14 @@ class RecordingReader:
             channel = self._channel_by_id[record.channel_id]
             key = channel.topic
             encoding = channel.metadata.get("encoding")
-            is_made_for_viewers = encoding is None  # only channels of the robot's own messages state an encoding
+            # Only channels of the robot's own messages state an encoding.
+            is_made_for_viewers = encoding is None
             if is_made_for_viewers:
                 continue
             if keys is None or key in keys or find_row_key(key) in keys:
-                yield RecordedMessage(key, record.data, encoding, record.log_time, record.publish_time)
+                yield RecordedMessage(
+                    key, record.data, encoding, record.log_time, record.publish_time
+                )
 
     def read_records(self) -> Iterator[McapRecord]:
         """Yield every schema, channel, message and metadata that can be read, a channel before its messages.
@@ -127,7 +139,9 @@ class RecordingReader:
                 yield from self._read_file_records(file, size)
                 self._count_losses_at_end()
         except OSError as error:
-            raise ConfigError(f"{self.path} cannot be read: {error.strerror}", code="file/not-readable") from None
+            raise ConfigError(
+                f"{self.path} cannot be read: {error.strerror}", code="file/not-readable"
+            ) from None
 
     # --- reading
 
@@ -288,7 +302,9 @@ class RecordingReader:
                     self.losses.dropped_count_by_key[str(key)[:MAX_KEY_LENGTH]] = count
         earlier = self.metadata.get(EARLIER_LOSSES_ENTRY)
         if isinstance(earlier, list):
-            self.losses.earlier_losses = [str(text)[:MAX_EARLIER_LENGTH] for text in earlier[:MAX_EARLIER_LOSSES]]
+            self.losses.earlier_losses = [
+                str(text)[:MAX_EARLIER_LENGTH] for text in earlier[:MAX_EARLIER_LOSSES]
+            ]
 
     # --- losses
 
@@ -334,7 +350,9 @@ class RecordingReader:
         if gaps and gaps[-1].end_ns is None and time_ns < MAX_ROBOT_TIME_NS:
             gaps[-1].end_ns = max(time_ns, gaps[-1].begin_ns)
 
-    def _add_loss(self, key: str, count: int, gap_count_at_last_message: int, end_ns: int | None) -> None:
+    def _add_loss(
+        self, key: str, count: int, gap_count_at_last_message: int, end_ns: int | None
+    ) -> None:
         """Count lost messages of a key in the newest gap, or in a new one if there was none since its last message.
 
         Args:
@@ -362,6 +380,8 @@ class RecordingReader:
                 last = self._last_position_by_channel.get(channel_id, _UNREAD_CHANNEL)
                 has_plausible_loss = last.sequence < message_count < MAX_ROBOT_TIME_NS
                 if has_plausible_loss:
-                    channel = self._channel_by_id.get(channel_id) or self._find_channel_in_summary(channel_id)
+                    channel = self._channel_by_id.get(channel_id) or self._find_channel_in_summary(
+                        channel_id
+                    )
                     key = UNKNOWN_KEYS if channel is None else channel.topic
                     self._add_loss(key, message_count - last.sequence, last.gap_count, None)

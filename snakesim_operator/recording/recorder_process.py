@@ -29,7 +29,11 @@ from snakesim_hal.network.run_key import has_valid_proof, read_own_run_key
 from snakesim_hal.network.session import ConnectionSettings, Session
 from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.network.waiting import open_session_when_ready
-from snakesim_hal.programs.arguments import add_network_arguments, add_parent_argument, add_scenario_arguments
+from snakesim_hal.programs.arguments import (
+    add_network_arguments,
+    add_parent_argument,
+    add_scenario_arguments,
+)
 from snakesim_hal.programs.service_program import ProcessOptions, read_process_options
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire import keys
@@ -79,13 +83,14 @@ class RobotRecorder:
         self.writer = RecordingWriter(path, viewer_robot_name, on_viewer_message, log_time_clock)
 
         # A new host publishes its description, and robot time starts over, in either order.
-        self._latched_arrivals: dict[str, ReceivedSample] = {}  # newest messages that each file begins with, by key
+        # Newest messages that each file begins with, by key.
+        self._latched_arrivals: dict[str, ReceivedSample] = {}
         self._host_id: str | None = None
         self._host_count = 1
-        self._awaits_new_host_clock = False  # a new host has described itself, and its file is not started yet
-        self._restarted_clock: ReceivedSample | None = (
-            None  # newest clock since robot time went back, until a file starts
-        )
+        # A new host has described itself, and its file is not started yet.
+        self._awaits_new_host_clock = False
+        # Newest clock since robot time went back, until a file starts.
+        self._restarted_clock: ReceivedSample | None = None
 
     def write_arrival(self, arrival: ReceivedSample) -> None:
         """Write one message. Once the description and the first clock of a new host have come, start a new file."""
@@ -95,7 +100,9 @@ class RobotRecorder:
                 self._detect_new_host(arrival.payload)
         self.writer.write_arrival(arrival)
         if arrival.key == keys.CLOCK:
-            has_restarted = self._restarted_clock is not None or self.writer.message_clock.has_gone_back
+            has_restarted = (
+                self._restarted_clock is not None or self.writer.message_clock.has_gone_back
+            )
             if has_restarted:
                 self._restarted_clock = arrival
         if self._awaits_new_host_clock and self._restarted_clock is not None:
@@ -145,7 +152,9 @@ class RobotRecorder:
         self._host_count += 1
         self.close({})
         self.path.rename(self._find_free_path())
-        self.writer = RecordingWriter(self.path, self._viewer_robot_name, self._on_viewer_message, self._log_time_clock)
+        self.writer = RecordingWriter(
+            self.path, self._viewer_robot_name, self._on_viewer_message, self._log_time_clock
+        )
         for arrival in (*self._latched_arrivals.values(), clock):
             self.writer.write_arrival(arrival)
 
@@ -268,7 +277,9 @@ def _record_until_stopped(
     try:
         recorder = RobotRecorder(path, viewer_robot_name, on_viewer_message, log_time_clock)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; choose another file", code="file/not-writable") from error
+        raise ConfigError(
+            f"{path}: {error.strerror}; choose another file", code="file/not-writable"
+        ) from error
     tap = MessageTap(session)
     present_hosts = _track_present_hosts(session)
     session.declare_alive(RECORDER)
@@ -350,7 +361,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_network_arguments(parser, "")
     add_parent_argument(parser)
     arguments = parser.parse_args(argv)
-    return run_tool(f"snakesim {RECORDER}", lambda: _record_run_until_stop_signal(read_process_options(arguments)))
+    return run_tool(
+        f"snakesim {RECORDER}",
+        lambda: _record_run_until_stop_signal(read_process_options(arguments)),
+    )
 
 
 def _record_run_until_stop_signal(options: ProcessOptions) -> int:
@@ -368,7 +382,12 @@ def _record_run_until_stop_signal(options: ProcessOptions) -> int:
         stop_signals: list[bool] = []
         call_on_stop_signals(lambda: stop_signals.append(True))
         recorder = _record_until_stopped(
-            session, options.link, path, lambda: not stop_signals, raw_only=raw_only, wait_for_host_exit=True
+            session,
+            options.link,
+            path,
+            lambda: not stop_signals,
+            raw_only=raw_only,
+            wait_for_host_exit=True,
         )
     if recorder.writer.failure:
         return EXIT_DISK_FULL

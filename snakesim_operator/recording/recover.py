@@ -10,7 +10,12 @@ from snakesim_operator.recording.disk import GrowingFile
 from snakesim_operator.recording.mcap_file import McapFileWriter
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.shown_messages import ViewerMessageWriter
-from snakesim_operator.recording.stamps import LogTimeClock, order_times, read_log_time_clock, with_log_time_clock
+from snakesim_operator.recording.stamps import (
+    LogTimeClock,
+    order_times,
+    read_log_time_clock,
+    with_log_time_clock,
+)
 from snakesim_operator.recording.writer import EARLIER_LOSSES_ENTRY, METADATA_NAME
 
 FLUSH_BYTES = 4 * 1024 * 1024  # bounds the memory that waiting messages take
@@ -38,12 +43,16 @@ def recover_recording(
     try:
         file = GrowingFile(output_path)
     except OSError as error:
-        raise ConfigError(f"{output_path}: {error.strerror}; choose another file", code="file/not-writable") from error
+        raise ConfigError(
+            f"{output_path}: {error.strerror}; choose another file", code="file/not-writable"
+        ) from error
     try:
         reader = RecordingReader(path)
         copy = _RecordingCopy(file, log_time_clock)
         if log_time_clock is not None:
-            copy.regenerate_viewer_messages(_find_robot_of_outdated_viewer_topics(path, log_time_clock))
+            copy.regenerate_viewer_messages(
+                _find_robot_of_outdated_viewer_topics(path, log_time_clock)
+            )
         for record in reader.read_records():
             copy.add_record(record)
         missing = reader.missing
@@ -78,7 +87,11 @@ def _find_robot_of_outdated_viewer_topics(path: Path, log_time_clock: LogTimeClo
 
 def _is_viewer_channel(channel: Channel) -> bool:
     """Return whether a channel has messages made for viewers, on a topic such as `/planar13/tf`."""
-    return "encoding" not in channel.metadata and channel.topic.startswith("/") and channel.topic.count("/") > 1
+    return (
+        "encoding" not in channel.metadata
+        and channel.topic.startswith("/")
+        and channel.topic.count("/") > 1
+    )
 
 
 class _RecordingCopy:
@@ -93,14 +106,17 @@ class _RecordingCopy:
         """
         self._file = file
         self._mcap = McapFileWriter(file)
-        self._new_schema_id_by_id: dict[int, int] = {}  # number in the copy, by number in the original
-        self._new_channel_id_by_id: dict[int, int] = {}  # number in the copy, by number in the original
-        self._key_by_channel: dict[int, str] = {}  # keys of the robot's own messages, by channel in the original
+        # Number in the copy, by number in the original.
+        self._new_schema_id_by_id: dict[int, int] = {}
+        # Number in the copy, by number in the original.
+        self._new_channel_id_by_id: dict[int, int] = {}
+        # Keys of the robot's own messages, by channel in the original.
+        self._key_by_channel: dict[int, str] = {}
         self._requested_log_time_clock: LogTimeClock | None = log_time_clock
-        self._log_time_clock_by_channel: dict[int, LogTimeClock] = {}  # in the copy, by channel in the original
-        self._viewer_messages: ViewerMessageWriter | None = (
-            None  # makes the messages for viewers again; None: they are copied
-        )
+        # In the copy, by channel in the original.
+        self._log_time_clock_by_channel: dict[int, LogTimeClock] = {}
+        # Makes the messages for viewers again; None: they are copied.
+        self._viewer_messages: ViewerMessageWriter | None = None
         self.message_count = 0
 
     def regenerate_viewer_messages(self, robot_name: str | None) -> None:
@@ -110,13 +126,17 @@ class _RecordingCopy:
             robot_name: Name of the robot in the viewer topics. If None, the messages are copied after all.
         """
         if robot_name is not None and self._requested_log_time_clock is not None:
-            self._viewer_messages = ViewerMessageWriter(self._mcap, robot_name, self._requested_log_time_clock)
+            self._viewer_messages = ViewerMessageWriter(
+                self._mcap, robot_name, self._requested_log_time_clock
+            )
 
     def add_record(self, record: McapRecord) -> None:
         """Add a record, unless it is repeated or is the original's metadata about itself."""
         match record:
             case Schema() if record.id not in self._new_schema_id_by_id:
-                self._new_schema_id_by_id[record.id] = self._mcap.add_schema(record.name, record.encoding, record.data)
+                self._new_schema_id_by_id[record.id] = self._mcap.add_schema(
+                    record.name, record.encoding, record.data
+                )
             case Channel() if record.id not in self._new_channel_id_by_id:
                 self._add_channel(record)
             case Metadata() if record.name != METADATA_NAME:
@@ -130,10 +150,14 @@ class _RecordingCopy:
         """Add a channel, unless its messages are made again."""
         if self._viewer_messages is not None and _is_viewer_channel(channel):
             return
-        log_time_clock: LogTimeClock = self._requested_log_time_clock or read_log_time_clock(channel.metadata)
+        log_time_clock: LogTimeClock = self._requested_log_time_clock or read_log_time_clock(
+            channel.metadata
+        )
         schema_id = self._new_schema_id_by_id.get(channel.schema_id, 0)
         metadata = with_log_time_clock(channel.metadata, log_time_clock)
-        channel_id = self._mcap.add_channel(channel.topic, channel.message_encoding, schema_id, metadata)
+        channel_id = self._mcap.add_channel(
+            channel.topic, channel.message_encoding, schema_id, metadata
+        )
         self._new_channel_id_by_id[channel.id] = channel_id
         self._log_time_clock_by_channel[channel.id] = log_time_clock
         if "encoding" in channel.metadata:
@@ -142,12 +166,18 @@ class _RecordingCopy:
     def _add_message(self, message: Message) -> None:
         channel_id = self._new_channel_id_by_id[message.channel_id]
         log_time_clock = self._log_time_clock_by_channel[message.channel_id]
-        log_time_ns, publish_time_ns = order_times(message.log_time, message.publish_time, log_time_clock)
-        self._mcap.add_message(channel_id, log_time_ns, publish_time_ns, message.sequence, message.data)
+        log_time_ns, publish_time_ns = order_times(
+            message.log_time, message.publish_time, log_time_clock
+        )
+        self._mcap.add_message(
+            channel_id, log_time_ns, publish_time_ns, message.sequence, message.data
+        )
         self.message_count += 1
         key = self._key_by_channel.get(message.channel_id)
         if self._viewer_messages is not None and key is not None:
-            self.message_count += self._viewer_messages.write(key, message.data, log_time_ns, publish_time_ns)
+            self.message_count += self._viewer_messages.write(
+                key, message.data, log_time_ns, publish_time_ns
+            )
         if self._file.buffered_bytes > FLUSH_BYTES:
             self._mcap.flush()
 
@@ -163,5 +193,7 @@ class _RecordingCopy:
         """
         if missing:
             about = {**about, EARLIER_LOSSES_ENTRY: missing}
-        self._mcap.add_metadata(METADATA_NAME, {name: json.dumps(value) for name, value in about.items()})
+        self._mcap.add_metadata(
+            METADATA_NAME, {name: json.dumps(value) for name, value in about.items()}
+        )
         self._mcap.finish_file()

@@ -5,7 +5,8 @@ import msgspec
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 
-MAX_CLOCK_DISTANCE_NS = 1_000_000_000  # a tick further away from the clock is wrong, or belongs to another host
+# A tick further away from the clock is wrong, or belongs to another host.
+MAX_CLOCK_DISTANCE_NS = 1_000_000_000
 MAX_STORED_TIME_NS = 2**63 - 1  # the file stores unsigned 64 bits; readers use signed ones
 
 

@@ -51,7 +51,8 @@ PATH_HEIGHT_M = 0.005  # above the ground, else the ground hides parts of it
 MAX_DEPTH_MM = 65535  # 16 bits
 
 _UPRIGHT = Quaternion(w=1.0)
-_ROTATION_FROM_Z_TO_X = Quaternion(w=math.sqrt(0.5), y=math.sqrt(0.5))  # lays a cylinder along the link
+# Lays a cylinder along the link.
+_ROTATION_FROM_Z_TO_X = Quaternion(w=math.sqrt(0.5), y=math.sqrt(0.5))
 _OPTICAL_IN_CAMERA = (0.5, -0.5, 0.5, -0.5)  # wxyz: Foxglove's camera frame in the robot's
 
 
@@ -61,7 +62,11 @@ def make_timestamp(time_ns: int) -> Timestamp:
 
 
 def make_frame_transform(
-    time_ns: int, parent: str, child: str, position: Sequence[float], orientation_wxyz: Sequence[float]
+    time_ns: int,
+    parent: str,
+    child: str,
+    position: Sequence[float],
+    orientation_wxyz: Sequence[float],
 ) -> FrameTransform:
     """Return a FrameTransform with the pose of a child frame in its parent frame.
 
@@ -122,7 +127,9 @@ def _draw_link(link: LinkDescription, time_ns: int) -> SceneEntity:
     )
 
 
-def draw_obstacles(obstacles: Iterable[KnownObstacle], name: str, color: Color, time_ns: int) -> SceneEntity:
+def draw_obstacles(
+    obstacles: Iterable[KnownObstacle], name: str, color: Color, time_ns: int
+) -> SceneEntity:
     """Return obstacles as one entity of a Foxglove scene, in the world frame.
 
     Args:
@@ -146,7 +153,9 @@ def draw_obstacles(obstacles: Iterable[KnownObstacle], name: str, color: Color, 
                 size = Vector3(x=2 * half_x_m, y=2 * half_y_m, z=2 * half_z_m)
                 entity.cubes.append(CubePrimitive(pose=pose, size=size, color=color))
             case "cylinder":
-                entity.cylinders.append(_make_cylinder(pose, obstacle.radius_m, obstacle.height_m, color))
+                entity.cylinders.append(
+                    _make_cylinder(pose, obstacle.radius_m, obstacle.height_m, color)
+                )
     return entity
 
 
@@ -192,7 +201,9 @@ def draw_path(points_w: Iterable[Sequence[float]], time_ns: int) -> SceneEntity:
         color=PATH_COLOR,
         points=[Point3(x=point[0], y=point[1], z=PATH_HEIGHT_M) for point in points_w],
     )
-    return SceneEntity(timestamp=make_timestamp(time_ns), frame_id=WORLD_FRAME, id="path", lines=[line])
+    return SceneEntity(
+        timestamp=make_timestamp(time_ns), frame_id=WORLD_FRAME, id="path", lines=[line]
+    )
 
 
 def make_raw_image(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> RawImage:
@@ -231,7 +242,9 @@ def _convert_to_millimeters(image: DepthImage) -> bytes:
     return depth_mm.astype("<u2").tobytes()
 
 
-def make_calibration(image: DepthImage | ColorImage, frame_id: str, time_ns: int) -> CameraCalibration:
+def make_calibration(
+    image: DepthImage | ColorImage, frame_id: str, time_ns: int
+) -> CameraCalibration:
     """Return the pinhole model of an image's camera: intrinsics K, no rectification R, projection P."""
     fx = image.fx_px
     fy = image.fy_px

@@ -8,7 +8,8 @@ from snakesim_operator.recording.foxglove_topics import FoxgloveMessage, make_sc
 from snakesim_operator.recording.mcap_file import McapFileWriter
 from snakesim_operator.recording.stamps import LogTimeClock, with_log_time_clock
 
-OnViewerMessage = Callable[[FoxgloveMessage, int], None]  # called with a message for viewers, and its log time in ns
+# Called with a message for viewers, and its log time in ns.
+OnViewerMessage = Callable[[FoxgloveMessage, int], None]
 
 
 class ViewerMessageWriter:
@@ -56,7 +57,11 @@ class ViewerMessageWriter:
                 channel_id = self._open_channel(message)
             self._message_count_by_topic[message.topic] += 1
             self._mcap.add_message(
-                channel_id, log_time_ns, publish_time_ns, self._message_count_by_topic[message.topic], message.payload
+                channel_id,
+                log_time_ns,
+                publish_time_ns,
+                self._message_count_by_topic[message.topic],
+                message.payload,
             )
             if self._on_viewer_message is not None:
                 self._on_viewer_message(message, log_time_ns)
@@ -71,6 +76,8 @@ class ViewerMessageWriter:
             )
         schema_id = self._schema_id_by_name[schema.name]
         metadata = with_log_time_clock({}, self._log_time_clock)
-        channel_id = self._mcap.add_channel(message.topic, schema.message_encoding, schema_id, metadata)
+        channel_id = self._mcap.add_channel(
+            message.topic, schema.message_encoding, schema_id, metadata
+        )
         self._channel_id_by_topic[message.topic] = channel_id
         return channel_id

@@ -9,14 +9,17 @@ from typing import Literal, get_args
 
 LogTimeClock = Literal["robot", "wall"]
 LOG_TIME_CLOCKS: tuple[LogTimeClock, ...] = get_args(LogTimeClock)
-CLOCK_ENTRY = "stamps"  # name of the entry in a channel's metadata; without it, the log times are robot time
+# Name of the entry in a channel's metadata; without it, the log times are robot time.
+CLOCK_ENTRY = "stamps"
 LOG_TIME_CLOCK_HELP = (
     "clock of the times in the file: robot time, or the wall clock of the computer that recorded, to view the file "
     "beside files of other programs"
 )
 
 
-def order_times(robot_time_ns: int, wall_time_ns: int, log_time_clock: LogTimeClock) -> tuple[int, int]:
+def order_times(
+    robot_time_ns: int, wall_time_ns: int, log_time_clock: LogTimeClock
+) -> tuple[int, int]:
     """Return the log time and the publish time of a message, by the clock of the file's log times."""
     if log_time_clock == "wall":
         return wall_time_ns, robot_time_ns

@@ -104,9 +104,12 @@ class StateMessages:
     """Makes the state message for viewers, and log entries when the state changes."""
 
     def __init__(self) -> None:
-        self._last_logged_by_source: dict[str, tuple[str, str]] = {}  # by source: state, and its reason without numbers
+        # By source: state, and its reason without numbers.
+        self._last_logged_by_source: dict[str, tuple[str, str]] = {}
 
-    def update_state(self, status_payload: bytes | None, control_payload: bytes | None, time_ns: int) -> StateUpdate:
+    def update_state(
+        self, status_payload: bytes | None, control_payload: bytes | None, time_ns: int
+    ) -> StateUpdate:
         """Combine the newest messages of host and controller into the state that viewers show.
 
         Args:
@@ -154,12 +157,16 @@ class StateMessages:
         if state.lifecycle in ("fault", "estop"):
             host_level = Log.ERROR
         host_reason, _, _ = state.lifecycle_reason.partition("; ")
-        host_entry = self._make_log_if_changed("hal", state.lifecycle, host_reason, host_level, time_ns)
+        host_entry = self._make_log_if_changed(
+            "hal", state.lifecycle, host_reason, host_level, time_ns
+        )
 
         control_level = Log.INFO
         if state.jammed or state.saturated:
             control_level = Log.WARNING
-        control_entry = self._make_log_if_changed("control", state.locomotion, state.reason, control_level, time_ns)
+        control_entry = self._make_log_if_changed(
+            "control", state.locomotion, state.reason, control_level, time_ns
+        )
         return [entry for entry in (host_entry, control_entry) if entry is not None]
 
     def _make_log_if_changed(
@@ -183,12 +190,18 @@ class StateMessages:
             state_name = "silent"
             reason = f"the state of {source} is no longer published"
             level = Log.ERROR
-        reason_without_numbers = _NUMBER.sub("#", reason)  # a force or an age that changes is no new state
+        # A force or an age that changes is no new state.
+        reason_without_numbers = _NUMBER.sub("#", reason)
         content = (state_name, reason_without_numbers)
         if self._last_logged_by_source.get(source) == content:
             return None
         self._last_logged_by_source[source] = content
-        return Log(timestamp=make_timestamp(time_ns), level=level, name=source, message=f"{state_name}: {reason}")
+        return Log(
+            timestamp=make_timestamp(time_ns),
+            level=level,
+            name=source,
+            message=f"{state_name}: {reason}",
+        )
 
 
 def _decode_status(payload: bytes | None) -> _StatusFields:

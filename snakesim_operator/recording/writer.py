@@ -27,12 +27,12 @@ from snakesim_operator.recording.shown_messages import OnViewerMessage, ViewerMe
 from snakesim_operator.recording.stamps import LogTimeClock, order_times, with_log_time_clock
 
 FLUSH_S = 0.5
-MAX_EARLY_CUSTOM_SAMPLES = 1000  # of custom sensors before the description; further ones get no schema of their own
+# Of custom sensors before the description; further ones get no schema of their own.
+MAX_EARLY_CUSTOM_SAMPLES = 1000
 MAX_ENCODING_NAME_CHARACTERS = 200  # characters; it comes from the network
 METADATA_NAME = "snakesim"  # the name of the metadata record
-EARLIER_LOSSES_ENTRY = (
-    "lacked_before_copy"  # entry of that record: what the recording lacked that this one was copied from
-)
+# Entry of that record: what the recording lacked that this one was copied from.
+EARLIER_LOSSES_ENTRY = "lacked_before_copy"
 
 
 class RecordingWriter:
@@ -60,21 +60,22 @@ class RecordingWriter:
         self._log_time_clock: LogTimeClock = log_time_clock
         self.failure = ""  # why nothing is written any more
         self.message_clock = MessageClock()
-        self._wall_offset_ns = time.time_ns() - time.monotonic_ns()  # wall clock minus monotonic clock
+        # Wall clock minus monotonic clock.
+        self._wall_offset_ns = time.time_ns() - time.monotonic_ns()
 
         # The file.
         self._file = GrowingFile(path)
         self._mcap = McapFileWriter(self._file)
         self._channel_id_by_key: dict[str, int] = {}  # channel numbers, by key
-        self._schema_id_by_name: dict[str, int] = {}  # ids of the schemas in the file, by name; by text if custom
+        # Ids of the schemas in the file, by name; by text if custom.
+        self._schema_id_by_name: dict[str, int] = {}
         self._next_flush_s = 0.0
 
         # The robot's messages.
         self.counts: Counter[str] = Counter()  # messages written, by key
         self._custom_message_by_key: dict[str, CustomMessage] = {}
-        self._early_custom_samples: (
-            list[ReceivedSample] | None
-        ) = []  # of custom sensors; None once the description is known
+        # Of custom sensors; None once the description is known.
+        self._early_custom_samples: list[ReceivedSample] | None = []
 
         # Messages made for viewers.
         self._viewer_messages: ViewerMessageWriter | None = None
@@ -126,7 +127,9 @@ class RecordingWriter:
         """
         self._write_early_custom_samples()
         if not self.failure:
-            self._mcap.add_metadata(METADATA_NAME, {name: json.dumps(value) for name, value in about.items()})
+            self._mcap.add_metadata(
+                METADATA_NAME, {name: json.dumps(value) for name, value in about.items()}
+            )
             try:
                 self._mcap.finish_file()
             except OSError as error:
@@ -156,9 +159,13 @@ class RecordingWriter:
             return
         robot_time_ns = self.message_clock.find_robot_time_ns(arrival.key, arrival.payload)
         wall_time_ns = arrival.monotonic_ns + self._wall_offset_ns
-        log_time_ns, publish_time_ns = order_times(robot_time_ns, wall_time_ns, self._log_time_clock)
+        log_time_ns, publish_time_ns = order_times(
+            robot_time_ns, wall_time_ns, self._log_time_clock
+        )
         self.counts[arrival.key] += 1
-        self._mcap.add_message(channel_id, log_time_ns, publish_time_ns, self.counts[arrival.key], arrival.payload)
+        self._mcap.add_message(
+            channel_id, log_time_ns, publish_time_ns, self.counts[arrival.key], arrival.payload
+        )
         if self._viewer_messages is not None:
             self._viewer_messages.write(arrival.key, arrival.payload, log_time_ns, publish_time_ns)
 
@@ -187,7 +194,9 @@ class RecordingWriter:
         """Return the id of a message's published schema, which is added to the file when it is first needed."""
         if name not in self._schema_id_by_name:
             content = (SCHEMAS_DIR / "messages" / f"{name}.json").read_bytes()
-            self._schema_id_by_name[name] = self._mcap.add_schema(f"snakesim.{name}", "jsonschema", content)
+            self._schema_id_by_name[name] = self._mcap.add_schema(
+                f"snakesim.{name}", "jsonschema", content
+            )
         return self._schema_id_by_name[name]
 
     def _add_custom_schema(self, custom_type: CustomMessage) -> int:

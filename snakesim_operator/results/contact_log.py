@@ -20,15 +20,18 @@ class ContactLog:
     """Contact forces of obstacles on the links, in the order of the samples."""
 
     ticks: NDArray[np.int64]  # (s,) of the samples; ascending
-    obstacles: list[str] = field(default_factory=list[str])  # names of those that were touched, sorted
+    # Names of those that were touched, sorted.
+    obstacles: list[str] = field(default_factory=list[str])
 
     # One row for each contact.
-    sample_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (c,) index into `ticks`
-    link_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # (c,) from 0 at the tail
-    obstacle_index: NDArray[np.int64] = field(
-        default_factory=lambda: np.zeros(0, np.int64)
-    )  # (c,) index into `obstacles`
-    force_l_n: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) on the body, in the link's frame
+    # (c,) index into `ticks`.
+    sample_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    # (c,) from 0 at the tail.
+    link_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    # (c,) index into `obstacles`.
+    obstacle_index: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    # (c, 3) on the body, in the link's frame.
+    force_l_n: Floats = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 class ContactCollector:
@@ -74,7 +77,9 @@ class ContactCollector:
             obstacles=obstacles,
             sample_index=sample_indices[contact_rows],
             link_index=np.array(self._link_indices, dtype=np.int64)[contact_rows],
-            obstacle_index=new_index_by_old_obstacle[np.array(self._obstacle_indices, dtype=np.int64)[contact_rows]],
+            obstacle_index=new_index_by_old_obstacle[
+                np.array(self._obstacle_indices, dtype=np.int64)[contact_rows]
+            ],
             force_l_n=np.array(self._force_l_n, dtype=float).reshape(-1, 3)[contact_rows],
         )
 

@@ -45,7 +45,9 @@ def _get_last_run_path() -> Path:
 
 
 def _write_last_run(last_run: LastRun) -> None:
-    with contextlib.suppress(OSError, ValueError):  # ValueError: the name of the folder is not valid text
+    with contextlib.suppress(
+        OSError, ValueError
+    ):  # ValueError: the name of the folder is not valid text
         file = _get_last_run_path()
         file.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(file, msgspec.json.encode(last_run))

@@ -91,7 +91,10 @@ def describe_unwritten_data(host: HostRecord) -> list[str]:
 
 def describe_undecodable_messages(undecodable_counts: Counter[str]) -> list[str]:
     """Describe by sentences the messages of a recording that could not be decoded, counted by key and error."""
-    return [f"recording: {count} messages cannot be read, {what}" for what, count in sorted(undecodable_counts.items())]
+    return [
+        f"recording: {count} messages cannot be read, {what}"
+        for what, count in sorted(undecodable_counts.items())
+    ]
 
 
 def _mask_invalid_numbers(values: NDArray[Any]) -> NDArray[np.bool_]:
@@ -108,7 +111,9 @@ def _describe_counts_by_joint(is_invalid: NDArray[np.bool_], robot: RobotDescrip
     return ", ".join(parts)
 
 
-def _count_invalid_poses(values: NDArray[Any], is_invalid: NDArray[np.bool_], *, has_pose: bool) -> int:
+def _count_invalid_poses(
+    values: NDArray[Any], is_invalid: NDArray[np.bool_], *, has_pose: bool
+) -> int:
     """Count the rows with an invalid pose since the first sample of the pose."""
     invalid_rows = np.array(is_invalid.any(axis=1))
     rows_with_sample = np.flatnonzero(~np.isnan(values).all(axis=1))

@@ -44,7 +44,8 @@ SERVICE_OUTPUT_KEYS = (keys.CONTROL_STATE, keys.WORLD, keys.TRAJECTORY)
 """Keys of the messages that guidance, navigation and control publish."""
 OUTPUT_KEYS = (*SERVICE_OUTPUT_KEYS, keys.CUSTOM_ALL, keys.CONTACTS)
 """Keys of the messages that the black box of the host does not contain."""
-CONTROLLER_SUFFIX = "controller"  # last part of the names of columns with values that a controller defined
+# Last part of the names of columns with values that a controller defined.
+CONTROLLER_SUFFIX = "controller"
 TIME_TOLERANCE_S = 1e-9  # times that differ by less belong to the same tick
 MAX_WORLDS_PER_S = 20.0  # as often as control publishes its state
 # Keys whose messages belong to one tick each.
@@ -62,14 +63,19 @@ class RunOutputs:
     """What services and custom sensors published in a run, and what of it is missing."""
 
     control: list[ControlState] = field(default_factory=list[ControlState])  # in time order
-    worlds: list[WorldModel] = field(default_factory=list[WorldModel])  # in time order, at most MAX_WORLDS_PER_S
-    trajectories: list[Trajectory] = field(default_factory=list[Trajectory])  # in time order, one for each path
-    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # by tick of a cycle of navigation
-    custom: dict[str, Floats] = field(default_factory=dict[str, Floats])  # columns that sensors and controllers define
+    # In time order, at most MAX_WORLDS_PER_S.
+    worlds: list[WorldModel] = field(default_factory=list[WorldModel])
+    # In time order, one for each path.
+    trajectories: list[Trajectory] = field(default_factory=list[Trajectory])
+    # By tick of a cycle of navigation.
+    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])
+    # Columns that sensors and controllers define.
+    custom: dict[str, Floats] = field(default_factory=dict[str, Floats])
     contact_log: ContactLog = field(default_factory=lambda: ContactCollector().make_log())
     replay_of: str = ""  # the recording whose sensors the services read; empty: a run
     missing: list[str] = field(default_factory=list[str])  # sentences about missing data
-    unreached: list[str] = field(default_factory=list[str])  # those of them about data that never reached the recorder
+    # Those of them about data that never reached the recorder.
+    unreached: list[str] = field(default_factory=list[str])
 
 
 @dataclass
@@ -84,35 +90,42 @@ class RecordingContents:
     status: RobotStatus | None = None
 
     # Messages of the run.
-    streams: dict[str, list[Any]] = field(default_factory=lambda: {key: [] for key in SERVICE_OUTPUT_KEYS})
+    streams: dict[str, list[Any]] = field(
+        default_factory=lambda: {key: [] for key in SERVICE_OUTPUT_KEYS}
+    )
     messages_by_tick: dict[str, dict[int, Any]] = field(  # key -> tick -> message
         default_factory=lambda: {key: {} for key in _TICK_KEYS}
     )
-    custom: dict[str, list[RecordedMessage]] = field(default_factory=dict[str, list[RecordedMessage]])  # custom sensors
+    custom: dict[str, list[RecordedMessage]] = field(
+        default_factory=dict[str, list[RecordedMessage]]
+    )  # custom sensors
     contacts: ContactCollector = field(default_factory=ContactCollector)
-    contact_summaries: dict[int, tuple[float, int]] = field(  # tick -> strongest force in N, number of obstacles
-        default_factory=dict[int, tuple[float, int]]
+    contact_summaries: dict[int, tuple[float, int]] = (
+        field(  # tick -> strongest force in N, number of obstacles
+            default_factory=dict[int, tuple[float, int]]
+        )
     )
-    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])  # by tick of a cycle of navigation
-    armed_wall_ns: list[int] = field(default_factory=list[int])  # wall clock at each clock since the first arming
+    # By tick of a cycle of navigation.
+    searched_nodes: dict[int, int] = field(default_factory=dict[int, int])
+    # Wall clock at each clock since the first arming.
+    armed_wall_ns: list[int] = field(default_factory=list[int])
     replay_of: str = ""  # the recording whose sensors these are
 
     # Missing data.
-    undecodable_counts: Counter[str] = field(
-        default_factory=Counter[str]
-    )  # messages that cannot be decoded, by key and reason
+    # Messages that cannot be decoded, by key and reason.
+    undecodable_counts: Counter[str] = field(default_factory=Counter[str])
     missing: list[str] = field(default_factory=list[str])
     applied_tick_count: int = 0  # with setpoints as applied
-    lost_tick_count: int | None = 0  # of these, as the file itself reports; None: it does not report that
+    # Of these, as the file itself reports; None: it does not report that.
+    lost_tick_count: int | None = 0
     last_applied_time_ns: int | None = None  # robot time of the last of them
     is_finished: bool = True  # the file has an end
 
     def add_message(self, recorded: RecordedMessage) -> None:
         """Decode and store one message at a key of RUN_KEYS. Messages are added in the order of the file."""
         if keys.find_row_key(recorded.key) == keys.CUSTOM_ALL:
-            self.custom.setdefault(recorded.key, []).append(
-                recorded
-            )  # decoded later: their schema is in the description
+            # Decoded later: their schema is in the description.
+            self.custom.setdefault(recorded.key, []).append(recorded)
             return
         message_type = keys.find_message(recorded.key)
         if message_type is None:
@@ -181,7 +194,9 @@ class RecordingContents:
             last = f"the last that came is of {self.last_applied_time_ns * 1e-9:.2f} s"
         return [f"recording: {lost} of {ticks} ticks did not reach the recorder; {last}"]
 
-    def collect_outputs(self, robot: RobotDescription, time_s: Floats, unreached: Sequence[str] = ()) -> RunOutputs:
+    def collect_outputs(
+        self, robot: RobotDescription, time_s: Floats, unreached: Sequence[str] = ()
+    ) -> RunOutputs:
         """Collect what guidance, navigation, control and custom sensors published in the run.
 
         Args:
@@ -229,9 +244,13 @@ class RecordingContents:
             "mode": np.array([row.setpoints.mode for row in rows], dtype=np.int8).reshape(shape),
         }
         for name in _JOINT_COLUMNS:
-            columns[name] = np.array([getattr(row.joints, name) for row in rows], dtype=float).reshape(shape)
+            columns[name] = np.array(
+                [getattr(row.joints, name) for row in rows], dtype=float
+            ).reshape(shape)
         for name in _SETPOINT_COLUMNS:
-            columns[name] = np.array([getattr(row.setpoints, name) for row in rows], dtype=float).reshape(shape)
+            columns[name] = np.array(
+                [getattr(row.setpoints, name) for row in rows], dtype=float
+            ).reshape(shape)
         return columns
 
     def _build_tick_rows(self, joint_count: int) -> list["_TickRow"]:
@@ -266,7 +285,14 @@ class RecordingContents:
             is_armed = bool(clocks[tick].arm_session)
             if is_armed and joint_state.has_joint_count(joint_count):
                 rows.append(
-                    _TickRow(tick, joint_state, applied_commands[tick], newest_pose, contact_peak_n, contact_count)
+                    _TickRow(
+                        tick,
+                        joint_state,
+                        applied_commands[tick],
+                        newest_pose,
+                        contact_peak_n,
+                        contact_count,
+                    )
                 )
         return rows
 
@@ -307,7 +333,9 @@ class RecordingContents:
             columns[f"age_s.{sensor}"] = time_s - _take_values(timestamps_s, newest_index)
         return columns
 
-    def _decode_custom_samples(self, key: str, kind: CustomMessage) -> dict[int, tuple[int, dict[str, float]]]:
+    def _decode_custom_samples(
+        self, key: str, kind: CustomMessage
+    ) -> dict[int, tuple[int, dict[str, float]]]:
         """Decode the samples of a custom sensor: timestamp in ns and values by name, for each tick."""
         decoder = MessageDecoder(kind.message)
         samples: dict[int, tuple[int, dict[str, float]]] = {}
@@ -390,12 +418,16 @@ def make_telemetry_columns(states: Sequence[ControlState], time_s: Floats) -> di
     newest_index = _find_newest_sample_indices(sent_s, time_s)
     names = dict.fromkeys(name for state in states for name in state.custom)
     return {
-        f"{name}.{CONTROLLER_SUFFIX}": _take_values([state.custom.get(name, np.nan) for state in states], newest_index)
+        f"{name}.{CONTROLLER_SUFFIX}": _take_values(
+            [state.custom.get(name, np.nan) for state in states], newest_index
+        )
         for name in names
     }
 
 
-def _find_newest_sample_indices(sampled_s: NDArray[np.floating[Any]], time_s: Floats) -> NDArray[np.int64]:
+def _find_newest_sample_indices(
+    sampled_s: NDArray[np.floating[Any]], time_s: Floats
+) -> NDArray[np.int64]:
     """Find the index of the newest sample at each time, (n,); -1 before the first sample.
 
     Args:
@@ -414,7 +446,9 @@ def _take_values(values: list[float], index: NDArray[np.int64]) -> NDArray[np.fl
 
 
 def read_recording(
-    path: Path, selected_keys: Collection[str] = RUN_KEYS, on_message: Callable[[RecordedMessage], None] | None = None
+    path: Path,
+    selected_keys: Collection[str] = RUN_KEYS,
+    on_message: Callable[[RecordedMessage], None] | None = None,
 ) -> RecordingContents:
     """Read the messages of a recording, and determine what is missing in it.
 

@@ -4,7 +4,8 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.run_log.host_record import HostRecord
 
 COMPLETE = "complete"
-GOAL_REQUESTER = "snakesim run, at the goal"  # requester in the request that finishes a run at its goal
+# Requester in the request that finishes a run at its goal.
+GOAL_REQUESTER = "snakesim run, at the goal"
 UNKNOWN_PREFIX = "unknown: "  # prefix of a sentence that explains why the ending is unknown
 
 
@@ -24,7 +25,9 @@ def describe_early_end(host: HostRecord, config: RunConfig) -> str:
             return f"the run ended {progress}: {host.ended_why}"
 
 
-def describe_recorded_end(host: HostRecord, config: RunConfig, recorded_s: float, *, finished: bool) -> str:
+def describe_recorded_end(
+    host: HostRecord, config: RunConfig, recorded_s: float, *, finished: bool
+) -> str:
     """Describe how a run ended, as far as a recording alone shows it.
 
     Args:

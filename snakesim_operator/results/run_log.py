@@ -56,28 +56,28 @@ class RunRecord:
     contact_count: Floats  # (n,) obstacles touched
 
     # More of the recording.
-    searched_nodes_by_tick: dict[int, int] = field(default_factory=dict[int, int])  # by tick of a cycle of navigation
-    custom_columns: dict[str, Floats] = field(
-        default_factory=dict[str, Floats]
-    )  # (n,) columns of custom sensors and telemetry
-    contact_log: ContactLog = field(
-        default_factory=lambda: ContactCollector().make_log()
-    )  # contact forces in the recording
+    # By tick of a cycle of navigation.
+    searched_nodes_by_tick: dict[int, int] = field(default_factory=dict[int, int])
+    # (n,) columns of custom sensors and telemetry.
+    custom_columns: dict[str, Floats] = field(default_factory=dict[str, Floats])
+    # Contact forces in the recording.
+    contact_log: ContactLog = field(default_factory=lambda: ContactCollector().make_log())
     replay_of: str = ""  # recording whose sensors the services read; empty if the run is no replay
 
     # How much of the run is known.
     ending: str = COMPLETE  # COMPLETE, or a sentence on how the run ended
     missing: list[str] = field(default_factory=list[str])  # sentences about missing data
-    recorder_losses: list[str] = field(
-        default_factory=list[str]
-    )  # those of them about data that never reached the recorder
+    # Those of them about data that never reached the recorder.
+    recorder_losses: list[str] = field(default_factory=list[str])
 
     # Files.
     config_path: Path | None = None  # None if there is no such file
     recording_path: Path | None = None
 
     @staticmethod
-    def load(path: Path, host: HostRecord | None = None, on_message: MessageHandler | None = None) -> "RunRecord":
+    def load(
+        path: Path, host: HostRecord | None = None, on_message: MessageHandler | None = None
+    ) -> "RunRecord":
         """Load the record of a run from its folder or from a recording. The run may have been killed.
 
         Args:
@@ -96,7 +96,8 @@ class RunRecord:
         except READ_ERRORS as error:
             reason = f"{type(error).__name__}: {error}"[:300]
             raise ConfigError(
-                f"{path}: the record of this run is damaged ({reason}); run it again", code="recording/not-readable"
+                f"{path}: the record of this run is damaged ({reason}); run it again",
+                code="recording/not-readable",
             ) from None
 
     @staticmethod
@@ -195,5 +196,8 @@ class RunRecord:
         if len(self.time_s) == 0 or not self.has_pose[row]:
             return None
         return compute_body_points_w(
-            self.description, self.position_w_m[row], self.orientation_wxyz[row], self.angle_rad[row]
+            self.description,
+            self.position_w_m[row],
+            self.orientation_wxyz[row],
+            self.angle_rad[row],
         )

@@ -24,7 +24,12 @@ from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import RobotDescription, RunConfiguration
 from snakesim_operator.recording.message import RECORDING_FILENAME, RecordedMessage
-from snakesim_operator.results.recording_contents import OUTPUT_KEYS, RecordingContents, RunOutputs, read_recording
+from snakesim_operator.results.recording_contents import (
+    OUTPUT_KEYS,
+    RecordingContents,
+    RunOutputs,
+    read_recording,
+)
 from snakesim_operator.results.run_ending import COMPLETE, describe_early_end, describe_recorded_end
 
 # Names of files in the folder of a run, besides those of the host.
@@ -84,7 +89,9 @@ class RunReader(Protocol):
         ...
 
 
-def open_run(path: Path, host: HostRecord | None = None, on_message: MessageHandler | None = None) -> RunReader:
+def open_run(
+    path: Path, host: HostRecord | None = None, on_message: MessageHandler | None = None
+) -> RunReader:
     """Open a stored run: return the reader for the folder of a run, or for a recording.
 
     Args:
@@ -107,7 +114,8 @@ def open_run(path: Path, host: HostRecord | None = None, on_message: MessageHand
     for name in required_files:
         if not (path / name).is_file():
             raise ConfigError(
-                f"{path} is not the folder of a run: {name} is missing; {PATH_HINT}", code="recording/not-a-run"
+                f"{path} is not the folder of a run: {name} is missing; {PATH_HINT}",
+                code="recording/not-a-run",
             )
     return RunFolderReader(path, host, on_message)
 
@@ -120,14 +128,18 @@ def find_recording_path(path: Path) -> Path:
     """
     recording_path = path / RECORDING_FILENAME if path.is_dir() else path
     if not recording_path.is_file():
-        raise ConfigError(f"{recording_path}: there is no such recording; {PATH_HINT}", code="file/not-found")
+        raise ConfigError(
+            f"{recording_path}: there is no such recording; {PATH_HINT}", code="file/not-found"
+        )
     return recording_path
 
 
 class RunFolderReader(RunReader):
     """Reads a run's folder: ticks and statistics from the run log, the services' output from the recording."""
 
-    def __init__(self, folder: Path, host: HostRecord | None, on_message: MessageHandler | None) -> None:
+    def __init__(
+        self, folder: Path, host: HostRecord | None, on_message: MessageHandler | None
+    ) -> None:
         self.path = folder
         self.config_path = folder / CONFIG_FILENAME
         self.recording_path = folder / RECORDING_FILENAME
@@ -186,13 +198,17 @@ class RunFolderReader(RunReader):
             return host
         # The host was killed: its last statistics are older than its last ticks.
         tick_count = len(self._ticks["tick"])
-        return msgspec.structs.replace(host, ticks=tick_count, command_digest=compute_digest(self._ticks))
+        return msgspec.structs.replace(
+            host, ticks=tick_count, command_digest=compute_digest(self._ticks)
+        )
 
 
 class RecordingOnlyReader(RunReader):
     """Reads a recording without the other files of its run: a full disk may have had no room for them."""
 
-    def __init__(self, path: Path, host: HostRecord | None, on_message: MessageHandler | None) -> None:
+    def __init__(
+        self, path: Path, host: HostRecord | None, on_message: MessageHandler | None
+    ) -> None:
         self.path = path
         self.config_path = None
         self.recording_path = path
@@ -219,7 +235,9 @@ class RecordingOnlyReader(RunReader):
         recorded_duration_s = 0.0
         if len(time_s):
             recorded_duration_s = float(time_s[-1] - time_s[0]) + 1 / self._config.rate_hz
-        return describe_recorded_end(self._host, self._config, recorded_duration_s, finished=self._contents.is_finished)
+        return describe_recorded_end(
+            self._host, self._config, recorded_duration_s, finished=self._contents.is_finished
+        )
 
     @cached_property
     def _contents(self) -> RecordingContents:
@@ -232,7 +250,8 @@ class RecordingOnlyReader(RunReader):
         if description is None or config is None:
             reason = "; ".join(self._contents.missing) or "was it recorded beside a HAL host?"
             raise ConfigError(
-                f"{self.path}: holds no hal/description and hal/config; {reason}", code="recording/missing-data"
+                f"{self.path}: holds no hal/description and hal/config; {reason}",
+                code="recording/missing-data",
             )
         return description, config
 
@@ -248,7 +267,8 @@ class RecordingOnlyReader(RunReader):
             return msgspec.json.decode(config.content, type=RunConfig)
         except UNDECODABLE as error:
             raise ConfigError(
-                f"{self.path}: its hal/config cannot be read: {str(error)[:200]}", code="recording/not-readable"
+                f"{self.path}: its hal/config cannot be read: {str(error)[:200]}",
+                code="recording/not-readable",
             ) from None
 
     @cached_property

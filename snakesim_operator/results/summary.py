@@ -48,85 +48,125 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     scene: str
     backend: str
-    emulated: Annotated[bool | None, Meta(description="whether nothing real moved; null: unknown")] = None
+    emulated: Annotated[
+        bool | None, Meta(description="whether nothing real moved; null: unknown")
+    ] = None
     controller: str
     seed: int
     clock_mode: ClockMode
     rate_hz: Annotated[float, _make_quantity_meta("Hz", "control rate")]
-    duration_s: Annotated[float, _make_quantity_meta("s", "robot time from the first arming to the end")]
+    duration_s: Annotated[
+        float, _make_quantity_meta("s", "robot time from the first arming to the end")
+    ]
     wall_s: Annotated[float, _make_quantity_meta("s", "wall-clock time of the same")]
     real_time_factor: Annotated[float | None, _make_quantity_meta("1", "duration over wall time")]
     ticks: int
     overruns: Annotated[int, Meta(description="ticks that missed their deadline (realtime)")]
-    answered_fraction: Annotated[float | None, _make_quantity_meta("1", "ticks whose command came within the tick")]
+    answered_fraction: Annotated[
+        float | None, _make_quantity_meta("1", "ticks whose command came within the tick")
+    ]
     command_digest: Annotated[str, Meta(description="SHA-256 of every setpoint as applied")]
-    path_distance_m: Annotated[float | None, _make_quantity_meta("m", "advance of the body along the scene's route")]
+    path_distance_m: Annotated[
+        float | None, _make_quantity_meta("m", "advance of the body along the scene's route")
+    ]
     net_displacement_m: Annotated[
         float | None, _make_quantity_meta("m", "distance of the center of mass from its start")
     ]
     mean_speed_m_s: Annotated[
-        float | None, _make_quantity_meta("m/s", "path distance (or displacement) over the time in which it is known")
+        float | None,
+        _make_quantity_meta(
+            "m/s", "path distance (or displacement) over the time in which it is known"
+        ),
     ]
     pose_from: Annotated[
-        str | None, Meta(description="what guidance had the pose from: sensor or dead_reckoning; null: unknown")
+        str | None,
+        Meta(
+            description="what guidance had the pose from: sensor or dead_reckoning; null: unknown"
+        ),
     ] = None
     contacts_from: Annotated[
-        str | None, Meta(description="what guidance had contacts from: sensor or joint_torques; null: none, or unknown")
+        str | None,
+        Meta(
+            description="what guidance had contacts from: sensor or joint_torques; null: none, or unknown"
+        ),
     ] = None
     dead_reckoned_distance_m: Annotated[
         float | None, _make_quantity_meta("m", "advance by dead reckoning; null: it was measured")
     ] = None
     dead_reckoning_error_m: Annotated[
         float | None,
-        _make_quantity_meta("m", "largest error of the pose by dead reckoning; null: one of the poses is unknown"),
+        _make_quantity_meta(
+            "m", "largest error of the pose by dead reckoning; null: one of the poses is unknown"
+        ),
     ] = None
     locomoting_fraction: Annotated[
         float | None,
         _make_quantity_meta(
-            "1", "share of the time in which the center of mass moved 2 cm or more within a second, as measured"
+            "1",
+            "share of the time in which the center of mass moved 2 cm or more within a second, as measured",
         ),
     ]
     propulsion_joints: Annotated[
-        list[str] | None, Meta(description="one at a time, in order of use; null: control reported nothing")
+        list[str] | None,
+        Meta(description="one at a time, in order of use; null: control reported nothing"),
     ]
     hand_overs: Annotated[
-        int | None, Meta(description="how often propulsion passed from one joint to another; null: as above")
+        int | None,
+        Meta(description="how often propulsion passed from one joint to another; null: as above"),
     ] = None
     jammed: Annotated[bool, Meta(description="whether the controller reported a jam at any time")]
-    last_state: Annotated[str | None, Meta(description="at the end, by the measured motion; null: the pose is unknown")]
-    last_reason: Annotated[
-        str | None, Meta(description="why, as control reported it if its state agrees with the motion")
+    last_state: Annotated[
+        str | None,
+        Meta(description="at the end, by the measured motion; null: the pose is unknown"),
     ]
-    reported_state: Annotated[str | None, Meta(description="the last one that control reported")] = None
-    reported_reason: Annotated[str | None, Meta(description="the reason that control reported with it")] = None
-    peak_joint_torque_nm: Annotated[float | None, _make_quantity_meta("N·m", "largest torque of any joint")]
+    last_reason: Annotated[
+        str | None,
+        Meta(description="why, as control reported it if its state agrees with the motion"),
+    ]
+    reported_state: Annotated[
+        str | None, Meta(description="the last one that control reported")
+    ] = None
+    reported_reason: Annotated[
+        str | None, Meta(description="the reason that control reported with it")
+    ] = None
+    peak_joint_torque_nm: Annotated[
+        float | None, _make_quantity_meta("N·m", "largest torque of any joint")
+    ]
     torque_saturated_fraction: Annotated[
         float | None, _make_quantity_meta("1", "ticks with a joint at its torque limit")
     ]
     peak_contact_force_n: Annotated[
         float | None,
         _make_quantity_meta(
-            "N", "largest force of one contact, mean over 50 ms; or at one time, if the sensor does not average"
+            "N",
+            "largest force of one contact, mean over 50 ms; or at one time, if the sensor does not average",
         ),
     ]
     desired_force_correlation: Annotated[
         float | None,
         _make_quantity_meta(
-            "1", "of measured with desired forces at push-points while it locomoted; null: nothing to compare"
+            "1",
+            "of measured with desired forces at push-points while it locomoted; null: nothing to compare",
         ),
     ]
     desired_force_error: Annotated[
         float | None, _make_quantity_meta("1", "|measured - desired| over desired there, median")
     ]
-    empty_push_points: Annotated[float | None, _make_quantity_meta("1", "share of those push-points without contact")]
+    empty_push_points: Annotated[
+        float | None, _make_quantity_meta("1", "share of those push-points without contact")
+    ]
     energy_j: Annotated[
         float | None,
-        _make_quantity_meta("J", "sum over joints of |torque x velocity| over time, from one sample a control period"),
+        _make_quantity_meta(
+            "J",
+            "sum over joints of |torque x velocity| over time, from one sample a control period",
+        ),
     ]
     torque_joints_j: Annotated[
         float | None,
         _make_quantity_meta(
-            "J", "sum of torque x velocity over time of joints in torque mode, from one sample a control period"
+            "J",
+            "sum of torque x velocity over time of joints in torque mode, from one sample a control period",
         ),
     ] = None
     position_joints_j: Annotated[
@@ -138,20 +178,28 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         ),
     ] = None
     goal_m: Annotated[
-        float | None, _make_quantity_meta("m", "distance from the start to the mission's goal; null without one")
+        float | None,
+        _make_quantity_meta("m", "distance from the start to the mission's goal; null without one"),
     ] = None
-    crossed: Annotated[bool | None, Meta(description="whether the goal was reached; null without one")] = None
-    crossed_s: Annotated[float | None, _make_quantity_meta("s", "from the first arming until the goal was reached")] = (
-        None
-    )
+    crossed: Annotated[
+        bool | None, Meta(description="whether the goal was reached; null without one")
+    ] = None
+    crossed_s: Annotated[
+        float | None, _make_quantity_meta("s", "from the first arming until the goal was reached")
+    ] = None
     advance_m: Annotated[
         float | None,
-        _make_quantity_meta("m", "largest advance towards the goal; without one, along the body's first heading"),
+        _make_quantity_meta(
+            "m", "largest advance towards the goal; without one, along the body's first heading"
+        ),
     ] = None
     advance_m_s: Annotated[
-        float | None, _make_quantity_meta("m/s", "that, over the time until the goal was reached or the end")
+        float | None,
+        _make_quantity_meta("m/s", "that, over the time until the goal was reached or the end"),
     ] = None
-    energy_j_per_m: Annotated[float | None, _make_quantity_meta("J/m", "energy until then over the advance")] = None
+    energy_j_per_m: Annotated[
+        float | None, _make_quantity_meta("J/m", "energy until then over the advance")
+    ] = None
     stalled_s: Annotated[
         float | None,
         _make_quantity_meta(
@@ -163,20 +211,27 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     heading_advance_m: Annotated[
         float | None, _make_quantity_meta("m", "largest advance along the body's first heading")
     ] = None
-    heading_energy_j_per_m: Annotated[float | None, _make_quantity_meta("J/m", "energy of the run over that")] = None
+    heading_energy_j_per_m: Annotated[
+        float | None, _make_quantity_meta("J/m", "energy of the run over that")
+    ] = None
     heading_body_lengths_s: Annotated[
-        float | None, _make_quantity_meta("1/s", "that advance in lengths of the body over the time of the run")
+        float | None,
+        _make_quantity_meta("1/s", "that advance in lengths of the body over the time of the run"),
     ] = None
     heading_cost_of_transport: Annotated[
         float | None, _make_quantity_meta("1", "energy of the run over weight times that advance")
     ] = None
     displacement_m_s: Annotated[
         float | None,
-        _make_quantity_meta("m/s", "`net_displacement_m` over the time of the run, whatever the body's heading"),
+        _make_quantity_meta(
+            "m/s", "`net_displacement_m` over the time of the run, whatever the body's heading"
+        ),
     ] = None
     displacement_bearing_rad: Annotated[
         float | None,
-        _make_quantity_meta("rad", "net displacement's direction from the body's first heading; left is positive"),
+        _make_quantity_meta(
+            "rad", "net displacement's direction from the body's first heading; left is positive"
+        ),
     ] = None
     displacement_energy_j_per_m: Annotated[
         float | None, _make_quantity_meta("J/m", "energy of the run over `net_displacement_m`")
@@ -185,67 +240,105 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None, _make_quantity_meta("1/s", "`displacement_m_s` in lengths of the body")
     ] = None
     displacement_cost_of_transport: Annotated[
-        float | None, _make_quantity_meta("1", "energy of the run over weight times `net_displacement_m`")
+        float | None,
+        _make_quantity_meta("1", "energy of the run over weight times `net_displacement_m`"),
     ] = None
     displacement_efficiency: Annotated[
         float | None,
         _make_quantity_meta(
-            "1", "sliding friction of the weight over `net_displacement_m`, over the energy; level ground"
+            "1",
+            "sliding friction of the weight over `net_displacement_m`, over the energy; level ground",
         ),
     ] = None
     displacement_slip: Annotated[
-        float | None, _make_quantity_meta("1", "1 less `net_displacement_m` over the mean path length of the links")
+        float | None,
+        _make_quantity_meta(
+            "1", "1 less `net_displacement_m` over the mean path length of the links"
+        ),
     ] = None
     lateral_slip: Annotated[
-        float | None, _make_quantity_meta("1", "share of the links' paths that is across their own axes")
+        float | None,
+        _make_quantity_meta("1", "share of the links' paths that is across their own axes"),
     ] = None
-    body_lengths_s: Annotated[float | None, _make_quantity_meta("1/s", "`advance_m_s` in lengths of the body")] = None
+    body_lengths_s: Annotated[
+        float | None, _make_quantity_meta("1/s", "`advance_m_s` in lengths of the body")
+    ] = None
     cost_of_transport: Annotated[
         float | None, _make_quantity_meta("1", "energy until then over weight times advance")
     ] = None
     propulsive_efficiency: Annotated[
         float | None,
-        _make_quantity_meta("1", "sliding friction of the weight over the advance, over that energy; level ground"),
+        _make_quantity_meta(
+            "1", "sliding friction of the weight over the advance, over that energy; level ground"
+        ),
     ] = None
-    jam_ratio: Annotated[float | None, _make_quantity_meta("1", "`stalled_s` over the time until then")] = None
+    jam_ratio: Annotated[
+        float | None, _make_quantity_meta("1", "`stalled_s` over the time until then")
+    ] = None
     impulse_n_s_per_m: Annotated[
         float | None, _make_quantity_meta("N·s/m", "of all contacts until then over the advance")
     ] = None
     torque_headroom: Annotated[
         float | None,
-        _make_quantity_meta("1", "share of its limit that every joint had left in 95 % of the ticks until then"),
+        _make_quantity_meta(
+            "1", "share of its limit that every joint had left in 95 % of the ticks until then"
+        ),
     ] = None
     form_closure: Annotated[
         float | None,
-        _make_quantity_meta("1", "share of the time until then in which obstacles within 2 cm would hold a stiff body"),
+        _make_quantity_meta(
+            "1",
+            "share of the time until then in which obstacles within 2 cm would hold a stiff body",
+        ),
     ] = None
     planning_fraction: Annotated[
-        float | None, _make_quantity_meta("1", "share of navigation's turns until then in which it searched for a path")
+        float | None,
+        _make_quantity_meta(
+            "1", "share of navigation's turns until then in which it searched for a path"
+        ),
     ] = None
     state_to_command_us: Annotated[
         dict[str, float | None], _make_quantity_meta("µs", "state published to command received")
     ]
     tick_times: Annotated[
         dict[str, TimingStatistics],
-        Meta(description="while armed: cycle, late (begin after the deadline), read and write (calls of the backend)"),
+        Meta(
+            description="while armed: cycle, late (begin after the deadline), read and write (calls of the backend)"
+        ),
     ] = {}
     too_slow: Annotated[
-        list[str], Meta(description="services that could not keep up in real time, and what shows it")
+        list[str],
+        Meta(description="services that could not keep up in real time, and what shows it"),
     ] = []
     rejected_commands: Annotated[dict[str, int], Meta(description="by reason")]
-    limited_commands: Annotated[dict[str, int], Meta(description="joint setpoints changed by the limiter, by limit")]
+    limited_commands: Annotated[
+        dict[str, int], Meta(description="joint setpoints changed by the limiter, by limit")
+    ]
     faults: list[Fault]
-    faults_left_out: Annotated[int, Meta(description="of `faults`, between the first and the newest")] = 0
+    faults_left_out: Annotated[
+        int, Meta(description="of `faults`, between the first and the newest")
+    ] = 0
     isolated: Annotated[list[str], Meta(description="joints that were isolated at the end")] = []
-    hosts: Annotated[int, Meta(description="how many HAL hosts the run had; all numbers here are of the last one")] = 1
-    restarts: Annotated[list[ProcessRestart], Meta(description="processes that ended and were restarted")] = []
+    hosts: Annotated[
+        int,
+        Meta(description="how many HAL hosts the run had; all numbers here are of the last one"),
+    ] = 1
+    restarts: Annotated[
+        list[ProcessRestart], Meta(description="processes that ended and were restarted")
+    ] = []
     ended: Annotated[str, Meta(description="complete, interrupted, or what failed")]
-    missing: Annotated[list[str], Meta(description="gaps of the record; numbers are computed from the rest")] = []
+    missing: Annotated[
+        list[str], Meta(description="gaps of the record; numbers are computed from the rest")
+    ] = []
     own_arithmetic: Annotated[
         list[str],
-        Meta(description="what rounds otherwise than on most computers with NumPy 2.2 to 2.4: then the digest differs"),
+        Meta(
+            description="what rounds otherwise than on most computers with NumPy 2.2 to 2.4: then the digest differs"
+        ),
     ] = []
-    config: Annotated[dict[str, Any], Meta(description="the effective configuration; repeats the run")]
+    config: Annotated[
+        dict[str, Any], Meta(description="the effective configuration; repeats the run")
+    ]
 
 
 def get_distance_m(summary: RunSummary) -> float | None:
@@ -258,11 +351,16 @@ def get_distance_m(summary: RunSummary) -> float | None:
 def get_estimates(summary: RunSummary) -> EstimateMetrics:
     """Return the estimates of guidance that the summary of a run contains."""
     return EstimateMetrics(
-        summary.pose_from, summary.contacts_from, summary.dead_reckoned_distance_m, summary.dead_reckoning_error_m
+        summary.pose_from,
+        summary.contacts_from,
+        summary.dead_reckoned_distance_m,
+        summary.dead_reckoning_error_m,
     )
 
 
-def summarize_run(record: RunRecord, ended: str, restarts: Sequence[ProcessRestart] = (), hosts: int = 1) -> RunSummary:
+def summarize_run(
+    record: RunRecord, ended: str, restarts: Sequence[ProcessRestart] = (), hosts: int = 1
+) -> RunSummary:
     """Compute all metrics of a run from its record.
 
     Args:
@@ -310,17 +408,31 @@ def summarize_run(record: RunRecord, ended: str, restarts: Sequence[ProcessResta
         locomoting_fraction=stop_intervals.moving_fraction if stop_intervals else None,
         **_summarize_control_reports(record, stop_intervals, last_report),
         # Forces and effort.
-        **_compute_force_and_energy_metrics(record, has_torque_and_velocity=has_torque_and_velocity),
-        **_compute_advance_metrics(record, progress, has_torque_and_velocity=has_torque_and_velocity),
-        **vars(EffortMetrics.from_run(record, progress, has_torque_and_velocity=has_torque_and_velocity)),
+        **_compute_force_and_energy_metrics(
+            record, has_torque_and_velocity=has_torque_and_velocity
+        ),
+        **_compute_advance_metrics(
+            record, progress, has_torque_and_velocity=has_torque_and_velocity
+        ),
+        **vars(
+            EffortMetrics.from_run(
+                record, progress, has_torque_and_velocity=has_torque_and_velocity
+            )
+        ),
         **vars(
             HeadingEffort.from_run(
-                record, progress, pose_known_duration_s, has_torque_and_velocity=has_torque_and_velocity
+                record,
+                progress,
+                pose_known_duration_s,
+                has_torque_and_velocity=has_torque_and_velocity,
             )
         ),
         **vars(
             DisplacementMetrics.from_run(
-                record, progress, pose_known_duration_s, has_torque_and_velocity=has_torque_and_velocity
+                record,
+                progress,
+                pose_known_duration_s,
+                has_torque_and_velocity=has_torque_and_velocity,
             )
         ),
         # The host and its processes.
@@ -358,7 +470,9 @@ def _summarize_control_reports(
     hand_overs = None
     if record.control_states:
         periods = find_propulsion_periods(record)
-        propulsion_joints = [record.description.joints[period.joint_index].name for period in periods]
+        propulsion_joints = [
+            record.description.joints[period.joint_index].name for period in periods
+        ]
         hand_overs = count_hand_overs(periods)
     last_state, last_reason = find_last_state(stop_intervals, last_report)
     return {
@@ -372,7 +486,9 @@ def _summarize_control_reports(
     }
 
 
-def _compute_force_and_energy_metrics(record: RunRecord, *, has_torque_and_velocity: bool) -> dict[str, Any]:
+def _compute_force_and_energy_metrics(
+    record: RunRecord, *, has_torque_and_velocity: bool
+) -> dict[str, Any]:
     """Compute the metrics of torques, contact forces and energy of a run.
 
     Args:
@@ -403,7 +519,8 @@ def _compute_force_and_energy_metrics(record: RunRecord, *, has_torque_and_veloc
         "torque_joints_j": None,
         "position_joints_j": None,
     }
-    tracking = measure_force_tracking(record.control_states)  # None if no desired force can be compared
+    # None if no desired force can be compared.
+    tracking = measure_force_tracking(record.control_states)
     if tracking:
         metrics["desired_force_correlation"] = tracking.correlation
         metrics["desired_force_error"] = tracking.median_error
@@ -432,11 +549,17 @@ def _compute_advance_metrics(
         return dict.fromkeys(("goal_m", "crossed", "crossed_s", "advance_m", "advance_m_s"))
     return {
         "goal_m": progress.goal_distance_m,
-        "crossed": progress.goal_reached_s is not None if progress.goal_distance_m is not None else None,
+        "crossed": progress.goal_reached_s is not None
+        if progress.goal_distance_m is not None
+        else None,
         "crossed_s": progress.goal_reached_s,
         "advance_m": progress.final_advance_m,
-        "advance_m_s": progress.final_advance_m / progress.goal_or_end_s if progress.goal_or_end_s > 0 else None,
-        "energy_j_per_m": compute_energy_j_per_m(record, progress) if has_torque_and_velocity else None,
+        "advance_m_s": progress.final_advance_m / progress.goal_or_end_s
+        if progress.goal_or_end_s > 0
+        else None,
+        "energy_j_per_m": compute_energy_j_per_m(record, progress)
+        if has_torque_and_velocity
+        else None,
         "stalled_s": progress.stationary_duration_s,
     }
 
@@ -507,7 +630,9 @@ def _measure_distances(record: RunRecord) -> tuple[float | None, float | None, f
         return None, None, 0.0
 
     robot = record.description
-    displacement_w = compute_center_of_mass_w(robot, last_points_w) - compute_center_of_mass_w(robot, first_points_w)
+    displacement_w = compute_center_of_mass_w(robot, last_points_w) - compute_center_of_mass_w(
+        robot, first_points_w
+    )
     net_displacement_m = float(np.linalg.norm(displacement_w))
 
     path_distance_m = None

@@ -36,7 +36,9 @@ class LabeledInterval:
 
 def get_report_time_s(record: RunRecord, state: ControlState) -> float:
     """Return the time at which control reported a state, on the time axis, clipped to the run."""
-    return min(max(state.timestamp_ns * 1e-9 - get_time_origin_s(record), 0.0), get_run_end_s(record))
+    return min(
+        max(state.timestamp_ns * 1e-9 - get_time_origin_s(record), 0.0), get_run_end_s(record)
+    )
 
 
 def list_control_state_spans(record: RunRecord) -> list[tuple[float, float, ControlState]]:

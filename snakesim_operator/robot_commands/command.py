@@ -31,7 +31,13 @@ ANSWER_TIMEOUT_S = 5.0
 DESCRIPTION_TIMEOUT_S = 3.0
 RETRY_PERIOD_S = 0.5  # between two attempts to arm
 STATUS_TIMEOUT_S = 1.5  # until the host's status must show what it answered
-DONE_TEXT_BY_ACTION = {"pause": "paused", "resume": "resumed", "step": "stepped", "speed": "changed", "reset": "reset"}
+DONE_TEXT_BY_ACTION = {
+    "pause": "paused",
+    "resume": "resumed",
+    "step": "stepped",
+    "speed": "changed",
+    "reset": "reset",
+}
 
 
 class ResponseVerification(NamedTuple):
@@ -87,7 +93,9 @@ def arm_robot(
         time.sleep(RETRY_PERIOD_S)
 
 
-def _arm_once(robot: str, backend: str, selection: RobotSelection, print_text: PrintLine, *, unchecked: bool) -> int:
+def _arm_once(
+    robot: str, backend: str, selection: RobotSelection, print_text: PrintLine, *, unchecked: bool
+) -> int:
     """Send one request to arm a robot, if its name and its backend are those that the user typed.
 
     Args:
@@ -135,7 +143,11 @@ def disarm_robot(selection: RobotSelection, print_text: PrintLine = print_line) 
     """
     request = LifecycleRequest(action="disarm", requester=get_user_name())
     return _request_from_robot(
-        find_single_robot(selection, "robot disarm"), keys.LIFECYCLE, request, "disarmed", print_text
+        find_single_robot(selection, "robot disarm"),
+        keys.LIFECYCLE,
+        request,
+        "disarmed",
+        print_text,
     )
 
 
@@ -158,7 +170,9 @@ def reset_robot(selection: RobotSelection, print_text: PrintLine = print_line) -
     try:
         link = find_single_robot(selection, "robot reset")
     except NotConnectedError:
-        latched_stops = [path for path in find_latched_stops() if selection.namespace in (None, path.parent.name)]
+        latched_stops = [
+            path for path in find_latched_stops() if selection.namespace in (None, path.parent.name)
+        ]
         if not latched_stops or selection.endpoint is not None:
             raise
         for path in latched_stops:
@@ -168,11 +182,17 @@ def reset_robot(selection: RobotSelection, print_text: PrintLine = print_line) -
             )
         return 0
     return _request_from_robot(
-        link, keys.LIFECYCLE, LifecycleRequest(action="reset", requester=get_user_name()), "reset", print_text
+        link,
+        keys.LIFECYCLE,
+        LifecycleRequest(action="reset", requester=get_user_name()),
+        "reset",
+        print_text,
     )
 
 
-def control_simulator(order: SimulatorOrder, selection: RobotSelection, print_text: PrintLine = print_line) -> int:
+def control_simulator(
+    order: SimulatorOrder, selection: RobotSelection, print_text: PrintLine = print_line
+) -> int:
     """Pause, resume, step or reset a simulator, or change its speed. A robot that moves real hardware refuses.
 
     Args:
@@ -184,7 +204,10 @@ def control_simulator(order: SimulatorOrder, selection: RobotSelection, print_te
         0, the exit code of the command.
     """
     request = SimulatorRequest(
-        action=order.action, requester=order.requester or get_user_name(), ticks=order.ticks, speed=order.speed
+        action=order.action,
+        requester=order.requester or get_user_name(),
+        ticks=order.ticks,
+        speed=order.speed,
     )
     return _request_from_robot(
         find_single_robot(selection, f"sim {order}"),
@@ -293,7 +316,9 @@ def request_while_commanding(
         response.result()
 
 
-def verify_answers(answers: Sequence[Answer], status_reader: SampleReader[RobotStatus]) -> ResponseVerification:
+def verify_answers(
+    answers: Sequence[Answer], status_reader: SampleReader[RobotStatus]
+) -> ResponseVerification:
     """Check whether the robot's status confirms the answer of its host.
 
     An unauthorized process may answer in the host's name, or the host may answer and then hang. This waits up to
@@ -309,22 +334,30 @@ def verify_answers(answers: Sequence[Answer], status_reader: SampleReader[RobotS
     """
     if len(answers) > 1:
         status = _wait_for_status(status_reader, None)
-        return ResponseVerification(f"{len(answers)} answered in its name; at least one is an impostor", status)
+        return ResponseVerification(
+            f"{len(answers)} answered in its name; at least one is an impostor", status
+        )
     answered_lifecycle = answers[0].lifecycle if answers else None
     status = _wait_for_status(status_reader, answered_lifecycle)
     host_ids = {answer.host for answer in answers}
     if status is not None:
         host_ids.add(status.host)
     if len(host_ids) > 1:
-        problem = "the answer is not from the host that publishes its status; one of them is an impostor"
+        problem = (
+            "the answer is not from the host that publishes its status; one of them is an impostor"
+        )
         return ResponseVerification(problem, status)
     if status is None or status.lifecycle != answered_lifecycle:
-        problem = "its status does not show it; the host may hang, and the answer be from an impostor"
+        problem = (
+            "its status does not show it; the host may hang, and the answer be from an impostor"
+        )
         return ResponseVerification(problem, status)
     return ResponseVerification(None, status)
 
 
-def _wait_for_status(status_reader: SampleReader[RobotStatus], expected_lifecycle: str | None) -> RobotStatus | None:
+def _wait_for_status(
+    status_reader: SampleReader[RobotStatus], expected_lifecycle: str | None
+) -> RobotStatus | None:
     """Wait up to STATUS_TIMEOUT_S for a status with the expected lifecycle state.
 
     Args:

@@ -19,7 +19,9 @@ ESTOP_NICENESS = -10  # niceness of an emergency stop
 
 
 def _add_arm(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`")
+    parser.add_argument(
+        "robot", metavar="ROBOT", help="name of the robot, as printed by `snakesim status`"
+    )
     parser.add_argument("backend", metavar="BACKEND", help="its backend: sim, can, ...")
     add_unchecked_argument(parser)
     parser.add_argument(
@@ -42,7 +44,11 @@ def _add_teleop(parser: argparse.ArgumentParser) -> None:
         help="such as /dev/input/event5 (default: the first)",
     )
     parser.add_argument(
-        "--max-speed", type=float, default=0.3, metavar="M/S", help="speed at full deflection (default: 0.3)"
+        "--max-speed",
+        type=float,
+        default=0.3,
+        metavar="M/S",
+        help="speed at full deflection (default: 0.3)",
     )
     add_network_arguments(parser)
 
@@ -59,7 +65,9 @@ def _add_param_get(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_param_set(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("values", nargs="+", metavar="NAME=VALUE", help="such as control.speed_kp_s=0.3")
+    parser.add_argument(
+        "values", nargs="+", metavar="NAME=VALUE", help="such as control.speed_kp_s=0.3"
+    )
     add_network_arguments(parser)
 
 
@@ -68,8 +76,12 @@ def _add_fault_list(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_fault_inject(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", metavar="KIND", help="such as mute (`snakesim fault list` explains all of them)")
-    parser.add_argument("target", metavar="TARGET", help="such as joint_3, bus_1, control, actuator/joints")
+    parser.add_argument(
+        "kind", metavar="KIND", help="such as mute (`snakesim fault list` explains all of them)"
+    )
+    parser.add_argument(
+        "target", metavar="TARGET", help="such as joint_3, bus_1, control, actuator/joints"
+    )
     add_duration_argument(parser, "seconds of robot time until it ends (default: until --end)")
     parser.add_argument("--amount", type=float, metavar="X", help="amount, for kinds that have one")
     parser.add_argument("--end", action="store_true", help="end it")
@@ -127,7 +139,9 @@ def _list_faults(arguments: argparse.Namespace) -> int:
 def _inject_fault(arguments: argparse.Namespace) -> int:
     from snakesim_operator.robot_commands.fault import FaultOrder, inject_fault
 
-    order = FaultOrder(arguments.kind, arguments.target, arguments.duration, arguments.amount, arguments.end)
+    order = FaultOrder(
+        arguments.kind, arguments.target, arguments.duration, arguments.amount, arguments.end
+    )
     return inject_fault(order, select_robots(arguments))
 
 
@@ -181,7 +195,10 @@ COMMANDS: Commands = (
             "`--wait` is for scripts. A refusal that does not pass by itself, such as a fault or other settings, ends "
             "the wait at once. Exit code: 0 armed, 1 refused or not ready in time, 2 wrong input."
         ),
-        examples=("robot arm planar13 sim", "robot arm planar13 can --namespace lab/planar13 --wait 30"),
+        examples=(
+            "robot arm planar13 sim",
+            "robot arm planar13 can --namespace lab/planar13 --wait 30",
+        ),
     ),
     Command(
         name="robot disarm",
@@ -197,7 +214,11 @@ COMMANDS: Commands = (
         run=_reset_robot,
         examples=("robot reset", "robot reset --namespace planar13"),
     ),
-    CommandGroup(name="param", heading="robot", help="List, get and set parameters of the running controller."),
+    CommandGroup(
+        name="param",
+        heading="robot",
+        help="List, get and set parameters of the running controller.",
+    ),
     Command(
         name="param list",
         help="List all parameters of the controller: value, unit, range and description.",
@@ -217,7 +238,10 @@ COMMANDS: Commands = (
         help="Change parameters, all or none. The controller continues with them, and they are recorded.",
         add=_add_param_set,
         run=_set_parameters,
-        examples=("param set control.speed_kp_s=0.3", "param set control.speed_kp_s=0.3 --namespace planar13"),
+        examples=(
+            "param set control.speed_kp_s=0.3",
+            "param set control.speed_kp_s=0.3 --namespace planar13",
+        ),
     ),
     CommandGroup(name="fault", heading="robot", help="Inject faults into a run that allows it."),
     Command(

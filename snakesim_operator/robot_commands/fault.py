@@ -3,7 +3,13 @@
 from dataclasses import dataclass
 from math import inf
 
-from snakesim_hal.base.errors import ConfigError, NotConnectedError, RefusedError, shorten, suggest_word
+from snakesim_hal.base.errors import (
+    ConfigError,
+    NotConnectedError,
+    RefusedError,
+    shorten,
+    suggest_word,
+)
 from snakesim_hal.base.terminal import PrintLine, print_json, print_line
 from snakesim_hal.model.fault_kinds import (
     FAULT_KINDS,
@@ -44,7 +50,9 @@ def list_faults(*, as_json: bool) -> int:
     return 0
 
 
-def inject_fault(order: FaultOrder, selection: RobotSelection, print_text: PrintLine = print_line) -> int:
+def inject_fault(
+    order: FaultOrder, selection: RobotSelection, print_text: PrintLine = print_line
+) -> int:
     """Inject a fault into a run, or end an injected fault.
 
     Args:
@@ -71,7 +79,9 @@ def inject_fault(order: FaultOrder, selection: RobotSelection, print_text: Print
     link = find_single_robot(selection, f"fault inject {order.kind} {order.target}")
     with open_session(link, CONNECT_TIMEOUT_S) as session:
         try:
-            answer = session.send_request(keys.fault_key(injection.executing_part), request, ANSWER_TIMEOUT_S)
+            answer = session.send_request(
+                keys.fault_key(injection.executing_part), request, ANSWER_TIMEOUT_S
+            )
         except NotConnectedError:
             raise NotConnectedError(
                 f"{injection.executing_part} does not answer, and only it can {order.kind} {order.target}; "
@@ -98,12 +108,16 @@ def _validate_order(order: FaultOrder) -> FaultInjection:
             code="injection/unknown-fault",
         )
     injection = validate_and_complete_injection(
-        FaultInjection(order.kind, order.target, amount=order.amount), f"{order.kind} {order.target}"
+        FaultInjection(order.kind, order.target, amount=order.amount),
+        f"{order.kind} {order.target}",
     )
     if order.for_s is not None and not 0.0 < order.for_s < inf:
-        raise ConfigError(f"--duration {order.for_s:g}: give more than 0 s", code="injection/unknown-fault")
+        raise ConfigError(
+            f"--duration {order.for_s:g}: give more than 0 s", code="injection/unknown-fault"
+        )
     if injection.kind_info.is_instantaneous and (order.end or order.for_s is not None):
         raise ConfigError(
-            f"{order.kind} happens once and has no end; omit --duration and --end", code="injection/unknown-fault"
+            f"{order.kind} happens once and has no end; omit --duration and --end",
+            code="injection/unknown-fault",
         )
     return injection

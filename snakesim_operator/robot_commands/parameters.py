@@ -38,7 +38,8 @@ MAX_NAME_CHARACTERS = 40
 MAX_DESCRIPTION_CHARACTERS = 200
 PUBLICATION_TIMEOUT_S = 3.0  # a controller publishes its parameters within this time
 MAX_SILENCE_S = 1.0  # no parameters for so long after a change mean that the controller has ended
-REPORT_TIMEOUT_S = 0.3  # real time until the next report of a controller that continues; robot time may be paused
+# Real time until the next report of a controller that continues; robot time may be paused.
+REPORT_TIMEOUT_S = 0.3
 POLL_PERIOD_S = 0.01
 
 
@@ -159,7 +160,9 @@ def find_changed_parameters(
 
 def read_parameters_in_force(session: Session) -> ControlParameters:
     """Return the parameters of the running controller. Raises NotConnectedError when no controller publishes any."""
-    in_force = session.wait_for_latched(keys.PARAMETERS_IN_FORCE, ControlParameters, PUBLICATION_TIMEOUT_S)
+    in_force = session.wait_for_latched(
+        keys.PARAMETERS_IN_FORCE, ControlParameters, PUBLICATION_TIMEOUT_S
+    )
     if in_force is None:
         raise NotConnectedError(
             f"no controller publishes its parameters within {PUBLICATION_TIMEOUT_S:g} s: control does not run here, "
@@ -192,7 +195,9 @@ def change_parameters(
     for name, value in changes.items():
         values[find_field_name(name, before)] = value
     parameters = msgspec.json.encode(values).decode()
-    request = ParametersRequest(requester=requester, controller=before.controller, parameters=parameters)
+    request = ParametersRequest(
+        requester=requester, controller=before.controller, parameters=parameters
+    )
     state_reader = session.declare_reader(keys.CONTROL_STATE, ControlState)
     try:
         response = session.send_request(keys.PARAMETERS, request, ANSWER_TIMEOUT_S)
@@ -204,7 +209,8 @@ def change_parameters(
         session.close_reader(state_reader)
     if after is None:
         raise RefusedError(
-            f"NOT CONFIRMED: {response.reason}; but no controller publishes them", code="robot/not-confirmed"
+            f"NOT CONFIRMED: {response.reason}; but no controller publishes them",
+            code="robot/not-confirmed",
         )
     return before, after
 
@@ -221,14 +227,18 @@ def _wait_for_change(session: Session, before: ControlParameters) -> ControlPara
     """
     deadline_s = time.monotonic() + STATUS_TIMEOUT_S
     while time.monotonic() < deadline_s:
-        in_force = session.wait_for_latched(keys.PARAMETERS_IN_FORCE, ControlParameters, MAX_SILENCE_S)
+        in_force = session.wait_for_latched(
+            keys.PARAMETERS_IN_FORCE, ControlParameters, MAX_SILENCE_S
+        )
         if in_force is None or in_force.changes > before.changes:
             return in_force
     return None
 
 
 def _wait_until_controller_continues(
-    state_reader: SampleReader[ControlState], after: ControlParameters | None, changes: Mapping[str, Any]
+    state_reader: SampleReader[ControlState],
+    after: ControlParameters | None,
+    changes: Mapping[str, Any],
 ) -> None:
     """Wait until the controller has run with changed parameters, but at most REPORT_TIMEOUT_S.
 
@@ -248,7 +258,9 @@ def _wait_until_controller_continues(
         reports = state_reader.drain()
         for report in reports:
             if report.failed:
-                values_text = ", ".join(f"{name}={format_value(value)}" for name, value in changes.items())
+                values_text = ", ".join(
+                    f"{name}={format_value(value)}" for name, value in changes.items()
+                )
                 raise ControllerError(
                     f"{values_text}: set, and then control has ended: {report.reason}. The robot stops. Start control "
                     "again with another value"
@@ -295,8 +307,12 @@ def print_parameters(selection: RobotSelection, *, as_json: bool) -> int:
         in_force = read_parameters_in_force(session)
     parameters = parse_parameters(in_force)
     if as_json:
-        content = [{**asdict(parameter), "name": PREFIX + parameter.name} for parameter in parameters]
-        print_json({"controller": in_force.controller, "set_by": in_force.requester, "parameters": content})
+        content = [
+            {**asdict(parameter), "name": PREFIX + parameter.name} for parameter in parameters
+        ]
+        print_json(
+            {"controller": in_force.controller, "set_by": in_force.requester, "parameters": content}
+        )
         return 0
     if in_force.requester is None:
         origin = "from its configuration"
@@ -304,7 +320,10 @@ def print_parameters(selection: RobotSelection, *, as_json: bool) -> int:
         origin = f"set by {in_force.requester} at {in_force.timestamp_ns * 1e-9:g} s"
     print_line(f"controller {in_force.controller}, {len(parameters)} parameters, {origin}")
     # Three aligned columns, then the description.
-    rows = [(PREFIX + parameter.name, parameter.value_with_unit, parameter.range_text) for parameter in parameters]
+    rows = [
+        (PREFIX + parameter.name, parameter.value_with_unit, parameter.range_text)
+        for parameter in parameters
+    ]
     column_widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
     for row, parameter in zip(rows, parameters, strict=True):
         cells = [cell.ljust(width) for cell, width in zip(row, column_widths, strict=True)]
@@ -331,7 +350,9 @@ def print_parameter(name: str, selection: RobotSelection, *, as_json: bool) -> i
     with open_session(find_single_robot(selection, "param get"), CONNECT_TIMEOUT_S) as session:
         in_force = read_parameters_in_force(session)
     field = find_field_name(name, in_force)
-    value = next(parameter.value for parameter in parse_parameters(in_force) if parameter.name == field)
+    value = next(
+        parameter.value for parameter in parse_parameters(in_force) if parameter.name == field
+    )
     if as_json:
         print_json({name: value})
     else:

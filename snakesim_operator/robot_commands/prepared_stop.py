@@ -36,11 +36,11 @@ from snakesim_operator.robot_commands.stop_by_query import request_stop_over_ses
 from snakesim_operator.robot_commands.stop_result import StopResult
 
 SELF_TEST_PERIOD_S = 1.0
-SELF_TEST_VALIDITY_S = 3.0  # a robot counts as ready to be stopped for this long after a test that succeeded
+# A robot counts as ready to be stopped for this long after a test that succeeded.
+SELF_TEST_VALIDITY_S = 3.0
 HOST_RESPONSE_TIMEOUT_S = 1.0  # for the robot's host to answer a test over the network
-CONFIRMATION_TIMEOUT_S = (
-    1.5  # for the network, once the stop port has confirmed: then only a warning of an impostor is awaited
-)
+# For the network, once the stop port has confirmed: then only a warning of an impostor is awaited.
+CONFIRMATION_TIMEOUT_S = 1.5
 STUCK_TIMEOUT_S = 30.0  # a stop that is under way for longer than any limit of its parts
 WAITING_FOR_ROBOT = "waiting for the robot"
 ResultT = TypeVar("ResultT")
@@ -138,7 +138,9 @@ class PreparedStop:
         with self._lock:
             self._pending_requesters.append(requester)
             if self._pending_stop is None:
-                self._pending_stop = self._coordinator_thread.submit(self._stop_for_pending_requests)
+                self._pending_stop = self._coordinator_thread.submit(
+                    self._stop_for_pending_requests
+                )
             return self._pending_stop
 
     def stop_and_wait(self, requester: str) -> str:
@@ -173,13 +175,17 @@ class PreparedStop:
         began_s = self._stop_start_s
         if began_s is not None:
             stuck = now_s - began_s > STUCK_TIMEOUT_S
-            return StopReadiness(not stuck, f"a stop has been under way for {now_s - began_s:.0f} s")
+            return StopReadiness(
+                not stuck, f"a stop has been under way for {now_s - began_s:.0f} s"
+            )
         if self._session is None:
             return StopReadiness(True, WAITING_FOR_ROBOT)
         without_network = self._network_self_test.explain_problem(now_s)
         if without_network:
             also = "; it is also sent to the robot's stop port" if self._list_ports() else ""
-            return StopReadiness(False, f"a stop over the network is not ready: {without_network}{also}")
+            return StopReadiness(
+                False, f"a stop over the network is not ready: {without_network}{also}"
+            )
         without_port = self._port_self_test.explain_problem(now_s) if self._list_ports() else ""
         if without_port:
             return StopReadiness(True, f"ready over the network only: {without_port}")
@@ -218,7 +224,9 @@ class PreparedStop:
                 else "the robot's host does not answer"
             )
         except Exception as error:
-            self._network_self_test = _SelfTest(time.monotonic(), f"{type(error).__name__}: {error}"[:200])
+            self._network_self_test = _SelfTest(
+                time.monotonic(), f"{type(error).__name__}: {error}"[:200]
+            )
             raise
         self._network_self_test = _SelfTest(time.monotonic(), problem)
 
@@ -259,12 +267,18 @@ class PreparedStop:
         pending_port_results = self._datagram_thread.submit(self._request_stop_at_ports)
         pending_network_results = self._network_thread.submit(self._request_stop_over_network)
         full_timeout_s = STOP_TIMEOUT_S + HOST_RESPONSE_TIMEOUT_S
-        port_results, port_problems = _wait_for_result(pending_port_results, full_timeout_s, _PortResults())
+        port_results, port_problems = _wait_for_result(
+            pending_port_results, full_timeout_s, _PortResults()
+        )
         # A local stop port cannot be forged. Once it has confirmed the stop, the network can only add a warning.
         is_confirmed = are_all_stopped(port_results.local_results)
         network_timeout_s = CONFIRMATION_TIMEOUT_S if is_confirmed else full_timeout_s
-        network_results, network_problems = _wait_for_result(pending_network_results, network_timeout_s, [])
-        results = combine_results(port_results.local_results, port_results.remote_results, network_results)
+        network_results, network_problems = _wait_for_result(
+            pending_network_results, network_timeout_s, []
+        )
+        results = combine_results(
+            port_results.local_results, port_results.remote_results, network_results
+        )
         lines = describe_results(results, port_results.local_results, network_results)
         if are_all_stopped(results):
             return True, "; ".join(lines)
@@ -279,9 +293,13 @@ class PreparedStop:
         def request(address: Address) -> StopAnswer | None:
             return self._datagram_requester.request_stop(address, self._user, STOP_TIMEOUT_S)
 
-        local_results = [request_stop_at_port(request, address, robot) for address, robot in self._local_ports.items()]
+        local_results = [
+            request_stop_at_port(request, address, robot)
+            for address, robot in self._local_ports.items()
+        ]
         remote_results = [
-            request_stop_at_port(request, address, robot) for address, robot in self._remote_ports.items()
+            request_stop_at_port(request, address, robot)
+            for address, robot in self._remote_ports.items()
         ]
         # A closed port has no result.
         return _PortResults(
@@ -297,7 +315,9 @@ class PreparedStop:
             return request_stop_over_session(part, self._link, STOP_TIMEOUT_S)
 
 
-def _wait_for_result(pending: "Future[ResultT]", timeout_s: float, default: ResultT) -> tuple[ResultT, list[str]]:
+def _wait_for_result(
+    pending: "Future[ResultT]", timeout_s: float, default: ResultT
+) -> tuple[ResultT, list[str]]:
     """Wait for one way of stopping the robot. Its error does not end the stop, but becomes a line of the result.
 
     Args:

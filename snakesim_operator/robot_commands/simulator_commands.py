@@ -13,12 +13,16 @@ MAX_SPEED = 10.0
 
 
 def _add_step(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("number", nargs="?", type=float, metavar="TICKS", help="number of ticks (default: 1)")
+    parser.add_argument(
+        "number", nargs="?", type=float, metavar="TICKS", help="number of ticks (default: 1)"
+    )
     add_network_arguments(parser)
 
 
 def _add_speed(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("number", type=float, metavar="X", help="robot time over wall time, from 0.1 to 10")
+    parser.add_argument(
+        "number", type=float, metavar="X", help="robot time over wall time, from 0.1 to 10"
+    )
     add_network_arguments(parser)
 
 
@@ -31,7 +35,9 @@ def _resume_simulator(arguments: argparse.Namespace) -> int:
 
 
 def _step_simulator(arguments: argparse.Namespace) -> int:
-    return _send_order(SimulatorOrder("step", ticks=_validate_tick_count(arguments.number)), arguments)
+    return _send_order(
+        SimulatorOrder("step", ticks=_validate_tick_count(arguments.number)), arguments
+    )
 
 
 def _set_simulator_speed(arguments: argparse.Namespace) -> int:
@@ -53,9 +59,12 @@ def _send_order(order: SimulatorOrder, arguments: argparse.Namespace) -> int:
 def _validate_tick_count(number: float | None) -> int:
     """Return the number of ticks, by default 1. Raises ConfigError unless it is a whole number in its range."""
     ticks = 1 if number is None else number
-    if not 1 <= ticks <= MAX_TICKS or ticks != int(ticks):  # in this order: NaN and infinity have no int()
+    if not 1 <= ticks <= MAX_TICKS or ticks != int(
+        ticks
+    ):  # in this order: NaN and infinity have no int()
         raise ConfigError(
-            f"sim step {ticks:g}: give a whole number of ticks from 1 to {MAX_TICKS}", code="command/invalid-option"
+            f"sim step {ticks:g}: give a whole number of ticks from 1 to {MAX_TICKS}",
+            code="command/invalid-option",
         )
     return int(ticks)
 
@@ -71,7 +80,9 @@ def _validate_speed(speed: float) -> float:
 
 
 SIMULATOR_COMMANDS: Commands = (
-    CommandGroup(name="sim", heading="robot", help="Pause, step, speed up, slow down or reset a simulator."),
+    CommandGroup(
+        name="sim", heading="robot", help="Pause, step, speed up, slow down or reset a simulator."
+    ),
     Command(
         name="sim pause",
         help="Pause a simulator: robot time is paused, also for leases and ages.",

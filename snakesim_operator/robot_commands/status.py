@@ -19,11 +19,17 @@ from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageDecoder
 from snakesim_hal.wire.messages import ProcessInfo, RobotDescription, RobotStatus
-from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, get_namespace, make_robot_flags
+from snakesim_operator.base.targets import (
+    CONNECT_TIMEOUT_S,
+    RobotSelection,
+    get_namespace,
+    make_robot_flags,
+)
 from snakesim_operator.results import last_run
 
 MESSAGE_WAIT_S = 1.0  # for the messages of a network
-SINGLE_ATTEMPT_TIMEOUT_S = 0.0  # as a time to connect: Zenoh tries once, and reports a refused connection at once
+# As a time to connect: Zenoh tries once, and reports a refused connection at once.
+SINGLE_ATTEMPT_TIMEOUT_S = 0.0
 
 
 @dataclass(frozen=True)
@@ -31,9 +37,11 @@ class _NewestMessages:
     """The newest messages of one robot on the network, as `snakesim status` prints them."""
 
     link: ConnectionSettings
-    statuses: list[RobotStatus]  # newest status of each host with the robot's name; more than one means an impostor
+    # Newest status of each host with the robot's name; more than one means an impostor.
+    statuses: list[RobotStatus]
     processes: list[ProcessInfo]  # running processes of the robot
-    description: RobotDescription | None  # from the host with the last of these statuses; None if none arrived
+    # From the host with the last of these statuses; None if none arrived.
+    description: RobotDescription | None
 
     @property
     def status(self) -> RobotStatus:
@@ -64,16 +72,22 @@ def print_status(selection: RobotSelection, *, as_json: bool = False) -> int:
             robots += _find_robots(link, _choose_connect_timeout_s(link, local_endpoints))
     reachable_addresses = {(robot.link.endpoint, robot.link.namespace) for robot in robots}
     silent_robots = [
-        robot for robot in selection.list_local_robots() if (robot.endpoint, robot.namespace) not in reachable_addresses
+        robot
+        for robot in selection.list_local_robots()
+        if (robot.endpoint, robot.namespace) not in reachable_addresses
     ]
     has_fault = any(robot.status.lifecycle not in ("armed", "disarmed") for robot in robots)
     is_all_right = bool(robots) and not has_fault and not silent_robots
     exit_code = 0 if is_all_right else 1
     if as_json:
-        print_json({"robots": [_convert_to_json(robot) for robot in robots], "silent": silent_robots})
+        print_json(
+            {"robots": [_convert_to_json(robot) for robot in robots], "silent": silent_robots}
+        )
         return exit_code
     for robot in silent_robots:
-        print_line(f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}")
+        print_line(
+            f"{robot.namespace}: NO ANSWER on {robot.endpoint}; its run is process {robot.pid}"
+        )
     if not robots and not silent_robots:
         _print_no_robot(selection)
     for robot in robots:
@@ -84,7 +98,11 @@ def print_status(selection: RobotSelection, *, as_json: bool = False) -> int:
 def _print_no_robot(selection: RobotSelection) -> None:
     """Print how the last run on this computer ended, and how to start another."""
     last = last_run.read_last_run()
-    ending = f"; the last run on this computer ended so: {last.ended} ({last.folder})" if last is not None else ""
+    ending = (
+        f"; the last run on this computer ended so: {last.ended} ({last.folder})"
+        if last is not None
+        else ""
+    )
     print_line(f"no robot answers on {', '.join(selection.list_endpoints())}{ending}")
     print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenario list`")
 
@@ -92,7 +110,9 @@ def _print_no_robot(selection: RobotSelection) -> None:
 def _print_robot(robot: _NewestMessages) -> None:
     lines = [*_describe_robot(robot), *describe_processes(robot.processes)]
     if robot.is_impostor:
-        lines.append("  IMPOSTOR: more than one host publishes a status under this name; trust none of them")
+        lines.append(
+            "  IMPOSTOR: more than one host publishes a status under this name; trust none of them"
+        )
     lines += _suggest_next_commands(robot.link, robot.status)
     for line in lines:
         print_line(line)
@@ -146,7 +166,9 @@ class _NetworkMessages:
                     self.processes.setdefault(name, []).append(message)
 
 
-def _choose_connect_timeout_s(connection: ConnectionSettings, local_endpoints: Collection[str]) -> float:
+def _choose_connect_timeout_s(
+    connection: ConnectionSettings, local_endpoints: Collection[str]
+) -> float:
     """Return the time in s for which to try to connect to a network.
 
     On loopback Zenoh reports at once whether a process listens, so one attempt is enough. Attempts are repeated where
@@ -183,7 +205,9 @@ def _find_robots(connection: ConnectionSettings, connect_timeout_s: float) -> li
         statuses = list(status_by_host.values())
         description = messages.descriptions.get((name, statuses[-1].host))
         processes = messages.processes.get(name, [])
-        robots.append(_NewestMessages(replace(connection, namespace=name), statuses, processes, description))
+        robots.append(
+            _NewestMessages(replace(connection, namespace=name), statuses, processes, description)
+        )
     return robots
 
 
@@ -191,7 +215,9 @@ def _convert_to_json(robot: _NewestMessages) -> dict[str, Any]:
     return {
         "namespace": robot.link.namespace,
         "endpoint": robot.link.endpoint,
-        "emulated": None if robot.description is None else robot.description.emulated,  # null: unknown
+        "emulated": None
+        if robot.description is None
+        else robot.description.emulated,  # null: unknown
         "impostor": robot.is_impostor,
         "processes": robot.processes,
         "status": robot.status,
@@ -202,7 +228,9 @@ def describe_processes(processes: Sequence[ProcessInfo]) -> list[str]:
     """Return lines for each process: machine, version, uptime, and how its configuration differs from the host's."""
     host = next((entry for entry in processes if entry.name == HOST), None)
     lines: list[str] = []
-    for entry in sorted(processes, key=lambda entry: (entry.name != HOST, entry.name, entry.machine, entry.pid)):
+    for entry in sorted(
+        processes, key=lambda entry: (entry.name != HOST, entry.name, entry.machine, entry.pid)
+    ):
         uptime_s = time.time() - entry.started_unix_s
         uptime = "its clock is ahead of this one's"
         if uptime_s >= 0:
@@ -211,7 +239,9 @@ def describe_processes(processes: Sequence[ProcessInfo]) -> list[str]:
             f"  process {entry.name}: {entry.machine}, {entry.pid} of {entry.user}, snakesim {entry.version}, {uptime}"
         )
         if host is not None:
-            lines += [f"    DIFFERS: {difference}" for difference in describe_differences(entry, host)]
+            lines += [
+                f"    DIFFERS: {difference}" for difference in describe_differences(entry, host)
+            ]
     return lines
 
 
@@ -275,7 +305,9 @@ def _describe_faults(status: RobotStatus) -> list[str]:
         repetitions = f" and {len(fault_ticks) - 1} times more" if len(fault_ticks) > 1 else ""
         lines.append(f"  fault {what}{joint_text} at tick {fault_ticks[0]}{repetitions}: {cause}")
     if status.faults_left_out:
-        lines.append(f"  and {status.faults_left_out} more faults, between the first and the newest of these")
+        lines.append(
+            f"  and {status.faults_left_out} more faults, between the first and the newest of these"
+        )
     return lines
 
 
@@ -302,7 +334,9 @@ def _suggest_next_commands(connection: ConnectionSettings, status: RobotStatus) 
         ]
     if status.ready_to_arm:
         return [f"  next: {arm}"]
-    start_commands = [f"`snakesim start service {name} SCENARIO{flags}`" for name in status.waiting_for]
+    start_commands = [
+        f"`snakesim start service {name} SCENARIO{flags}`" for name in status.waiting_for
+    ]
     if start_commands:
         return [f"  next: {', '.join(start_commands)}"]
     return ["  next: `snakesim status` again: what prevents arming is named above"]

@@ -18,7 +18,8 @@ from snakesim_operator.robot_commands.stop_result import StopResult
 
 STOP_TIMEOUT_S = 5.0
 RobotAddress = tuple[str, str | None]  # endpoint and namespace of a robot
-RequestStopAtPort = Callable[[Address], StopAnswer | None]  # raises NotConnectedError when the port is closed
+# Raises NotConnectedError when the port is closed.
+RequestStopAtPort = Callable[[Address], StopAnswer | None]
 
 
 def stop_robots(selection: RobotSelection, print_text: PrintLine = print_line) -> int:
@@ -52,7 +53,8 @@ def stop_robots(selection: RobotSelection, print_text: PrintLine = print_line) -
         from snakesim_operator.robot_commands.stop_by_query import request_stop_on_network
 
         network_futures = [
-            pool.submit(request_stop_on_network, link, STOP_TIMEOUT_S) for link in selection.list_networks()
+            pool.submit(request_stop_on_network, link, STOP_TIMEOUT_S)
+            for link in selection.list_networks()
         ]
         local_results = _collect_results(local_futures)
         remote_results = _collect_results(remote_futures)
@@ -80,7 +82,9 @@ def _print_other_robots(selection: RobotSelection, print_text: PrintLine) -> Non
     from snakesim_operator.base.targets import find_robots
 
     for link in find_robots(replace(selection, namespace=None)):
-        print_text(f"there is {link.namespace}, on {link.endpoint}; `snakesim estop` without --namespace stops all")
+        print_text(
+            f"there is {link.namespace}, on {link.endpoint}; `snakesim estop` without --namespace stops all"
+        )
 
 
 def find_local_stop_ports(selection: RobotSelection) -> dict[Address, RobotAddress]:
@@ -139,7 +143,9 @@ def request_stop_at_port(
 
 
 def combine_results(
-    local_results: Sequence[StopResult], remote_results: Sequence[StopResult], network_results: Sequence[StopResult]
+    local_results: Sequence[StopResult],
+    remote_results: Sequence[StopResult],
+    network_results: Sequence[StopResult],
 ) -> list[StopResult]:
     """Combine the results of stop ports and of queries over the network to one result for each robot.
 
@@ -150,13 +156,21 @@ def combine_results(
     """
     port_results = (*local_results, *remote_results)
     network_only_results = [
-        result for result in network_results if not any(_is_same_robot(result, other) for other in port_results)
+        result
+        for result in network_results
+        if not any(_is_same_robot(result, other) for other in port_results)
     ]
-    return [*local_results, *_confirm_remote_results(remote_results, network_results), *network_only_results]
+    return [
+        *local_results,
+        *_confirm_remote_results(remote_results, network_results),
+        *network_only_results,
+    ]
 
 
 def describe_results(
-    results: Sequence[StopResult], local_results: Sequence[StopResult], network_results: Sequence[StopResult]
+    results: Sequence[StopResult],
+    local_results: Sequence[StopResult],
+    network_results: Sequence[StopResult],
 ) -> list[str]:
     """Return a line for each robot, and a warning for each robot for which an impostor may answer on the network.
 
@@ -197,11 +211,15 @@ def _confirm_remote_results(
     """
     confirmed_results: list[StopResult] = []
     for result in remote_results:
-        is_confirmed = any(_is_same_robot(result, other) and other.is_stopped for other in network_results)
+        is_confirmed = any(
+            _is_same_robot(result, other) and other.is_stopped for other in network_results
+        )
         if result.is_stopped and is_confirmed:
             confirmed_results.append(result)
         elif result.is_stopped:
-            text = f"its stop port reports it, but nothing on its network confirms it: {result.text}"
+            text = (
+                f"its stop port reports it, but nothing on its network confirms it: {result.text}"
+            )
             confirmed_results.append(replace(result, stopped=False, text=text))
         elif not is_confirmed:
             confirmed_results.append(result)

@@ -49,7 +49,9 @@ def _has_listener(connection: ConnectionSettings) -> bool:
         return False
 
 
-def request_stop_over_session(session: Session, connection: ConnectionSettings, timeout_s: float) -> list[StopResult]:
+def request_stop_over_session(
+    session: Session, connection: ConnectionSettings, timeout_s: float
+) -> list[StopResult]:
     """Stop robots by queries to their hosts, and check the answers against the status that the hosts publish.
 
     The status subscriptions stay until the session is closed.
@@ -62,17 +64,27 @@ def request_stop_over_session(session: Session, connection: ConnectionSettings, 
     Returns:
         One result for each robot that is known or that has answered.
     """
-    robot_names = [connection.namespace] if connection.namespace is not None else find_namespaces(session)
-    status_reader_by_robot = {name: _subscribe_to_status(session, connection, name) for name in robot_names}
-    answers_by_robot = _request_stop_from_hosts(session, connection, timeout_s, should_repeat=bool(robot_names))
+    robot_names = (
+        [connection.namespace] if connection.namespace is not None else find_namespaces(session)
+    )
+    status_reader_by_robot = {
+        name: _subscribe_to_status(session, connection, name) for name in robot_names
+    }
+    answers_by_robot = _request_stop_from_hosts(
+        session, connection, timeout_s, should_repeat=bool(robot_names)
+    )
     results: list[StopResult] = []
     for name in dict.fromkeys([*robot_names, *answers_by_robot]):
         if name not in answers_by_robot:
             text = f"NO ANSWER for {timeout_s:g} s: use its own emergency stop"
             results.append(StopResult(name, connection.endpoint, is_stopped=False, text=text))
             continue
-        status_reader = status_reader_by_robot.get(name) or _subscribe_to_status(session, connection, name)
-        results.append(_make_verified_result(name, connection, answers_by_robot[name], status_reader))
+        status_reader = status_reader_by_robot.get(name) or _subscribe_to_status(
+            session, connection, name
+        )
+        results.append(
+            _make_verified_result(name, connection, answers_by_robot[name], status_reader)
+        )
     return results
 
 
@@ -105,7 +117,10 @@ def _request_stop_from_hosts(
 
 
 def _make_verified_result(
-    name: str, connection: ConnectionSettings, answers: list[Answer], status_reader: SampleReader[RobotStatus]
+    name: str,
+    connection: ConnectionSettings,
+    answers: list[Answer],
+    status_reader: SampleReader[RobotStatus],
 ) -> StopResult:
     """Return the result for one robot, which is stopped only if its status confirms the answer and no host refused.
 
@@ -127,7 +142,9 @@ def _make_verified_result(
     )
 
 
-def _subscribe_to_status(session: Session, connection: ConnectionSettings, name: str) -> SampleReader[RobotStatus]:
+def _subscribe_to_status(
+    session: Session, connection: ConnectionSettings, name: str
+) -> SampleReader[RobotStatus]:
     """Subscribe to the status of one robot, and return the reader."""
     key = keys.STATUS if connection.namespace is not None else f"{name}/{keys.STATUS}"
     return session.declare_latched_reader(key, RobotStatus)

@@ -37,17 +37,25 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
         "faults (may be repeated)",
     )
     parser.add_argument(
-        "--stay", action="store_true", help="faults do not end the run: processes restart, you reset and arm"
+        "--stay",
+        action="store_true",
+        help="faults do not end the run: processes restart, you reset and arm",
     )
     add_unchecked_argument(parser)
-    parser.add_argument("--with-router", action="store_true", help="start a router for the run, as in a lab")
+    parser.add_argument(
+        "--with-router", action="store_true", help="start a router for the run, as in a lab"
+    )
     parser.add_argument(
         "--in-process",
         action="store_true",
         help="run in one process, without a network: lockstep, and faster, where nothing can connect, arm or stop it",
     )
-    parser.add_argument("--until-goal", action="store_true", help="end when the mission's goal is reached")
-    parser.add_argument("--no-record", action="store_true", help="keep no recording of the messages")
+    parser.add_argument(
+        "--until-goal", action="store_true", help="end when the mission's goal is reached"
+    )
+    parser.add_argument(
+        "--no-record", action="store_true", help="keep no recording of the messages"
+    )
     parser.add_argument("--raw-only", action="store_true", help=RAW_ONLY_HELP)
     parser.add_argument(
         "--console",
@@ -64,10 +72,12 @@ def _run_scenario(arguments: argparse.Namespace) -> int:
     """Run `snakesim run`, in processes or in this one, and return its exit code."""
     check_network(arguments)
     if arguments.in_process:
-        from snakesim_operator.run.guarded_process import run_in_guarded_child  # before anything large is loaded
+        # Before anything large is loaded.
+        from snakesim_operator.run.guarded_process import run_in_guarded_child
 
         return run_in_guarded_child(
-            lambda step_times: _run_scenario_in_process(arguments, step_times), owns_process=arguments.owns_process
+            lambda step_times: _run_scenario_in_process(arguments, step_times),
+            owns_process=arguments.owns_process,
         )
     config = _load_checked_config(arguments)
 
@@ -92,7 +102,9 @@ def _run_scenario(arguments: argparse.Namespace) -> int:
         return run_in_processes(request)
 
 
-def _run_scenario_in_process(arguments: argparse.Namespace, step_times: "SharedStepTimes | None") -> int:
+def _run_scenario_in_process(
+    arguments: argparse.Namespace, step_times: "SharedStepTimes | None"
+) -> int:
     config = _load_checked_config(arguments)
     for flag in ("endpoint", "router", "session", "namespace", "stay", "with_router", "console"):
         if getattr(arguments, flag):
@@ -107,7 +119,11 @@ def _run_scenario_in_process(arguments: argparse.Namespace, step_times: "SharedS
         tune_garbage_collector()  # what has been imported by now is never garbage
     with tolerate_failed_output():
         return run_in_process(
-            config, arguments.out, record=not arguments.no_record, raw_only=arguments.raw_only, step_times=step_times
+            config,
+            arguments.out,
+            record=not arguments.no_record,
+            raw_only=arguments.raw_only,
+            step_times=step_times,
         )
 
 
@@ -115,9 +131,8 @@ def _load_checked_config(arguments: argparse.Namespace) -> "RunConfig":
     from snakesim_hal.programs.preflight import validate_and_complete_config
 
     loaded = load_scenario_from_arguments(arguments)
-    return validate_and_complete_config(
-        loaded.config, loaded.table
-    )  # here, because only the table knows which flag set what
+    # Here, because only the table knows which flag set what.
+    return validate_and_complete_config(loaded.config, loaded.table)
 
 
 def _start_host(arguments: argparse.Namespace) -> int:
@@ -148,7 +163,11 @@ COMMANDS: Commands = (
             "run peg_row --controller obstacle_aided --duration 10 --out runs/demo",
         ),
     ),
-    CommandGroup(name="start", heading="robot", help="Start one process of a robot that is distributed over machines."),
+    CommandGroup(
+        name="start",
+        heading="robot",
+        help="Start one process of a robot that is distributed over machines.",
+    ),
     Command(
         name="start host",
         help="Start the HAL host of a robot, which moves the drives or the simulator.",
@@ -156,7 +175,10 @@ COMMANDS: Commands = (
         run=_start_host,
         details="It runs until Ctrl-C, and boots disarmed: `snakesim robot arm` arms it. Faults do not end it. Exit "
         "code: 0 ended with --end-after-duration and without a fault, 1 ended otherwise, 2 wrong input.",
-        examples=("start host triplet", "start host triplet --backend can --router tcp/10.0.0.1:7447 --out runs/host"),
+        examples=(
+            "start host triplet",
+            "start host triplet --backend can --router tcp/10.0.0.1:7447 --out runs/host",
+        ),
     ),
     Command(
         name="start service",
@@ -164,6 +186,9 @@ COMMANDS: Commands = (
         add=add_service_arguments,
         run=_start_service,
         details="It waits for the network and for the robot's host, and joins the next host after a restart.",
-        examples=("start service control triplet", "start service guidance triplet --router tcp/10.0.0.1:7447"),
+        examples=(
+            "start service control triplet",
+            "start service guidance triplet --router tcp/10.0.0.1:7447",
+        ),
     ),
 )

@@ -43,7 +43,9 @@ class ProcessOutput:
         return text.splitlines()[-MAX_LINES_SHOWN:]
 
     def _read_pipe(self) -> None:
-        with contextlib.suppress(OSError):  # the kernel may not allow a larger pipe than the default
+        with contextlib.suppress(
+            OSError
+        ):  # the kernel may not allow a larger pipe than the default
             fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         while output := os.read(self._pipe, READ_BYTES):
             self._tail = (self._tail + output)[-OUTPUT_TAIL_BYTES:]
@@ -100,10 +102,14 @@ def start_child(
     """
     deterministic_env = {"PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0"}
     environment = make_child_environment(
-        arithmetic.make_common_arithmetic_env(), arithmetic.SINGLE_THREAD_ENV, deterministic_env, extra_env
+        arithmetic.make_common_arithmetic_env(),
+        arithmetic.SINGLE_THREAD_ENV,
+        deterministic_env,
+        extra_env,
     )
     read_end, write_end = os.pipe()
-    old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child inherits the blocked signal
+    # The child inherits the blocked signal.
+    old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         process = subprocess.Popen(
             make_python_command("-m", *arguments, "--parent", str(os.getpid())),
@@ -145,5 +151,7 @@ def stop_children(children: Sequence[ChildProcess]) -> None:
         except subprocess.TimeoutExpired:
             child.was_killed = True
             child.process.kill()
-            with contextlib.suppress(subprocess.TimeoutExpired):  # a disk that hangs may block even a killed process
+            with contextlib.suppress(
+                subprocess.TimeoutExpired
+            ):  # a disk that hangs may block even a killed process
                 child.process.wait(STOP_TIMEOUT_S)

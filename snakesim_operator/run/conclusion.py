@@ -22,12 +22,19 @@ from snakesim_operator.results.missing_data import EXIT_INCOMPLETE, describe_unw
 from snakesim_operator.results.run_ending import COMPLETE, describe_early_end
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import REPORT_FILENAME, SUMMARY_FILENAME
-from snakesim_operator.results.summary import ProcessRestart, RunSummary, get_distance_m, get_estimates, summarize_run
+from snakesim_operator.results.summary import (
+    ProcessRestart,
+    RunSummary,
+    get_distance_m,
+    get_estimates,
+    summarize_run,
+)
 from snakesim_operator.run.ending import RunEnding
 from snakesim_operator.run.run_files import RunFiles
 
 MAX_JOINTS_SHOWN = 8
-MAX_ENERGY_DEVIATION = 0.2  # of the energy per meter: a larger difference shows that the body traveled sideways
+# Of the energy per meter: a larger difference shows that the body traveled sideways.
+MAX_ENERGY_DEVIATION = 0.2
 EXIT_COMPLETE, EXIT_FAILED, EXIT_INTERRUPTED = 0, 1, 130
 
 
@@ -40,13 +47,17 @@ class RunConclusion:
     restarts: Sequence[ProcessRestart] = ()
     host_count: int = 1
     recording_losses: Sequence[str] = ()  # reasons why the recording is incomplete
-    slow_services: Sequence[
-        str
-    ] = ()  # services that could not keep up in real time; only known for a run in one process
+    # Services that could not keep up in real time; only known for a run in one process.
+    slow_services: Sequence[str] = ()
 
 
 def write_and_print_results(
-    config: RunConfig, files: RunFiles, ending: RunEnding, outcome: RunConclusion, *, stay: bool = False
+    config: RunConfig,
+    files: RunFiles,
+    ending: RunEnding,
+    outcome: RunConclusion,
+    *,
+    stay: bool = False,
 ) -> int:
     """Write the results of a run, print them, and close its files.
 
@@ -83,7 +94,9 @@ def _choose_exit_code(ending: RunEnding, host: HostRecord | None, missing: Seque
     return EXIT_INCOMPLETE if missing else EXIT_COMPLETE
 
 
-def add_end_causes(ending: RunEnding, host: HostRecord, config: RunConfig, *, stay: bool = False) -> None:
+def add_end_causes(
+    ending: RunEnding, host: HostRecord, config: RunConfig, *, stay: bool = False
+) -> None:
     """Add the causes for which a run is not complete. A run is complete if it was armed for all of its time.
 
     Args:
@@ -179,7 +192,9 @@ def _print_run_end(
         print_line(verdict)
     if outcome.host_record is None:
         reason = ending.reason or "the host ended early"
-        logs = f"; the logs of its processes are in {files.folder}" if files.folder is not None else ""
+        logs = (
+            f"; the logs of its processes are in {files.folder}" if files.folder is not None else ""
+        )
         print_line(f"the run left no record: {reason}{logs}")
     elif ending.reason is not None and not ending.is_interrupted:
         print_line(f"fault: {ending.reason}")
@@ -205,7 +220,9 @@ def _print_stored_emergency_stop(robot: RobotDescription) -> None:
     """Print how to reset a stored emergency stop of the robot, if there is one."""
     stop = get_robot_state_folder(robot.robot, robot.backend, robot.hardware) / ESTOP
     if stop.is_file():
-        print_line(f"{robot.robot} is still stopped, and begins so in every run: `snakesim robot reset` ends that")
+        print_line(
+            f"{robot.robot} is still stopped, and begins so in every run: `snakesim robot reset` ends that"
+        )
 
 
 def _print_host(host: HostRecord) -> None:
@@ -222,7 +239,11 @@ def _print_row(name: str, value: str) -> None:
 
 def print_summary(summary: RunSummary) -> None:
     """Print the main metrics of a run, one per line."""
-    for name, value in (*_make_motion_rows(summary), *_make_state_rows(summary), *_make_failure_rows(summary)):
+    for name, value in (
+        *_make_motion_rows(summary),
+        *_make_state_rows(summary),
+        *_make_failure_rows(summary),
+    ):
         _print_row(name, value)
     for missing in summary.missing:
         _print_row("not known", missing)

@@ -21,14 +21,18 @@ def require_console() -> None:
     """Raise ConfigError if the console or a package that it needs is not installed."""
     if importlib.util.find_spec(CONSOLE_MODULE) is None:
         raise ConfigError(
-            "--console: this installation is one without the console; leave it out", code="extra/not-installed"
+            "--console: this installation is one without the console; leave it out",
+            code="extra/not-installed",
         )
     extras.require_extra("console", "--console", "; or leave it out")
 
 
 @contextlib.contextmanager
 def run_console(
-    common_arguments: Sequence[str], connection: ConnectionSettings, files: RunFiles, report: Callable[[str], None]
+    common_arguments: Sequence[str],
+    connection: ConnectionSettings,
+    files: RunFiles,
+    report: Callable[[str], None],
 ) -> Iterator[None]:
     """Run the console in two child processes, the front process and the page server, while the context is active.
 
@@ -43,7 +47,9 @@ def run_console(
         front_process = start_console_front(ports, connection, on_output)
         pages_fd = ports.pages.fileno()
         arguments = [CONSOLE_MODULE, *common_arguments, "--listening", str(pages_fd)]
-        page_server_process = children.start_child("console", arguments, on_output, pass_fds=[pages_fd])
+        page_server_process = children.start_child(
+            "console", arguments, on_output, pass_fds=[pages_fd]
+        )
         report(f"console: {ports.address}")
         # This process closes its copies: if the console ends, browsers then lose their connection at once.
         ports.close()

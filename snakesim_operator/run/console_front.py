@@ -29,7 +29,9 @@ def start_console_front(
         *_make_robot_arguments(connection),
     ]
     token = {TOKEN_VARIABLE: ports.token}
-    return children.start_child("console front", arguments, on_output, pass_fds=[browsers_fd], extra_env=token)
+    return children.start_child(
+        "console front", arguments, on_output, pass_fds=[browsers_fd], extra_env=token
+    )
 
 
 def _make_robot_arguments(connection: ConnectionSettings | None) -> list[str]:

@@ -79,7 +79,9 @@ def _hold_lock_file(out: Path) -> Iterator[None]:
     while lock_handle is None:
         lock_handle = _try_to_lock(out)
     try:
-        with contextlib.suppress(OSError):  # a full disk: the lock is valid, but without the process id
+        with contextlib.suppress(
+            OSError
+        ):  # a full disk: the lock is valid, but without the process id
             os.ftruncate(lock_handle, 0)
             os.pwrite(lock_handle, str(os.getpid()).encode(), 0)
         yield
@@ -102,7 +104,9 @@ def _try_to_lock(out: Path) -> int | None:
     """
     folder_handle = _open_folder(out)
     try:
-        lock_handle = os.open(LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644, dir_fd=folder_handle)
+        lock_handle = os.open(
+            LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644, dir_fd=folder_handle
+        )
         try:
             fcntl.flock(lock_handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -137,7 +141,8 @@ def _open_folder(out: Path) -> int:
             was_just_renamed = isinstance(error, FileNotFoundError)
             if not attempts_left or not was_just_renamed:
                 raise ConfigError(
-                    f"--out {out}: {error.strerror}: {error.filename}; choose another folder", code="file/not-writable"
+                    f"--out {out}: {error.strerror}: {error.filename}; choose another folder",
+                    code="file/not-writable",
                 ) from error
 
 
@@ -153,7 +158,8 @@ def _rename_earlier_run(out: Path) -> Path:
     """Rename a folder to FOLDER.TIME, with the time of its earlier run, and return the new path. Raises ConfigError."""
     if Path.cwd().is_relative_to(out):
         raise ConfigError(
-            f"--out {out} holds an earlier run, and you are in it; choose another folder", code="file/already-exists"
+            f"--out {out} holds an earlier run, and you are in it; choose another folder",
+            code="file/already-exists",
         )
     start_s = min((out / name).stat().st_mtime for name in RUN_FILES if (out / name).exists())
     start_time = datetime.fromtimestamp(start_s).strftime(TIME_FORMAT)

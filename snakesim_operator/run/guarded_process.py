@@ -18,14 +18,17 @@ from snakesim_hal.base.step_limit import SharedStepTimes
 from snakesim_hal.base.terminal import print_stderr
 
 CHECK_PERIOD_S = 0.25
-INTERRUPT_TIMEOUT_S = 3.0  # for the current step, after Ctrl-C; Python code is interrupted long before
+# For the current step, after Ctrl-C; Python code is interrupted long before.
+INTERRUPT_TIMEOUT_S = 3.0
 OVERDUE_TIMEOUT_S = 5.0  # for a step that is due; Python code is interrupted long before
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130  # as shells report a program that Ctrl-C has ended
 RECORD_HINT = "What was recorded until then is in the run's folder; `snakesim recording report FOLDER` shows it"
 
 
-def run_in_guarded_child(function: Callable[[SharedStepTimes | None], int], *, owns_process: bool) -> int:
+def run_in_guarded_child(
+    function: Callable[[SharedStepTimes | None], int], *, owns_process: bool
+) -> int:
     """Call a function in a child process, which this process can end even if the function hangs.
 
     Args:
@@ -109,7 +112,8 @@ class _ChildGuard:
         signal_time_s = self._signal_time_s
         if signal_time_s is not None and start_s <= signal_time_s < now_s - INTERRUPT_TIMEOUT_S:
             return (
-                f"one step of the run had not returned {INTERRUPT_TIMEOUT_S:g} s after it received the signal to stop"
+                f"one step of the run had not returned {INTERRUPT_TIMEOUT_S:g} s after it "
+                "received the signal to stop"
             )
         return ""
 

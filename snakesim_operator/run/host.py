@@ -33,7 +33,9 @@ def run_host(arguments: argparse.Namespace) -> int:
         if arguments.out is not None:
             arguments.out = exit_stack.enter_context(lock_run_folder(arguments.out, print_line))
             write_config(config, arguments.out / CONFIG_FILENAME)
-        print_line(f"{link.namespace}: {config.robot.name} on backend {config.backend}, {config.clock_mode}")
+        print_line(
+            f"{link.namespace}: {config.robot.name} on backend {config.backend}, {config.clock_mode}"
+        )
         return run_host_program(options, partial(_report_network, link))
 
 

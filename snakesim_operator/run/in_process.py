@@ -42,7 +42,12 @@ from snakesim_operator.results.recording_contents import SERVICE_OUTPUT_KEYS
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import CONFIG_FILENAME
 from snakesim_operator.results.summary import RunSummary
-from snakesim_operator.run.conclusion import RunConclusion, add_end_causes, write_and_print_results, write_results
+from snakesim_operator.run.conclusion import (
+    RunConclusion,
+    add_end_causes,
+    write_and_print_results,
+    write_results,
+)
 from snakesim_operator.run.ending import RunEnding, end_run_on_signals
 from snakesim_operator.run.pinned_process import call_in_pinned_process
 from snakesim_operator.run.progress import RunProgress
@@ -131,7 +136,9 @@ def simulate(
             f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path",
             code="python/invalid-argument",
         )
-    if not is_pinned() and not has_registered_plugins():  # a child would not have the plugins that this program offers
+    if (
+        not is_pinned() and not has_registered_plugins()
+    ):  # a child would not have the plugins that this program offers
         return call_in_pinned_process(
             simulate,
             config=config,
@@ -151,7 +158,9 @@ def simulate(
         else:
             files, _ = exit_stack.enter_context(open_run_files(config, out))
         if files.folder is None:
-            raise ConfigError(f"{out} cannot be written to; choose another folder", code="file/not-writable")
+            raise ConfigError(
+                f"{out} cannot be written to; choose another folder", code="file/not-writable"
+            )
         exit_stack.callback(files.close)
         recorded_keys = (*SERVICE_OUTPUT_KEYS, keys.CONTACTS) if out is None else _list_all_keys()
         run, outcome, has_stalled = _run_until_over(
@@ -166,9 +175,13 @@ def simulate(
             turn_limit_s=turn_limit_s,
         )
         add_end_causes(ending, create_host_record(run.host), config)
-        record, summary = write_results(files, files.folder, ending, outcome, report=out is not None)
+        record, summary = write_results(
+            files, files.folder, ending, outcome, report=out is not None
+        )
         # No local variable holds the failure: its traceback holds this function's frame.
-        return InProcessResult(record, summary, has_stalled, ControlFailure.from_error(run.pop_errors().get(CONTROL)))
+        return InProcessResult(
+            record, summary, has_stalled, ControlFailure.from_error(run.pop_errors().get(CONTROL))
+        )
 
 
 def run_in_process(
@@ -264,15 +277,25 @@ def _run_until_over(
         goal_monitor = GoalMonitor(config, host.description, stall_timeout_s)
         ends_at_goal = until_goal or config.mission.until_goal
         with (
-            HostRecordWriter(host.black_box, host.description, partial(create_host_record, host), files.folder),
-            _record_messages(session, files, recorded_keys, None if raw_only else config.robot.name) as recording,
+            HostRecordWriter(
+                host.black_box, host.description, partial(create_host_record, host), files.folder
+            ),
+            _record_messages(
+                session, files, recorded_keys, None if raw_only else config.robot.name
+            ) as recording,
         ):
             for tick_count, _ in enumerate(run.iterate_ticks()):
                 if tick_count % TICKS_PER_POLL == 0:
                     if recording is not None:
                         recording.flush_when_due()
-                    if progress is not None and host.authority.arm_session:  # before the arming nothing changes
-                        progress.update(host.build_status(), control_states.pop_newest(lambda _state: True), armed=True)
+                    if (
+                        progress is not None and host.authority.arm_session
+                    ):  # before the arming nothing changes
+                        progress.update(
+                            host.build_status(),
+                            control_states.pop_newest(lambda _state: True),
+                            armed=True,
+                        )
                     if ends_at_goal and goal_monitor.update_and_check_end(host.black_box):
                         host.request_completion()
                 if ending.is_interrupted:
@@ -308,7 +331,8 @@ def _record_messages(
     recording = None
     try:
         if files.folder is not None and recorded_keys:
-            from snakesim_operator.recording.writer import RecordingWriter  # needs the extra `record`
+            # Needs the extra `record`.
+            from snakesim_operator.recording.writer import RecordingWriter
 
             recording = RecordingWriter(files.folder / RECORDING_FILENAME, viewer_name)
             for key in recorded_keys:
@@ -319,7 +343,9 @@ def _record_messages(
         yield recording
     finally:
         if recording is not None:
-            recording.close({"version": version("snakesim"), "dropped": {}, "keys": list(recorded_keys)})
+            recording.close(
+                {"version": version("snakesim"), "dropped": {}, "keys": list(recorded_keys)}
+            )
             if recording.failure:
                 files.warn(recording.failure)
 

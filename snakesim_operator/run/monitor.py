@@ -27,16 +27,23 @@ from snakesim_operator.run.processor_waits import ProcessorWaits
 from snakesim_operator.run.progress import RunProgress
 from snakesim_operator.run.supervisor import HOST, RunSupervisor
 
-RUN_ON_AFTER_FAULT_S = 1.5  # the host continues for so long after a fault, so that the safe stop is in the record
+# The host continues for so long after a fault, so that the safe stop is in the record.
+RUN_ON_AFTER_FAULT_S = 1.5
 POLL_S = 0.05
 ARM_TIMEOUT_S = 10.0  # for the response of the host to the request to arm
 RECORDER_TIMEOUT_S = 20.0  # once everything else is ready
 REQUESTER = "snakesim run"
-LEASE_PROCESSES = ("host", "control")  # the lease expires if one of these two waits too long for a processor
+# The lease expires if one of these two waits too long for a processor.
+LEASE_PROCESSES = "host", "control"
 MIN_REAL_TIME_FACTOR = 0.95  # below it, the computer does not keep up
 MIN_LATE_TICKS = 10  # a process that was only stopped for a while causes fewer late ticks
 MAX_SILENCE_S = 10.0  # the host sends its status five times a second
-PROCESS_STATES = {"T": "was stopped by a signal", "R": "computes", "S": "waits in a call", "D": "waits for a device"}
+PROCESS_STATES = {
+    "T": "was stopped by a signal",
+    "R": "computes",
+    "S": "waits in a call",
+    "D": "waits for a device",
+}
 
 
 class RunMonitor:
@@ -79,7 +86,11 @@ class RunMonitor:
         # What control and navigation published.
         self._control_states = session.declare_reader(keys.CONTROL_STATE, ControlState)
         self._control_state: ControlState | None = None
-        self._trajectory = session.declare_reader(keys.TRAJECTORY, Trajectory) if config.mission.until_goal else None
+        self._trajectory = (
+            session.declare_reader(keys.TRAJECTORY, Trajectory)
+            if config.mission.until_goal
+            else None
+        )
 
         # The recorder.
         self._recorder_is_ready = RECORDER not in supervisor.process_names
@@ -90,13 +101,15 @@ class RunMonitor:
         self._status: RobotStatus | None = None
         self._robot: RobotDescription | None = None
         self._host_count = supervisor.host_count
-        self._polls_without_status = 0  # polls instead of time: a pause of this process is no silence of the host
+        # Polls instead of time: a pause of this process is no silence of the host.
+        self._polls_without_status = 0
         self._silence: str | None = None  # a sentence, if the host is silent
         self._last_latched: str | None = None  # the fault or emergency stop that was printed last
 
         # Arming.
         self._has_been_armed = False  # True after the first arming, by this run or by a person
-        self._is_arming_allowed = config.has_internal_control  # until the first fault; afterwards only a person arms
+        # Until the first fault; afterwards only a person arms.
+        self._is_arming_allowed = config.has_internal_control
         self._own_services = frozenset(config.internal_services)
         self._arm_request_time_s: float | None = None
 
@@ -105,11 +118,17 @@ class RunMonitor:
         arming_deadline_s = time.monotonic() + SERVICE_START_LIMIT_S
         with self._progress:
             try:
-                while self._supervisor.restart_ended_processes() and not self._ending.is_interrupted:
+                while (
+                    self._supervisor.restart_ended_processes() and not self._ending.is_interrupted
+                ):
                     if not self._poll(arming_deadline_s):
                         break
                     time.sleep(POLL_S)
-                if self._ending.reason is not None and self._has_been_armed and not self._ending.is_interrupted:
+                if (
+                    self._ending.reason is not None
+                    and self._has_been_armed
+                    and not self._ending.is_interrupted
+                ):
                     self._wait_for_safe_stop()
             finally:
                 self._faults.undo_all()
@@ -156,7 +175,9 @@ class RunMonitor:
 
     def _sample_processor_waits(self) -> None:
         pids = self._supervisor.get_pids()
-        self._processor_waits.take_sample({name: pids[name] for name in pids if name in LEASE_PROCESSES})
+        self._processor_waits.take_sample(
+            {name: pids[name] for name in pids if name in LEASE_PROCESSES}
+        )
 
     def _on_new_host(self) -> None:
         """Start over with a host that was restarted or reset. It boots disarmed, and a person arms it."""
@@ -193,7 +214,9 @@ class RunMonitor:
             refusal = self._faults.describe_refusal(self._robot)
             if refusal is not None:
                 raise RefusedError(refusal, code="injection/not-allowed")
-        self._faults.apply_due_faults(self._robot, status.lifecycle if status is not None else "disarmed")
+        self._faults.apply_due_faults(
+            self._robot, status.lifecycle if status is not None else "disarmed"
+        )
         if status is None:
             return
         if status.lifecycle in ("fault", "estop"):
@@ -228,18 +251,25 @@ class RunMonitor:
         wait = self._processor_waits.find_longest()
         if wait is not None:
             name, waited_s, window_s = wait
-            evidence.append(f"{name} waited for a processor for {1e3 * waited_s:.0f} of {1e3 * window_s:.0f} ms")
+            evidence.append(
+                f"{name} waited for a processor for {1e3 * waited_s:.0f} of {1e3 * window_s:.0f} ms"
+            )
         factor = status.real_time_factor
         many_late_ticks = status.overruns >= MIN_LATE_TICKS and status.speed == 1.0
         if many_late_ticks and factor is not None and factor < MIN_REAL_TIME_FACTOR:
-            evidence.append(f"{status.overruns} ticks were late, and robot time passed at {factor:.2f} of real time")
+            evidence.append(
+                f"{status.overruns} ticks were late, and robot time passed at {factor:.2f} of real time"
+            )
         if not evidence:
             return None
         return f"this computer is too slow: {', '.join(evidence)}"
 
     def _describe_silence(self, status: RobotStatus) -> str | None:
         """Describe that the host runs but sends no status; None if it sends its status, or has ended."""
-        if self._polls_without_status * POLL_S < MAX_SILENCE_S or not self._supervisor.is_host_running():
+        if (
+            self._polls_without_status * POLL_S < MAX_SILENCE_S
+            or not self._supervisor.is_host_running()
+        ):
             return None
         stat = Path(f"/proc/{self._supervisor.get_pids()[HOST]}/stat").read_text()
         state = stat.rpartition(")")[2].split()[0]
@@ -266,7 +296,12 @@ class RunMonitor:
             return
         if self._own_services.isdisjoint(status.waiting_for):
             self._supervisor.has_started_up = True
-        if self._has_been_armed or not self._is_arming_allowed or not status.ready_to_arm or self._robot is None:
+        if (
+            self._has_been_armed
+            or not self._is_arming_allowed
+            or not status.ready_to_arm
+            or self._robot is None
+        ):
             return
         if self._waits_for_recorder():
             return
@@ -293,7 +328,9 @@ class RunMonitor:
             self._recorder_due_s = now + RECORDER_TIMEOUT_S
         if now < self._recorder_due_s:
             return True
-        self._print_text(f"warning: no recorder within {RECORDER_TIMEOUT_S:.0f} s; the run continues without")
+        self._print_text(
+            f"warning: no recorder within {RECORDER_TIMEOUT_S:.0f} s; the run continues without"
+        )
         self._recorder_is_ready = True
         return False
 
@@ -315,12 +352,18 @@ class RunMonitor:
                 raise RefusedError(response.reason, code="robot/not-ready")
             self._has_been_armed = response.ok
         elif time.monotonic() - self._arm_request_time_s > ARM_TIMEOUT_S:
-            raise NotConnectedError(f"the host does not answer within {ARM_TIMEOUT_S:.0f} s; see host.log")
+            raise NotConnectedError(
+                f"the host does not answer within {ARM_TIMEOUT_S:.0f} s; see host.log"
+            )
 
     def _wait_for_safe_stop(self) -> None:
         """Keep the host running briefly after a failure, so that the safe stop is in the record and in `status`."""
         deadline = time.monotonic() + 2 * RUN_ON_AFTER_FAULT_S
-        while self._supervisor.is_host_running() and time.monotonic() < deadline and not self._ending.is_interrupted:
+        while (
+            self._supervisor.is_host_running()
+            and time.monotonic() < deadline
+            and not self._ending.is_interrupted
+        ):
             self._read_messages()
             time.sleep(POLL_S)
         self._note_slow_controller()

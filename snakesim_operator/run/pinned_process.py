@@ -16,7 +16,11 @@ from typing import Any, TypeVar
 
 from snakesim_hal.base import errors
 from snakesim_hal.base.arithmetic import make_common_arithmetic_env
-from snakesim_hal.base.process import make_child_environment, make_python_command, set_parent_death_signal
+from snakesim_hal.base.process import (
+    make_child_environment,
+    make_python_command,
+    set_parent_death_signal,
+)
 
 ResultT = TypeVar("ResultT")
 CALL_FILENAME = "call"  # holds the function and its arguments
@@ -46,7 +50,9 @@ def call_in_pinned_process(function: Callable[..., ResultT], **arguments: Any) -
         call_path.write_bytes(pickle.dumps((function, arguments)))
         variables = {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": folder}
         process = subprocess.Popen(
-            make_python_command("-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())),
+            make_python_command(
+                "-m", "snakesim_operator.run.pinned_process", folder, str(os.getpid())
+            ),
             env=make_child_environment(make_common_arithmetic_env(), variables),
             stdin=subprocess.DEVNULL,
         )
@@ -58,7 +64,9 @@ def call_in_pinned_process(function: Callable[..., ResultT], **arguments: Any) -
             process.kill()
             process.wait()
         if process.returncode:
-            raise errors.SnakesimError(f"the process of the run ended with exit code {process.returncode}; see above")
+            raise errors.SnakesimError(
+                f"the process of the run ended with exit code {process.returncode}; see above"
+            )
         result = pickle.loads(result_path.read_bytes())
     if isinstance(result, tuple):  # the function raised an error
         error_name, lines, code = result
@@ -79,7 +87,8 @@ def main() -> int:
     """
     folder = Path(sys.argv[1])
     parent_pid = int(sys.argv[2])
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C reaches both processes; the parent reports it
+    # Ctrl-C reaches both processes; the parent reports it.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     set_parent_death_signal(parent_pid)
     function, arguments = pickle.loads((folder / CALL_FILENAME).read_bytes())
     try:

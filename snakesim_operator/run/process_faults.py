@@ -12,7 +12,12 @@ from queue import SimpleQueue
 
 from snakesim_hal.base.errors import ConfigError, RefusedError, WireError
 from snakesim_hal.base.process import step_wall_clock
-from snakesim_hal.model.fault_kinds import RUN, FaultInjection, InjectionPlan, validate_and_complete_injection
+from snakesim_hal.model.fault_kinds import (
+    RUN,
+    FaultInjection,
+    InjectionPlan,
+    validate_and_complete_injection,
+)
 from snakesim_hal.model.fault_plan import parse_planned_faults
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session
@@ -53,7 +58,11 @@ class ProcessFaults:
     """Injects the faults that the scenario plans, and those that clients request on `fault/run`."""
 
     def __init__(
-        self, config: RunConfig, session: Session, supervisor: RunSupervisor, print_text: Callable[[str], None]
+        self,
+        config: RunConfig,
+        session: Session,
+        supervisor: RunSupervisor,
+        print_text: Callable[[str], None],
     ) -> None:
         """Prepare the faults of processes that the scenario plans, and accept requests for further ones.
 
@@ -67,11 +76,16 @@ class ProcessFaults:
         self._supervisor = supervisor
         self._print_text = print_text
         self._plan = InjectionPlan(
-            injection for injection in parse_planned_faults(config) if injection.executing_part == RUN
+            injection
+            for injection in parse_planned_faults(config)
+            if injection.executing_part == RUN
         )
-        self._time = RobotTime(session) if self._has_plan() else None  # each clock message wakes this process
-        self._resume_time_by_process: dict[str, float] = {}  # name of a process -> monotonic time at which it continues
-        self._requested_injections: list[FaultInjection] = []  # begin at the next `apply_due_faults`
+        # Each clock message wakes this process.
+        self._time = RobotTime(session) if self._has_plan() else None
+        # Name of a process -> monotonic time at which it continues.
+        self._resume_time_by_process: dict[str, float] = {}
+        # Begin at the next `apply_due_faults`.
+        self._requested_injections: list[FaultInjection] = []
         self._clock_offset_s = 0.0
         self._decoder = MessageDecoder(FaultRequest)
         self._queries: SimpleQueue[IncomingQuery] = SimpleQueue()
@@ -135,7 +149,12 @@ class ProcessFaults:
         """
 
         def refuse(reason: str, refusal: str) -> Answer:
-            return Answer(ok=False, reason=reason[:MAX_REASON_CHARACTERS], refusal=refusal, lifecycle=lifecycle)
+            return Answer(
+                ok=False,
+                reason=reason[:MAX_REASON_CHARACTERS],
+                refusal=refusal,
+                lifecycle=lifecycle,
+            )
 
         if robot is None:
             return refuse("the robot is not known yet", "not_allowed")
@@ -150,10 +169,15 @@ class ProcessFaults:
             )
             if request.end:
                 self._end_fault(injection)
-                return Answer(ok=True, reason=f"ended: {injection.kind}:{injection.target}", lifecycle=lifecycle)
+                return Answer(
+                    ok=True,
+                    reason=f"ended: {injection.kind}:{injection.target}",
+                    lifecycle=lifecycle,
+                )
             self._validate_injection(injection)
             if injection.target_type == "process":
-                self._requested_injections.append(injection)  # not now: the response may pass through that process
+                # Not now: the response may pass through that process.
+                self._requested_injections.append(injection)
             else:
                 self._start_fault(injection)
         except WireError as error:
@@ -162,7 +186,9 @@ class ProcessFaults:
             return refuse(str(error), "unknown_fault")
         except RefusedError as error:
             return refuse(str(error), "not_permitted")
-        return Answer(ok=True, reason=f"begins: {injection.kind}:{injection.target}", lifecycle=lifecycle)
+        return Answer(
+            ok=True, reason=f"begins: {injection.kind}:{injection.target}", lifecycle=lifecycle
+        )
 
     def _describe_prohibition(self, robot: RobotDescription) -> str | None:
         """Describe why faults may not be injected into a robot; None if they may."""
@@ -180,12 +206,19 @@ class ProcessFaults:
                 f"{injection.kind}:{injection.target} is carried out at {keys.fault_key(injection.executing_part)}",
                 code="injection/not-supported",
             )
-        if injection.target_type == "process" and injection.target not in self._supervisor.process_names:
+        if (
+            injection.target_type == "process"
+            and injection.target not in self._supervisor.process_names
+        ):
             raise ConfigError(
                 f"there is no process {injection.target!r}; this run has {', '.join(self._supervisor.process_names)}",
                 code="injection/unknown-target",
             )
-        if injection.kind == "freeze" and injection.target in REQUEST_ROUTING_PROCESSES and injection.end_s == inf:
+        if (
+            injection.kind == "freeze"
+            and injection.target in REQUEST_ROUTING_PROCESSES
+            and injection.end_s == inf
+        ):
             raise ConfigError(
                 f"freeze:{injection.target} needs an end, because a frozen {injection.target} cannot receive the "
                 f"request to end it: give --for SECONDS",
@@ -202,7 +235,9 @@ class ProcessFaults:
             return
         self._supervisor.send_signal(injection.target, SIGNALS[injection.kind])
         if injection.kind == "freeze":
-            self._resume_time_by_process[injection.target] = time.monotonic() + injection.end_s - injection.start_s
+            self._resume_time_by_process[injection.target] = (
+                time.monotonic() + injection.end_s - injection.start_s
+            )
 
     def _end_fault(self, injection: FaultInjection) -> None:
         """End a freeze before its time. Raises ConfigError for a fault that is not active."""

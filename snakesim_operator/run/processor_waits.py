@@ -48,7 +48,9 @@ def read_usages(pid: int) -> dict[int, ThreadUsage]:
             with contextlib.suppress(OSError, ValueError, IndexError):
                 ran_ns, waited_ns, *_ = (task / "schedstat").read_text().split()
                 state = (task / "stat").read_text().rpartition(")")[2].split()[0]
-                usages[int(task.name)] = ThreadUsage(int(ran_ns) * 1e-9, int(waited_ns) * 1e-9, state == "R")
+                usages[int(task.name)] = ThreadUsage(
+                    int(ran_ns) * 1e-9, int(waited_ns) * 1e-9, state == "R"
+                )
     return usages
 
 
@@ -71,7 +73,8 @@ class ProcessorWaits:
         self._lease_s = lease_s
         self._read = read
         self._clock = clock
-        self._last_change: dict[int, tuple[ThreadUsage, float]] = {}  # of each thread: its usage, and when that was new
+        # Of each thread: its usage, and when that was new.
+        self._last_change: dict[int, tuple[ThreadUsage, float]] = {}
         self._samples: deque[WaitSample] = deque()
 
     def take_sample(self, pids: Mapping[str, int]) -> None:
@@ -80,7 +83,9 @@ class ProcessorWaits:
         usages = {name: self._read(pid) for name, pid in pids.items()}
         waited_s: dict[str, float] = {}
         for name, threads in usages.items():
-            waited_s[name] = sum(self._update_waited_s(thread, usage, now_s) for thread, usage in threads.items())
+            waited_s[name] = sum(
+                self._update_waited_s(thread, usage, now_s) for thread, usage in threads.items()
+            )
         self._samples.append(WaitSample(now_s, waited_s))
         while len(self._samples) > 2 and now_s - self._samples[1].time_s > HISTORY_S:
             self._samples.popleft()
@@ -97,12 +102,19 @@ class ProcessorWaits:
             if last is None:
                 break
             for wait in self._find_long_waits(first, last):
-                if longest is None or wait.waited_s / wait.window_s > longest.waited_s / longest.window_s:
+                if (
+                    longest is None
+                    or wait.waited_s / wait.window_s > longest.waited_s / longest.window_s
+                ):
                     longest = wait
         return longest
 
-    def _find_sample_after_lease(self, first: WaitSample, later: list[WaitSample]) -> WaitSample | None:
-        return next((sample for sample in later if sample.time_s - first.time_s >= self._lease_s), None)
+    def _find_sample_after_lease(
+        self, first: WaitSample, later: list[WaitSample]
+    ) -> WaitSample | None:
+        return next(
+            (sample for sample in later if sample.time_s - first.time_s >= self._lease_s), None
+        )
 
     def _find_long_waits(self, first: WaitSample, last: WaitSample) -> list[LongWait]:
         """Return the processes that waited too long between two samples."""

@@ -61,7 +61,9 @@ class RunProgress(StatusLine):
         self._last_status = None
         self._armed_s = 0.0
 
-    def update(self, status: RobotStatus | None, control: ControlState | None, *, armed: bool) -> None:
+    def update(
+        self, status: RobotStatus | None, control: ControlState | None, *, armed: bool
+    ) -> None:
         """Update the progress line, if an update is due.
 
         Args:

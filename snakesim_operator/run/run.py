@@ -35,7 +35,8 @@ from snakesim_operator.run.run_files import RunFiles
 from snakesim_operator.run.supervisor import HOST, RunSupervisor
 
 CONNECT_TIMEOUT_S = 0.5
-REPORT_PERIOD_S = 20.0  # between two lines on the terminal while the host has not opened its network
+# Between two lines on the terminal while the host has not opened its network.
+REPORT_PERIOD_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class RunRequest:
 
     # Arming and faults.
     unchecked: bool = False  # also arm a robot whose joints have not been checked
-    stay: bool = False  # a fault does not end the run: processes restart, and a person resets and arms
+    # A fault does not end the run: processes restart, and a person resets and arms.
+    stay: bool = False
 
     # Output.
     record: bool = True  # every message, in recording.mcap
@@ -92,19 +94,30 @@ def run_in_processes(request: RunRequest) -> int:
     """
     request = replace(request, config=validate_and_complete_config(request.config))
     _check_request(request)
-    link, stop_port = reserve_endpoint(request.endpoint, request.router_link, request.robot_namespace)
+    link, stop_port = reserve_endpoint(
+        request.endpoint, request.router_link, request.robot_namespace
+    )
     ending = RunEnding()
-    with contextlib.closing(stop_port), open_run_files(request.config, request.out) as (files, config_file):
+    with (
+        contextlib.closing(stop_port),
+        open_run_files(request.config, request.out) as (files, config_file),
+    ):
         supervisor = RunSupervisor(files, ending, print_line, stop_port, stay=request.stay)
         processes = _RunProcesses(request, supervisor, link, files, config_file)
         robot = LocalRobot.from_connection(
-            link, request.config.robot.name, request.config.backend, stop_port, str(config_file.absolute())
+            link,
+            request.config.robot.name,
+            request.config.backend,
+            stop_port,
+            str(config_file.absolute()),
         )
         with end_run_on_signals(ending):
             with contextlib.ExitStack() as exit_stack:
                 registry_failure = exit_stack.enter_context(register_robot(robot))
                 if request.console:  # before the robot, because the operator waits for it
-                    exit_stack.enter_context(run_console(processes.common_arguments, link, files, print_line))
+                    exit_stack.enter_context(
+                        run_console(processes.common_arguments, link, files, print_line)
+                    )
                 if registry_failure is not None:
                     print_line(registry_failure)
                 _run_until_over(processes, ending)
@@ -122,7 +135,9 @@ def _check_request(request: RunRequest) -> None:
     check_no_other_robot(request.endpoint, request.router_link)
 
 
-def _conclude_run(request: RunRequest, supervisor: RunSupervisor, files: RunFiles, ending: RunEnding) -> int:
+def _conclude_run(
+    request: RunRequest, supervisor: RunSupervisor, files: RunFiles, ending: RunEnding
+) -> int:
     """Write and print the results of a run, close its files, and return the exit code."""
     # Imported only now, because the start of the robot does not need it.
     from snakesim_operator.run.conclusion import RunConclusion, write_and_print_results
@@ -138,7 +153,9 @@ def _conclude_run(request: RunRequest, supervisor: RunSupervisor, files: RunFile
 
 
 @contextlib.contextmanager
-def open_run_files(config: RunConfig, output_folder: Path | None) -> Iterator[tuple[RunFiles, Path]]:
+def open_run_files(
+    config: RunConfig, output_folder: Path | None
+) -> Iterator[tuple[RunFiles, Path]]:
     """Lock the folder of a run while the context is active, and write the configuration into it.
 
     If the folder cannot be created, locked or written because of the file system, the run continues without files. The
@@ -194,7 +211,11 @@ def _check_router(request: RunRequest) -> None:
                 code="command/conflicting-options",
             )
         return
-    router_faults = [injection for injection in parse_planned_faults(request.config) if injection.target == ROUTER]
+    router_faults = [
+        injection
+        for injection in parse_planned_faults(request.config)
+        if injection.target == ROUTER
+    ]
     if router_faults:
         raise ConfigError(
             f"fault {str(router_faults[0])!r}: this run has no router of its own; add --with-router",
@@ -239,7 +260,11 @@ class _RunProcesses:
             self._start_recorder(self._files.folder)
 
     def _start_router(self) -> None:
-        arguments = ["snakesim_hal.programs.router_program", *self.common_arguments, *self._listening]
+        arguments = [
+            "snakesim_hal.programs.router_program",
+            *self.common_arguments,
+            *self._listening,
+        ]
         self.supervisor.start(ROUTER, arguments)
 
     def _start_host(self) -> None:
@@ -265,7 +290,12 @@ class _RunProcesses:
             self.supervisor.start(name, arguments, may_restart=service.restart)
 
     def _start_recorder(self, folder: Path) -> None:
-        arguments = ["snakesim_operator.recording.recorder_process", *self.common_arguments, "--out", str(folder)]
+        arguments = [
+            "snakesim_operator.recording.recorder_process",
+            *self.common_arguments,
+            "--out",
+            str(folder),
+        ]
         if self.request.raw_only:
             arguments.append("--raw-only")
         self.supervisor.start(RECORDER, arguments, vital=False)
@@ -280,7 +310,13 @@ def _run_until_over(processes: _RunProcesses, ending: RunEnding) -> None:
         with _open_run_session(processes.link, supervisor, ending) as session:
             _print_start(request.config, processes.link)
             monitor = RunMonitor(
-                request.config, session, supervisor, ending, print_line, stay=request.stay, unchecked=request.unchecked
+                request.config,
+                session,
+                supervisor,
+                ending,
+                print_line,
+                stay=request.stay,
+                unchecked=request.unchecked,
             )
             monitor.run()
     except SnakesimError as error:
@@ -296,7 +332,9 @@ def _print_start(config: RunConfig, connection: ConnectionSettings) -> None:
     )
     print_line(f"network: {connection.endpoint}, namespace {connection.namespace}")
     if not config.has_internal_control:
-        print_line("no control service of its own: a client that takes the lease commands and arms the robot")
+        print_line(
+            "no control service of its own: a client that takes the lease commands and arms the robot"
+        )
 
 
 @contextlib.contextmanager
@@ -321,7 +359,9 @@ def _open_run_session(
     with contextlib.ExitStack() as stack:
         while True:
             try:
-                session = stack.enter_context(open_session(connection, connect_timeout_s=CONNECT_TIMEOUT_S))
+                session = stack.enter_context(
+                    open_session(connection, connect_timeout_s=CONNECT_TIMEOUT_S)
+                )
                 break
             except NotConnectedError:
                 ended_process = supervisor.describe_first_end()
@@ -331,6 +371,8 @@ def _open_run_session(
                 if now_s > start_s + SERVICE_START_LIMIT_S or ending.is_interrupted:
                     raise
                 if now_s > last_report_s + REPORT_PERIOD_S:
-                    print_line(f"starting: the host has not opened its network yet, after {now_s - start_s:.0f} s")
+                    print_line(
+                        f"starting: the host has not opened its network yet, after {now_s - start_s:.0f} s"
+                    )
                     last_report_s = now_s
         yield session

@@ -16,7 +16,8 @@ from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.base.workers import start_restarting_thread
 
 MAX_PENDING_BYTES = 8 * 2**20
-MAX_LOG_BYTES = 64 * 2**20  # of one log, so that a process with endless output does not fill the disk
+# Of one log, so that a process with endless output does not fill the disk.
+MAX_LOG_BYTES = 64 * 2**20
 MAX_MERGED_BYTES = 2**16  # pending appends are merged up to this size
 RETRY_PERIOD_S = 0.5
 DISK_TIMEOUT_S = 5.0  # for a disk that hangs
@@ -63,7 +64,10 @@ class RunFiles:
         """Append to a file. The content is dropped if the file or the pending data is too large."""
         appended_bytes = self._appended.get(name, 0) + len(content)
         if appended_bytes > MAX_LOG_BYTES:
-            self._lost = self._lost or f"{name} is longer than {MAX_LOG_BYTES >> 20} MiB: the rest of it is lost"
+            self._lost = (
+                self._lost
+                or f"{name} is longer than {MAX_LOG_BYTES >> 20} MiB: the rest of it is lost"
+            )
             return
         self._appended[name] = appended_bytes
         self._add_task(_FileOperation("append", name, content))
@@ -107,9 +111,13 @@ class RunFiles:
             if self.folder is None:
                 return
             if self._waiting_bytes + len(task.content) > MAX_PENDING_BYTES:
-                self._lost = self._failure or f"{self.folder}: the disk is too slow for the run's output"
+                self._lost = (
+                    self._failure or f"{self.folder}: the disk is too slow for the run's output"
+                )
                 return
-            if len(self._tasks) > 1 and self._tasks[-1].can_merge(task):  # the first one may be in progress
+            if len(self._tasks) > 1 and self._tasks[-1].can_merge(
+                task
+            ):  # the first one may be in progress
                 self._tasks[-1].content += task.content
             else:
                 self._tasks.append(task)

@@ -27,9 +27,11 @@ from snakesim_operator.run.ending import RunEnding
 from snakesim_operator.run.run_files import RunFiles
 
 HOST = "host"
-MIN_RESTART_DELAY_S = 0.5  # before the first restart of a process; each further delay is twice the one before
+# Before the first restart of a process; each further delay is twice the one before.
+MIN_RESTART_DELAY_S = 0.5
 MAX_RESTART_DELAY_S = 10.0
-MIN_HEALTHY_DURATION_S = 30.0  # a process that ran this long is restarted with the minimum delay again
+# A process that ran this long is restarted with the minimum delay again.
+MIN_HEALTHY_DURATION_S = 30.0
 HOST_RECORD_BYTES = 2**20  # more than the host's statistics ever take
 REGULAR_EXIT_CODES = (0, 1)  # the host wrote its record before it ended
 
@@ -92,7 +94,8 @@ class RunSupervisor:
         """
         # What the run reports about its processes.
         self.restarts: list[ProcessRestart] = []
-        self.losses_by_process: dict[str, str] = {}  # last output of each ended process that was not vital
+        # Last output of each ended process that was not vital.
+        self.losses_by_process: dict[str, str] = {}
         self.has_started_up = False  # until then a restart would not help a process that ends
 
         # Collaborators.
@@ -111,7 +114,9 @@ class RunSupervisor:
         self.host: StarterEnd | None = None  # the private channel to the newest host
         self._start_time_s = time.monotonic()
 
-    def start(self, name: str, arguments: Sequence[str], *, may_restart: bool = True, vital: bool = True) -> None:
+    def start(
+        self, name: str, arguments: Sequence[str], *, may_restart: bool = True, vital: bool = True
+    ) -> None:
         """Start a Python module as a process of the run.
 
         Args:
@@ -130,7 +135,9 @@ class RunSupervisor:
             return self._launch_host(arguments, on_output)
         return children.start_child(name, arguments, on_output, extra_env=self._secret)
 
-    def _launch_host(self, arguments: Sequence[str], on_output: Callable[[bytes], object]) -> ChildProcess:
+    def _launch_host(
+        self, arguments: Sequence[str], on_output: Callable[[bytes], object]
+    ) -> ChildProcess:
         """Start a host that inherits the stop port and its end of a new private channel."""
         supervisor_end, host_end = socket_pair()
         with host_end:
@@ -169,12 +176,20 @@ class RunSupervisor:
         for _ in range(self.host.resets - resets_before):
             self._note_restart(HOST, "host was reset", delay_s=0.0)
             robot = self.host.description
-            command = f"snakesim robot arm {robot.robot} {robot.backend}" if robot is not None else "snakesim robot arm"
-            self._print_text(f"the simulator was reset: it is at the start, and disarmed; continue with `{command}`")
+            command = (
+                f"snakesim robot arm {robot.robot} {robot.backend}"
+                if robot is not None
+                else "snakesim robot arm"
+            )
+            self._print_text(
+                f"the simulator was reset: it is at the start, and disarmed; continue with `{command}`"
+            )
 
     def _note_restart(self, name: str, how: str, delay_s: float) -> None:
         elapsed_s = time.monotonic() - self._start_time_s
-        self.restarts.append(ProcessRestart(name=name, how=how, at_s=round(elapsed_s, 3), after_s=delay_s))
+        self.restarts.append(
+            ProcessRestart(name=name, how=how, at_s=round(elapsed_s, 3), after_s=delay_s)
+        )
 
     @property
     def process_names(self) -> list[str]:
@@ -287,8 +302,12 @@ class RunSupervisor:
     def _note_loss(self, process: SupervisedProcess) -> None:
         """Note what is missing in the record because a process that is not vital failed."""
         if _was_starting(process.child):
-            self.losses_by_process[process.name] = f"{process.name} had not started when the run ended"
-            self._print_text(f"warning: {self.losses_by_process[process.name]}: there is nothing of it")
+            self.losses_by_process[process.name] = (
+                f"{process.name} had not started when the run ended"
+            )
+            self._print_text(
+                f"warning: {self.losses_by_process[process.name]}: there is nothing of it"
+            )
         else:
             self._continue_without(process, process.child.describe_exit() or "")
 

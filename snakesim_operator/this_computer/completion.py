@@ -29,7 +29,8 @@ LIST_VALUES_BY_ARGUMENT: dict[
     "key": lambda: [row.key for row in keys.SPACE if row.kind in ("stream", "latched")],
 }
 ZSH_PREAMBLE = (
-    "(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }; autoload -Uz bashcompinit && bashcompinit"
+    "(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }; autoload "
+    "-Uz bashcompinit && bashcompinit"
 )
 SHELL_FUNCTION = """\
 _snakesim() {
@@ -62,7 +63,8 @@ class CommandCompletions:
     path: str
     options: list[str] = field(default_factory=list[str])
     words: list[str] = field(default_factory=list[str])  # subcommands and choices that stand alone
-    values: dict[str, list[str]] = field(default_factory=dict[str, list[str]])  # of options that take one; [] is any
+    # Of options that take one; [] is any.
+    values: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
 
 
 def generate_completion_script(parser: argparse.ArgumentParser, shell: str) -> Iterator[str]:
@@ -78,7 +80,9 @@ def generate_completion_script(parser: argparse.ArgumentParser, shell: str) -> I
     for command in commands:
         for option, choices in command.values.items():
             values.setdefault(" ".join(choices), []).append(f'"{command.path}:{option}"')
-    after = [f'        {"|".join(places)}) choices="{choices}" ;;' for choices, places in values.items()]
+    after = [
+        f'        {"|".join(places)}) choices="{choices}" ;;' for choices, places in values.items()
+    ]
     words: list[str] = []
     for command in commands:
         lists = f'choices="{" ".join(command.words)}"; options="{" ".join(command.options)}"'
@@ -89,7 +93,9 @@ def generate_completion_script(parser: argparse.ArgumentParser, shell: str) -> I
     yield from text.replace("@WORDS@", "\n".join(words)).splitlines()
 
 
-def _find_completions(parser: argparse.ArgumentParser, command_path: str) -> Iterator[CommandCompletions]:
+def _find_completions(
+    parser: argparse.ArgumentParser, command_path: str
+) -> Iterator[CommandCompletions]:
     """Yield the completions of a command, then those of each of its subcommands.
 
     Args:
@@ -100,7 +106,8 @@ def _find_completions(parser: argparse.ArgumentParser, command_path: str) -> Ite
     completions = CommandCompletions(command_path)
     subcommand_completions: list[CommandCompletions] = []
     for action in parser._actions:
-        is_internal = action.help == argparse.SUPPRESS and action.option_strings  # only other processes use it
+        # Only other processes use it.
+        is_internal = action.help == argparse.SUPPRESS and action.option_strings
         if is_internal:
             continue
         choices = _list_choices(action)

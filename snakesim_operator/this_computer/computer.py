@@ -82,7 +82,9 @@ def check_python() -> Iterator[ComputerFinding]:
         yield ComputerFinding(what="Python", state="ok", detail=detail)
     else:
         fix = ["make setup PYTHON=python3.11"]
-        yield ComputerFinding(what="Python", state="fail", detail=f"{detail}; 3.11 or newer is needed", fix=fix)
+        yield ComputerFinding(
+            what="Python", state="fail", detail=f"{detail}; 3.11 or newer is needed", fix=fix
+        )
 
 
 def check_packages() -> Iterator[ComputerFinding]:
@@ -91,7 +93,8 @@ def check_packages() -> Iterator[ComputerFinding]:
     Yields:
         One finding for the packages of the core, and one for those of each extra.
     """
-    installed_by_extra: dict[str, list[str]] = {}  # extra -> packages with their versions; the core's extra is empty
+    # Extra -> packages with their versions; the core's extra is empty.
+    installed_by_extra: dict[str, list[str]] = {}
     missing_by_extra: dict[str, list[str]] = {}  # extra -> packages
     for requirement in importlib.metadata.requires("snakesim") or []:
         # Such as `numpy>=2; extra == "report"`.
@@ -111,7 +114,9 @@ def check_packages() -> Iterator[ComputerFinding]:
             yield _make_missing_packages_finding(extra, missing_by_extra[extra])
         else:
             yield ComputerFinding(
-                what=_format_packages_label(extra), state="ok", detail=", ".join(installed_by_extra[extra])
+                what=_format_packages_label(extra),
+                state="ok",
+                detail=", ".join(installed_by_extra[extra]),
             )
 
 
@@ -126,7 +131,9 @@ def _make_missing_packages_finding(extra: str, names: list[str]) -> ComputerFind
     packages = ", ".join(names)
     if extra:
         fix = ["make setup", f"python -m pip install 'snakesim[{extra}]'"]
-        return ComputerFinding(what=what, state="ok", detail=f"left out, needs: {packages}", fix=fix)
+        return ComputerFinding(
+            what=what, state="ok", detail=f"left out, needs: {packages}", fix=fix
+        )
     fix = ["make setup", "python -m pip install --force-reinstall snakesim"]
     return ComputerFinding(what=what, state="fail", detail=f"missing: {packages}", fix=fix)
 
@@ -142,7 +149,9 @@ def check_laws() -> Iterator[ComputerFinding]:
     what = "Physics in C"
     problem = _run_python_program(PHYSICS_LIBRARY_PROBE_PROGRAM)
     if not problem:
-        yield ComputerFinding(what=what, state="ok", detail="ground and friction are computed in MuJoCo's engine")
+        yield ComputerFinding(
+            what=what, state="ok", detail="ground and friction are computed in MuJoCo's engine"
+        )
         return
     detail = f"{LAWS_LIBRARY.python_cost}, with the same results: {problem}"
     fix = ["sudo apt install gcc libc6-dev", "python -m pip install ziglang"]
@@ -179,7 +188,9 @@ def check_opengl() -> Iterator[ComputerFinding]:
             return
         errors.append(f"{renderer.upper()}: {error}")
     detail = f"no color images and videos: {'; '.join(errors)}"
-    yield ComputerFinding(what="OpenGL", state="warn", detail=detail, fix=["sudo apt install libegl1 libgl1-mesa-dri"])
+    yield ComputerFinding(
+        what="OpenGL", state="warn", detail=detail, fix=["sudo apt install libegl1 libgl1-mesa-dri"]
+    )
 
 
 def _find_render_error(renderer: str) -> str | None:
@@ -218,7 +229,8 @@ def check_can() -> Iterator[ComputerFinding]:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
         detail = (
-            f"this kernel has none ({error.strerror}); only real joint modules need it, `--backend can` emulates them"
+            f"this kernel has none ({error.strerror}); only real joint modules need it, "
+            "`--backend can` emulates them"
         )
         run_in_vm = "python3 deploy/vm/with_vcan.py -- .venv/bin/snakesim run triplet --backend can"
         fix = ["sudo modprobe -a can_raw vcan", run_in_vm]
@@ -229,13 +241,17 @@ def check_can() -> Iterator[ComputerFinding]:
         if type_file.read_text().strip() == ARPHRD_CAN:
             interfaces.append(type_file.parent.name)
     if not interfaces:
-        yield ComputerFinding(what="CAN", state="warn", detail="no interface", fix=["sudo deploy/can/up.sh vcan0"])
+        yield ComputerFinding(
+            what="CAN", state="warn", detail="no interface", fix=["sudo deploy/can/up.sh vcan0"]
+        )
         return
     up_interfaces = [name for name in interfaces if _is_interface_up(name)]
     down_interfaces = [name for name in interfaces if name not in up_interfaces]
     detail = f"up: {', '.join(up_interfaces) or 'none'}"
     fix = [f"sudo ip link set {name} up" for name in down_interfaces]
-    yield ComputerFinding(what="CAN", state="warn" if down_interfaces else "ok", detail=detail, fix=fix)
+    yield ComputerFinding(
+        what="CAN", state="warn" if down_interfaces else "ok", detail=detail, fix=fix
+    )
 
 
 def _is_interface_up(name: str) -> bool:
@@ -254,7 +270,10 @@ def check_kvm() -> Iterator[ComputerFinding]:
     elif device.exists():
         fix = ["sudo usermod -aG kvm $USER    # then log in again"]
         yield ComputerFinding(
-            what="KVM", state="warn", detail=f"no permission for {device}; VMs for CAN are slow", fix=fix
+            what="KVM",
+            state="warn",
+            detail=f"no permission for {device}; VMs for CAN are slow",
+            fix=fix,
         )
     else:
         detail = f"no {device}: VMs for CAN are emulated, and slow; switch virtualization on in the BIOS or the cloud"
@@ -269,7 +288,9 @@ def check_clocks() -> Iterator[ComputerFinding]:
     yield _check_wake_ups()
     if ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES)) == ADJTIMEX_TIME_ERROR:
         detail = "not synchronized; only dates of records and of other machines' certificates depend on it"
-        yield ComputerFinding(what="wall clock", state="warn", detail=detail, fix=["sudo timedatectl set-ntp true"])
+        yield ComputerFinding(
+            what="wall clock", state="warn", detail=detail, fix=["sudo timedatectl set-ntp true"]
+        )
     else:
         yield ComputerFinding(what="wall clock", state="ok", detail="synchronized")
 
@@ -285,7 +306,8 @@ def _check_wake_ups() -> ComputerFinding:
     median_s = delays_s[WAKE_UP_COUNT // 2]
     p99_s = delays_s[int(0.99 * WAKE_UP_COUNT) - 1]
     detail = (
-        f"wake-ups {median_s * 1e6:.0f} us late in the median, {p99_s * 1e6:.0f} us in 99 % (no real-time priority)"
+        f"wake-ups {median_s * 1e6:.0f} us late in the median, {p99_s * 1e6:.0f} us in "
+        "99 % (no real-time priority)"
     )
     if p99_s > MAX_WAKE_UP_DELAY_S:
         fix = ["uptime    # is something else running?"]
@@ -309,11 +331,14 @@ def _check_priority() -> ComputerFinding:
         os.sched_setscheduler(0, policy_before, parameters_before)
     except OSError as error:
         detail = (
-            f"SCHED_FIFO {HOST_PRIORITY} is refused ({error.strerror}): real-time runs miss ticks on a busy machine"
+            f"SCHED_FIFO {HOST_PRIORITY} is refused ({error.strerror}): real-time runs miss "
+            "ticks on a busy machine"
         )
         fix = [_format_limit_command(f"rtprio {HOST_PRIORITY}")]
         return ComputerFinding(what="priority", state="warn", detail=detail, fix=fix)
-    return ComputerFinding(what="priority", state="ok", detail=f"SCHED_FIFO {HOST_PRIORITY} is granted")
+    return ComputerFinding(
+        what="priority", state="ok", detail=f"SCHED_FIFO {HOST_PRIORITY} is granted"
+    )
 
 
 def _check_memory_lock() -> ComputerFinding:
@@ -323,7 +348,10 @@ def _check_memory_lock() -> ComputerFinding:
     if refusal is None:
         return ComputerFinding(what="memory lock", state="ok", detail="granted")
     return ComputerFinding(
-        what="memory lock", state="warn", detail=refusal, fix=[_format_limit_command("memlock unlimited")]
+        what="memory lock",
+        state="warn",
+        detail=refusal,
+        fix=[_format_limit_command("memlock unlimited")],
     )
 
 
@@ -332,7 +360,9 @@ def _check_open_files() -> ComputerFinding:
     detail = f"{soft_limit}, at most {hard_limit}"
     if hard_limit == resource.RLIM_INFINITY or hard_limit >= MIN_OPEN_FILES:
         return ComputerFinding(what="open files", state="ok", detail=detail)
-    return ComputerFinding(what="open files", state="warn", detail=detail, fix=[_format_limit_command("nofile 8192")])
+    return ComputerFinding(
+        what="open files", state="warn", detail=detail, fix=[_format_limit_command("nofile 8192")]
+    )
 
 
 def _format_limit_command(limit: str) -> str:
@@ -346,7 +376,10 @@ def check_disk() -> Iterator[ComputerFinding]:
     free_bytes = shutil.disk_usage(folder).free
     if not os.access(folder, os.W_OK):
         yield ComputerFinding(
-            what="disk", state="warn", detail=f"{folder} is read-only; give runs an --out", fix=["cd ~"]
+            what="disk",
+            state="warn",
+            detail=f"{folder} is read-only; give runs an --out",
+            fix=["cd ~"],
         )
         return
     detail = f"{free_bytes / GB:.1f} GB free in {folder}"

@@ -46,7 +46,9 @@ def run_doctor(selection: RobotSelection, *, as_json: bool) -> int:
         print_json({"ok": not failed_checks, "findings": msgspec.to_builtins(findings)})
     else:
         warning_count = sum(finding.state == "warn" for finding in findings)
-        print_line(f"{len(findings)} checked; fail: {', '.join(failed_checks) or 'none'}; warnings: {warning_count}")
+        print_line(
+            f"{len(findings)} checked; fail: {', '.join(failed_checks) or 'none'}; warnings: {warning_count}"
+        )
     return 1 if failed_checks else 0
 
 

@@ -60,10 +60,16 @@ def _expand_shorthand_key(config: RunConfig, name: str) -> str:
 def _find_inner_keys(keys: Mapping[str, ScenarioKey], table: str) -> list[ScenarioKey]:
     """Return the keys directly inside of a table."""
     prefix = f"{table}."
-    return [key for name, key in keys.items() if name.startswith(prefix) and "." not in name.removeprefix(prefix)]
+    return [
+        key
+        for name, key in keys.items()
+        if name.startswith(prefix) and "." not in name.removeprefix(prefix)
+    ]
 
 
-def _make_unknown_key_error(keys: Mapping[str, ScenarioKey], requested_name: str, full_name: str) -> ConfigError:
+def _make_unknown_key_error(
+    keys: Mapping[str, ScenarioKey], requested_name: str, full_name: str
+) -> ConfigError:
     """Make the error for a key that does not exist. Its text names a similar key, or all keys of the same table.
 
     Args:
@@ -128,7 +134,10 @@ def _format_explanation(key: ScenarioKey, inner_keys: Sequence[ScenarioKey]) -> 
         yield f"  {name:<8} {text}"
     if inner_keys:
         yield "keys"
-        yield from (f"  {line}" for line in align_columns(COLUMNS, [_make_table_row(inner) for inner in inner_keys]))
+        yield from (
+            f"  {line}"
+            for line in align_columns(COLUMNS, [_make_table_row(inner) for inner in inner_keys])
+        )
 
 
 def _describe_table(key: ScenarioKey) -> dict[str, str]:

@@ -32,7 +32,9 @@ def _check_preemption(root: Path) -> Iterator[ComputerFinding]:
         yield ComputerFinding(what="kernel", state="ok", detail="PREEMPT_RT")
         return
     detail = "not PREEMPT_RT: ticks may be milliseconds late; `snakesim topic rate` shows it (docs/how-to/real-time.md)"
-    yield ComputerFinding(what="kernel", state="warn", detail=detail, fix=["sudo apt install linux-image-rt-amd64"])
+    yield ComputerFinding(
+        what="kernel", state="warn", detail=detail, fix=["sudo apt install linux-image-rt-amd64"]
+    )
 
 
 def _check_governor(root: Path) -> Iterator[ComputerFinding]:
@@ -40,7 +42,9 @@ def _check_governor(root: Path) -> Iterator[ComputerFinding]:
     governors = {_read_text_or_none(path) for path in paths} - {None}
     if not governors:
         yield ComputerFinding(
-            what="governor", state="ok", detail="not known: this kernel does not set the processors' clock"
+            what="governor",
+            state="ok",
+            detail="not known: this kernel does not set the processors' clock",
         )
     elif governors == {"performance"}:
         yield ComputerFinding(what="governor", state="ok", detail="performance")
@@ -48,7 +52,10 @@ def _check_governor(root: Path) -> Iterator[ComputerFinding]:
         names = ", ".join(sorted(name for name in governors if name))
         detail = f"{names}: a processor that has slowed down takes longer for the first ticks"
         yield ComputerFinding(
-            what="governor", state="warn", detail=detail, fix=["sudo cpupower frequency-set -g performance"]
+            what="governor",
+            state="warn",
+            detail=detail,
+            fix=["sudo cpupower frequency-set -g performance"],
         )
 
 
@@ -72,7 +79,9 @@ def _check_serial_adapters(root: Path) -> Iterator[ComputerFinding]:
             yield ComputerFinding(what="serial adapter", state="warn", detail=detail, fix=fix)
         else:
             yield ComputerFinding(
-                what="serial adapter", state="ok", detail=f"{port}: latency timer {latency_ms or '?'} ms"
+                what="serial adapter",
+                state="ok",
+                detail=f"{port}: latency timer {latency_ms or '?'} ms",
             )
 
 
@@ -97,7 +106,9 @@ def _check_serial_port(port: Path) -> ComputerFinding:
         fcntl.flock(file_descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         detail = f"{port.name} is in use by another program"
-        return ComputerFinding(what="serial port", state="warn", detail=detail, fix=[f"sudo fuser -v {port}"])
+        return ComputerFinding(
+            what="serial port", state="warn", detail=detail, fix=[f"sudo fuser -v {port}"]
+        )
     finally:
         os.close(file_descriptor)
     return ComputerFinding(what="serial port", state="ok", detail=f"{port.name} can be opened")

@@ -20,11 +20,15 @@ def check_ports() -> Iterator[ComputerFinding]:
     robots = [robot for robot in list_local_robots() if robot.endpoint == DEFAULT_ENDPOINT]
     used_protocols = _find_used_protocols(host, int(port))
     if robots:
-        yield ComputerFinding(what=what, state="ok", detail=f"used by {robots[0].namespace}, process {robots[0].pid}")
+        yield ComputerFinding(
+            what=what, state="ok", detail=f"used by {robots[0].namespace}, process {robots[0].pid}"
+        )
     elif used_protocols:
         protocols = " and ".join(used_protocols)
         detail = f"{protocols} used by another program; runs choose other ports, which the commands find here"
-        yield ComputerFinding(what=what, state="warn", detail=detail, fix=[f"ss -lntup | grep {port}"])
+        yield ComputerFinding(
+            what=what, state="warn", detail=detail, fix=[f"ss -lntup | grep {port}"]
+        )
     else:
         yield ComputerFinding(what=what, state="ok", detail="free")
 
@@ -55,7 +59,9 @@ def check_routers(selection: RobotSelection) -> Iterator[ComputerFinding]:
         except SnakesimError as error:
             fix = ["snakesim start router    # there; and is a firewall between?"]
             detail = f"{link.endpoint}: {error}"
-            yield ComputerFinding(what="endpoint", state="fail", detail=detail, fix=fix, code=error.code)
+            yield ComputerFinding(
+                what="endpoint", state="fail", detail=detail, fix=fix, code=error.code
+            )
             continue
         detail = f"{link.endpoint} answers in {duration_s * 1e3:.0f} ms: {robots}"
         yield ComputerFinding(what="endpoint", state="ok", detail=detail)

@@ -23,7 +23,11 @@ def get_section_type(plugin: Any) -> type[msgspec.Struct]:
 
 
 def decode_section(
-    plugin: Any, values: dict[str, Any], source: str, section_key: str, origin_by_key: dict[str, str] | None = None
+    plugin: Any,
+    values: dict[str, Any],
+    source: str,
+    section_key: str,
+    origin_by_key: dict[str, str] | None = None,
 ) -> msgspec.Struct:
     """Decode and check the section of a scenario that a plugin reads.
 

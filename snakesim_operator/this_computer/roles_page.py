@@ -62,9 +62,16 @@ def _make_key_row(rights: AccessRule) -> tuple[str, ...]:
 
 def _iter_message_rows() -> Iterator[tuple[str, ...]]:
     """Yield rows of an action and its Zenoh messages: those into the router, and those out of it."""
-    for suffix, acts in (("", ZENOH_MESSAGES_BY_ACTION), (", of a latched key also", LATCHED_ZENOH_MESSAGES_BY_ACTION)):
+    for suffix, acts in (
+        ("", ZENOH_MESSAGES_BY_ACTION),
+        (", of a latched key also", LATCHED_ZENOH_MESSAGES_BY_ACTION),
+    ):
         for act, messages in acts.items():
-            yield f"{act}{suffix}", _format_messages(messages, "ingress"), _format_messages(messages, "egress")
+            yield (
+                f"{act}{suffix}",
+                _format_messages(messages, "ingress"),
+                _format_messages(messages, "egress"),
+            )
 
 
 def _format_messages(messages: Iterable[tuple[str, str, str]], flow: str) -> str:

@@ -8,7 +8,12 @@ import msgspec
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.controller import Controller, decode_parameters
-from snakesim_hal.model.files import ConfigTable, iterate_leaves, list_shipped_names, read_table_with_base
+from snakesim_hal.model.files import (
+    ConfigTable,
+    iterate_leaves,
+    list_shipped_names,
+    read_table_with_base,
+)
 from snakesim_hal.model.plugins import (
     BACKENDS,
     CONTROLLERS,
@@ -31,7 +36,8 @@ def print_shipped_files(*, as_json: bool) -> int:
     shipped_files: dict[str, dict[str, str]] = {}
     for kind, description_key in DESCRIPTION_KEYS.items():
         shipped_files[kind] = {
-            name: read_table_with_base(name, kind).values.get(description_key, "") for name in list_shipped_names(kind)
+            name: read_table_with_base(name, kind).values.get(description_key, "")
+            for name in list_shipped_names(kind)
         }
     if as_json:
         print_json(shipped_files)
@@ -73,10 +79,14 @@ def _print_unchecked_sections(config: RunConfig) -> None:
         (config.control_section, config.controller),
         (config.backend_section, config.backend),
     ]
-    plugins += [(f"services.{name}", service.plugin) for name, service in config.internal_services.items()]
+    plugins += [
+        (f"services.{name}", service.plugin) for name, service in config.internal_services.items()
+    ]
     for section, plugin in plugins:
         if is_file_plugin(plugin):
-            print_line(f"{section}: not checked, because that would run {plugin}; `snakesim run` checks it")
+            print_line(
+                f"{section}: not checked, because that would run {plugin}; `snakesim run` checks it"
+            )
 
 
 def collect_values(scenario: LoadedScenario) -> list[Row]:
@@ -97,16 +107,22 @@ def _check_plugin_sections(config: RunConfig, table: ConfigTable) -> Iterator[tu
     """Yield the dotted key and the checked values of the controller's and the backend's section; files are left out."""
     plugin = load_plugin_unless_file(CONTROLLERS, config.controller)
     if plugin is not None:
-        controller = require_base_class(plugin, Controller, f"controller {shorten(config.controller)!r}")
+        controller = require_base_class(
+            plugin, Controller, f"controller {shorten(config.controller)!r}"
+        )
         section = config.control_section
         yield (
             section,
-            decode_parameters(controller, config.controller_parameters, table.source, section, table.origin_by_key),
+            decode_parameters(
+                controller, config.controller_parameters, table.source, section, table.origin_by_key
+            ),
         )
     backend = load_plugin_unless_file(BACKENDS, config.backend)
     if backend is not None:
         section = config.backend_section
         yield (
             section,
-            decode_plugin_settings(backend, config.backend_settings, table.source, section, table.origin_by_key),
+            decode_plugin_settings(
+                backend, config.backend_settings, table.source, section, table.origin_by_key
+            ),
         )

@@ -23,10 +23,13 @@ from snakesim_operator.this_computer.plugin_sections import decode_section, get_
 
 PLUGIN_SECTIONS = {"controllers": CONTROLLERS, "backends": BACKENDS}
 JOINTS_KEY = "robot.joints"  # a table by name, which may have an entry for every joint of the robot
-PHYSICS_MODEL = "physics_model"  # a key that names a plugin, whose settings are in the section of the next name
+# A key that names a plugin, whose settings are in the section of the next name.
+PHYSICS_MODEL = "physics_model"
 PHYSICS_MODEL_SETTINGS = "physics_model_settings"
 UNCHECKED_DESCRIPTION = "Checked by the code of its plugin."
-UNCHECKED_FIELD_DOC = FieldDoc("", "any value", "", "", "none", UNCHECKED_DESCRIPTION, inspect.AnyType())
+UNCHECKED_FIELD_DOC = FieldDoc(
+    "", "any value", "", "", "none", UNCHECKED_DESCRIPTION, inspect.AnyType()
+)
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,8 @@ class ScenarioKey:
     doc: FieldDoc
     value: Any
     origin: str = "default"
-    is_pattern: bool = False  # true: it stands for this key in every entry of a list or of a table by name
+    # True: it stands for this key in every entry of a list or of a table by name.
+    is_pattern: bool = False
 
     @property
     def is_table(self) -> bool:
@@ -61,11 +65,15 @@ def collect_keys(scenario: LoadedScenario, include_section_of: str = "") -> dict
     # The robot file names only joints that differ from the others. Here every joint gets an entry, so that the keys of
     # each joint are collected; the value of the table itself is set back to that of the file below.
     joints_in_file = values["robot"]["joints"]
-    values["robot"]["joints"] = {joint.name: joints_in_file.get(joint.name, {}) for joint in config.robot.joint_table}
+    values["robot"]["joints"] = {
+        joint.name: joints_in_file.get(joint.name, {}) for joint in config.robot.joint_table
+    }
 
     key_by_name: dict[str, ScenarioKey] = {}
     for key in _iter_struct_keys(RunConfig, values, ""):
-        if key.name in key_by_name:  # several kinds of one table, such as obstacles of several shapes, share a key
+        if (
+            key.name in key_by_name
+        ):  # several kinds of one table, such as obstacles of several shapes, share a key
             key_by_name[key.name] = _merge_duplicate_keys(key_by_name[key.name], key)
         else:
             key_by_name[key.name] = key
@@ -73,7 +81,10 @@ def collect_keys(scenario: LoadedScenario, include_section_of: str = "") -> dict
     for section, group in PLUGIN_SECTIONS.items():
         for key in _iter_plugin_keys(scenario, section, group, include_section_of):
             key_by_name[key.name] = key
-    return {name: replace(key, origin=scenario.table.find_origin(name)) for name, key in key_by_name.items()}
+    return {
+        name: replace(key, origin=scenario.table.find_origin(name))
+        for name, key in key_by_name.items()
+    }
 
 
 def _merge_duplicate_keys(key: ScenarioKey, other: ScenarioKey) -> ScenarioKey:
@@ -117,7 +128,9 @@ def _iter_physics_model_keys(model: str, values: Any, name: str) -> Iterator[Sce
     yield from _iter_struct_keys(get_section_type(plugin), msgspec.to_builtins(checked), f"{name}.")
 
 
-def _iter_inner_keys(info: inspect.Type, value: Any, name: str, *, is_pattern: bool = False) -> Iterator[ScenarioKey]:
+def _iter_inner_keys(
+    info: inspect.Type, value: Any, name: str, *, is_pattern: bool = False
+) -> Iterator[ScenarioKey]:
     """Yield the keys inside of a value: of a table, of entries of a list, or of entries of a table by name."""
     for option in list_union_members(info):
         match option:
@@ -144,7 +157,11 @@ def _iter_entry_keys(entry_type: inspect.Type, value: Any, name: str) -> Iterato
 
 def _document_entry(entry_type: inspect.Type, entry_name: Any) -> FieldDoc:
     """Return the documentation of an entry: the first line of its Struct's docstring."""
-    structs = [option.cls for option in list_union_members(entry_type) if isinstance(option, inspect.StructType)]
+    structs = [
+        option.cls
+        for option in list_union_members(entry_type)
+        if isinstance(option, inspect.StructType)
+    ]
     meanings = [(struct.__doc__ or "").partition("\n")[0] for struct in structs]
     return FieldDoc(str(entry_name), "table", "", "", None, " / ".join(meanings), entry_type)
 
@@ -199,14 +216,22 @@ def _iter_plugin_keys(
     for name in sorted({*plugin_by_section, *values_by_name}):
         key = f"{section}.{name}"
         values = values_by_name.get(name, {})
-        plugin = load_plugin_unless_file(group, plugin_by_section[name]) if name in plugin_by_section else None
+        plugin = (
+            load_plugin_unless_file(group, plugin_by_section[name])
+            if name in plugin_by_section
+            else None
+        )
         if plugin is None:
-            yield ScenarioKey(key, replace(UNCHECKED_FIELD_DOC, name=name, type_words="table"), values)
+            yield ScenarioKey(
+                key, replace(UNCHECKED_FIELD_DOC, name=name, type_words="table"), values
+            )
             yield from _iter_unchecked_keys(values, key)
             continue
         description = (get_section_type(plugin).__doc__ or "").partition("\n")[0]
         yield ScenarioKey(
-            key, replace(UNCHECKED_FIELD_DOC, name=name, type_words="table", description=description), values
+            key,
+            replace(UNCHECKED_FIELD_DOC, name=name, type_words="table", description=description),
+            values,
         )
         yield from _iter_plugin_setting_keys(scenario, plugin, values, key)
 
@@ -223,9 +248,15 @@ def _find_plugin_name_in_key(key_name: str, section: str) -> list[str]:
 def _iter_plugin_setting_keys(
     scenario: LoadedScenario, plugin: Any, values: dict[str, Any], section: str
 ) -> Iterator[ScenarioKey]:
-    required_names = [doc.name for doc in document_fields(get_section_type(plugin)) if doc.default is None]
+    required_names = [
+        doc.name for doc in document_fields(get_section_type(plugin)) if doc.default is None
+    ]
     if all(name in values for name in required_names):
-        checked = decode_section(plugin, values, scenario.table.source, section, scenario.table.origin_by_key)
-        yield from _iter_struct_keys(get_section_type(plugin), msgspec.to_builtins(checked), f"{section}.")
+        checked = decode_section(
+            plugin, values, scenario.table.source, section, scenario.table.origin_by_key
+        )
+        yield from _iter_struct_keys(
+            get_section_type(plugin), msgspec.to_builtins(checked), f"{section}."
+        )
     else:  # of a plugin that the scenario does not use
         yield from _iter_struct_keys(get_section_type(plugin), values, f"{section}.")

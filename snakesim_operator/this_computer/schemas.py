@@ -70,7 +70,11 @@ def generate_contract_files() -> Iterator[tuple[str, str]]:
     yield "files/summary.json", _format_schema(RunSummary)
     for name, struct in find_bundled_plugins(FILES):
         yield f"files/{name}.json", _format_schema(struct)
-    for group, section in ((BACKENDS, "backends"), (CONTROLLERS, "control"), (PHYSICS_MODELS, "physics_models")):
+    for group, section in (
+        (BACKENDS, "backends"),
+        (CONTROLLERS, "control"),
+        (PHYSICS_MODELS, "physics_models"),
+    ):
         for name, plugin in find_bundled_plugins(group):
             yield f"files/{section}.{name}.json", _format_schema(get_section_type(plugin))
 
@@ -98,7 +102,9 @@ def _format_key_space_page() -> str:
         else:
             name = row.message.__name__
             message = f"[{name}](messages/{name}.json) `{format_encoding(row.message).rpartition(';')[2]}`"
-        rows.append(f"| `{row.key}` | {message} | {row.writer} | {row.kind} | {row.when} | {row.about} |")
+        rows.append(
+            f"| `{row.key}` | {message} | {row.writer} | {row.kind} | {row.when} | {row.about} |"
+        )
     rows += [
         "",
         "There are four kinds. A *stream* is published regularly, and old samples are useless. A *latched* value is",

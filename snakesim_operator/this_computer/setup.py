@@ -18,7 +18,9 @@ from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 
 def _add_config(parser: argparse.ArgumentParser) -> None:
     add_scenario_arguments(parser)
-    parser.add_argument("--explain", metavar="KEY", help="show what one key or table means, and what it may be")
+    parser.add_argument(
+        "--explain", metavar="KEY", help="show what one key or table means, and what it may be"
+    )
     add_json_argument(parser)
 
 
@@ -29,7 +31,11 @@ def _add_doctor(parser: argparse.ArgumentParser) -> None:
 
 def _add_router(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "config", type=Path, nargs="?", metavar="FILE", help="JSON5 file (default: the shipped one, for this computer)"
+        "config",
+        type=Path,
+        nargs="?",
+        metavar="FILE",
+        help="JSON5 file (default: the shipped one, for this computer)",
     )
     add_insecure_argument(parser)
 
@@ -49,7 +55,9 @@ def _print_config_or_explain_key(arguments: argparse.Namespace) -> int:
     if arguments.explain is not None:
         from snakesim_operator.this_computer.explain import explain_key
 
-        return explain_key(load_scenario_from_arguments(arguments), arguments.explain, as_json=arguments.json)
+        return explain_key(
+            load_scenario_from_arguments(arguments), arguments.explain, as_json=arguments.json
+        )
 
     from snakesim_operator.this_computer.scenario_files import print_config
 
@@ -77,7 +85,12 @@ def _run_router(arguments: argparse.Namespace) -> int:
 def _list_or_write_schemas(arguments: argparse.Namespace) -> int:
     from snakesim_operator.this_computer.schemas import list_published_files, write_schemas
 
-    paths = [str(path) for path in (list_published_files() if arguments.out is None else write_schemas(arguments.out))]
+    paths = [
+        str(path)
+        for path in (
+            list_published_files() if arguments.out is None else write_schemas(arguments.out)
+        )
+    ]
     if arguments.json:
         print_json({"files": paths})
         return 0
@@ -102,7 +115,9 @@ COMMANDS: Commands = (
         run=_run_router,
         examples=("start router", "start router lab/hub/router.main.json5"),
     ),
-    CommandGroup(name="scenario", heading="files and computers", help="List what is shipped to be run."),
+    CommandGroup(
+        name="scenario", heading="files and computers", help="List what is shipped to be run."
+    ),
     Command(
         name="scenario list",
         help="List the shipped scenarios, robots, scenes and suites.",

@@ -10,7 +10,12 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_serial_backend.dynamixel import registers
-from snakesim_serial_backend.dynamixel.emulator import MAX_CURRENT, MODEL, EmulatedDynamixel, EmulatedModel
+from snakesim_serial_backend.dynamixel.emulator import (
+    MAX_CURRENT,
+    MODEL,
+    EmulatedDynamixel,
+    EmulatedModel,
+)
 from snakesim_serial_backend.dynamixel.load import PORT_LOAD
 from snakesim_serial_backend.dynamixel.packets import LAST_ID
 from snakesim_serial_backend.dynamixel.port import DynamixelPort
@@ -31,15 +36,19 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
     Settings = DynamixelSettings
     name = NAME
     port_load: ClassVar[PortLoad] = PORT_LOAD
-    polling_feeds_watchdog: ClassVar[bool] = True  # the bus watchdog counts every packet to the servo
-    supported_modes = ("position", "torque")  # servos have no other mode, even if the robot file lists one
+    # The bus watchdog counts every packet to the servo.
+    polling_feeds_watchdog: ClassVar[bool] = True
+    # Servos have no other mode, even if the robot file lists one.
+    supported_modes = "position", "torque"
 
     @classmethod
     def open_probe(cls, config: RunConfig, settings: DynamixelSettings) -> DynamixelProbe:
         return DynamixelProbe(config, settings)
 
     @classmethod
-    def check_drives(cls, config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
+    def check_drives(
+        cls, config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]
+    ) -> None:
         validate_joints(config, settings, joints)
         cls.validate_port_load(config, settings, joints)
 
@@ -68,7 +77,9 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
     ) -> EmulatedDynamixel:
         model = select_emulated_model(settings)
         torque_constants_nm_per_a = [get_torque_constant(joint, model) for joint in joints]
-        return EmulatedDynamixel(body, ptys, torque_constants_nm_per_a, settings.baud, clock.now_ns, model)
+        return EmulatedDynamixel(
+            body, ptys, torque_constants_nm_per_a, settings.baud, clock.now_ns, model
+        )
 
 
 def make_servo(joint: Joint, port: DynamixelPort, settings: DynamixelSettings) -> DynamixelServo:
@@ -99,7 +110,9 @@ def get_torque_constant(joint: Joint, model: EmulatedModel) -> float:
     return joint.motor.torque_constant_nm_per_a or joint.limits.torque_nm / joint.drive.gear / max_a
 
 
-def validate_joints(config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]) -> None:
+def validate_joints(
+    config: RunConfig, settings: DynamixelSettings, joints: Sequence[Joint]
+) -> None:
     """Raise ConfigError for joints that no servo can drive."""
     has_real_servos = not all(is_emulated(port) for port in settings.ports)
     for joint in joints:

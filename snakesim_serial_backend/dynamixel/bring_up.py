@@ -56,26 +56,34 @@ def _bring_up_with_extended_timeouts(
     pings, problem_by_name = _find_servos(servos, settings.bring_up_limit_s)
     problems: list[str] = []
     for servo in servos:
-        problem = problem_by_name.get(servo.name) or _find_servo_problem(servo, pings.get(servo.name), settings)
+        problem = problem_by_name.get(servo.name) or _find_servo_problem(
+            servo, pings.get(servo.name), settings
+        )
         if problem:
             problems.append(f"  {servo.label} {problem}")
     if problems:
         if len(pings) < len(servos):
             problems += _describe_unknown_servos(servos, port)
-        raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
+        raise BackendError(
+            "the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete"
+        )
     for servo in servos:
         _write_registers(servo)
     ids = [servo.id for servo in servos]
-    port.fast = len(port.read_all(ids, registers.PRESENT, registers.present_form.size)) == len(
-        ids
-    )  # older firmware is not
+    # Older firmware is not.
+    port.fast = len(port.read_all(ids, registers.PRESENT, registers.present_form.size)) == len(ids)
     return [
-        (_read_measurements(servo), _read_registers(servo, registers.TORQUE_ENABLE, registers.HEALTH_SIZE))
+        (
+            _read_measurements(servo),
+            _read_registers(servo, registers.TORQUE_ENABLE, registers.HEALTH_SIZE),
+        )
         for servo in servos
     ]
 
 
-def _find_servo_problem(servo: DynamixelServo, ping: DynamixelPacket | None, settings: DynamixelSettings) -> str:
+def _find_servo_problem(
+    servo: DynamixelServo, ping: DynamixelPacket | None, settings: DynamixelSettings
+) -> str:
     """Return why a servo cannot be used; empty if it can. ping: its answer to a ping, None without one."""
     if ping is None:
         return NO_ANSWER
@@ -199,7 +207,9 @@ def _find_current_limit_problem(servo: DynamixelServo, eeprom: DynamixelPacket) 
     return ""
 
 
-def _describe_unknown_servos(servos: Sequence[DynamixelServo], port: DynamixelPort) -> Iterator[str]:
+def _describe_unknown_servos(
+    servos: Sequence[DynamixelServo], port: DynamixelPort
+) -> Iterator[str]:
     """Yield a line for each servo that answers and is no joint's: perhaps it is one that is missing."""
     ids = {servo.id for servo in servos}
     for ping in port.scan():
@@ -220,7 +230,9 @@ def _write_registers(servo: DynamixelServo) -> None:
     if state[registers.WATCHDOG - registers.TORQUE_ENABLE] == registers.TRIPPED:
         _log.warning("%s: clearing an expired bus watchdog of an earlier run", servo.label)
     eeprom = _read_registers(servo, 0, registers.EEPROM_SIZE).data
-    differing = {address: value for address, value in EEPROM_VALUES.items() if eeprom[address] != value}
+    differing = {
+        address: value for address, value in EEPROM_VALUES.items() if eeprom[address] != value
+    }
     for address, value in {**STARTUP_REGISTERS, **differing}.items():
         status = _try_to_write(servo, address, value)
         if status is None:
@@ -258,7 +270,9 @@ def _read_registers(servo: DynamixelServo, address: int, size: int) -> Dynamixel
     """Read registers of a servo. Raises BackendError without an answer."""
     status = servo.port.try_to_read(servo.id, address, size)
     if status is None:
-        raise BackendError(f"{servo.label}: has stopped answering; nothing was enabled", code="drive/silent")
+        raise BackendError(
+            f"{servo.label}: has stopped answering; nothing was enabled", code="drive/silent"
+        )
     return status
 
 

@@ -107,15 +107,22 @@ class EmulatedDynamixel(ServoEmulator):
             model: Model of all servos.
         """
         self.servos: list[EmulatedDynamixelServo] = []
-        for joint, port, torque_constant_nm_per_a in zip(body.joints, ports, torque_constants_nm_per_a, strict=True):
-            servo = EmulatedDynamixelServo(bytearray(registers.SIZE), port, model.current_a * torque_constant_nm_per_a)
+        for joint, port, torque_constant_nm_per_a in zip(
+            body.joints, ports, torque_constants_nm_per_a, strict=True
+        ):
+            servo = EmulatedDynamixelServo(
+                bytearray(registers.SIZE), port, model.current_a * torque_constant_nm_per_a
+            )
             servo.write_register("H", registers.MODEL, model.number)
             self._write_factory_settings(servo, joint.id, baud)
-            servo.write_register("H", registers.MIN_VOLTAGE, round(joint.limits.min_voltage_v / registers.VOLTS))
+            servo.write_register(
+                "H", registers.MIN_VOLTAGE, round(joint.limits.min_voltage_v / registers.VOLTS)
+            )
             self.servos.append(servo)
         super().__init__(body, ports, clock_ns)
         self._decoders = [DynamixelDecoder() for _ in self._bus_ends]
-        self._second_servo_delays = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
+        # Of a second servo with the id of one.
+        self._second_servo_delays = [FACTORY_DELAY] * len(self.servos)
         for i in range(len(self.servos)):
             self.restart(i)
 
@@ -135,7 +142,8 @@ class EmulatedDynamixel(ServoEmulator):
         servo.table[SHUTDOWN] = SHUTDOWN_ERRORS
 
     def __call__(self) -> None:
-        received = [port.receive() for port in self._bus_ends]  # may wait for the kernel, so it comes before the lock
+        # May wait for the kernel, so it comes before the lock.
+        received = [port.receive() for port in self._bus_ends]
         with self.body.lock:
             self.catch_up()
             for port, decoder, data in zip(self._bus_ends, self._decoders, received, strict=True):
@@ -149,7 +157,9 @@ class EmulatedDynamixel(ServoEmulator):
     def _handle_packet(self, port: PseudoTerminal, packet: DynamixelPacket) -> None:
         """Handle a packet for one servo or for several servos of a port."""
         listening_servos = [
-            i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)
+            i
+            for i, servo in enumerate(self.servos)
+            if servo.port is port and not self.body.is_booting(i)
         ]
         index_by_id = {self.servos[i].id: i for i in listening_servos}
         for i in listening_servos:
@@ -180,7 +190,9 @@ class EmulatedDynamixel(ServoEmulator):
         servo = self.servos[i]
         match instruction:
             case DynamixelInstruction.PING:
-                self._send_status(i, bytes(servo.table[:2]) + bytes([servo.table[FIRMWARE_VERSION]]))
+                self._send_status(
+                    i, bytes(servo.table[:2]) + bytes([servo.table[FIRMWARE_VERSION]])
+                )
             case DynamixelInstruction.READ:
                 data, refusal = self._read_registers(i, parameters)
                 self._send_status(i, data, refusal, self._read_second_servo(i, parameters))
@@ -204,7 +216,11 @@ class EmulatedDynamixel(ServoEmulator):
                 self._write_registers(i, address, parameters[start + 1 : start + 1 + size])
 
     def _execute_sync_read(
-        self, port: PseudoTerminal, instruction: int, register_range: bytes, indices: Sequence[int | None]
+        self,
+        port: PseudoTerminal,
+        instruction: int,
+        register_range: bytes,
+        indices: Sequence[int | None],
     ) -> None:
         """Send the responses to a sync read, in the order of the ids in the packet.
 
@@ -217,7 +233,8 @@ class EmulatedDynamixel(ServoEmulator):
             indices: Index of the servo of each id in the packet; None for an id that no servo has.
         """
         parts: list[tuple[int, int, bytes]] = []  # error, id and data of each servo
-        second_parts: list[tuple[int, int, bytes]] = []  # the same, with the data of a second servo with its id
+        # The same, with the data of a second servo with its id.
+        second_parts: list[tuple[int, int, bytes]] = []
         for i in indices:
             if i is None or self.body.is_silent(i):
                 break
@@ -232,11 +249,14 @@ class EmulatedDynamixel(ServoEmulator):
         if parts:
             port.send(
                 simulate_collision(
-                    encode_fast_status(parts, len(indices)), encode_fast_status(second_parts, len(indices))
+                    encode_fast_status(parts, len(indices)),
+                    encode_fast_status(second_parts, len(indices)),
                 )
             )
 
-    def _send_status(self, i: int, data: bytes, refusal: int = 0, second_data: bytes | None = None) -> None:
+    def _send_status(
+        self, i: int, data: bytes, refusal: int = 0, second_data: bytes | None = None
+    ) -> None:
         """Send a servo's status. second_data: the data of a second servo with its id, where they differ."""
         if self.body.is_silent(i):
             return
@@ -285,9 +305,13 @@ class EmulatedDynamixel(ServoEmulator):
         temperature_c = self.body.read_temperatures(i)[0]
         current = max(min(round(torque_nm / servo.torque_unit_nm), 32767), -32768)
         servo.write_register("h", registers.PRESENT, current)
-        servo.write_register("i", registers.PRESENT_VELOCITY, round(velocity_rad_s / registers.SPEED))
         servo.write_register(
-            "i", registers.PRESENT_POSITION, round(angle_rad / registers.RAD) - servo.turn_offset_counts
+            "i", registers.PRESENT_VELOCITY, round(velocity_rad_s / registers.SPEED)
+        )
+        servo.write_register(
+            "i",
+            registers.PRESENT_POSITION,
+            round(angle_rad / registers.RAD) - servo.turn_offset_counts,
         )
         servo.write_register("H", registers.VOLTAGE, round(voltage_v / registers.VOLTS))
         servo.table[registers.TEMPERATURE] = min(max(round(temperature_c), 0), 255)
@@ -323,7 +347,9 @@ class EmulatedDynamixel(ServoEmulator):
         return 0
 
     @staticmethod
-    def _find_write_refusal(servo: EmulatedDynamixelServo, table: bytearray, address: int, end: int) -> int:
+    def _find_write_refusal(
+        servo: EmulatedDynamixelServo, table: bytearray, address: int, end: int
+    ) -> int:
         """Return the refusal of a write, 0 for none. table: the control table after it; address, end: what it sets."""
         after = EmulatedDynamixelServo(table, servo.port, servo.torque_unit_nm)
         sets_watchdog = address <= registers.WATCHDOG < end
@@ -340,7 +366,10 @@ class EmulatedDynamixel(ServoEmulator):
             "H", registers.CURRENT_LIMIT
         ):
             return DynamixelErrorCode.LIMIT
-        if table[registers.TORQUE_ENABLE] and servo.table[registers.HARDWARE_ERROR] & servo.table[SHUTDOWN]:
+        if (
+            table[registers.TORQUE_ENABLE]
+            and servo.table[registers.HARDWARE_ERROR] & servo.table[SHUTDOWN]
+        ):
             return DynamixelErrorCode.FAILED
         return 0
 
@@ -353,11 +382,15 @@ class EmulatedDynamixel(ServoEmulator):
         servo.table[registers.STATUS_LEVEL] = 2
         servo.hold_position_counts = None
         servo.write_register("H", registers.P_GAIN, 800)
-        servo.write_register("h", registers.GOALS, servo.read_register("H", registers.CURRENT_LIMIT))
+        servo.write_register(
+            "h", registers.GOALS, servo.read_register("H", registers.CURRENT_LIMIT)
+        )
         counts = round(self.body.read_shaft(i)[0] / registers.RAD)
         servo.turn_offset_counts = counts // registers.COUNTS * registers.COUNTS
         self._update_measurements(i)
-        servo.write_register("i", registers.GOAL_POSITION, servo.read_register("i", registers.PRESENT_POSITION))
+        servo.write_register(
+            "i", registers.GOAL_POSITION, servo.read_register("i", registers.PRESENT_POSITION)
+        )
         self._drive_motor(i)
 
     def _drive_motor(self, i: int) -> None:
@@ -377,20 +410,35 @@ class EmulatedDynamixel(ServoEmulator):
         if servo.is_torque_on and mode == registers.CURRENT_BASED_POSITION:
             d_gain = servo.read_register("H", registers.GAINS)
             p_gain = servo.read_register("H", registers.P_GAIN)
-            stiffness, damping = registers.compute_position_law(d_gain, p_gain, servo.torque_unit_nm)
+            stiffness, damping = registers.compute_position_law(
+                d_gain, p_gain, servo.torque_unit_nm
+            )
             goal_counts = servo.hold_position_counts
             if goal_counts is None:
-                goal_counts = servo.read_register("i", registers.GOAL_POSITION) + servo.turn_offset_counts
+                goal_counts = (
+                    servo.read_register("i", registers.GOAL_POSITION) + servo.turn_offset_counts
+                )
             self.body.drive_motor(
-                i, JointMode.POSITION, goal_counts * registers.RAD, limit_nm, stiffness, damping, speed_rad_s
+                i,
+                JointMode.POSITION,
+                goal_counts * registers.RAD,
+                limit_nm,
+                stiffness,
+                damping,
+                speed_rad_s,
             )
         elif servo.is_torque_on and mode == registers.CURRENT_CONTROL:
-            self.body.drive_motor(i, JointMode.TORQUE, current * servo.torque_unit_nm, limit_nm, 0.0, 0.0, speed_rad_s)
+            self.body.drive_motor(
+                i, JointMode.TORQUE, current * servo.torque_unit_nm, limit_nm, 0.0, 0.0, speed_rad_s
+            )
         else:
             self.body.drive_motor(i, JointMode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
 
     def list_enabled(self) -> list[bool]:
-        return [servo.is_torque_on and servo.table[registers.WATCHDOG] != registers.TRIPPED for servo in self.servos]
+        return [
+            servo.is_torque_on and servo.table[registers.WATCHDOG] != registers.TRIPPED
+            for servo in self.servos
+        ]
 
     def on_step(self, now_us: float) -> None:
         """Let watchdogs expire, and detect servos that are too hot or have too little supply voltage."""

@@ -15,9 +15,12 @@ REGISTERS = 4  # bytes of the address and the size in a request
 def count_cycle_bytes(servo_count: int) -> int:
     """Return the number of bytes on the wire, in both directions, without stuffing."""
     read_request = PACKET_OVERHEAD + REGISTERS + servo_count
-    read_answer = PACKET_OVERHEAD + servo_count * (registers.present_form.size + 4)  # each with error, id and CRC
-    health = PACKET_OVERHEAD + REGISTERS + PACKET_OVERHEAD + 1 + registers.HEALTH_SIZE  # request, and answer with error
-    goals = PACKET_OVERHEAD + REGISTERS + servo_count * (1 + registers.goals_form.size)  # each with id
+    # Each with error, id and CRC.
+    read_answer = PACKET_OVERHEAD + servo_count * (registers.present_form.size + 4)
+    # Request, and answer with error.
+    health = PACKET_OVERHEAD + REGISTERS + PACKET_OVERHEAD + 1 + registers.HEALTH_SIZE
+    # Each with id.
+    goals = PACKET_OVERHEAD + REGISTERS + servo_count * (1 + registers.goals_form.size)
     return read_request + read_answer + health + goals
 
 

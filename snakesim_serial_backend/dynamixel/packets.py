@@ -128,7 +128,9 @@ def encode_sync_write(address: int, data_by_id: Sequence[tuple[int, bytes]]) -> 
     _, first_data = data_by_id[0]
     values = b"".join(bytes([id_]) + data for id_, data in data_by_id)
     return encode_packet(
-        BROADCAST_ID, DynamixelInstruction.SYNC_WRITE, struct.pack("<HH", address, len(first_data)) + values
+        BROADCAST_ID,
+        DynamixelInstruction.SYNC_WRITE,
+        struct.pack("<HH", address, len(first_data)) + values,
     )
 
 
@@ -141,7 +143,9 @@ def encode_fast_status(parts: Sequence[tuple[int, int, bytes]], requested: int) 
     """
     _, _, first_data = parts[0]
     part_size = len(first_data) + PART_OVERHEAD
-    packet = HEADER + struct.pack("<BHB", BROADCAST_ID, 1 + requested * part_size, DynamixelInstruction.STATUS)
+    packet = HEADER + struct.pack(
+        "<BHB", BROADCAST_ID, 1 + requested * part_size, DynamixelInstruction.STATUS
+    )
     for error, id_, data in parts:
         packet += bytes([error, id_]) + data
         packet += struct.pack("<H", crc16(packet))
@@ -177,7 +181,11 @@ class DynamixelDecoder(StreamDecoder[DynamixelPacket]):
 
     def feed_statuses(self, data: bytes) -> Iterator[DynamixelPacket]:
         """Add received bytes, and yield the statuses that are complete now."""
-        return (packet for packet in self.feed(data) if packet.instruction == DynamixelInstruction.STATUS)
+        return (
+            packet
+            for packet in self.feed(data)
+            if packet.instruction == DynamixelInstruction.STATUS
+        )
 
 
 def split_fast_status(packet: DynamixelPacket, size: int) -> list[DynamixelPacket]:

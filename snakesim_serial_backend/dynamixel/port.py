@@ -38,7 +38,9 @@ class DynamixelPort(RequestPort[DynamixelPacket]):
 
     def ping(self, id_: int) -> RequestResponses[DynamixelPacket]:
         """Request the model (2 bytes) and firmware of a servo."""
-        return self._request_all_responses(id_, encode_packet(id_, DynamixelInstruction.PING), PING_SIZE, 1)
+        return self._request_all_responses(
+            id_, encode_packet(id_, DynamixelInstruction.PING), PING_SIZE, 1
+        )
 
     def read_alone(self, id_: int, address: int, size: int) -> RequestResponses[DynamixelPacket]:
         """Read registers of a servo, and wait for a second answer, too."""
@@ -63,7 +65,9 @@ class DynamixelPort(RequestPort[DynamixelPacket]):
     def write(self, id_: int, address: int, data: bytes) -> DynamixelPacket | None:
         """Write registers of a servo, and return its answer; its `error` is 0 if the servo accepted them."""
         parameters = struct.pack("<H", address) + data
-        return self._request_single_response(id_, encode_packet(id_, DynamixelInstruction.WRITE, parameters), 0)
+        return self._request_single_response(
+            id_, encode_packet(id_, DynamixelInstruction.WRITE, parameters), 0
+        )
 
     def reboot(self, id_: int) -> None:
         """Restart a servo."""
@@ -78,8 +82,16 @@ class DynamixelPort(RequestPort[DynamixelPacket]):
         if not ids:
             return {}
         request = encode_sync_read_request(ids, address, size, fast=self.fast)
-        statuses = self._request_fast(len(ids), request, size) if self.fast else self._sync_read(ids, request, size)
-        return {status.id: status for status in statuses if status.id in ids and len(status.data) == size}
+        statuses = (
+            self._request_fast(len(ids), request, size)
+            if self.fast
+            else self._sync_read(ids, request, size)
+        )
+        return {
+            status.id: status
+            for status in statuses
+            if status.id in ids and len(status.data) == size
+        }
 
     def write_all(self, address: int, data_by_id: Sequence[tuple[int, bytes]]) -> None:
         """Write the same registers of several servos at once; they do not answer.
@@ -103,7 +115,9 @@ class DynamixelPort(RequestPort[DynamixelPacket]):
             size: Bytes of data in each part; a packet of another length is a late answer to another request.
         """
         length = count * (size + PART_OVERHEAD)
-        for status in self._send_request(self._make_decoder(), request, self._response_gap_s, self._response_gap_s):
+        for status in self._send_request(
+            self._make_decoder(), request, self._response_gap_s, self._response_gap_s
+        ):
             if status.id == BROADCAST_ID and len(status.parameters) == length:
                 return split_fast_status(status, size)
             self._match_response(status.id)

@@ -55,11 +55,21 @@ TEMPERATURE = 146
 SIZE = 147  # of the part of the control table that is used here
 
 # Value of the baud rate's register for each rate in bit/s.
-RATE = {9600: 0, 57600: 1, 115200: 2, 1_000_000: 3, 2_000_000: 4, 3_000_000: 5, 4_000_000: 6, 4_500_000: 7}
+RATE = {
+    9600: 0,
+    57600: 1,
+    115200: 2,
+    1_000_000: 3,
+    2_000_000: 4,
+    3_000_000: 5,
+    4_000_000: 6,
+    4_500_000: 7,
+}
 
 # Groups of registers that are read or written at once.
 gains_form = Struct("<HHH")  # D, I, P
-goals_form = Struct("<hiIIi")  # current, velocity, acceleration and velocity of the profile (0: none), position
+# Current, velocity, acceleration and velocity of the profile (0: none), position.
+goals_form = Struct("<hiIIi")
 present_form = Struct("<hii")  # current, velocity, position: signed
 HEALTH_SIZE = TEMPERATURE + 1 - TORQUE_ENABLE  # from TORQUE_ENABLE on
 STATE_SIZE = WATCHDOG + 1 - TORQUE_ENABLE  # from TORQUE_ENABLE on: torque, hardware error, watchdog
@@ -129,7 +139,11 @@ def find_model_number(name: str) -> int | None:
 
 def describe_errors(error_count: int) -> str:
     """Return the names of the bits of a hardware error."""
-    names = [error.name.lower().replace("_", " ") for error in HardwareError if error_count & error and error.name]
+    names = [
+        error.name.lower().replace("_", " ")
+        for error in HardwareError
+        if error_count & error and error.name
+    ]
     return ", ".join(names) or f"0x{error_count:02x}"
 
 
@@ -158,7 +172,9 @@ def compute_position_law(d_gain: int, p_gain: int, torque_unit_nm: float) -> tup
     return stiffness, damping
 
 
-def find_whole_turns(angle_rad: float, lower_rad: float, upper_rad: float, slack_rad: float) -> int | None:
+def find_whole_turns(
+    angle_rad: float, lower_rad: float, upper_rad: float, slack_rad: float
+) -> int | None:
     """Return the number of whole revolutions to add to a reported angle, so that a servo is within its travel.
 
     Args:

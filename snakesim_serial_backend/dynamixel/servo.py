@@ -37,11 +37,15 @@ class DynamixelServo(SerialServo[DynamixelPort]):
 
         direction: positive for a goal above the upper limit, negative for one below the lower limit.
         """
-        beyond_rad = OUT_OF_REACH * (self.torque_nm + self.damping * self.speed_rad_s) / self.stiffness
+        beyond_rad = (
+            OUT_OF_REACH * (self.torque_nm + self.damping * self.speed_rad_s) / self.stiffness
+        )
         if direction > 0:
             return self.upper_rad + beyond_rad
         return self.lower_rad - beyond_rad
 
     def encode_gain_registers(self) -> bytes:
         """Return the gains of its position law as registers."""
-        return registers.gains_form.pack(*registers.gains(self.stiffness, self.damping, self.torque_unit_nm))
+        return registers.gains_form.pack(
+            *registers.gains(self.stiffness, self.damping, self.torque_unit_nm)
+        )

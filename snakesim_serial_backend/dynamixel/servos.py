@@ -65,11 +65,17 @@ class DynamixelServos(SerialServos[DynamixelServo, DynamixelPacket]):
         servo.alert = status.alert
         if not status.alert:
             servo.errors = 0
-        if not servo.is_torque_requested:  # it may have restarted, and lost count of its revolutions
-            turns = registers.find_whole_turns(angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD)
+        if (
+            not servo.is_torque_requested
+        ):  # it may have restarted, and lost count of its revolutions
+            turns = registers.find_whole_turns(
+                angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD
+            )
             if turns is not None:
                 servo.turns = turns
-        self._readings.set_motion(i, angle_rad + servo.turns * REVOLUTION_RAD, velocity * registers.SPEED)
+        self._readings.set_motion(
+            i, angle_rad + servo.turns * REVOLUTION_RAD, velocity * registers.SPEED
+        )
         self._readings.set_torque(i, current * servo.torque_unit_nm)
         servo.current_a = abs(current) * servo.torque_unit_nm / servo.torque_constant_nm_per_a
 
@@ -109,22 +115,32 @@ class DynamixelServos(SerialServos[DynamixelServo, DynamixelPacket]):
         servos_to_disable = [
             i
             for i in all_servos
-            if i not in enabled_drives and (self.servos[i].is_torque_requested or self.servos[i].enabled)
+            if i not in enabled_drives
+            and (self.servos[i].is_torque_requested or self.servos[i].enabled)
         ]
-        servos_to_enable = [i for i in all_servos if i in enabled_drives and not self.servos[i].is_torque_requested]
+        servos_to_enable = [
+            i for i in all_servos if i in enabled_drives and not self.servos[i].is_torque_requested
+        ]
 
         # A servo gets its gains, its watchdog and its goal before its torque is switched on.
         self._write_to_servos(registers.TORQUE_ENABLE, servos_to_disable, b"\0")
         if self._settings.write_gains:
             self._port.write_all(
-                registers.GAINS, [(self.servos[i].id, self.servos[i].encode_gain_registers()) for i in servos_to_enable]
+                registers.GAINS,
+                [
+                    (self.servos[i].id, self.servos[i].encode_gain_registers())
+                    for i in servos_to_enable
+                ],
             )
-        self._write_to_servos(registers.WATCHDOG, servos_to_enable, b"\0")  # 0 clears a watchdog that has expired
+        # 0 clears a watchdog that has expired.
+        self._write_to_servos(registers.WATCHDOG, servos_to_enable, b"\0")
         self._write_to_servos(registers.WATCHDOG, servos_to_enable, self._watchdog_register)
         goals = [
             (
                 self.servos[i].id,
-                self._encode_goal_registers(i, command.modes[i], command.targets[i], command.limits_nm[i]),
+                self._encode_goal_registers(
+                    i, command.modes[i], command.targets[i], command.limits_nm[i]
+                ),
             )
             for i in all_servos
             if i in enabled_drives
@@ -136,7 +152,9 @@ class DynamixelServos(SerialServos[DynamixelServo, DynamixelPacket]):
         for i in servos_to_enable:
             self.servos[i].record_switch(is_torque_requested=True, now_ns=self._clock_ns())
 
-    def _encode_goal_registers(self, i: int, mode: JointMode, target: float, limit_nm: float) -> bytes:
+    def _encode_goal_registers(
+        self, i: int, mode: JointMode, target: float, limit_nm: float
+    ) -> bytes:
         """Return the goal registers of a setpoint; a mode that servos do not have gets no current."""
         servo = self.servos[i]
         goal_rad = float(self._readings.angle_rad[i])
@@ -173,13 +191,18 @@ class DynamixelServos(SerialServos[DynamixelServo, DynamixelPacket]):
         servo = self.servos[i]
         if servo.errors:
             cause = (
-                f"{servo.label} reports {registers.describe_errors(servo.errors)}; `snakesim robot reset` restarts it"
+                f"{servo.label} reports {registers.describe_errors(servo.errors)}; `snakesim "
+                "robot reset` restarts it"
             )
             return FaultFinding("drive_fault", cause, i, affects_only_joint=True)
         if servo.watchdog == registers.TRIPPED:
             cause = f"{servo.label} was stopped by its bus watchdog, as it got no packet in time"
             return FaultFinding("drive_fault", cause, i, affects_only_joint=True)
-        if servo.is_torque_requested and servo.health_read_ns > servo.torque_switched_ns and not servo.enabled:
+        if (
+            servo.is_torque_requested
+            and servo.health_read_ns > servo.torque_switched_ns
+            and not servo.enabled
+        ):
             cause = f"{servo.label} does not follow: its torque is off: it has restarted"
             return FaultFinding("drive_not_armed", cause, i, affects_only_joint=True)
         return None

@@ -14,7 +14,9 @@ Current = Annotated[float, Meta(gt=0, le=1, extra_json_schema={"unit": "A"})]
 class DynamixelSettings(DriveSettings, frozen=True, kw_only=True):
     """The scenario's `[backends.dynamixel]` section. `watchdog_s` is written to the servos, in steps of 0.02 s."""
 
-    ports: Annotated[list[Annotated[str, Meta(min_length=1, max_length=255)]], Meta(max_length=8)] = []
+    ports: Annotated[
+        list[Annotated[str, Meta(min_length=1, max_length=255)]], Meta(max_length=8)
+    ] = []
     """Serial ports, such as /dev/ttyUSB0. Empty: emulated servos in this process."""
 
     baud: Baud = 1_000_000

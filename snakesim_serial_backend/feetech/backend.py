@@ -30,7 +30,8 @@ class FeetechBackend(ServoBackend[EmulatedFeetech]):
     Settings = FeetechSettings
     name = NAME
     port_load: ClassVar[PortLoad] = PORT_LOAD
-    supported_modes = ("position",)  # servos have no other mode that the driver uses, even if the robot file lists one
+    # Servos have no other mode that the driver uses, even if the robot file lists one.
+    supported_modes = ("position",)
     unmeasured: ClassVar[Collection[Measurement]] = ("torque",)
     has_watchdog: ClassVar[bool] = False
 
@@ -39,7 +40,9 @@ class FeetechBackend(ServoBackend[EmulatedFeetech]):
         return FeetechProbe(config, settings)
 
     @classmethod
-    def check_drives(cls, config: RunConfig, settings: FeetechSettings, joints: Sequence[Joint]) -> None:
+    def check_drives(
+        cls, config: RunConfig, settings: FeetechSettings, joints: Sequence[Joint]
+    ) -> None:
         if not all(is_emulated(port) for port in settings.ports):
             validate_real_servos(settings)
         validate_joints(config, joints)
@@ -69,7 +72,9 @@ class FeetechBackend(ServoBackend[EmulatedFeetech]):
         clock: DriverClock,
     ) -> EmulatedFeetech:
         stall_torques_nm = [get_stall_torque_nm(joint, settings) for joint in joints]
-        return EmulatedFeetech(body, ptys, stall_torques_nm, settings.baud, settings.speed_unit_counts_s, clock.now_ns)
+        return EmulatedFeetech(
+            body, ptys, stall_torques_nm, settings.baud, settings.speed_unit_counts_s, clock.now_ns
+        )
 
 
 def make_servo(joint: Joint, port: FeetechPort, settings: FeetechSettings) -> FeetechServo:

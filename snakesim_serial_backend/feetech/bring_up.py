@@ -28,7 +28,8 @@ EEPROM_VALUES = {
     registers.OPERATING_MODE: registers.POSITION_MODE,
 }  # written where they differ
 PROTECTIONS = ServoError.OVERHEATING | ServoError.OVERLOAD  # that must switch the torque off
-MEASURED = RegisterRange(registers.PRESENT, registers.present_form.size)  # in which two servos differ
+# In which two servos differ.
+MEASURED = RegisterRange(registers.PRESENT, registers.present_form.size)
 MAX_TEMPERATURE_C = 80  # that a servo may allow itself; the maker delivers 70
 
 
@@ -52,17 +53,26 @@ def bring_up(
         found_names = _find_servos(servos, settings.bring_up_limit_s)
         problems: list[str] = []
         for servo in servos:
-            problem = _find_servo_problem(servo, settings) if servo.name in found_names else NO_ANSWER
+            problem = (
+                _find_servo_problem(servo, settings) if servo.name in found_names else NO_ANSWER
+            )
             if problem:
                 problems.append(f"  {servo.label} {problem}")
         if problems:
             if len(found_names) < len(servos):
                 problems += _describe_unknown_servos(servos)
-            raise BackendError("the robot is not complete; nothing was enabled:", *problems, code="drive/not-complete")
+            raise BackendError(
+                "the robot is not complete; nothing was enabled:",
+                *problems,
+                code="drive/not-complete",
+            )
         for servo in servos:
             _write_registers(servo)
         return [
-            (_read_measurements(servo), _read_registers(servo, registers.TORQUE_ENABLE, registers.STATE_SIZE))
+            (
+                _read_measurements(servo),
+                _read_registers(servo, registers.TORQUE_ENABLE, registers.STATE_SIZE),
+            )
             for servo in servos
         ]
 
@@ -224,7 +234,9 @@ def _write_registers(servo: FeetechServo) -> None:
     """Switch the torque off, and write the registers that the driver needs. Raises BackendError."""
     _write_and_verify(servo, registers.TORQUE_ENABLE, 0)
     eeprom = _read_registers(servo, 0, registers.EEPROM_SIZE).data
-    values = {address: value for address, value in EEPROM_VALUES.items() if eeprom[address] != value}
+    values = {
+        address: value for address, value in EEPROM_VALUES.items() if eeprom[address] != value
+    }
     if eeprom[registers.PHASE] & registers.MULTI_TURN_FEEDBACK:
         values[registers.PHASE] = eeprom[registers.PHASE] & ~registers.MULTI_TURN_FEEDBACK
     if not values:
@@ -267,7 +279,9 @@ def _read_registers(servo: FeetechServo, address: int, size: int) -> FeetechPack
     """Read registers of a servo. Raises BackendError without an answer."""
     status = servo.port.try_to_read(servo.id, address, size)
     if status is None:
-        raise BackendError(f"{servo.label}: has stopped answering; nothing was enabled", code="drive/silent")
+        raise BackendError(
+            f"{servo.label}: has stopped answering; nothing was enabled", code="drive/silent"
+        )
     return status
 
 

@@ -88,16 +88,20 @@ class EmulatedFeetech(ServoEmulator):
             servo = EmulatedFeetechServo(bytearray(registers.SIZE), port, stall_torque_nm)
             _write_factory_settings(servo, joint.id, baud)
             servo.table[registers.MIN_VOLTAGE] = round(joint.limits.min_voltage_v / registers.VOLTS)
-            servo.table[registers.MAX_VOLTAGE] = min(round(joint.supply.voltage_v / registers.VOLTS) + 20, 255)
+            servo.table[registers.MAX_VOLTAGE] = min(
+                round(joint.supply.voltage_v / registers.VOLTS) + 20, 255
+            )
             self.servos.append(servo)
         super().__init__(body, ports, clock_ns)
         self._decoders = [FeetechDecoder() for _ in self._bus_ends]
-        self._second_servo_delays = [FACTORY_DELAY] * len(self.servos)  # of a second servo with the id of one
+        # Of a second servo with the id of one.
+        self._second_servo_delays = [FACTORY_DELAY] * len(self.servos)
         for i in range(len(self.servos)):
             self.restart(i)
 
     def __call__(self) -> None:
-        received = [port.receive() for port in self._bus_ends]  # may wait for the kernel, so it comes before the lock
+        # May wait for the kernel, so it comes before the lock.
+        received = [port.receive() for port in self._bus_ends]
         with self.body.lock:
             self.catch_up()
             for port, decoder, data in zip(self._bus_ends, self._decoders, received, strict=True):
@@ -110,7 +114,9 @@ class EmulatedFeetech(ServoEmulator):
     def _handle_packet(self, port: PseudoTerminal, packet: FeetechPacket) -> None:
         """Handle a packet for one servo or for several servos of a port."""
         listening_servos = [
-            i for i, servo in enumerate(self.servos) if servo.port is port and not self.body.is_booting(i)
+            i
+            for i, servo in enumerate(self.servos)
+            if servo.port is port and not self.body.is_booting(i)
         ]
         index_by_id = {self.servos[i].id: i for i in listening_servos}
         match packet.code:
@@ -133,7 +139,11 @@ class EmulatedFeetech(ServoEmulator):
                 self._send_status(i, b"")
             case FeetechInstruction.READ:
                 address, size = packet.parameters
-                self._send_status(i, self._read_registers(i, address, size), self._read_second_servo(i, address, size))
+                self._send_status(
+                    i,
+                    self._read_registers(i, address, size),
+                    self._read_second_servo(i, address, size),
+                )
             case FeetechInstruction.WRITE:
                 self._write_registers(i, packet.parameters[0], packet.parameters[1:])
                 if self.servos[i].table[registers.STATUS_LEVEL]:
@@ -156,7 +166,9 @@ class EmulatedFeetech(ServoEmulator):
             i = index_by_id.get(id_)
             if i is None or self.body.is_silent(i):
                 return
-            self._send_status(i, self._read_registers(i, address, size), self._read_second_servo(i, address, size))
+            self._send_status(
+                i, self._read_registers(i, address, size), self._read_second_servo(i, address, size)
+            )
 
     def _send_status(self, i: int, data: bytes, second_data: bytes | None = None) -> None:
         """Send a servo's status. second_data: the data of a second servo with its id, where they differ."""
@@ -170,7 +182,8 @@ class EmulatedFeetech(ServoEmulator):
             return
         second_status = encode_packet(servo.id, error, data if second_data is None else second_data)
         if servo.table[registers.DELAY] == self._second_servo_delays[i]:
-            servo.port.send(bytes(a & b for a, b in zip(status, second_status, strict=True)))  # a 0 of either wins
+            # A 0 of either wins.
+            servo.port.send(bytes(a & b for a, b in zip(status, second_status, strict=True)))
         else:
             servo.port.send(status + second_status)
 
@@ -200,7 +213,9 @@ class EmulatedFeetech(ServoEmulator):
         servo.write_word(registers.PRESENT + 2, encode_sign_magnitude(speed, SIGN_BIT))
         servo.write_word(registers.PRESENT + 4, encode_sign_magnitude(load, 10))
         servo.table[registers.VOLTAGE] = min(round(voltage_v / registers.VOLTS), 255)
-        servo.table[registers.TEMPERATURE] = min(max(round(self.body.read_temperatures(i)[0]), 0), 255)
+        servo.table[registers.TEMPERATURE] = min(
+            max(round(self.body.read_temperatures(i)[0]), 0), 255
+        )
         servo.write_word(registers.CURRENT, min(round(abs(current_a) / registers.CURRENT_A), 32767))
 
     def _write_registers(self, i: int, address: int, data: bytes) -> None:
@@ -237,12 +252,18 @@ class EmulatedFeetech(ServoEmulator):
         servo = self.servos[i]
         joint = self.body.joints[i]
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
-        if not servo.is_torque_on or servo.table[registers.OPERATING_MODE] != registers.POSITION_MODE:
+        if (
+            not servo.is_torque_on
+            or servo.table[registers.OPERATING_MODE] != registers.POSITION_MODE
+        ):
             self.body.drive_motor(i, JointMode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
             return
         offset = decode_sign_magnitude(servo.read_word(registers.HOMING_OFFSET), OFFSET_SIGN_BIT)
         goal = decode_sign_magnitude(servo.read_word(registers.GOALS), SIGN_BIT)
-        goal = min(max(goal, servo.read_word(registers.MIN_POSITION)), servo.read_word(registers.MAX_POSITION))
+        goal = min(
+            max(goal, servo.read_word(registers.MIN_POSITION)),
+            servo.read_word(registers.MAX_POSITION),
+        )
         limit_nm = (
             min(servo.read_word(registers.TORQUE_LIMIT), registers.PER_MILLE)
             / registers.PER_MILLE
@@ -251,7 +272,9 @@ class EmulatedFeetech(ServoEmulator):
         stiffness = joint.motor.stiffness_nm_per_rad / joint.drive.gear**2
         damping = joint.motor.damping_nm_s_per_rad / joint.drive.gear**2
         goal_rad = registers.to_angle_rad(goal + offset)
-        self.body.drive_motor(i, JointMode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s)
+        self.body.drive_motor(
+            i, JointMode.POSITION, goal_rad, limit_nm, stiffness, damping, speed_rad_s
+        )
 
     def list_enabled(self) -> list[bool]:
         return [servo.is_torque_on for servo in self.servos]

@@ -92,7 +92,9 @@ def encode_sync_write(address: int, data_by_id: Sequence[tuple[int, bytes]]) -> 
     """
     _, first_data = data_by_id[0]
     values = b"".join(bytes([id_]) + data for id_, data in data_by_id)
-    return encode_packet(BROADCAST_ID, FeetechInstruction.SYNC_WRITE, bytes([address, len(first_data)]) + values)
+    return encode_packet(
+        BROADCAST_ID, FeetechInstruction.SYNC_WRITE, bytes([address, len(first_data)]) + values
+    )
 
 
 def decode_sign_magnitude(word: int, sign_bit: int) -> int:

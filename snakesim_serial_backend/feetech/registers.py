@@ -23,7 +23,8 @@ VOLTS = 0.1  # in a unit of voltage
 CURRENT_A = 0.0065  # in a unit of the present current, without a sign
 PER_MILLE = 1000  # of the stall torque: unit of torque limits
 PROTECTION_TIME_S = 0.01  # in a unit of the protection time
-ACCELERATION = 254  # no ramp, as LeRobot sets it; a servo that restarts forgets it, so it also shows a restart
+# No ramp, as LeRobot sets it; a servo that restarts forgets it, so it also shows a restart.
+ACCELERATION = 254
 # A unit of speed is 1 count/s in older examples of the maker and 50 counts/s in newer ones: a setting.
 # Not known at all: the unit of the load, which is not used, and what the P, D and I gains are in N·m/rad.
 # A write of a goal may switch the torque on by itself: the maker's examples never write register 40.
@@ -85,7 +86,11 @@ def get_model_name(number: int) -> str:
 
 def describe_errors(error_count: int) -> str:
     """Return the names of the bits of an error."""
-    names = [error.name.lower().replace("_", " ") for error in ServoError if error_count & error and error.name]
+    names = [
+        error.name.lower().replace("_", " ")
+        for error in ServoError
+        if error_count & error and error.name
+    ]
     return ", ".join(names) or f"0x{error_count:02x}"
 
 

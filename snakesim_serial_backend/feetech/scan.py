@@ -3,7 +3,12 @@
 from collections.abc import Iterator
 
 from snakesim_serial_backend.feetech import registers
-from snakesim_serial_backend.feetech.packets import OFFSET_SIGN_BIT, SIGN_BIT, FeetechPacket, decode_sign_magnitude
+from snakesim_serial_backend.feetech.packets import (
+    OFFSET_SIGN_BIT,
+    SIGN_BIT,
+    FeetechPacket,
+    decode_sign_magnitude,
+)
 from snakesim_serial_backend.feetech.port import FeetechPort
 from snakesim_serial_backend.wire import SerialWire
 
@@ -38,7 +43,9 @@ def _describe_registers(data: bytes) -> dict[str, str]:
     model = registers.get_model_name(number)
     if number in registers.MODELS:
         model = f"{model} ({number})"
-    angle_rad = registers.to_angle_rad(decode_sign_magnitude(_word(data, registers.PRESENT), SIGN_BIT))
+    angle_rad = registers.to_angle_rad(
+        decode_sign_magnitude(_word(data, registers.PRESENT), SIGN_BIT)
+    )
     return {
         "model": model,
         "firmware": f"{data[registers.FIRMWARE]}.{data[registers.FIRMWARE + 1]}",

@@ -24,9 +24,9 @@ class FeetechServo(SerialServo[FeetechPort]):
     # What it reported.
     firmware: str = ""
     current_a: float = 0.0
-    has_restarted: bool = False  # since its torque was switched on: it has forgotten what it was sent
+    # Since its torque was switched on: it has forgotten what it was sent.
+    has_restarted: bool = False
 
     # What happened to it.
-    unsupervised_s: float = (
-        0.0  # how long it held its last goal while the driver did not run, until a reset; 0: it did not
-    )
+    # How long it held its last goal while the driver did not run, until a reset; 0: it did not.
+    unsupervised_s: float = 0.0

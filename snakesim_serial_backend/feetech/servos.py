@@ -85,15 +85,23 @@ class FeetechServos(SerialServos[FeetechServo, FeetechPacket]):
         """Store the motion, voltage and temperature that a servo has reported in the readings."""
         servo = self.servos[i]
         position, speed, _load, voltage, temperature = registers.present_form.unpack(status.data)
-        speed_rad_s = decode_sign_magnitude(speed, SIGN_BIT) * self._settings.speed_unit_counts_s * registers.RAD
+        speed_rad_s = (
+            decode_sign_magnitude(speed, SIGN_BIT)
+            * self._settings.speed_unit_counts_s
+            * registers.RAD
+        )
         servo.errors = status.error
-        self._readings.set_motion(i, registers.to_angle_rad(decode_sign_magnitude(position, SIGN_BIT)), speed_rad_s)
+        self._readings.set_motion(
+            i, registers.to_angle_rad(decode_sign_magnitude(position, SIGN_BIT)), speed_rad_s
+        )
         self._readings.set_supply(i, voltage * registers.VOLTS, servo.current_a)
         self._readings.set_temperatures(i, float(temperature), float(temperature))
 
     def _store_health(self, i: int, status: FeetechPacket) -> None:
         """Store a servo's current and state; voltage and temperature come with its motion."""
-        current = int.from_bytes(status.data[registers.CURRENT - registers.TORQUE_ENABLE :][:2], "little")
+        current = int.from_bytes(
+            status.data[registers.CURRENT - registers.TORQUE_ENABLE :][:2], "little"
+        )
         self.servos[i].current_a = decode_sign_magnitude(current, SIGN_BIT) * registers.CURRENT_A
         self._store_state(i, status)
 
@@ -122,14 +130,19 @@ class FeetechServos(SerialServos[FeetechServo, FeetechPacket]):
         now_ns = self._clock_ns()
         self._last_setpoint_ns = now_ns
         all_servos = range(len(self.servos))
-        position_servos = {i for i in command.enabled_drives if command.modes[i] == JointMode.POSITION}
-        position_servos -= {i for i in all_servos if self.servos[i].unsupervised_s or self.servos[i].has_restarted}
+        position_servos = {
+            i for i in command.enabled_drives if command.modes[i] == JointMode.POSITION
+        }
+        position_servos -= {
+            i for i in all_servos if self.servos[i].unsupervised_s or self.servos[i].has_restarted
+        }
         if not command.may_enable:
             position_servos &= {i for i in all_servos if self.servos[i].is_torque_requested}
         servos_to_disable = [
             i
             for i in all_servos
-            if i not in position_servos and (self.servos[i].is_torque_requested or self.servos[i].enabled)
+            if i not in position_servos
+            and (self.servos[i].is_torque_requested or self.servos[i].enabled)
         ]
         unchecked_servos = self._readings.drives_to_check
         servos_to_enable = sorted(
@@ -138,9 +151,16 @@ class FeetechServos(SerialServos[FeetechServo, FeetechPacket]):
 
         # A goal may switch the torque on by itself, so it comes with its torque limit, in one packet.
         self._write_to_servos(registers.TORQUE_ENABLE, servos_to_disable, b"\0")
-        self._write_to_servos(registers.ACCELERATION_ADDRESS, servos_to_enable, bytes([registers.ACCELERATION]))
+        self._write_to_servos(
+            registers.ACCELERATION_ADDRESS, servos_to_enable, bytes([registers.ACCELERATION])
+        )
         goals = [
-            (self.servos[i].id, self._encode_goal_registers(i, float(command.targets[i]), float(command.limits_nm[i])))
+            (
+                self.servos[i].id,
+                self._encode_goal_registers(
+                    i, float(command.targets[i]), float(command.limits_nm[i])
+                ),
+            )
             for i in sorted(position_servos - unchecked_servos)
         ]
         self._port.write_all(registers.GOALS, goals)
@@ -153,7 +173,9 @@ class FeetechServos(SerialServos[FeetechServo, FeetechPacket]):
     def _encode_goal_registers(self, i: int, target_rad: float, limit_nm: float) -> bytes:
         """Return the goal registers of a position."""
         servo = self.servos[i]
-        torque_limit = min(int(limit_nm / servo.stall_torque_nm * registers.PER_MILLE), servo.max_per_mille)
+        torque_limit = min(
+            int(limit_nm / servo.stall_torque_nm * registers.PER_MILLE), servo.max_per_mille
+        )
         return registers.goals_form.pack(registers.to_position(target_rad), 0, 0, torque_limit)
 
     def reset_faults(self, joints: frozenset[int]) -> None:
@@ -177,8 +199,14 @@ class FeetechServos(SerialServos[FeetechServo, FeetechPacket]):
                 "because it has no watchdog; now its torque is off"
             )
             return FaultFinding("drive_fault", cause, i, affects_only_joint=True)
-        is_off = servo.is_torque_requested and servo.health_read_ns > servo.torque_switched_ns and not servo.enabled
+        is_off = (
+            servo.is_torque_requested
+            and servo.health_read_ns > servo.torque_switched_ns
+            and not servo.enabled
+        )
         if servo.has_restarted or is_off:
-            cause = f"{servo.label} does not follow: its torque was switched off, or it has restarted"
+            cause = (
+                f"{servo.label} does not follow: its torque was switched off, or it has restarted"
+            )
             return FaultFinding("drive_not_armed", cause, i, affects_only_joint=True)
         return None

@@ -20,7 +20,9 @@ class FeetechSettings(DriveSettings, frozen=True, kw_only=True):
     accept_no_watchdog: bool = False
     """True: real servos are driven, although each holds its last angle with torque on if the host dies."""
 
-    ports: Annotated[list[Annotated[str, Meta(min_length=1, max_length=255)]], Meta(max_length=8)] = []
+    ports: Annotated[
+        list[Annotated[str, Meta(min_length=1, max_length=255)]], Meta(max_length=8)
+    ] = []
     """Serial ports, such as /dev/ttyACM0; empty: emulated servos in this process."""
 
     baud: Baud = 1_000_000
@@ -29,7 +31,9 @@ class FeetechSettings(DriveSettings, frozen=True, kw_only=True):
     model: str = ""
     """Model of all servos, such as STS3215 or `model 1234`; empty: any model that the driver knows."""
 
-    stall_torque_nm: Annotated[float, Meta(gt=0, le=100, extra_json_schema={"unit": "N·m"})] | None = None
+    stall_torque_nm: (
+        Annotated[float, Meta(gt=0, le=100, extra_json_schema={"unit": "N·m"})] | None
+    ) = None
     """Stall torque of a servo at its supply voltage, which scales its torque limit; none: only for emulated servos."""
 
     speed_unit_counts_s: Annotated[float, Meta(gt=0, le=100)] = 1.0

@@ -13,7 +13,12 @@ from mujoco.batch import Batch, SimulationError
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
 from snakesim_sim_backend.actuators import INPUTS_PER_MOTOR
-from snakesim_sim_backend.batch.placed import TOUCH_NUMBERS, PlacedRobot, find_contact_slice, view_link_rotations
+from snakesim_sim_backend.batch.placed import (
+    TOUCH_NUMBERS,
+    PlacedRobot,
+    find_contact_slice,
+    view_link_rotations,
+)
 from snakesim_sim_backend.batch.simulations import (
     NO_CONTACT_ARRAYS,
     NO_MOTORS,
@@ -22,7 +27,12 @@ from snakesim_sim_backend.batch.simulations import (
     MotorArrays,
     SimulationBatch,
 )
-from snakesim_sim_backend.laws.native_laws import CONTACT_COUNT, CONTACT_NUMBERS, FOOT_NUMBERS, MEMORY_NUMBERS
+from snakesim_sim_backend.laws.native_laws import (
+    CONTACT_COUNT,
+    CONTACT_NUMBERS,
+    FOOT_NUMBERS,
+    MEMORY_NUMBERS,
+)
 from snakesim_sim_backend.laws.version import FRICTION_INSTANCE
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS
 from snakesim_sim_backend.state.divergence import (
@@ -97,7 +107,8 @@ class BatchedSimulations(SimulationBatch):
         self._rotations = batch.bind("xmat")
         self.torque_nm = np.zeros((self._count, joints))
         self._start_rotations: Floats = np.zeros((self._count, len(sim.link_geoms), 9))
-        self._is_at_start: Mask = np.ones(self._count, dtype=np.bool_)  # not stepped since it was loaded
+        # Not stepped since it was loaded.
+        self._is_at_start: Mask = np.ones(self._count, dtype=np.bool_)
 
         # What the laws have written into the states.
         plugin_state = batch.bind("plugin_state")
@@ -111,7 +122,9 @@ class BatchedSimulations(SimulationBatch):
         # The last good states. Contacts come last in a state, and there is room for many more than there are.
         feet = len(sim.link_geoms) + 1
         numbers_before_plugins = batch.state.shape[1] - plugin_state.shape[1]
-        self._numbers_before_contacts = numbers_before_plugins + friction + MEMORY_NUMBERS + FOOT_NUMBERS * feet
+        self._numbers_before_contacts = (
+            numbers_before_plugins + friction + MEMORY_NUMBERS + FOOT_NUMBERS * feet
+        )
         self._good_states = np.empty_like(batch.state)
 
     def _try_model(self, robot_index: int, placed: PlacedRobot) -> bool:
@@ -152,7 +165,9 @@ class BatchedSimulations(SimulationBatch):
             batch.step(row_ids, nstep=self._steps)
         except SimulationError as error:
             for robot in error.ids.tolist():
-                divergence_reasons[robot] = f"MuJoCo cannot go on at tick {ticks[robot]}: {batch.error(robot)}"
+                divergence_reasons[robot] = (
+                    f"MuJoCo cannot go on at tick {ticks[robot]}: {batch.error(robot)}"
+                )
         self.torque_nm[rows] = self._all_torques_nm[rows, : self._joints]
         self._is_at_start[rows] = False
         is_good = self._find_good_states()
@@ -195,7 +210,8 @@ class BatchedSimulations(SimulationBatch):
         bad_state = batch.state[robot_index].copy()
         batch.state[robot_index] = self._good_states[robot_index]
         mujoco.mj_setState(model, data, batch.state[robot_index], COMPLETE_STATE)
-        watch = DivergenceWatch(model, data, placed.physics, self._steps)  # stores the good state of `data`
+        # Stores the good state of `data`.
+        watch = DivergenceWatch(model, data, placed.physics, self._steps)
         mujoco.mj_setState(model, data, bad_state, COMPLETE_STATE)
         data.qacc[:] = self._qacc[robot_index]
         data.warning.number[:] = batch.warning[robot_index, :, 1]
@@ -216,5 +232,7 @@ class BatchedSimulations(SimulationBatch):
         links = contacts[:, 0].astype(np.intp)
         rotations = self._rotations[:, self._links][rows, links]
         if self._is_at_start.any():
-            rotations = np.where(self._is_at_start[rows, None], self._start_rotations[rows, links], rotations)
+            rotations = np.where(
+                self._is_at_start[rows, None], self._start_rotations[rows, links], rotations
+            )
         return ContactArrays(rows, links, contacts[:, 1:], rotations)

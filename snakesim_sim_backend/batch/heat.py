@@ -23,16 +23,20 @@ class HeatArrays:
         # Parameters.
         self._ambient_c = np.zeros(shape)
         self._rise = np.zeros(shape)  # K/(N·m)²
-        self._approach = np.zeros(shape)  # fraction of the way to the settled temperature, in a control period
+        # Fraction of the way to the settled temperature, in a control period.
+        self._approach = np.zeros(shape)
         self._derate_from_c = np.ones(shape)
         self._stop_at_c = np.full(shape, 2.0)
-        self._derated = set[int]()  # robots with a hot motor when `find_robots_to_derate` was called
+        # Robots with a hot motor when `find_robots_to_derate` was called.
+        self._derated = set[int]()
 
     def restart(self, robot_index: int, joints: Sequence[Joint]) -> None:
         """Start a robot with every winding at the ambient temperature."""
         time_s = np.array([-joint.heat.time_constant_s for joint in joints])
         self._ambient_c[robot_index] = [joint.heat.ambient_c for joint in joints]
-        self._rise[robot_index] = [joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints]
+        self._rise[robot_index] = [
+            joint.heat.rise_at_rated_k / joint.rated_nm**2 for joint in joints
+        ]
         self._approach[robot_index] = -np.expm1(self._period_s / time_s)
         self._derate_from_c[robot_index] = [joint.limits.derate_from_c for joint in joints]
         self._stop_at_c[robot_index] = [joint.limits.stop_at_c for joint in joints]

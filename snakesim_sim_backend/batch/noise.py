@@ -41,7 +41,9 @@ class NoiseStreams:
         if len(self._first) == 1:  # faster
             start = int(self._next[0]) + self._skipped
             return self._numbers[:, start : start + count]
-        return self._numbers.take((self._first + self._next + self._skipped)[:, None] + np.arange(count))
+        return self._numbers.take(
+            (self._first + self._next + self._skipped)[:, None] + np.arange(count)
+        )
 
     def skip(self, count: int, robots: Mask) -> None:
         """Leave out the next numbers of some robots."""

@@ -70,14 +70,18 @@ def create_settled_robot(config: RunConfig) -> PlacedRobot:
     sim = build_sim_model(config, settings, stores_contacts_in_state=True)
     data = mujoco.MjData(sim.model)
     physics = PhysicsStepper(sim, data)
-    motors = ModelMotors(sim.model, data, config.robot, config.period_ns * 1e-9, settings.motor_gain_scale)
+    motors = ModelMotors(
+        sim.model, data, config.robot, config.period_ns * 1e-9, settings.motor_gain_scale
+    )
     place_and_settle_robot(sim, data, physics, config, motors, settings.settle_s)
     if settings.tether is not None:
         TetherRope(sim.model, data, settings.tether).tighten()
     # Disable MuJoCo's sensors: the model defines only IMUs, which environments do not read.
     sim.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     contact_plugin_state = None
-    if sim.laws == "c":  # the C version of the laws is a plugin of MuJoCo, which writes the contacts into its state
+    if (
+        sim.laws == "c"
+    ):  # the C version of the laws is a plugin of MuJoCo, which writes the contacts into its state
         contact_plugin_state = data.plugin_state[find_contact_slice(sim.model)]
     return PlacedRobot(
         config=config,

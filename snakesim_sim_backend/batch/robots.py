@@ -60,9 +60,8 @@ class SimulatedRobots:
         self._max_torque_nm = np.zeros((robot_count, joints))
         self._torque_limit_nm = np.zeros((robot_count, joints))  # of the last setpoints
         self._last_limit_nm: Floats | None = None  # the same array in many ticks
-        self._robots_with_pending_limits = set[
-            int
-        ]()  # robots whose torque limits have not reached their new values yet
+        # Robots whose torque limits have not reached their new values yet.
+        self._robots_with_pending_limits = set[int]()
         # Supply voltages in V and idle currents in A of the joints, for each robot.
         self._supplies: list[tuple[list[float], list[float]]] = [([], [])] * robot_count
 
@@ -102,7 +101,9 @@ class SimulatedRobots:
         only_this_robot = np.zeros(len(self._supplies), dtype=np.bool_)
         only_this_robot[robot_index] = True
         ticks = np.zeros(len(self._supplies), dtype=np.int64)
-        self.sensors.sample(ticks, only_this_robot, self._simulations, self._heat.winding_c, is_reset=True)
+        self.sensors.sample(
+            ticks, only_this_robot, self._simulations, self._heat.winding_c, is_reset=True
+        )
         return True
 
     def enact(self, mode: JointMode, target: Floats, torque_limit_nm: Floats, robots: Mask) -> None:
@@ -125,7 +126,9 @@ class SimulatedRobots:
         is_changed = torque_limit_nm != self._torque_limit_nm
         for robot in np.flatnonzero(is_changed.any(axis=1) & robots).tolist():
             modes = [mode] * self._joints
-            self._simulations.motors[robot].set_inputs(modes, target[robot].tolist(), torque_limit_nm[robot].tolist())
+            self._simulations.motors[robot].set_inputs(
+                modes, target[robot].tolist(), torque_limit_nm[robot].tolist()
+            )
             self._torque_limit_nm[robot] = torque_limit_nm[robot]
             self._robots_with_pending_limits.add(robot)
 
@@ -184,7 +187,8 @@ class SimulatedRobots:
         """
         joint_count = self._joints
         values = joints_of_robot.tolist()
-        age_ticks = min(tick, self.sensors.joint_delay_ticks)  # at first the reading of the start is used
+        # At first the reading of the start is used.
+        age_ticks = min(tick, self.sensors.joint_delay_ticks)
         return JointState(
             tick=tick,
             timestamp_ns=tick * self._period_ns,

@@ -58,7 +58,8 @@ class DelayedValues:
         self._delay_ticks = round_to_ticks(delay_s, period_ns)
         self._all_robots = all_robots
         self.no_robots: Mask = np.zeros(robots, dtype=np.bool_)
-        self._delay_queue: deque[tuple[Floats, Mask]] = deque()  # values, and the mask of robots with a sample
+        # Values, and the mask of robots with a sample.
+        self._delay_queue: deque[tuple[Floats, Mask]] = deque()
         self.values: Floats = np.zeros((robots, width))
         self.is_known: Mask = np.zeros(robots, dtype=np.bool_)
         self.is_new: Mask = np.zeros(robots, dtype=np.bool_)
@@ -86,7 +87,10 @@ class DelayedValues:
             if is_reset and self._delay_queue:
                 # The other robots' samples of this tick are queued already: merge the new ones into them.
                 last_values, last_due = self._delay_queue[-1]
-                self._delay_queue[-1] = (np.where(due[:, None], values, last_values), last_due | due)
+                self._delay_queue[-1] = (
+                    np.where(due[:, None], values, last_values),
+                    last_due | due,
+                )
                 return
             self._delay_queue.append((values, due))
             if len(self._delay_queue) <= self._delay_ticks:

@@ -31,7 +31,12 @@ ROUNDING_ERROR = 1e-9  # relative; more than that of the size of a force
 def encode_sensor_timing(config: RunConfig) -> bytes:
     """Return what must be equal for all robots that are simulated together: which sensors they have, and when."""
     sensors = config.robot.sensors
-    parts: list[object] = [config.period_ns, config.rate_hz, config.robot.chain.modules, sensors.joints.delay_s]
+    parts: list[object] = [
+        config.period_ns,
+        config.rate_hz,
+        config.robot.chain.modules,
+        sensors.joints.delay_s,
+    ]
     parts.append(_has_noise(sensors.joints))
     for _, sensor in _remove_mounted_sensors(sensors).iterate_published():
         parts += [type(sensor).__name__, sensor.rate_hz, sensor.delay_s, _has_noise(sensor)]
@@ -109,8 +114,11 @@ class SensorArrays:
         if sensors.pose is not None:
             self._pose_schedule = due_ticks(sensors.pose.rate_hz)
             self._pose_has_noise = _has_noise(sensors.pose)
-            self._raw_poses = DelayedValues(all_robots, VALUES_PER_RAW_POSE, sensors.pose.delay_s, config.period_ns)
-            self._raw_poses.values[:, 3] = 1.0  # a quaternion that can be normalized, until there is a pose
+            self._raw_poses = DelayedValues(
+                all_robots, VALUES_PER_RAW_POSE, sensors.pose.delay_s, config.period_ns
+            )
+            # A quaternion that can be normalized, until there is a pose.
+            self._raw_poses.values[:, 3] = 1.0
         self._pose_sigma = np.zeros((robots, 6))
         self._no_pose_noise = np.zeros((robots, 6))
 
@@ -119,7 +127,9 @@ class SensorArrays:
         self.windings: DelayedValues | None = None
         if sensors.power is not None:
             self._power_schedule = due_ticks(sensors.power.rate_hz)
-            self.windings = DelayedValues(all_robots, joints, sensors.power.delay_s, config.period_ns)
+            self.windings = DelayedValues(
+                all_robots, joints, sensors.power.delay_s, config.period_ns
+            )
 
     def restart(self, robot_index: int, config: RunConfig) -> None:
         """Remove all samples of a robot that starts a new episode, and use the noise of its new configuration.
@@ -131,7 +141,11 @@ class SensorArrays:
         sensors = config.robot.sensors
         joints = self._joint_count
         # Columns: angles, velocities and torques of all joints.
-        sigma = [sensors.joints.angle_noise_rad, sensors.joints.velocity_noise_rad_s, sensors.joints.torque_noise_nm]
+        sigma = [
+            sensors.joints.angle_noise_rad,
+            sensors.joints.velocity_noise_rad_s,
+            sensors.joints.torque_noise_nm,
+        ]
         self._joint_sigma[robot_index] = np.repeat(sigma, joints)
         for i, joint in enumerate(config.robot.joint_table):
             self._is_measured[robot_index, 2 * joints + i] = "torque" in joint.drive.measures
@@ -145,14 +159,21 @@ class SensorArrays:
                 other_robots_due[robot_index] = False
                 self._contact_delay_queue[queue_index] = (sample, other_robots_due)
         if sensors.pose is not None:
-            pose_sigma = [sensors.pose.position_noise_m, 0.5 * sensors.pose.angle_noise_rad]  # of a quaternion
+            # Of a quaternion.
+            pose_sigma = [sensors.pose.position_noise_m, 0.5 * sensors.pose.angle_noise_rad]
             self._pose_sigma[robot_index] = np.repeat(pose_sigma, 3)
             self._raw_poses.restart(robot_index)
         if self.windings is not None:
             self.windings.restart(robot_index)
 
     def sample(
-        self, ticks: Ticks, active: Mask, simulations: SimulationBatch, winding_c: Floats, *, is_reset: bool = False
+        self,
+        ticks: Ticks,
+        active: Mask,
+        simulations: SimulationBatch,
+        winding_c: Floats,
+        *,
+        is_reset: bool = False,
     ) -> None:
         """Read the sensors of the active robots at their current ticks.
 
@@ -168,13 +189,19 @@ class SensorArrays:
                 tick.
         """
         if self._contact_schedule is not None:
-            self._sample_contacts(self._contact_schedule.find_due_robots(ticks, active), simulations, is_reset)
+            self._sample_contacts(
+                self._contact_schedule.find_due_robots(ticks, active), simulations, is_reset
+            )
         if self._imu_schedule is not None:
             # IMUs are not simulated in batches. Only their random numbers are drawn, so that the other sensors get the
             # same numbers as in a single run.
-            self._noise.skip(self._imu_draw_count, self._imu_schedule.find_due_robots(ticks, active))
+            self._noise.skip(
+                self._imu_draw_count, self._imu_schedule.find_due_robots(ticks, active)
+            )
         if self._pose_schedule is not None:
-            self._sample_poses(self._pose_schedule.find_due_robots(ticks, active), simulations, is_reset)
+            self._sample_poses(
+                self._pose_schedule.find_due_robots(ticks, active), simulations, is_reset
+            )
         if self._power_schedule is not None and self.windings is not None:
             due = self._power_schedule.find_due_robots(ticks, active)
             if np.count_nonzero(due):
@@ -186,7 +213,9 @@ class SensorArrays:
 
     def _sample_contacts(self, due: Mask, simulations: SimulationBatch, is_reset: bool) -> None:
         contacts = simulations.find_obstacle_contacts(due)
-        sample = NO_CONTACTS if contacts is NO_CONTACT_ARRAYS else self._draw_contact_noise(contacts)
+        sample = (
+            NO_CONTACTS if contacts is NO_CONTACT_ARRAYS else self._draw_contact_noise(contacts)
+        )
         if self._contact_delay_ticks:
             if is_reset and self._contact_delay_queue:
                 # The other robots have taken their samples of this tick already: merge the new ones into them.
@@ -213,14 +242,17 @@ class SensorArrays:
         Returns:
             The selected contacts, at most MAX_CONTACTS of each robot.
         """
-        is_detected = _find_forces_above_threshold(contacts.force_w, self._contact_threshold_n[contacts.robot])
+        is_detected = _find_forces_above_threshold(
+            contacts.force_w, self._contact_threshold_n[contacts.robot]
+        )
         if not is_detected.all():
             contacts = _select_contacts(contacts, is_detected)
         if not len(contacts.robot):
             return NO_CONTACTS
         contact_count = len(contacts.robot)
         count_by_robot = np.bincount(contacts.robot, minlength=self._count)
-        first_by_robot = np.cumsum(count_by_robot) - count_by_robot  # row of each robot's first contact
+        # Row of each robot's first contact.
+        first_by_robot = np.cumsum(count_by_robot) - count_by_robot
         # Number of each contact among those of its robot, from 0.
         number_in_robot = np.arange(contact_count) - first_by_robot[contacts.robot]
         noise = np.zeros((contact_count, 3))
@@ -233,7 +265,9 @@ class SensorArrays:
         if contact_count > MAX_CONTACTS:
             # A message holds no more contacts of a robot.
             fits_in_message = number_in_robot < MAX_CONTACTS
-            return ContactSample(_select_contacts(contacts, fits_in_message), noise[fits_in_message])
+            return ContactSample(
+                _select_contacts(contacts, fits_in_message), noise[fits_in_message]
+            )
         return ContactSample(contacts, noise)
 
     def _sample_poses(self, due: Mask, simulations: SimulationBatch, is_reset: bool) -> None:
@@ -256,7 +290,9 @@ class SensorArrays:
             is_reset: Whether the active robots have just been reset. Then the current reading fills the queue.
         """
         joints = self._joint_count
-        values = np.concatenate((simulations.angle_rad, simulations.velocity_rad_s, simulations.torque_nm), axis=1)
+        values = np.concatenate(
+            (simulations.angle_rad, simulations.velocity_rad_s, simulations.torque_nm), axis=1
+        )
         if self._joints_have_noise:
             values += self._joint_sigma * self._noise.peek(3 * joints)
             self._noise.skip(3 * joints, active)
@@ -265,7 +301,9 @@ class SensorArrays:
         if is_reset and self._joint_delay_queue:
             # The reading of the start is used until a delayed one is delivered.
             for queue_index, queued_values in enumerate(self._joint_delay_queue):
-                self._joint_delay_queue[queue_index] = np.where(active[:, None], values, queued_values)
+                self._joint_delay_queue[queue_index] = np.where(
+                    active[:, None], values, queued_values
+                )
         else:
             self._joint_delay_queue.append(values)
         delivered = self._joint_delay_queue[0]
@@ -313,7 +351,9 @@ class SensorArrays:
         force_l = _rotate_into(contacts.rotation, contacts.force_w)
         if self._contacts_have_noise:
             force_l = force_l + sigma_n * self._contacts.noise
-        for robot, link, force in zip(contacts.robot.tolist(), contacts.link.tolist(), force_l.tolist(), strict=True):
+        for robot, link, force in zip(
+            contacts.robot.tolist(), contacts.link.tolist(), force_l.tolist(), strict=True
+        ):
             forces_n[robot][link] += math.hypot(*force)
         return np.array(forces_n)
 
@@ -340,13 +380,17 @@ def _find_forces_above_threshold(force_w: Floats, thresholds_n: Floats) -> Mask:
 
 
 def _select_contacts(contacts: ContactArrays, mask: Mask) -> ContactArrays:
-    return ContactArrays(contacts.robot[mask], contacts.link[mask], contacts.force_w[mask], contacts.rotation[mask])
+    return ContactArrays(
+        contacts.robot[mask], contacts.link[mask], contacts.force_w[mask], contacts.rotation[mask]
+    )
 
 
 def _remove_robot_contacts(sample: ContactSample, robot_index: int) -> ContactSample:
     """Return a sample of contacts without those of one robot."""
     is_other_robot = sample.arrays.robot != robot_index
-    return ContactSample(_select_contacts(sample.arrays, is_other_robot), sample.noise[is_other_robot])
+    return ContactSample(
+        _select_contacts(sample.arrays, is_other_robot), sample.noise[is_other_robot]
+    )
 
 
 def _replace_contacts(old: ContactSample, new: ContactSample, due: Mask) -> ContactSample:
@@ -390,7 +434,12 @@ def _rotate(wxyz: Floats, vector: Floats) -> Floats:
     ty = 2 * (z * vx - x * vz)
     tz = 2 * (x * vy - y * vx)
     return np.stack(
-        (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx), axis=1
+        (
+            vx + w * tx + y * tz - z * ty,
+            vy + w * ty + z * tx - x * tz,
+            vz + w * tz + x * ty - y * tx,
+        ),
+        axis=1,
     )
 
 
@@ -404,5 +453,6 @@ def _perturb_orientation(wxyz: Floats, half_angles: Floats) -> Floats:
     """Return the unit quaternions along wxyz * (1, half angles): small rotations about axes of the base are added."""
     terms = SIGN_OF_TERM * (half_angles[:, FACTOR_OF_TERM] * wxyz[:, COMPONENT_OF_TERM])
     quaternion = wxyz + terms[:, 0] + terms[:, 1] + terms[:, 2]
-    squares = np.cumsum(quaternion * quaternion, axis=1)  # in order, so that it does not depend on how many there are
+    # In order, so that it does not depend on how many there are.
+    squares = np.cumsum(quaternion * quaternion, axis=1)
     return quaternion / np.sqrt(squares[:, 3:])

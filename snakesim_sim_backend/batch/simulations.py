@@ -42,7 +42,9 @@ class ContactArrays:
     rotation: Floats  # (n, 9), world_from_link, row by row
 
 
-NO_CONTACT_ARRAYS = ContactArrays(np.empty(0, np.intp), np.empty(0, np.intp), np.empty((0, 3)), np.empty((0, 9)))
+NO_CONTACT_ARRAYS = ContactArrays(
+    np.empty(0, np.intp), np.empty(0, np.intp), np.empty((0, 3)), np.empty((0, 9))
+)
 
 
 class SimulationBatch(ABC):
@@ -138,7 +140,9 @@ class LoopedSimulations(SimulationBatch):
             self.motor_state = np.zeros((len(self._placed), len(data.act)))
         self._placed[robot_index] = placed
         self.motors[robot_index] = placed.motors
-        self._watches[robot_index] = DivergenceWatch(placed.sim.model, data, placed.physics, placed.sim.steps_per_tick)
+        self._watches[robot_index] = DivergenceWatch(
+            placed.sim.model, data, placed.physics, placed.sim.steps_per_tick
+        )
         if len(self._placed) == 1:
             self._bind_views(data)
             return True
@@ -159,7 +163,8 @@ class LoopedSimulations(SimulationBatch):
             is its last good one.
         """
         divergence_reasons: dict[int, str] = {}
-        is_view = len(self._placed) == 1  # the arrays of a single robot are views of MuJoCo's: nothing is copied
+        # The arrays of a single robot are views of MuJoCo's: nothing is copied.
+        is_view = len(self._placed) == 1
         for robot in robots:
             tick = ticks[robot]
             placed = self._placed[robot]
@@ -196,7 +201,9 @@ class LoopedSimulations(SimulationBatch):
                 rotations.append(view_link_rotations(placed)[link].copy())
         if not rows:
             return NO_CONTACT_ARRAYS
-        return ContactArrays(np.array(rows), np.array(links), np.array(forces_w), np.array(rotations))
+        return ContactArrays(
+            np.array(rows), np.array(links), np.array(forces_w), np.array(rotations)
+        )
 
     def _copy_state(self, data: mujoco.MjData, robot_index: int) -> None:
         """Copy what a step has changed into the row of a robot."""

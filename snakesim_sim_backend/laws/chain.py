@@ -27,7 +27,8 @@ class LinkChain:
         self._wrenches: Floats | None = None  # (6, n_links), collected in this step
 
         # Views of MuJoCo's arrays.
-        self._reference_w = data.subtree_com[first_body]  # the point about which MuJoCo takes moments
+        # The point about which MuJoCo takes moments.
+        self._reference_w = data.subtree_com[first_body]
         self._base_axes = data.cdof[:FREE_DOFS]
         self._joint_axes = data.cdof[FREE_DOFS:dofs]
         self._base_forces = data.qfrc_passive[:FREE_DOFS]
@@ -38,7 +39,9 @@ class LinkChain:
         self._sum_of_all = self._sums[-1]
         self._sums_beyond_joints = self._sums[-2::-1]  # tail to head
 
-    def push(self, forces_w: Sequence[Vector], points_w: Sequence[Vector], bodies: Sequence[int]) -> None:
+    def push(
+        self, forces_w: Sequence[Vector], points_w: Sequence[Vector], bodies: Sequence[int]
+    ) -> None:
         """Collect forces, in N, that act at points on the links with these body numbers."""
         sums = [0.0] * (6 * self._link_count)
         cx, cy, cz = self._reference_w.tolist()

@@ -113,18 +113,22 @@ class ContactFriction:
         self._data = data
         self._chain = chain
         self._memory = memory
-        self._stretch_and_force: dict[float, tuple[Vector, Vector]] = {}  # of each contact in this step, by its key
+        # Of each contact in this step, by its key.
+        self._stretch_and_force: dict[float, tuple[Vector, Vector]] = {}
         self.min_friction = 0.0
 
         # Properties of geoms and bodies.
-        self._friction: list[float] = model.geom_friction[:, 0].tolist()  # Coulomb coefficient with a link
+        # Coulomb coefficient with a link.
+        self._friction: list[float] = model.geom_friction[:, 0].tolist()
         self._directions: list[list[float]] = model.geom_user.tolist()
         self._underside = underside
         self._link_geoms = frozenset(link_geoms)
         self._body_of_geom: list[int] = model.geom_bodyid.tolist()
-        self._mobility = [_compute_end_mobility(mass_kg) for mass_kg in model.body_mass.tolist()]  # 1/kg
+        # 1/kg.
+        self._mobility = [_compute_end_mobility(mass_kg) for mass_kg in model.body_mass.tolist()]
         self._stiffness_per_kg = (PHASE_RAD / step_s) * (PHASE_RAD / step_s)  # N/m for each kg
-        self._damping_per_kg = 2.0 * DAMPING_RATIO * PHASE_RAD / (step_s * step_s)  # N per m in one step, for each kg
+        # N per m in one step, for each kg.
+        self._damping_per_kg = 2.0 * DAMPING_RATIO * PHASE_RAD / (step_s * step_s)
         self._damping_per_viscous = 1.0 / step_s  # 1/s
 
         # Views of MuJoCo's arrays.
@@ -187,7 +191,14 @@ class ContactFriction:
                 axis_w = self._underside.find_axis(link_body, neighbor, weight, (nx, ny, nz))
                 if coefficients.separate_limits:
                     (sx, sy, sz), force_w = apply_separate_limits(
-                        stretch_w, (dx, dy, dz), axis_w, coefficients, mu_n, k, d, self._damping_per_viscous
+                        stretch_w,
+                        (dx, dy, dz),
+                        axis_w,
+                        coefficients,
+                        mu_n,
+                        k,
+                        d,
+                        self._damping_per_viscous,
                     )
                 else:
                     force_w = apply_directional_friction(
@@ -205,7 +216,15 @@ class ContactFriction:
     def _apply_reaction_force(self, body_id: int, force_w: Vector, point_w: Vector) -> None:
         """Apply the opposite of a link's friction force to the body that it touches."""
         passive = self._data.qfrc_passive
-        mujoco.mj_applyFT(self._model, self._data, -np.array(force_w), NO_TORQUE, np.array(point_w), body_id, passive)
+        mujoco.mj_applyFT(
+            self._model,
+            self._data,
+            -np.array(force_w),
+            NO_TORQUE,
+            np.array(point_w),
+            body_id,
+            passive,
+        )
 
     def update_contacts(self) -> None:
         """Store the contacts of the step that was just made. `apply` uses them in the next step."""
@@ -235,7 +254,9 @@ class ContactFriction:
             else:
                 link_geom, other_geom, sign = second_geom, first_geom, 1.0
             is_pressed = self.normal_force_n[i] > 0.0 and link_geom in link_geoms
-            has_friction = friction[other_geom] > 0.0 or max(self._directions[other_geom][FORWARD:]) > 0.0
+            has_friction = (
+                friction[other_geom] > 0.0 or max(self._directions[other_geom][FORWARD:]) > 0.0
+            )
             if is_pressed and (has_friction or self.min_friction > 0.0):
                 friction_contacts.append(_FrictionContact(i, link_geom, other_geom, sign))
         capacity = (len(self._memory) - 1) // VALUES_PER_CONTACT
@@ -268,12 +289,17 @@ class ContactFriction:
             if stretch_and_force is not None:
                 stretch, self.friction_force_w[i] = stretch_and_force
 
-            normal_w = [sign * component for component in frames[i][:3]]  # from the other body into the link
+            # From the other body into the link.
+            normal_w = [sign * component for component in frames[i][:3]]
             # All contacts of a link share its mass.
-            mass_kg = 1.0 / (link_bodies.count(link_body) * (mobility[link_body] + mobility[other_body]))
+            mass_kg = 1.0 / (
+                link_bodies.count(link_body) * (mobility[link_body] + mobility[other_body])
+            )
             nx, ny, nz = normal_w
             link_point = self._to_body(link_body, *points_w[i])
-            coefficients = self._find_coefficients(link_geom, other_geom, link_point[0], (nx, ny, nz))
+            coefficients = self._find_coefficients(
+                link_geom, other_geom, link_point[0], (nx, ny, nz)
+            )
             normal_force_n = self.normal_force_n[i]
             mu_n = coefficients.largest * normal_force_n
             values += (key, link_body, other_body, mass_kg, mu_n, *normal_w, *stretch)
@@ -319,7 +345,13 @@ class ContactFriction:
             else:
                 viscous_along = viscous_across
         return combine_coefficients(
-            forward, backward, sideways, viscous_along, viscous_across, self.min_friction, separate_limits
+            forward,
+            backward,
+            sideways,
+            viscous_along,
+            viscous_across,
+            self.min_friction,
+            separate_limits,
         )
 
     def _to_world(self, body_id: int, x: float, y: float, z: float) -> Vector:

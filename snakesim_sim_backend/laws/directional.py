@@ -41,7 +41,8 @@ from snakesim_hal.wire.quantities import Vector
 FOOT_MARK, FORWARD, BACKWARD, SIDEWAYS, VISCOUS_ALONG, VISCOUS_ACROSS, SEPARATE_LIMITS = range(7)
 USER_VALUES_PER_GEOM = 7
 
-UNDERSIDE_COSINE = 0.7  # of the angle between a surface's normal and a link's z axis: within 45 degrees
+# Of the angle between a surface's normal and a link's z axis: within 45 degrees.
+UNDERSIDE_COSINE = 0.7
 MIN_AXIS = 0.1  # length of the mean of two directions; below it the body is folded, and has none
 NO_AXIS = (0.0, 0.0, 0.0)
 
@@ -84,7 +85,9 @@ def combine_coefficients(
     sideways = max(sideways, min_friction)
     largest = max(forward, backward, sideways)
     if largest == 0.0:
-        return DirectionalCoefficients(0.0, 1.0, 1.0, 1.0, viscous_along, viscous_across, separate_limits)
+        return DirectionalCoefficients(
+            0.0, 1.0, 1.0, 1.0, viscous_along, viscous_across, separate_limits
+        )
     return DirectionalCoefficients(
         largest,
         forward / largest,
@@ -151,7 +154,11 @@ class LinkUndersides:
         x, y, z = _read_axis(self._rotations, body_id, column)
         ox, oy, oz = _read_axis(self._rotations, neighbor, column)
         own_weight = 1.0 - weight
-        return own_weight * x + weight * ox, own_weight * y + weight * oy, own_weight * z + weight * oz
+        return (
+            own_weight * x + weight * ox,
+            own_weight * y + weight * oy,
+            own_weight * z + weight * oz,
+        )
 
 
 def apply_directional_friction(
@@ -186,9 +193,15 @@ def apply_directional_friction(
     damping_across = damping_per_viscous * coefficients.viscous_across
     result_along = ratio * force_along - damping_along * slip_along
     return (
-        result_along * ax + sideways * (fx - force_along * ax) - damping_across * (sx - slip_along * ax),
-        result_along * ay + sideways * (fy - force_along * ay) - damping_across * (sy - slip_along * ay),
-        result_along * az + sideways * (fz - force_along * az) - damping_across * (sz - slip_along * az),
+        result_along * ax
+        + sideways * (fx - force_along * ax)
+        - damping_across * (sx - slip_along * ax),
+        result_along * ay
+        + sideways * (fy - force_along * ay)
+        - damping_across * (sy - slip_along * ay),
+        result_along * az
+        + sideways * (fz - force_along * az)
+        - damping_across * (sz - slip_along * az),
     )
 
 
@@ -232,7 +245,9 @@ def apply_separate_limits(
     # Along the link. A stretch or a force forward belongs to a link that slides forward.
     ratio = coefficients.forward if stretch_along > 0.0 else coefficients.backward
     sx, sy, sz = sx - stretch_along * ax, sy - stretch_along * ay, sz - stretch_along * az
-    stretch_along = _compute_limit_scale(ratio * max_friction_n, stiffness * abs(stretch_along)) * stretch_along
+    stretch_along = (
+        _compute_limit_scale(ratio * max_friction_n, stiffness * abs(stretch_along)) * stretch_along
+    )
     force_along = stiffness * stretch_along + damping * slip_along
     ratio = coefficients.forward if force_along > 0.0 else coefficients.backward
     force_along = -_compute_limit_scale(ratio * max_friction_n, abs(force_along)) * force_along
@@ -243,7 +258,11 @@ def apply_separate_limits(
     scale = _compute_limit_scale(limit_n, stiffness * math.sqrt(sx * sx + sy * sy + sz * sz))
     sx, sy, sz = scale * sx, scale * sy, scale * sz
     dx, dy, dz = dx - slip_along * ax, dy - slip_along * ay, dz - slip_along * az
-    fx, fy, fz = stiffness * sx + damping * dx, stiffness * sy + damping * dy, stiffness * sz + damping * dz
+    fx, fy, fz = (
+        stiffness * sx + damping * dx,
+        stiffness * sy + damping * dy,
+        stiffness * sz + damping * dz,
+    )
     scale = -_compute_limit_scale(limit_n, math.sqrt(fx * fx + fy * fy + fz * fz))
     damping_across = damping_per_viscous * coefficients.viscous_across
     force_w = (

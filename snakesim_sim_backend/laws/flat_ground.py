@@ -39,7 +39,8 @@ from snakesim_sim_backend.laws.directional import (
 )
 
 SINK_M = 2e-4  # how deep a foot sinks in under its share of the weight
-MAX_PHASE_RAD = 0.7  # the normal spring vibrates by at most this in one step; long steps get softer ground
+# The normal spring vibrates by at most this in one step; long steps get softer ground.
+MAX_PHASE_RAD = 0.7
 DAMPING_RATIO = 0.5  # of critical damping
 VALUES_PER_FOOT = 5  # in `userdata`: two of its slip, three of its position
 FOOT = 1.0  # first number of a geom's user data, if the geom is a foot that flat ground carries
@@ -65,13 +66,17 @@ class GroundFeet:
         return any(numbers[FORWARD:] != same for numbers in self.directions)
 
 
-def find_feet(model: mujoco.MjModel, first_body: int, link_count: int, radius_m: float) -> GroundFeet:
+def find_feet(
+    model: mujoco.MjModel, first_body: int, link_count: int, radius_m: float
+) -> GroundFeet:
     """Return the feet of a compiled model, whose geoms are called `foot_0` onwards."""
     masses_kg = model.body_mass[first_body : first_body + link_count]
     geoms = np.array([model.geom(f"foot_{i}").id for i in range(link_count + 1)])
     carried_kg = 0.5 * (np.append(masses_kg, 0.0) + np.append(0.0, masses_kg))
     friction = float(model.geom_friction[geoms[0], 0])
-    return GroundFeet(geoms, first_body, carried_kg, radius_m, friction, model.geom_user[geoms].tolist())
+    return GroundFeet(
+        geoms, first_body, carried_kg, radius_m, friction, model.geom_user[geoms].tolist()
+    )
 
 
 class FlatGround:
@@ -103,7 +108,12 @@ class FlatGround:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, data: mujoco.MjData, chain: LinkChain, feet: GroundFeet, underside: LinkUndersides
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        chain: LinkChain,
+        feet: GroundFeet,
+        underside: LinkUndersides,
     ) -> None:
         """Prepare the law for a compiled model: compute stiffness and damping, and allocate all buffers.
 
@@ -120,7 +130,8 @@ class FlatGround:
         min_time_constant_s = step_s / MAX_PHASE_RAD  # of the normal spring
         sink_m = max(SINK_M, gravity * (min_time_constant_s * min_time_constant_s))
         stiffness = feet.carried_kg * gravity / sink_m  # N/m
-        damping = 2.0 * DAMPING_RATIO * feet.carried_kg * math.sqrt(gravity / sink_m) / step_s  # N per m in one step
+        # N per m in one step.
+        damping = 2.0 * DAMPING_RATIO * feet.carried_kg * math.sqrt(gravity / sink_m) / step_s
         self._chain = chain
         self.min_friction = 0.0
         self.normal_force_n = np.zeros(count)
@@ -138,7 +149,8 @@ class FlatGround:
         self._minus_damping_xy = -damping.repeat(2)
         self._gravity_along_ground = model.opt.gravity[:2]  # m/s², along x and y; a view
         self._start_stretch_per_gravity = sink_m / gravity  # s²
-        self._roll_per_rad_s_xy = np.tile([-feet.radius_m * step_s, feet.radius_m * step_s], count)  # m for 1 rad/s
+        # M for 1 rad/s.
+        self._roll_per_rad_s_xy = np.tile([-feet.radius_m * step_s, feet.radius_m * step_s], count)
         self._radius_m = np.full(count, feet.radius_m)
         self._zeros = np.full(count, 0.0)
         self._min_divisor = np.full(count, MIN_DIVISOR)
@@ -172,7 +184,8 @@ class FlatGround:
         z_indices = 3 * feet.geoms + 2
         self._positions = data.geom_xpos.reshape(-1)
         self._position_indices = np.concatenate((xy_indices, z_indices))
-        self._body_cvel = data.cvel.reshape(-1)  # per body: angular velocity (x, y, z), then linear velocity
+        # Per body: angular velocity (x, y, z), then linear velocity.
+        self._body_cvel = data.cvel.reshape(-1)
         # The velocity of a point, v = omega x r, has the x component omega_y r_z and the y component -omega_x r_z: so y
         # comes first.
         self._angular_yx_indices = np.add.outer(6 * bodies, [1, 0]).ravel()
@@ -255,7 +268,8 @@ class FlatGround:
         if self._is_directional:
             stretches = self._bristle_deflection_xy.reshape(-1, 2).tolist()
         self._bristle_deflection_xy *= (
-            max_friction_n / np.maximum(self._stiffness * np.abs(self._bristle_deflection_complex), divisor)
+            max_friction_n
+            / np.maximum(self._stiffness * np.abs(self._bristle_deflection_complex), divisor)
         ).repeat(2)
 
         # F = -(k s + d ds), limited to mu N
@@ -263,7 +277,9 @@ class FlatGround:
         slip_xy *= self._minus_damping_xy
         self._pull_xy += slip_xy
         forces = self._forces
-        np.multiply(self._pull_by_axis, max_friction_n / np.maximum(np.abs(self._pull), divisor), forces[:2])
+        np.multiply(
+            self._pull_by_axis, max_friction_n / np.maximum(np.abs(self._pull), divisor), forces[:2]
+        )
         if self._is_directional:
             self._apply_directional_friction(coefficients, slips, stretches)
         forces[2] = self.normal_force_n
@@ -277,7 +293,9 @@ class FlatGround:
         neighbor, weight = self._neighbors[foot]
         if not self._underside.faces(self._bodies[foot], neighbor, weight, UP):
             side = self._friction
-            return combine_coefficients(side, side, side, viscous_across, viscous_across, self.min_friction)
+            return combine_coefficients(
+                side, side, side, viscous_across, viscous_across, self.min_friction
+            )
         return combine_coefficients(
             numbers[FORWARD],
             numbers[BACKWARD],
@@ -289,7 +307,10 @@ class FlatGround:
         )
 
     def _apply_directional_friction(
-        self, coefficients: list[DirectionalCoefficients], slips: list[list[float]], stretches: list[list[float]]
+        self,
+        coefficients: list[DirectionalCoefficients],
+        slips: list[list[float]],
+        stretches: list[list[float]],
     ) -> None:
         """Change the friction forces of the feet by the direction in which they slide.
 
@@ -321,7 +342,11 @@ class FlatGround:
                     self._forces[:2, foot] = force_x, force_y
                     continue
                 force_x, force_y, _ = apply_directional_friction(
-                    (force_x, force_y, 0.0), (slip_x, slip_y, 0.0), axis_w, of_foot, damping_per_viscous
+                    (force_x, force_y, 0.0),
+                    (slip_x, slip_y, 0.0),
+                    axis_w,
+                    of_foot,
+                    damping_per_viscous,
                 )
                 self._forces[:2, foot] = force_x, force_y
 

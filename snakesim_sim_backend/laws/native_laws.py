@@ -17,7 +17,11 @@ import mujoco
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.laws.laws import PhysicsLaws, find_normal_forces_n
-from snakesim_sim_backend.laws.version import FRICTION_INSTANCE, MEASURED_FORCE_INSTANCE, load_library
+from snakesim_sim_backend.laws.version import (
+    FRICTION_INSTANCE,
+    MEASURED_FORCE_INSTANCE,
+    load_library,
+)
 from snakesim_sim_backend.model.build import SimModel
 
 # Numbers in the memory of the plugin instance.
@@ -72,7 +76,9 @@ class NativeContacts:
             return {}
         records = self._records[:count].tolist()
         return {
-            int(record[CONTACT_INDEX]): tuple(record[CONTACT_FORCE]) for record in records if not record[CONTACT_IS_NEW]
+            int(record[CONTACT_INDEX]): tuple(record[CONTACT_FORCE])
+            for record in records
+            if not record[CONTACT_IS_NEW]
         }
 
 

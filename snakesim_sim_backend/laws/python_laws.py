@@ -36,7 +36,8 @@ class PythonLaws(PhysicsLaws):
         half_lengths_m = model.geom_size[sim.link_geoms, 1]
         underside = LinkUndersides(data, sim.first_link_body, (2.0 * half_lengths_m).tolist())
 
-        contacts_start = VALUES_PER_FOOT * (link_count + 1)  # the values of the feet come first in `userdata`
+        # The values of the feet come first in `userdata`.
+        contacts_start = VALUES_PER_FOOT * (link_count + 1)
         memory = data.userdata[contacts_start : contacts_start + count_contact_values(link_count)]
         self._friction = ContactFriction(model, data, chain, sim.link_geoms, memory, underside)
         self.contacts = self._friction
@@ -48,7 +49,8 @@ class PythonLaws(PhysicsLaws):
             self._force_laws.append(self._ground.apply)
         if sim.yielding:
             self._force_laws.append(YieldingObstacles(model, data, len(sim.yielding)).apply)
-        self._force_laws.append(chain.apply)  # last, because it applies the forces that the other laws have collected
+        # Last, because it applies the forces that the other laws have collected.
+        self._force_laws.append(chain.apply)
 
         self._contact_reader = ObstacleContactReader(sim, data, self.contacts)
         self._measured_force: MeasuredForce | None = None  # None until the measurement is started

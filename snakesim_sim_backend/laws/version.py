@@ -71,7 +71,9 @@ def add_laws(
     match laws:
         case "python":
             spec.nuserdata = (
-                VALUES_PER_FOOT * (link_count + 1) + count_contact_values(link_count) + DOFS * len(yielding_bodies)
+                VALUES_PER_FOOT * (link_count + 1)
+                + count_contact_values(link_count)
+                + DOFS * len(yielding_bodies)
             )
         case "c":
             load_library()

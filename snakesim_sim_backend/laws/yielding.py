@@ -42,7 +42,8 @@ def measure_foot(obstacle: KnownObstacle) -> tuple[float, float]:
     if obstacle.shape != "box":
         return math.pi * obstacle.radius_m**2, 2.0 / 3.0 * obstacle.radius_m
     length, width = (2.0 * half for half in obstacle.half_size_m[:2])
-    across = (np.arange(GRID_POINTS) + 0.5) / GRID_POINTS - 0.5  # middles of cells, as fractions of an edge
+    # Middles of cells, as fractions of an edge.
+    across = (np.arange(GRID_POINTS) + 0.5) / GRID_POINTS - 0.5
     distances_m = np.hypot(length * across[:, None], width * across)
     return length * width, float(distances_m.mean())
 
@@ -101,7 +102,9 @@ def validate_yielding_obstacles(
             )
 
 
-def compute_spring(placed: PlacedObstacle, step_s: float, normal_gravity_m_s2: float) -> list[float]:
+def compute_spring(
+    placed: PlacedObstacle, step_s: float, normal_gravity_m_s2: float
+) -> list[float]:
     """Return the parameters of an obstacle's spring, which are the user data of its body.
 
     Args:

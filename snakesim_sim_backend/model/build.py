@@ -41,7 +41,8 @@ from snakesim_sim_backend.settings import SimSettings
 FREE_QPOS = 7  # coordinates of the base: position and quaternion
 CLAMP_INERTIA = 1e6  # kg and kg·m²: more than the robot can move, in all six degrees of freedom
 CLAMP_DAMPING = 1e6  # N·s/m and N·m·s/rad
-MIN_GAP_RADII = 2.05  # links that are closer than this when the snake is straight would always touch
+# Links that are closer than this when the snake is straight would always touch.
+MIN_GAP_RADII = 2.05
 FOOT_GROUP = 3  # MuJoCo geom group of the feet, which are inside of the links' capsules
 ORANGE = [0.87, 0.45, 0.12, 1.0]  # color of the robot
 AXES: dict[Axis, list[float]] = {"yaw": [0.0, 0.0, 1.0], "pitch": [0.0, 1.0, 0.0]}
@@ -58,7 +59,8 @@ class SimModel:
     feet: GroundFeet | None  # None: the ground is not flat, and MuJoCo finds the contacts with it
     link_geoms: list[int]  # (n_links,), tail to head
     suspended: bool  # the tail link is clamped
-    yielding: list[PlacedObstacle]  # obstacles that move when they are pushed; their bodies come after the robot's
+    # Obstacles that move when they are pushed; their bodies come after the robot's.
+    yielding: list[PlacedObstacle]
     laws: LawsVersion  # which version of the laws the model is made for
 
 
@@ -183,7 +185,14 @@ def assemble_model_blueprint(
     add_fluid(spec, config.scene.fluid, links)
     set_friction(spec, config, placed, rough_ground_geoms, settings.self_friction)
     yielding_bodies = [make_geom_name(item) for item in yielding]
-    add_laws(spec, laws, links, yielding_bodies, keeps_touches=keeps_touches, measures_force=measures_force)
+    add_laws(
+        spec,
+        laws,
+        links,
+        yielding_bodies,
+        keeps_touches=keeps_touches,
+        measures_force=measures_force,
+    )
     return ModelBlueprint(spec, steps_per_tick, yielding, laws)
 
 
@@ -202,11 +211,14 @@ def _set_options(spec: mujoco.MjSpec, step_s: float, gravity_w: Vector) -> None:
     option = spec.option
     option.timestep = step_s
     option.gravity = list(gravity_w)
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # damping of the joints is integrated implicitly
+    # Damping of the joints is integrated implicitly.
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # faster for a snake than the sparse one
     # A diverged run is reported, not silently restarted. One snake is one constraint island.
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
+    option.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_ISLAND
+    )
 
 
 def _add_obstacles(
@@ -263,7 +275,8 @@ def _compile(spec: mujoco.MjSpec, robot_name: str) -> mujoco.MjModel:
         return spec.compile()
     except ValueError as error:
         raise ConfigError(
-            f"MuJoCo cannot build robot {robot_name!r} in this scene: {error}", code="simulator/cannot-build"
+            f"MuJoCo cannot build robot {robot_name!r} in this scene: {error}",
+            code="simulator/cannot-build",
         ) from error
 
 
@@ -274,7 +287,9 @@ def _parse_obstacle_name(name: str) -> str | None:
     return None
 
 
-def _add_snake(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, contact: ContactParameters) -> None:
+def _add_snake(
+    spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, contact: ContactParameters
+) -> None:
     """Add the links, joints and feet of the robot to the model.
 
     Links are capsules. Flat ground carries them at their feet, which are spheres at joints and ends: at a joint, two
@@ -317,7 +332,12 @@ def _add_snake(spec: mujoco.MjSpec, config: RunConfig, settings: SimSettings, co
 def _add_free_joint(body: mujoco.MjsBody, *, suspended: bool) -> None:
     """Add the joint of the base. A suspended robot is clamped there, by inertia and damping."""
     if suspended:
-        body.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_FREE, armature=CLAMP_INERTIA, damping=CLAMP_DAMPING)
+        body.add_joint(
+            name="base",
+            type=mujoco.mjtJoint.mjJNT_FREE,
+            armature=CLAMP_INERTIA,
+            damping=CLAMP_DAMPING,
+        )
     else:
         body.add_joint(name="base", type=mujoco.mjtJoint.mjJNT_FREE)
 
@@ -344,7 +364,9 @@ def _set_inertia(body: mujoco.MjsBody, link: Link, radius_m: float, scale: float
     body.fullinertia = [scale * value for value in link.inertia(radius_m)]
 
 
-def _add_foot(body: mujoco.MjsBody, name: str, along_m: float, radius_m: float, *, is_on_flat_ground: bool) -> None:
+def _add_foot(
+    body: mujoco.MjsBody, name: str, along_m: float, radius_m: float, *, is_on_flat_ground: bool
+) -> None:
     """Add a massless sphere at a joint or an end of the robot, on which flat ground carries the body.
 
     MuJoCo itself finds no contacts of the sphere. The law of flat ground computes them.

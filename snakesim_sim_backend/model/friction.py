@@ -2,7 +2,12 @@
 
 import mujoco
 
-from snakesim_hal.model.friction import DirectionalFriction, Surface, compute_link_factors, compute_surface_friction
+from snakesim_hal.model.friction import (
+    DirectionalFriction,
+    Surface,
+    compute_link_factors,
+    compute_surface_friction,
+)
 from snakesim_hal.model.placement import PlacedObstacle
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
@@ -35,17 +40,25 @@ def set_friction(
         viscous = [ground.viscous.along_s_per_m, ground.viscous.across_s_per_m]
 
     friction_by_geom: dict[str, float] = {}
-    directions_by_geom: dict[str, list[float]] = {}  # three dry and two viscous coefficients, see `directional`
+    # Three dry and two viscous coefficients, see `directional`.
+    directions_by_geom: dict[str, list[float]] = {}
     for name in rough_ground_geoms:
         friction_by_geom[name] = ground.friction
         directions_by_geom[name] = [*ground_coefficients, *viscous]
     for i, foot_factors in enumerate(_average_over_links(factors, robot.link_masses_kg)):
         friction_by_geom[f"foot_{i}"] = ground.friction
         pairs = zip(ground_coefficients, foot_factors, strict=True)
-        directions_by_geom[f"foot_{i}"] = [*(coefficient * factor for coefficient, factor in pairs), *viscous]
+        directions_by_geom[f"foot_{i}"] = [
+            *(coefficient * factor for coefficient, factor in pairs),
+            *viscous,
+        ]
     for item in placed:
         friction_by_geom[make_geom_name(item)] = item.friction
-        directions_by_geom[make_geom_name(item)] = [*_find_coefficients(robot, item.friction, item), 0.0, 0.0]
+        directions_by_geom[make_geom_name(item)] = [
+            *_find_coefficients(robot, item.friction, item),
+            0.0,
+            0.0,
+        ]
     for index, pipe in enumerate(config.scene.pipe):
         for name in get_pipe_geom_names(index, pipe):
             friction_by_geom[name] = pipe.friction
@@ -59,7 +72,9 @@ def set_friction(
         geom.friction[0] = friction_by_geom.get(geom.name, 0.0)
         if geom.name in directions_by_geom:
             foot_mark = geom.userdata[0] if len(geom.userdata) else 0.0
-            separate_limits = float(has_separate_limits and geom.name.startswith(("foot_", "link_")))
+            separate_limits = float(
+                has_separate_limits and geom.name.startswith(("foot_", "link_"))
+            )
             geom.userdata = [foot_mark, *directions_by_geom[geom.name], separate_limits]
 
 
@@ -67,14 +82,18 @@ def _find_coefficients(robot: RobotFile, friction: float, surface: Surface) -> D
     return compute_surface_friction(friction, surface, robot.skin, robot.wheels)
 
 
-def _average_over_links(factors: list[DirectionalFriction], masses_kg: list[float]) -> list[DirectionalFriction]:
+def _average_over_links(
+    factors: list[DirectionalFriction], masses_kg: list[float]
+) -> list[DirectionalFriction]:
     """Return the factors of every foot: the mean of those of the links that it ends, by the weight that it carries."""
     averages = [factors[0]]
     for i in range(1, len(factors)):
         behind_kg = masses_kg[i - 1]
         ahead_kg = masses_kg[i]
         mean = [
-            behind if behind == ahead else (behind_kg * behind + ahead_kg * ahead) / (behind_kg + ahead_kg)
+            behind
+            if behind == ahead
+            else (behind_kg * behind + ahead_kg * ahead) / (behind_kg + ahead_kg)
             for behind, ahead in zip(factors[i - 1], factors[i], strict=True)
         ]
         averages.append(DirectionalFriction(*mean))

@@ -51,7 +51,9 @@ def _add_plane(spec: mujoco.MjSpec, height_m: float) -> mujoco.MjsGeom:
     )
 
 
-def _add_hills(spec: mujoco.MjSpec, field: Heightfield, lowest_m: float, contact: ContactParameters) -> None:
+def _add_hills(
+    spec: mujoco.MjSpec, field: Heightfield, lowest_m: float, contact: ContactParameters
+) -> None:
     """Add a heightfield with the heights of the scene's hills.
 
     Args:

@@ -97,7 +97,9 @@ def _add_yielding_body(spec: mujoco.MjSpec, name: str, foot_w: Floats) -> mujoco
     return body
 
 
-def _make_obstacle_shape(placed: PlacedObstacle, body_radius_m: float, ground_relief_m: float) -> GeomArguments:
+def _make_obstacle_shape(
+    placed: PlacedObstacle, body_radius_m: float, ground_relief_m: float
+) -> GeomArguments:
     """Return the shape, place and orientation of an obstacle's geom.
 
     Obstacles other than spheres reach below the ground, so that no gap is left in a hollow or below a leaning one.
@@ -111,7 +113,9 @@ def _make_obstacle_shape(placed: PlacedObstacle, body_radius_m: float, ground_re
     x, y, z = obstacle.position_w
     if obstacle.shape == "sphere":
         size = [obstacle.radius_m, 0.0, 0.0]
-        return GeomArguments(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=[x, y, z], quat=UPRIGHT)
+        return GeomArguments(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=[x, y, z], quat=UPRIGHT
+        )
 
     half_x, half_y, _ = obstacle.half_size_m
     top = z + obstacle.height_m / 2
@@ -140,7 +144,11 @@ def _make_obstacle_shape(placed: PlacedObstacle, body_radius_m: float, ground_re
     return GeomArguments(
         type=geom_type,
         size=[*size, (top - bottom) / 2, 0.0][:3],  # MuJoCo has three sizes of every geom
-        pos=[x + shift * math.cos(direction_rad), y + shift * math.sin(direction_rad), middle * math.cos(lean_rad)],
+        pos=[
+            x + shift * math.cos(direction_rad),
+            y + shift * math.sin(direction_rad),
+            middle * math.cos(lean_rad),
+        ],
         quat=_compute_tilted_quaternion(obstacle.yaw_rad, lean_rad, direction_rad),
     )
 

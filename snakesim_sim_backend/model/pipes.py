@@ -49,7 +49,9 @@ def add_pipes(spec: mujoco.MjSpec, pipes: list[Pipe], contact: ContactParameters
             _add_staves(spec, index, pipe, pipe.inner_radius_m, contact)
 
 
-def _add_solid_pipe(spec: mujoco.MjSpec, index: int, pipe: Pipe, contact: ContactParameters) -> None:
+def _add_solid_pipe(
+    spec: mujoco.MjSpec, index: int, pipe: Pipe, contact: ContactParameters
+) -> None:
     half_m = pipe.length_m / 2 - pipe.radius_m
     middle = np.array([*pipe.position_m, pipe.find_axis_height_m()])
     along = half_m * np.array([math.cos(pipe.yaw_rad), math.sin(pipe.yaw_rad), 0.0])
@@ -65,7 +67,9 @@ def _add_solid_pipe(spec: mujoco.MjSpec, index: int, pipe: Pipe, contact: Contac
     )
 
 
-def _add_staves(spec: mujoco.MjSpec, index: int, pipe: Pipe, inner_radius_m: float, contact: ContactParameters) -> None:
+def _add_staves(
+    spec: mujoco.MjSpec, index: int, pipe: Pipe, inner_radius_m: float, contact: ContactParameters
+) -> None:
     """Add the staves of a hollow pipe. The first ones are at its left edge, and the middle of the half at its bottom.
 
     Staves are as wide as the outside requires, so that no gap is left there. They overlap in the corners of the inside,
@@ -84,7 +88,9 @@ def _add_staves(spec: mujoco.MjSpec, index: int, pipe: Pipe, inner_radius_m: flo
         left_m = middle_radius_m * math.cos(angle_rad)
         below_m = middle_radius_m * math.sin(angle_rad)
         orientation = np.zeros(4)
-        mujoco.mju_mulQuat(orientation, yaw, np.array([math.cos(roll_rad / 2), math.sin(roll_rad / 2), 0.0, 0.0]))
+        mujoco.mju_mulQuat(
+            orientation, yaw, np.array([math.cos(roll_rad / 2), math.sin(roll_rad / 2), 0.0, 0.0])
+        )
         spec.worldbody.add_geom(
             name=name,
             type=mujoco.mjtGeom.mjGEOM_BOX,

@@ -7,7 +7,8 @@ from typing import TypedDict
 
 from snakesim_sim_backend.settings import SimSettings
 
-IMPEDANCE = [0.95, 0.99, 0.001, 0.5, 2.0]  # solimp, see MuJoCo's manual: at first touch, and 1 mm deeper
+# Solimp, see MuJoCo's manual: at first touch, and 1 mm deeper.
+IMPEDANCE = [0.95, 0.99, 0.001, 0.5, 2.0]
 FRICTIONLESS_DIMENSION = 1  # condim: normal force alone
 
 
@@ -21,4 +22,6 @@ class ContactParameters(TypedDict):
 
 def make_contact_parameters(settings: SimSettings) -> ContactParameters:
     """Return the contact parameters of every geom that can touch another."""
-    return ContactParameters(condim=FRICTIONLESS_DIMENSION, solref=[settings.contact_time_s, 1.0], solimp=IMPEDANCE)
+    return ContactParameters(
+        condim=FRICTIONLESS_DIMENSION, solref=[settings.contact_time_s, 1.0], solimp=IMPEDANCE
+    )

@@ -22,7 +22,9 @@ WINCH = "tether_winch"
 LIMIT_FORCE = int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
 
 
-def add_tether(spec: mujoco.MjSpec, tether: TetherSettings, robot: RobotFile, contact_time_s: float) -> None:
+def add_tether(
+    spec: mujoco.MjSpec, tether: TetherSettings, robot: RobotFile, contact_time_s: float
+) -> None:
     """Add a slack tether between the world and a link to a model whose motors are complete.
 
     The tether is a tendon with a maximum length. If it is reeled in, a winch shortens it with a limited force.
@@ -42,11 +44,12 @@ def add_tether(spec: mujoco.MjSpec, tether: TetherSettings, robot: RobotFile, co
             code="config/out-of-range",
         )
     if np.hypot(*tether.direction_w) == 0:
-        raise ConfigError("`tether.direction_w` = (0, 0) is not a direction; give x and y, such as [-1, 0]")
+        raise ConfigError(
+            "`tether.direction_w` = (0, 0) is not a direction; give x and y, such as [-1, 0]"
+        )
     spec.body(f"link_{tether.link}").add_site(name=HOOK_SITE, pos=[tether.point_m, 0.0, 0.0])
-    spec.worldbody.add_site(
-        name=ANCHOR, pos=[ROPE_LENGTH_M, 0.0, 0.0]
-    )  # at the origin MuJoCo would not let it be moved
+    # At the origin MuJoCo would not let it be moved.
+    spec.worldbody.add_site(name=ANCHOR, pos=[ROPE_LENGTH_M, 0.0, 0.0])
     tendon = spec.add_tendon(
         name=TENDON,
         limited=True,
@@ -87,7 +90,9 @@ class TetherRope:
         mujoco.mj_kinematics(model, data)
         direction_w = np.array([*self._tether.direction_w, 0.0])
         hook_w = data.site(HOOK_SITE).xpos
-        model.site_pos[model.site(ANCHOR).id] = hook_w + ROPE_LENGTH_M * direction_w / np.linalg.norm(direction_w)
+        model.site_pos[model.site(ANCHOR).id] = (
+            hook_w + ROPE_LENGTH_M * direction_w / np.linalg.norm(direction_w)
+        )
         model.tendon_range[model.tendon(TENDON).id] = [0.0, ROPE_LENGTH_M]
         if self._winch is not None:
             data.ctrl[model.actuator_ctrladr[self._winch]] = -self._tether.reel_in_m_s

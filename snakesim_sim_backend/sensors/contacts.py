@@ -22,7 +22,12 @@ class ContactReader:
     """Measures the contacts with obstacles, in the frames of the links."""
 
     def __init__(
-        self, sim: SimModel, data: mujoco.MjData, sensor: ContactSensor, noise: Normal, physics: PhysicsStepper
+        self,
+        sim: SimModel,
+        data: mujoco.MjData,
+        sensor: ContactSensor,
+        noise: Normal,
+        physics: PhysicsStepper,
     ) -> None:
         first = sim.first_link_body
         self._contact_reader = ObstacleContactReader(sim, data, physics.contacts)

@@ -34,11 +34,18 @@ class RayCamera(SensorModel):
 
     def read(self, tick: int, timestamp_ns: int) -> DepthImage:
         """Return an image from the present place of the link."""
-        return make_depth_image(self._camera, self._mount, tick, timestamp_ns, self._rays.cast(), self._noise)
+        return make_depth_image(
+            self._camera, self._mount, tick, timestamp_ns, self._rays.cast(), self._noise
+        )
 
 
 def make_depth_image(
-    camera: DepthCamera, mount: SensorMount, tick: int, timestamp_ns: int, depth_m: Floats, noise: np.random.Generator
+    camera: DepthCamera,
+    mount: SensorMount,
+    tick: int,
+    timestamp_ns: int,
+    depth_m: Floats,
+    noise: np.random.Generator,
 ) -> DepthImage:
     """Make the message of a depth image from exact distances, with the noise, dropouts and range of a camera.
 
@@ -61,12 +68,16 @@ def make_depth_image(
     )
 
 
-def _apply_sensor_errors(camera: DepthCamera, depth_m: Floats, noise: np.random.Generator) -> NDArray[np.uint16]:
+def _apply_sensor_errors(
+    camera: DepthCamera, depth_m: Floats, noise: np.random.Generator
+) -> NDArray[np.uint16]:
     """Return distances in counts of SCALE_M with noise and dropouts, (n,) uint16; 0 where nothing is measured."""
     is_measured = (depth_m >= camera.range_min_m) & (depth_m <= camera.range_max_m)
     measured_m = np.where(is_measured, depth_m, 0.0).astype(np.float32)
     if camera.noise_m or camera.noise_m_per_m2:
-        sigma_m = np.float32(camera.noise_m) + np.float32(camera.noise_m_per_m2) * np.square(measured_m)
+        sigma_m = np.float32(camera.noise_m) + np.float32(camera.noise_m_per_m2) * np.square(
+            measured_m
+        )
         measured_m += sigma_m * noise.standard_normal(len(measured_m), dtype=np.float32)
     if camera.dropout:
         is_measured &= noise.random(len(measured_m), dtype=np.float32) >= camera.dropout

@@ -21,10 +21,17 @@ class JointReader:
     """
 
     def __init__(
-        self, data: mujoco.MjData, sensor: JointSensor, motors: ModelMotors, noise: Normal, period_ns: int
+        self,
+        data: mujoco.MjData,
+        sensor: JointSensor,
+        motors: ModelMotors,
+        noise: Normal,
+        period_ns: int,
     ) -> None:
         count = motors.count
-        self._unmeasured_torque_indices = [2 * count + i for i in motors.joints_without_torque_sensor]
+        self._unmeasured_torque_indices = [
+            2 * count + i for i in motors.joints_without_torque_sensor
+        ]
         self._count = count
         self._angles, self._velocities = view_joint_states(data, count)
         self._torques = motors.get_applied_torque_nm()

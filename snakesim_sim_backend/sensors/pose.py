@@ -19,7 +19,8 @@ class PoseReader:
     def __init__(self, data: mujoco.MjData, sensor: PoseSensor, noise: Normal) -> None:
         self._qpos = data.qpos[:FREE_QPOS]
         self._qvel = data.qvel[:FREE_DOFS]
-        sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]  # a quaternion has half the angle
+        # A quaternion has half the angle.
+        sigma = [sensor.position_noise_m, 0.5 * sensor.angle_noise_rad]
         self._sigma = np.repeat(sigma, 3)
         self._noise = noise if any(sigma) else None
 
@@ -35,7 +36,9 @@ class PoseReader:
         # MuJoCo gives a free joint's angular velocity in its own frame.
         angular_velocity_w = rotate((w, x, y, z), (ox, oy, oz))
         if self._noise is not None:
-            error_x, error_y, error_z, half_roll, half_pitch, half_yaw = (self._sigma * self._noise(6)).tolist()
+            error_x, error_y, error_z, half_roll, half_pitch, half_yaw = (
+                self._sigma * self._noise(6)
+            ).tolist()
             px = px + error_x
             py = py + error_y
             pz = pz + error_z

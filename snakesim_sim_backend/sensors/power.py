@@ -16,7 +16,11 @@ class PowerReader:
     """Supply, current and temperatures of the joint modules, without noise and without a leak."""
 
     def __init__(
-        self, data: mujoco.MjData, motors: ModelMotors, windings: ThermalModel, joints: Sequence[Joint]
+        self,
+        data: mujoco.MjData,
+        motors: ModelMotors,
+        windings: ThermalModel,
+        joints: Sequence[Joint],
     ) -> None:
         _, self._velocities = view_joint_states(data, motors.count)
         self._torques = motors.get_applied_torque_nm()

@@ -40,7 +40,9 @@ class RayBeams(SensorModel):
         distances_m = self._rays.cast()
         is_measured = (distances_m >= sensor.range_min_m) & (distances_m <= sensor.range_max_m)
         if sensor.noise_m:
-            distances_m = np.maximum(distances_m + sensor.noise_m * self._noise.standard_normal(sensor.beams), 0.0)
+            distances_m = np.maximum(
+                distances_m + sensor.noise_m * self._noise.standard_normal(sensor.beams), 0.0
+            )
         if sensor.dropout:
             is_measured &= self._noise.random(sensor.beams) >= sensor.dropout
         ranges_m = [

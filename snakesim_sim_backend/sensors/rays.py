@@ -13,9 +13,8 @@ from snakesim_sim_backend.sensors.scope import Floats, SensorScope
 
 VISIBLE_GROUPS = np.ones(mujoco.mjNGROUP, np.uint8)
 VISIBLE_GROUPS[FOOT_GROUP] = 0  # spheres inside of the links' capsules
-VISIBLE_GROUPS[PLANE_GROUP] = (
-    0  # mj_multiRay of MuJoCo 4.0.0 overlooks it where rays leave the box around the obstacles
-)
+# mj_multiRay of MuJoCo 4.0.0 overlooks it where rays leave the box around the obstacles.
+VISIBLE_GROUPS[PLANE_GROUP] = 0
 
 
 class RayBundle:
@@ -24,7 +23,9 @@ class RayBundle:
     They hit everything visible but the link that carries the sensor: the robot sees the rest of its own body.
     """
 
-    def __init__(self, mount: SensorMount, scope: SensorScope, rays_s: Floats, max_lengths: float) -> None:
+    def __init__(
+        self, mount: SensorMount, scope: SensorScope, rays_s: Floats, max_lengths: float
+    ) -> None:
         """Prepare a bundle of rays.
 
         Args:
@@ -71,4 +72,6 @@ class RayBundle:
             self._cutoff_m,
         )
         # MuJoCo returns a negative length for a ray that hits nothing.
-        return np.where(self._lengths < 0, ground_distances, np.minimum(self._lengths, ground_distances))
+        return np.where(
+            self._lengths < 0, ground_distances, np.minimum(self._lengths, ground_distances)
+        )

@@ -52,7 +52,9 @@ class RecordedDepth(SensorModel):
     def read(self, tick: int, timestamp_ns: int) -> DepthImage:
         """Return the image of this time, as if measured now, on the link of the robot file."""
         i = bisect.bisect_right(self._times_ns, timestamp_ns % self._duration_ns) - 1
-        return msgspec.structs.replace(self._images[i], tick=tick, timestamp_ns=timestamp_ns, link=self._link)
+        return msgspec.structs.replace(
+            self._images[i], tick=tick, timestamp_ns=timestamp_ns, link=self._link
+        )
 
 
 def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
@@ -74,7 +76,8 @@ def _read_images(file: str, camera: DepthCamera) -> list[DepthImage]:
         byte_count = path.stat().st_size
         if byte_count > MAX_BYTES:
             raise ConfigError(
-                f"{file}: {byte_count} bytes, at most {MAX_BYTES}; record for a shorter time", code="file/too-large"
+                f"{file}: {byte_count} bytes, at most {MAX_BYTES}; record for a shorter time",
+                code="file/too-large",
             )
         images = [decoder.decode(line).message for line in path.read_bytes().splitlines()]
     except (OSError, msgspec.DecodeError) as error:

@@ -21,7 +21,14 @@ from snakesim_hal.model.plugins import (
 )
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.sensor_model import SensorModel
-from snakesim_hal.model.sensors import AnyMounted, BodySensor, ContactSensor, ImuSensor, PoseSensor, PowerSensor
+from snakesim_hal.model.sensors import (
+    AnyMounted,
+    BodySensor,
+    ContactSensor,
+    ImuSensor,
+    PoseSensor,
+    PowerSensor,
+)
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ColorImage, CustomSample, Message
 from snakesim_sim_backend.sensors.contacts import ContactReader
@@ -59,7 +66,9 @@ def make_body_reader(sensor: BodySensor, scope: BodyScope) -> SensorReader:
         case PoseSensor():
             return PoseReader(scope.data, sensor, draw_normal)
         case PowerSensor():
-            return PowerReader(scope.data, scope.motors, scope.windings, scope.config.robot.joint_table)
+            return PowerReader(
+                scope.data, scope.motors, scope.windings, scope.config.robot.joint_table
+            )
 
 
 def make_sensor_rng(key: str, seed: int) -> np.random.Generator:
@@ -114,7 +123,9 @@ def _find_model(
         model_class = find(SENSORS, sensor.model)
         if model_class is None:
             return None
-        require_base_class(model_class, SensorModel, f"sensor {sensor.name!r}: model {sensor.model!r}")
+        require_base_class(
+            model_class, SensorModel, f"sensor {sensor.name!r}: model {sensor.model!r}"
+        )
     # A sensor with a custom message has a schema, which is checked instead.
     if message is not CustomSample and model_class.message is not message:
         raise ConfigError(

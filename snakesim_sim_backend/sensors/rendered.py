@@ -40,7 +40,9 @@ class RenderedDepth(SensorModel):
         """Return an image from the present place of the link."""
         _, depth_m = self._renderer.draw()
         flat_depth_m = depth_m.ravel().astype(np.float64)
-        return make_depth_image(self._camera, self._renderer.mount, tick, timestamp_ns, flat_depth_m, self._noise)
+        return make_depth_image(
+            self._camera, self._renderer.mount, tick, timestamp_ns, flat_depth_m, self._noise
+        )
 
 
 class RenderedColor(SensorModel):
@@ -57,7 +59,9 @@ class RenderedColor(SensorModel):
         """Return an image from the present place of the link."""
         constant_fields = self._renderer.mount.camera_fields(self._camera)
         rgb, _ = self._renderer.draw()
-        return ColorImage(**constant_fields, tick=tick, timestamp_ns=timestamp_ns, rgb=rgb.tobytes())
+        return ColorImage(
+            **constant_fields, tick=tick, timestamp_ns=timestamp_ns, rgb=rgb.tobytes()
+        )
 
 
 class CameraRenderer:
@@ -80,7 +84,9 @@ class CameraRenderer:
         self._model = model
         self._data = scope.data
         self._focal_px = camera.focal_px
-        self._hidden_geoms = frozenset(np.flatnonzero(model.geom_bodyid == self.mount.body).tolist())
+        self._hidden_geoms = frozenset(
+            np.flatnonzero(model.geom_bodyid == self.mount.body).tolist()
+        )
 
         # Quality of the pictures.
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, camera.width)
@@ -113,7 +119,9 @@ class CameraRenderer:
         """
         self._gl.make_current()
         categories = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._free_camera, categories, self._scene)
+        mujoco.mjv_updateScene(
+            self._model, self._data, self._option, None, self._free_camera, categories, self._scene
+        )
         self._place_cameras()
         self._hide_link()
         mujoco.mjr_render(self._frame, self._scene, self._context)

@@ -28,7 +28,11 @@ class SnapshotThread:
         return self._thread.submit(work).result()
 
     def start_sample(
-        self, read: Callable[[int, int], Message], tick: int, timestamp_ns: int, qpos: NDArray[np.float64]
+        self,
+        read: Callable[[int, int], Message],
+        tick: int,
+        timestamp_ns: int,
+        qpos: NDArray[np.float64],
     ) -> Future[Message]:
         """Begin a sample of the state `qpos`, which is copied. Samples are made in the order of these calls."""
         return self._thread.submit(self._read, read, tick, timestamp_ns, qpos.copy())
@@ -38,7 +42,11 @@ class SnapshotThread:
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _read(
-        self, read: Callable[[int, int], Message], tick: int, timestamp_ns: int, qpos: NDArray[np.float64]
+        self,
+        read: Callable[[int, int], Message],
+        tick: int,
+        timestamp_ns: int,
+        qpos: NDArray[np.float64],
     ) -> Message:
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self.data)

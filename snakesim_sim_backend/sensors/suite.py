@@ -16,7 +16,11 @@ from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.model.build import SimModel
 from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.sensors.joints import JointReader
-from snakesim_sim_backend.sensors.registry import make_body_reader, make_mounted_reader, make_sensor_rng
+from snakesim_sim_backend.sensors.registry import (
+    make_body_reader,
+    make_mounted_reader,
+    make_sensor_rng,
+)
 from snakesim_sim_backend.sensors.scope import BodyScope, SensorReader, SensorScope
 from snakesim_sim_backend.sensors.snapshots import SnapshotThread
 from snakesim_sim_backend.sensors.timing import DelayLine, SamplingSchedule, round_to_ticks
@@ -55,8 +59,12 @@ class SensorSuite:
             ConfigError: A sensor cannot be made.
         """
         sensors = config.robot.sensors
-        scope = BodyScope(config, sim, data, np.random.default_rng(config.seed), motors, physics, windings)
-        self._joints = JointReader(data, sensors.joints, motors, scope.noise.standard_normal, config.period_ns)
+        scope = BodyScope(
+            config, sim, data, np.random.default_rng(config.seed), motors, physics, windings
+        )
+        self._joints = JointReader(
+            data, sensors.joints, motors, scope.noise.standard_normal, config.period_ns
+        )
         self._channels: list[tuple[str, SynchronousSensor | ThreadedSensor]] = []
 
         # Samples that were dropped because they were not ready in time, and how many of them were reported, by key.
@@ -88,7 +96,9 @@ class SensorSuite:
         for key, count in self.dropped_counts.items():
             if count >= max(2 * self._reported[key], 1):
                 self._reported[key] = count
-                lines.append(f"{key}: {count} samples so far were not ready in time, and were dropped")
+                lines.append(
+                    f"{key}: {count} samples so far were not ready in time, and were dropped"
+                )
         return lines
 
     def close(self) -> None:
@@ -96,11 +106,15 @@ class SensorSuite:
         if self._snapshots is not None:
             self._snapshots.close()
 
-    def _make_threaded_sensor(self, key: str, sensor: AnyMounted, scope: SensorScope) -> "ThreadedSensor":
+    def _make_threaded_sensor(
+        self, key: str, sensor: AnyMounted, scope: SensorScope
+    ) -> "ThreadedSensor":
         """Make a sensor whose samples another thread makes. Its reader is made in that thread, too, for OpenGL."""
         snapshots = self._snapshots
         assert snapshots is not None
-        own_scope = SensorScope(scope.config, scope.sim, snapshots.data, make_sensor_rng(key, scope.config.seed))
+        own_scope = SensorScope(
+            scope.config, scope.sim, snapshots.data, make_sensor_rng(key, scope.config.seed)
+        )
         reader = snapshots.run(lambda: make_mounted_reader(key, sensor, own_scope))
         return ThreadedSensor(key, reader, sensor, scope, snapshots, self.dropped_counts)
 
@@ -151,7 +165,9 @@ class ThreadedSensor:
     def sample(self, tick: int, timestamp_ns: int) -> Message | None:
         """Begin a sample if one is due, and return the one that is delivered at this tick."""
         if self._schedule.is_due(timestamp_ns):
-            pending_sample = self._snapshots.start_sample(self._read, tick, timestamp_ns, self._qpos)
+            pending_sample = self._snapshots.start_sample(
+                self._read, tick, timestamp_ns, self._qpos
+            )
             self._waiting.append((tick + self._delay_ticks, pending_sample))
         if not self._waiting:
             return None

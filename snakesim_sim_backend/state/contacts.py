@@ -36,7 +36,9 @@ class ObstacleContactReader:
         self._contact = data.contact
         self._forces = forces
         self._obstacle_of_geom = sim.obstacle_of_geom
-        self._obstacle_geoms = frozenset(i for i, name in enumerate(sim.obstacle_of_geom) if name is not None)
+        self._obstacle_geoms = frozenset(
+            i for i, name in enumerate(sim.obstacle_of_geom) if name is not None
+        )
         self._link_of_geom: list[int] = (sim.model.geom_bodyid - sim.first_link_body).tolist()
 
     def read(self) -> Iterator[ObstacleContact]:
@@ -97,7 +99,9 @@ class ObstacleContactReader:
                 if i in friction_force_w:
                     fx, fy, fz = friction_force_w[i]
                     force_n = math.sqrt(normal_n * normal_n + fx * fx + fy * fy + fz * fz)
-                sums_n[first_geom, second_geom] = sums_n.get((first_geom, second_geom), 0.0) + force_n
+                sums_n[first_geom, second_geom] = (
+                    sums_n.get((first_geom, second_geom), 0.0) + force_n
+                )
         return sums_n
 
     def _find_obstacle_contacts(self, pairs: Sequence[Sequence[int]]) -> list[int]:

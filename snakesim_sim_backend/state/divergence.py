@@ -14,12 +14,13 @@ _log = logging.getLogger("snakesim.sim")
 MAX_POSITION = 1e4  # m or rad: of any coordinate
 MAX_SPEED = 1e3  # m/s or rad/s
 MAX_ACCELERATION = 1e9  # m/s² or rad/s²
-BASE_DOFS = ["the base along x", "the base along y", "the base along z"] + ["the base, turning,"] * 3
+BASE_DOFS = ["the base along x", "the base along y", "the base along z"] + [
+    "the base, turning,"
+] * 3
 # Parts of MuJoCo's state, as plain numbers: the binding would convert an enumeration at every call.
 COMPLETE_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-USER_INPUTS = int(mujoco.mjtState.mjSTATE_USER) & ~int(
-    mujoco.mjtState.mjSTATE_USERDATA
-)  # what the feet store is no input
+# What the feet store is no input.
+USER_INPUTS = int(mujoco.mjtState.mjSTATE_USER) & ~int(mujoco.mjtState.mjSTATE_USERDATA)
 
 
 def log_mujoco_warnings() -> None:

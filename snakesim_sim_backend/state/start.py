@@ -5,7 +5,11 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.kinematics import (
+    compute_link_frames,
+    quaternion_from_yaw,
+    rotation_from_quaternion,
+)
 from snakesim_hal.model.scenario import RunConfig, StartPose, compute_start_pose
 from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.actuators import ModelMotors
@@ -20,11 +24,17 @@ CLEARANCE_M = 0.2  # below the head of a suspended robot
 RAY_START_M = 100.0  # height from which rays look for the ground
 RAYS_PER_LINE = 7  # rays along a link, for each of three across it
 SETTLING_FRICTION = 2.0  # so that the snake stays in place while it comes to rest
-HEAD_DOWN = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]  # quaternion wxyz: a quarter revolution about y
+# Quaternion wxyz: a quarter revolution about y.
+HEAD_DOWN = [math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0]
 
 
 def place_and_settle_robot(
-    sim: SimModel, data: mujoco.MjData, physics: PhysicsStepper, config: RunConfig, motors: ModelMotors, settle_s: float
+    sim: SimModel,
+    data: mujoco.MjData,
+    physics: PhysicsStepper,
+    config: RunConfig,
+    motors: ModelMotors,
+    settle_s: float,
 ) -> None:
     """Place the robot at its start pose, let it come to rest, and set the time to 0 with the motors off.
 
@@ -70,7 +80,9 @@ def place_and_settle_robot(
     physics.reset()
 
 
-def find_highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: RunConfig, pose: StartPose) -> float:
+def find_highest_ground_m(
+    model: mujoco.MjModel, data: mujoco.MjData, config: RunConfig, pose: StartPose
+) -> float:
     """Return the height of the highest ground or step under the robot's outline, found by rays from above.
 
     Args:
@@ -94,12 +106,16 @@ def find_highest_ground_m(model: mujoco.MjModel, data: mujoco.MjData, config: Ru
     down_w = np.array([0.0, 0.0, -1.0])
     hit_geom = np.zeros(1, dtype=np.int32)
     highest_m = -np.inf
-    for origin_w, link_rotation, length_m in zip(origins_w, rotations, robot.link_lengths_m, strict=True):
+    for origin_w, link_rotation, length_m in zip(
+        origins_w, rotations, robot.link_lengths_m, strict=True
+    ):
         for along_m in np.linspace(-radius_m, length_m + radius_m, RAYS_PER_LINE):
             for across_m in (-radius_m, 0.0, radius_m):
                 point_w = origin_w + along_m * link_rotation[:, 0] + across_m * link_rotation[:, 1]
                 point_w[2] = RAY_START_M
-                distance_m = mujoco.mj_ray(model, data, point_w, down_w, ground_groups, 1, -1, hit_geom)
+                distance_m = mujoco.mj_ray(
+                    model, data, point_w, down_w, ground_groups, 1, -1, hit_geom
+                )
                 highest_m = max(highest_m, RAY_START_M - distance_m)
     return float(highest_m)
 

@@ -49,14 +49,20 @@ def register_driver_mutant(*clauses: str, declares_watchdog: bool = True) -> Cal
 
             @classmethod
             def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
-                def open_drives(port: str, joint_indices: Sequence[int], readings: DriveReadings) -> MinimalDrives:
+                def open_drives(
+                    port: str, joint_indices: Sequence[int], readings: DriveReadings
+                ) -> MinimalDrives:
                     assert context.body is not None
                     clock_ns = context.clock.now_ns
                     emulator = emulator_type(context.body, clock_ns, context.settings.watchdog_s)
                     joints = [context.joints[j] for j in joint_indices]
-                    return drives_type(emulator, joints, readings, clock_ns, context.config.period_ns)
+                    return drives_type(
+                        emulator, joints, readings, clock_ns, context.config.period_ns
+                    )
 
-                return make_bus_specs_by_port(context.joints, context.settings, ["memory"], open_drives)
+                return make_bus_specs_by_port(
+                    context.joints, context.settings, ["memory"], open_drives
+                )
 
         DRIVER_MUTANTS.append(
             Mutant(
@@ -148,7 +154,9 @@ class AnswersForSilentDrives(MinimalDrives):
     def read(self) -> None:
         super().read()
         for i in self.all_drives:
-            self.readings.set_motion(i, float(self.readings.angle_rad[i]), float(self.readings.velocity_rad_s[i]))
+            self.readings.set_motion(
+                i, float(self.readings.angle_rad[i]), float(self.readings.velocity_rad_s[i])
+            )
             self.readings.set_torque(i, float(self.readings.torque_nm[i]))
 
 
@@ -185,7 +193,11 @@ class ForgetsTheSecondDrive(MinimalDrives):
 
     def findings(self) -> list[FaultFinding]:
         findings = super().findings()
-        return [finding for finding in findings if not (self.is_forgotten and finding.what == "duplicate_node")]
+        return [
+            finding
+            for finding in findings
+            if not (self.is_forgotten and finding.what == "duplicate_node")
+        ]
 
 
 @register_driver_mutant(BUS_LOST)

@@ -43,6 +43,7 @@ class FirmwareDrives:
         known_count = len(TIME_PATTERN.findall(self._child.read_output()))
         self._child.write_line(f"advance {seconds:g}")
         wait_until(
-            lambda: len(TIME_PATTERN.findall(self._child.read_output())) > known_count, "the time of the modules"
+            lambda: len(TIME_PATTERN.findall(self._child.read_output())) > known_count,
+            "the time of the modules",
         )
         return float(TIME_PATTERN.findall(self._child.read_output())[-1])

@@ -17,7 +17,12 @@ from snakesim_drivers.kit.holding_brakes import HoldingBrakes
 from snakesim_drivers.kit.limit_switches import LimitSwitches
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.kit.start_up import StartUp, StartUpStep, StepFailedError
-from snakesim_drivers.template.minimal_driver import MinimalBackend, MinimalDrives, MinimalEmulator, Report
+from snakesim_drivers.template.minimal_driver import (
+    MinimalBackend,
+    MinimalDrives,
+    MinimalEmulator,
+    Report,
+)
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
@@ -77,7 +82,13 @@ class HomingEmulator(MinimalEmulator):
         if self.is_cut or self.body.is_silent(i):
             return None
         failed = i in self.without_index and self.extras[i].homing_until_us is None
-        return HomingInputs(self.extras[i].homed, failed, i in self.torque_off, i in self.at_lower, i in self.at_upper)
+        return HomingInputs(
+            self.extras[i].homed,
+            failed,
+            i in self.torque_off,
+            i in self.at_lower,
+            i in self.at_upper,
+        )
 
     def request_reports(self, i: int) -> list[Report]:
         reports = super().request_reports(i)
@@ -85,7 +96,9 @@ class HomingEmulator(MinimalEmulator):
             return reports
         return [report._replace(angle_rad=0.0) for report in reports]
 
-    def handle_extra(self, i: int, message: Literal["home", "stop_homing", "open_brake", "close_brake"]) -> None:
+    def handle_extra(
+        self, i: int, message: Literal["home", "stop_homing", "open_brake", "close_brake"]
+    ) -> None:
         """Carry out a message about homing or the brake, which a minimal drive does not have.
 
         Args:
@@ -131,7 +144,9 @@ class HomingEmulator(MinimalEmulator):
             joint = self.body.joints[i]
             damping = joint.motor.velocity_gain_nm_s_per_rad / joint.drive.gear**2
             limit_nm = joint.limits.torque_nm / joint.drive.gear
-            self.body.drive_motor(i, JointMode.VELOCITY, HOMING_RAD_S, limit_nm, 0.0, damping, HOMING_RAD_S)
+            self.body.drive_motor(
+                i, JointMode.VELOCITY, HOMING_RAD_S, limit_nm, 0.0, damping, HOMING_RAD_S
+            )
             return
         super()._drive_motor(i)
 
@@ -162,7 +177,9 @@ class HomingDrives(MinimalDrives):
         super().__init__(emulator, joints, readings, clock_ns, period_ns)
         self.inputs: list[HomingInputs | None] = [None] * len(joints)
         self.switches = LimitSwitches(self.labels)
-        self.brakes = HoldingBrakes(len(joints), release_s=RELEASE_S, engage_s=ENGAGE_S, clock_ns=clock_ns)
+        self.brakes = HoldingBrakes(
+            len(joints), release_s=RELEASE_S, engage_s=ENGAGE_S, clock_ns=clock_ns
+        )
         homing = StartUpStep(
             "homing",
             timeout_s=settings.homing_s + HOMING_MARGIN_S,
@@ -171,7 +188,9 @@ class HomingDrives(MinimalDrives):
             abort=lambda i: emulator.handle_extra(i, "stop_homing"),
             moves_joint=True,
         )
-        self.homing = StartUp(self.labels, readings, clock_ns, steps=[homing], may_move=settings.home_at_start)
+        self.homing = StartUp(
+            self.labels, readings, clock_ns, steps=[homing], may_move=settings.home_at_start
+        )
         self.start_up: StartUp | None = self.homing
 
     def is_homed(self, i: int) -> bool:
@@ -219,13 +238,17 @@ class HomingBackend(MinimalBackend):
 
     @classmethod
     def plan_buses(cls, context: DriverTypeContext) -> list[BusSpec]:
-        def open_drives(port: str, joint_indices: Sequence[int], readings: DriveReadings) -> HomingDrives:
+        def open_drives(
+            port: str, joint_indices: Sequence[int], readings: DriveReadings
+        ) -> HomingDrives:
             assert context.body is not None
             joints = [context.joints[j] for j in joint_indices]
             clock_ns = context.clock.now_ns
             emulator = HomingEmulator(context.body, clock_ns, context.settings.watchdog_s)
             period_ns = context.config.period_ns
             emulator.homing_us = context.settings.homing_s * 1e6
-            return HomingDrives(emulator, joints, readings, clock_ns, period_ns, settings=context.settings)
+            return HomingDrives(
+                emulator, joints, readings, clock_ns, period_ns, settings=context.settings
+            )
 
         return make_bus_specs_by_port(context.joints, context.settings, ["memory"], open_drives)

@@ -17,7 +17,14 @@ from msgspec.structs import replace
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Fault, JointMode, JointState, RangeScan, RobotDescription, SensorDescription
+from snakesim_hal.wire.messages import (
+    Fault,
+    JointMode,
+    JointState,
+    RangeScan,
+    RobotDescription,
+    SensorDescription,
+)
 from snakesim_testing.benches.driver_mutants import DRIVER_MUTANTS
 from snakesim_testing.benches.mutant import Mutant, make_test_names
 from snakesim_testing.benches.workbench import DrivesWorkbench, Workbench, WorkbenchDrives, mute
@@ -63,7 +70,11 @@ def register_mutant(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
     """
 
     def register(broken: Any) -> Any:
-        backend = type(broken.__name__, (FaultyWorkbench,), {lie: staticmethod(broken)}) if lie else broken
+        backend = (
+            type(broken.__name__, (FaultyWorkbench,), {lie: staticmethod(broken)})
+            if lie
+            else broken
+        )
         MUTANTS.append(
             Mutant(
                 name=backend.__name__,
@@ -78,7 +89,9 @@ def register_mutant(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
     return register
 
 
-describes, reads, alters = (partial(register_mutant, lie=lie) for lie in ("describes", "reads", "alters"))
+describes, reads, alters = (
+    partial(register_mutant, lie=lie) for lie in ("describes", "reads", "alters")
+)
 
 
 # --- the description -------------------------------------------------------------------------------------------
@@ -86,7 +99,9 @@ describes, reads, alters = (partial(register_mutant, lie=lie) for lie in ("descr
 
 def listing(robot: RobotDescription, key: str, rate_hz: float = 50.0) -> RobotDescription:
     """Return a description that lists one more sensor."""
-    return replace(robot, sensors=[*robot.sensors, SensorDescription(key=key, rate_hz=rate_hz, delay_s=0.0)])
+    return replace(
+        robot, sensors=[*robot.sensors, SensorDescription(key=key, rate_hz=rate_hz, delay_s=0.0)]
+    )
 
 
 @describes("the_description_matches_the_robot_file")
@@ -96,7 +111,9 @@ def named_from_the_head(robot):
 
 @describes("the_description_matches_the_robot_file")
 def limits_in_degrees(robot):
-    return replace(robot, joints=[replace(j, angle_max_rad=np.degrees(j.angle_max_rad)) for j in robot.joints])
+    return replace(
+        robot, joints=[replace(j, angle_max_rad=np.degrees(j.angle_max_rad)) for j in robot.joints]
+    )
 
 
 @describes("the_layout_is_the_hash_of_the_joints")
@@ -125,7 +142,9 @@ class NoisyDescription(Workbench):
 
     def describe(self):
         self.calls += 1
-        return replace(self.description, max_step_rad=self.description.max_step_rad + 0.001 * self.calls)
+        return replace(
+            self.description, max_step_rad=self.description.max_step_rad + 0.001 * self.calls
+        )
 
 
 # --- samples ---------------------------------------------------------------------------------------------------
@@ -149,7 +168,9 @@ def absurd_torque(joints):
 @register_mutant("every_joint_is_valid_and_fresh_at_every_tick")
 class ReadsEveryThirdTick(FaultyWorkbench):
     def reads(self, joints):
-        return replace(joints, age_ns=[joints.tick % 3 * self.description.period_ns] * len(joints.age_ns))
+        return replace(
+            joints, age_ns=[joints.tick % 3 * self.description.period_ns] * len(joints.age_ns)
+        )
 
 
 @reads("what_is_not_known_yet_is_not_reported_as_valid")
@@ -229,7 +250,9 @@ class SaysTheFurthestForNothing(WithSonar):
 
 def let_go(points: SafeSetpoints) -> SafeSetpoints:
     """Return the setpoints with all joints passive."""
-    return dataclasses.replace(points, mode=[JointMode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode))
+    return dataclasses.replace(
+        points, mode=[JointMode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode)
+    )
 
 
 @alters("position_mode_turns_only_the_requested_joint")
@@ -242,12 +265,17 @@ def head_to_tail(points):
     return SafeSetpoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
 
 
-@alters("position_mode_turns_only_the_requested_joint", "torque_mode_pushes_with_the_torque_that_is_asked")
+@alters(
+    "position_mode_turns_only_the_requested_joint",
+    "torque_mode_pushes_with_the_torque_that_is_asked",
+)
 def wrong_way_round(points):
     return dataclasses.replace(points, target=[-target for target in points.target])
 
 
-@alters("velocity_mode_turns_at_the_speed_that_is_asked", "joints_may_be_in_different_modes_at_once")
+@alters(
+    "velocity_mode_turns_at_the_speed_that_is_asked", "joints_may_be_in_different_modes_at_once"
+)
 def speed_in_turns(points):
     scale = [0.16 if mode == JointMode.VELOCITY else 1.0 for mode in points.mode]
     return dataclasses.replace(points, target=np.multiply(points.target, scale).tolist())
@@ -260,7 +288,9 @@ def one_mode_for_all(points):
 
 @alters("an_isolated_joint_is_passive_while_others_continue")
 def holds_what_is_lost(points):
-    held = [JointMode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)]
+    held = [
+        JointMode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)
+    ]
     target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
     return SafeSetpoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
 
@@ -276,30 +306,45 @@ class TakesNothingBack(FaultyWorkbench):
 
     def alters(self, points):
         self.lost |= points.isolated
-        modes = [JointMode.PASSIVE if i in self.lost else mode for i, mode in enumerate(points.mode)]
+        modes = [
+            JointMode.PASSIVE if i in self.lost else mode for i, mode in enumerate(points.mode)
+        ]
         return dataclasses.replace(points, mode=modes)
 
 
-@reads("the_reported_velocity_is_the_change_of_the_reported_angle", "velocity_mode_turns_at_the_speed_that_is_asked")
+@reads(
+    "the_reported_velocity_is_the_change_of_the_reported_angle",
+    "velocity_mode_turns_at_the_speed_that_is_asked",
+)
 def no_speedometer(joints):
     return replace(joints, velocity_rad_s=[0.0] * len(joints.velocity_rad_s))
 
 
 @reads("the_reported_velocity_is_the_change_of_the_reported_angle")
 def angle_in_degrees(joints):
-    return replace(joints, velocity_rad_s=[float(np.degrees(speed)) for speed in joints.velocity_rad_s])
+    return replace(
+        joints, velocity_rad_s=[float(np.degrees(speed)) for speed in joints.velocity_rad_s]
+    )
 
 
-@reads("torque_mode_pushes_with_the_torque_that_is_asked", "the_torque_limit_of_the_setpoints_is_kept")
+@reads(
+    "torque_mode_pushes_with_the_torque_that_is_asked", "the_torque_limit_of_the_setpoints_is_kept"
+)
 def no_torque_sensor(joints):
     return replace(joints, torque_nm=[0.0] * len(joints.torque_nm))
 
 
-@register_mutant("a_passive_joint_has_no_torque_and_stays", "nothing_moves_while_disarmed_whatever_is_commanded")
+@register_mutant(
+    "a_passive_joint_has_no_torque_and_stays", "nothing_moves_while_disarmed_whatever_is_commanded"
+)
 class PassiveGoesToZero(Workbench):
     def step(self):
         passive = self.mode == JointMode.PASSIVE
-        self.mode[passive], self.target[passive], self.limit[passive] = int(JointMode.POSITION), 0.0, 4.0
+        self.mode[passive], self.target[passive], self.limit[passive] = (
+            int(JointMode.POSITION),
+            0.0,
+            4.0,
+        )
         super().step()
 
 
@@ -307,7 +352,11 @@ class PassiveGoesToZero(Workbench):
 class PassivePushes(Workbench):
     def step(self):
         passive = self.mode == JointMode.PASSIVE
-        self.mode[passive], self.target[passive], self.limit[passive] = int(JointMode.TORQUE), 0.3, 4.0
+        self.mode[passive], self.target[passive], self.limit[passive] = (
+            int(JointMode.TORQUE),
+            0.3,
+            4.0,
+        )
         super().step()
 
 
@@ -336,7 +385,9 @@ class MovesAfterAll(FaultyWorkbench):
     """Has no torque mode, and moves without a setpoint."""
 
     def describes(self, robot):
-        first = replace(robot.joints[0], modes=[JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY])
+        first = replace(
+            robot.joints[0], modes=[JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY]
+        )
         return replace(robot, joints=[first, *robot.joints[1:]])
 
     def enact(self, setpoints, lifecycle):
@@ -354,14 +405,19 @@ def ignores_torque_limit(points):
 
 @alters("a_torque_limit_of_zero_lets_nothing_move")
 def zero_is_no_limit(points):
-    return dataclasses.replace(points, torque_limit_nm=[limit or 4.0 for limit in points.torque_limit_nm])
+    return dataclasses.replace(
+        points, torque_limit_nm=[limit or 4.0 for limit in points.torque_limit_nm]
+    )
 
 
 @register_mutant("no_joint_goes_beyond_its_limits")
 class NoStops(Workbench):
     def __init__(self, config, settings):
         super().__init__(config, settings)
-        self.lower_rad, self.upper_rad = np.full_like(self.angle, -3.0), np.full_like(self.angle, 3.0)
+        self.lower_rad, self.upper_rad = (
+            np.full_like(self.angle, -3.0),
+            np.full_like(self.angle, 3.0),
+        )
 
 
 @register_mutant("a_mode_switch_makes_no_jump")
@@ -527,7 +583,9 @@ class KeepsItsBus(Workbench):
 
 @reads("in_lockstep_same_seed_and_commands_give_same_samples")
 def own_dice(joints):
-    return replace(joints, torque_nm=[torque + random.gauss(0, 1e-4) for torque in joints.torque_nm])
+    return replace(
+        joints, torque_nm=[torque + random.gauss(0, 1e-4) for torque in joints.torque_nm]
+    )
 
 
 @register_mutant("a_simulator_stands_still_on_request_and_a_robot_refuses")
@@ -556,7 +614,10 @@ def pytest_snakesim_benches() -> list[Bench]:
     """Every mutant on a bench of its own."""
     return [
         Bench(
-            mutant.name, mutant.backend, mute_joint=mutant.mute_joint, make_emulated_drives=mutant.make_emulated_drives
+            mutant.name,
+            mutant.backend,
+            mute_joint=mutant.mute_joint,
+            make_emulated_drives=mutant.make_emulated_drives,
         )
         for mutant in MUTANTS
     ]

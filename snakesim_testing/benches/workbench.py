@@ -67,7 +67,10 @@ class DrivesWorkbench(Workbench):
                 self.enabled = self.still_brakes()
             case _:
                 self.enabled[:] = False
-        modes = [mode if on else JointMode.PASSIVE for mode, on in zip(setpoints.mode, self.enabled, strict=True)]
+        modes = [
+            mode if on else JointMode.PASSIVE
+            for mode, on in zip(setpoints.mode, self.enabled, strict=True)
+        ]
         super().enact(dataclasses.replace(setpoints, mode=modes), lifecycle)
 
     def may_be_enabled(self) -> Any:
@@ -84,8 +87,15 @@ class DrivesWorkbench(Workbench):
     def faults(self) -> list[Fault]:
         fresh = self.tripped & ~self.reported
         self.reported |= fresh
-        names = [joint.name for joint, is_fresh in zip(self.description.joints, fresh, strict=True) if is_fresh]
-        return [Fault(tick=0, what="drive_fault", cause=f"{name}: its watchdog", joint=name) for name in names]
+        names = [
+            joint.name
+            for joint, is_fresh in zip(self.description.joints, fresh, strict=True)
+            if is_fresh
+        ]
+        return [
+            Fault(tick=0, what="drive_fault", cause=f"{name}: its watchdog", joint=name)
+            for name in names
+        ]
 
 
 class WorkbenchDrives:
@@ -198,9 +208,12 @@ class BusWorkbench(DrivesWorkbench):
             self.armed_periods += 1
         else:
             self.armed_periods = 0
-        wake_up_periods = self.WAKE_UP_PERIODS + np.arange(len(self.angle))  # periods, of every joint
+        # Periods, of every joint.
+        wake_up_periods = self.WAKE_UP_PERIODS + np.arange(len(self.angle))
         super().enact(self.setpoints_on_bus, self.lifecycle)
-        self.mode = np.where(self.armed_periods < wake_up_periods, int(JointMode.PASSIVE), self.mode)
+        self.mode = np.where(
+            self.armed_periods < wake_up_periods, int(JointMode.PASSIVE), self.mode
+        )
         self.limit = np.round(self.limit, TORQUE_LIMIT_DECIMALS)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:

@@ -24,7 +24,9 @@ JOINTS = 4
 
 def config(joint_count: int = JOINTS, **dotted: Any) -> RunConfig:
     """So many joints at 100 Hz, without an obstacle."""
-    return make_run_config(**{"backend": "can", "robot__chain__modules": joint_count, "rate_hz": 100, **dotted})
+    return make_run_config(
+        **{"backend": "can", "robot__chain__modules": joint_count, "rate_hz": 100, **dotted}
+    )
 
 
 @dataclass
@@ -38,7 +40,8 @@ class DriverLoop:
     samples: list[Samples] = field(default_factory=list[Samples])
     faults: list[Fault] = field(default_factory=list[Fault])
     wanted: SafeSetpoints | None = None
-    true_speed_rad_s: list[float] = field(default_factory=list[float])  # of the fastest joint, at every tick
+    # Of the fastest joint, at every tick.
+    true_speed_rad_s: list[float] = field(default_factory=list[float])
 
     def run(self, ticks: int, wish: Callable[[int], SafeSetpoints] | None = None) -> None:
         """So many periods; a fault takes the robot out of `armed`, as the authority does."""
@@ -95,7 +98,9 @@ def chain_of(backend: CanBackend) -> ModuleChain:
 def loop(run: RunConfig | None = None, **settings: Any) -> Iterator[DriverLoop]:
     """Open, and close at the end."""
     run = run or config()
-    backend = CanBackend(run, CanSettings(physics_model=settings.pop("physics_model", "inertia"), **settings))
+    backend = CanBackend(
+        run, CanSettings(physics_model=settings.pop("physics_model", "inertia"), **settings)
+    )
     try:
         yield DriverLoop(backend, run)
     finally:

@@ -45,7 +45,9 @@ class Answer:
         """Return whether two answers are the same, to the bit on the bus and to rounding in the demand."""
         own_demand = (self.target, self.torque_limit_nm)
         other_demand = (other.target, other.torque_limit_nm)
-        is_same_demand = all(abs(a - b) <= DEMAND_TOLERANCE for a, b in zip(own_demand, other_demand, strict=True))
+        is_same_demand = all(
+            abs(a - b) <= DEMAND_TOLERANCE for a, b in zip(own_demand, other_demand, strict=True)
+        )
         return is_same_demand and self._exact() == other._exact()
 
     def _exact(self) -> tuple[object, ...]:
@@ -66,7 +68,12 @@ class Answer:
 def run_reference(program: Path, events: Sequence[str]) -> list[Answer]:
     """Return the answers of the reference firmware, in order."""
     completed = subprocess.run(
-        [str(program)], input="\n".join(events) + "\n", capture_output=True, text=True, timeout=60, check=False
+        [str(program)],
+        input="\n".join(events) + "\n",
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert completed.returncode == 0, completed.stderr
     answering_events = [event for event in events if event.startswith(("frame", "poll"))]
@@ -76,7 +83,9 @@ def run_reference(program: Path, events: Sequence[str]) -> list[Answer]:
 
 def _parse_answer(event: str, line: str) -> Answer:
     frames, _, rest = line.partition("|")
-    state, faults, last_stop, mode, target, limit, rejected, dropped, _bridge, _flash, due_us = rest.split()
+    state, faults, last_stop, mode, target, limit, rejected, dropped, _bridge, _flash, due_us = (
+        rest.split()
+    )
     assert dropped == "0", f"the outbox was full: {line}"
     return Answer(
         tuple(frames.split()),
@@ -139,7 +148,9 @@ class EmulatedReplay:
         health.board_c = values[8] / 10
         health.leak = bool(values[9])
         gyro = [_clamp(Opcode.GYRO, "rate_x", value) for value in values[24:27]]
-        acceleration = [_clamp(Opcode.ACCELEROMETER, "acceleration_x", value) for value in values[27:30]]
+        acceleration = [
+            _clamp(Opcode.ACCELEROMETER, "acceleration_x", value) for value in values[27:30]
+        ]
         self._readings = ModuleReadings(
             _clamp(Opcode.JOINT_STATE, "angle", values[1]),
             _clamp(Opcode.JOINT_STATE, "velocity", values[2]),
@@ -251,7 +262,9 @@ def shrink_difference(program: Path, difference: Difference) -> Difference:
     return _remove_parts(difference, differs)
 
 
-def _remove_parts(difference: Difference, differs: Callable[[list[str]], Difference | None]) -> Difference:
+def _remove_parts(
+    difference: Difference, differs: Callable[[list[str]], Difference | None]
+) -> Difference:
     part = len(difference.events) // 2
     while part >= 1:
         start = 1  # after `init`

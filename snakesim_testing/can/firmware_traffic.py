@@ -45,10 +45,12 @@ class Traffic:
         self._setpoint_count = 0
         self._sync_count = 0
 
-    def make(self, event_count: int) -> list[str]:
+    def generate_events(self, event_count: int) -> list[str]:
         """Return at least this many events."""
         rated_nm = self._random.choice((0.5, 4.0, 32.5))
-        self._append(f"init {NODE} {self._random.getrandbits(32)} {rated_nm} 6.25 800 1050 18000 {START_US}")
+        self._append(
+            f"init {NODE} {self._random.getrandbits(32)} {rated_nm} 6.25 800 1050 18000 {START_US}"
+        )
         self._set_sensors()
         scenes: list[tuple[int, Callable[[], None]]] = [
             (10, self._run_periods),
@@ -93,16 +95,22 @@ class Traffic:
         """Setpoints, commands and others with one error each."""
         self._command(CommandAction.ARM)
         for _ in range(self._random.randrange(1, 12)):
-            frame = self._random.choice((self._make_setpoint, self._make_command, self._make_parameter_request))()
+            frame = self._random.choice(
+                (self._make_setpoint, self._make_command, self._make_parameter_request)
+            )()
             self._send(self._break_frame(frame))
             if self._random.random() < 0.3:
                 self._sync()
 
     def _send_random_frames(self) -> None:
         for _ in range(self._random.randrange(1, 20)):
-            identifier = self._random.choice((self._random.randrange(0x800), self._random.randrange(0x10000)))
+            identifier = self._random.choice(
+                (self._random.randrange(0x800), self._random.randrange(0x10000))
+            )
             if self._random.random() < 0.5:
-                identifier = frame_id(self._random.choice(list(Opcode)), self._random.choice((0, NODE)))
+                identifier = frame_id(
+                    self._random.choice(list(Opcode)), self._random.choice((0, NODE))
+                )
             data = self._random.randbytes(self._random.randrange(9))
             self._send(CanFrame(identifier, data))
 
@@ -153,7 +161,9 @@ class Traffic:
         self._command(CommandAction.REBOOT)
         for _ in range(self._random.randrange(1, 6)):
             self._pause()
-            self._send(self._random.choice((self._make_setpoint, self._make_command, make_emergency))())
+            self._send(
+                self._random.choice((self._make_setpoint, self._make_command, make_emergency))()
+            )
         self._pause(100_000)
 
     def _be_silent(self) -> None:
@@ -195,7 +205,9 @@ class Traffic:
             self._random.randrange(-200, 200) if speed_mrad_s is None else speed_mrad_s,
             self._random.randrange(-40_000, 40_000),  # torque
             choose((0, 1)),  # derated
-            choose((0, 17_999, 18_000)) if broken == "voltage" or is_several else choose((18_000, 24_017, 70_000)),
+            choose((0, 17_999, 18_000))
+            if broken == "voltage" or is_several
+            else choose((18_000, 24_017, 70_000)),
             self._random.randrange(-40_000, 40_000),  # current
             self._choose_winding_tenths_c(broken),
             choose((-500, 213, 2152)),  # board
@@ -203,7 +215,8 @@ class Traffic:
         ]
         values.append(100 * values[9])  # water, in percent
         values += [*self._make_contact(), *self._make_contact()]
-        values += [choose((0, 1)), *(self._random.randrange(-40_000, 40_000) for _ in range(6))]  # IMU
+        # IMU.
+        values += [choose((0, 1)), *(self._random.randrange(-40_000, 40_000) for _ in range(6))]
         values += [choose((0, 1)), self._random.randrange(-40_000, 40_000)]  # shaft load
         self._append("sensors " + " ".join(str(value) for value in values))
 
@@ -218,7 +231,12 @@ class Traffic:
 
     def _make_contact(self) -> list[int]:
         forces = [self._random.randrange(-5_000, 5_000) for _ in range(3)]
-        return [self._random.choice((0, 1)), *forces, self._random.randrange(-700, 700), self._random.randrange(256)]
+        return [
+            self._random.choice((0, 1)),
+            *forces,
+            self._random.randrange(-700, 700),
+            self._random.randrange(256),
+        ]
 
     # --- frames -------------------------------------------------------------------------------------------------
 
@@ -244,7 +262,9 @@ class Traffic:
         )
         operation = self._random.choice((*ParameterOperation, ParameterOperation.WRITE, 3, 15))
         value = self._choose_value(index)
-        return CanFrame(frame_id(Opcode.PARAMETER_REQUEST, NODE), struct.pack("<BBf", index, operation, value))
+        return CanFrame(
+            frame_id(Opcode.PARAMETER_REQUEST, NODE), struct.pack("<BBf", index, operation, value)
+        )
 
     def _choose_value(self, index: int) -> float:
         """A value within the range of a parameter, at its ends, beyond them, or no number."""
@@ -252,12 +272,17 @@ class Traffic:
             return self._random.choice(BOUNDARY_VALUES + NOT_FINITE)
         if index == ModuleParameter.WATCHDOG and self._random.random() < 0.5:
             return self._random.choice(WATCHDOGS_S)
-        if index in (ModuleParameter.CONTACT_EVERY, ModuleParameter.IMU_EVERY) and self._random.random() < 0.7:
+        if (
+            index in (ModuleParameter.CONTACT_EVERY, ModuleParameter.IMU_EVERY)
+            and self._random.random() < 0.7
+        ):
             return self._random.choice(REPORT_PERIODS)
         allowed = PARAMETERS[ModuleParameter(index)]
         bound = self._random.choice((allowed.low, allowed.high))
         within = self._random.uniform(allowed.low, allowed.high)
-        return self._random.choice((bound, bound * (1 + 5e-7), bound * 1.00001, within, float(round(within))))
+        return self._random.choice(
+            (bound, bound * (1 + 5e-7), bound * 1.00001, within, float(round(within)))
+        )
 
     def _break_frame(self, frame: CanFrame) -> CanFrame:
         """Return a frame with a changed bit, another length, or another id."""

@@ -10,14 +10,20 @@ from snakesim_can_backend.protocol.definitions import CanFrame, ModuleState, Opc
 
 def joint_state(node_id: int, count: int, angle: float = 0.1, **other: float) -> CanFrame:
     values: dict[str, float] = {"state": ModuleState.DISARMED, **other}
-    return load_layouts()[Opcode.JOINT_STATE].encode(node_id, angle=angle, count=count % 16, **values)
+    return load_layouts()[Opcode.JOINT_STATE].encode(
+        node_id, angle=angle, count=count % 16, **values
+    )
 
 
-def heartbeat(node_id: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **other: float) -> CanFrame:
+def heartbeat(
+    node_id: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **other: float
+) -> CanFrame:
     return load_layouts()[Opcode.HEARTBEAT].encode(node_id, uptime=uptime_s, state=state, **other)
 
 
-def contact(node_id: int, count: int, *, tail: bool = False, touched: bool = True, **other: float) -> CanFrame:
+def contact(
+    node_id: int, count: int, *, tail: bool = False, touched: bool = True, **other: float
+) -> CanFrame:
     layout = load_layouts()[Opcode.TAIL_CONTACT if tail else Opcode.CONTACT]
     return layout.encode(node_id, count=count % 16, touched=touched, **other)
 
@@ -27,7 +33,9 @@ def gyro(node_id: int, count: int, rate_x: float) -> CanFrame:
 
 
 def accelerometer(node_id: int, count: int, acceleration_z: float) -> CanFrame:
-    return load_layouts()[Opcode.ACCELEROMETER].encode(node_id, acceleration_z=acceleration_z, count=count % 256)
+    return load_layouts()[Opcode.ACCELEROMETER].encode(
+        node_id, acceleration_z=acceleration_z, count=count % 256
+    )
 
 
 def health(node_id: int, **values: float) -> CanFrame:
@@ -56,7 +64,9 @@ def answer(reading: ModuleReports, nodes: Iterable[int] | None = None, **values:
         reading.process_frame(joint_state(node, reading.sync, **values))
 
 
-def syncs(reading: ModuleReports, count: int, nodes: Iterable[int] | None = None, **values: Any) -> None:
+def syncs(
+    reading: ModuleReports, count: int, nodes: Iterable[int] | None = None, **values: Any
+) -> None:
     """So many Syncs, answered by these nodes."""
     nodes = None if nodes is None else list(nodes)
     for _ in range(count):

@@ -104,13 +104,15 @@ class BusListener:
                 return self.received
             number, length, content = FRAME.unpack(data)
             seconds, nanoseconds = struct.unpack("=qq", extra[0][2])
-            self.received.append(ReceivedFrame(seconds * 10**9 + nanoseconds, CanFrame(number, content[:length])))
+            self.received.append(
+                ReceivedFrame(seconds * 10**9 + nanoseconds, CanFrame(number, content[:length]))
+            )
 
     def forget(self) -> None:
         self.listen()
         self.received = []
 
-    def of(self, opcode: Opcode) -> list[ReceivedFrame]:
+    def read_frames_of(self, opcode: Opcode) -> list[ReceivedFrame]:
         return [frame for frame in self.listen() if frame.opcode == opcode]
 
     def states(self) -> list[ModuleState]:
@@ -148,12 +150,19 @@ class RobotOnBus:
         return process
 
     def modules(self) -> None:
-        self.start("modules", "snakesim_can_backend.emulator.command", self._saved, "--pose", "none")
+        self.start(
+            "modules", "snakesim_can_backend.emulator.command", self._saved, "--pose", "none"
+        )
         self.until(lambda: "modules ready" in self.read_log("modules"), "modules ready")
 
     def control(self) -> subprocess.Popen[bytes]:
         return self.start(
-            "control", "snakesim_hal.programs.service_program", "control", self._saved, "--endpoint", self.endpoint
+            "control",
+            "snakesim_hal.programs.service_program",
+            "control",
+            self._saved,
+            "--endpoint",
+            self.endpoint,
         )
 
     @property
@@ -167,35 +176,41 @@ class RobotOnBus:
     def read_log(self, name: str) -> str:
         return (self.folder / f"{name}.log").read_text()
 
-    def until(self, condition: Callable[[], bool], what: str, limit_s: float = START_LIMIT_S) -> None:
+    def until(
+        self, condition: Callable[[], bool], what: str, limit_s: float = START_LIMIT_S
+    ) -> None:
         try:
             wait_until(condition, what, limit_s)
         except AssertionError as error:
             logs = "\n".join(f"{log.name}: {log.read_text()}" for log in self.folder.glob("*.log"))
             raise AssertionError(f"{error}\n{logs}") from None
 
-    def tell(self, *arguments: str) -> CompletedRun:
+    def run_command(self, *arguments: str) -> CompletedRun:
         """Run one of the operator's tools with the endpoint of the robot."""
         return snakesim(*arguments, "--endpoint", self.endpoint, cwd=self.folder)
 
     def _is_armed(self) -> bool:
         """Once what there is has been cleared."""
-        if self.tell("robot", "arm", self.config.robot.name, self.config.backend).code == 0:
+        if self.run_command("robot", "arm", self.config.robot.name, self.config.backend).code == 0:
             return True
-        print(self.tell("robot", "reset").printed)
+        print(self.run_command("robot", "reset").printed)
         return False
 
     def arm(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
         """Start modules, host and control, and wait until every module is armed. Returns the latter two processes."""
         self.modules()
         host = self.start("host", "snakesim_hal.programs.host_program", *self.host_arguments)
-        self.until(lambda: len(self.listener.of(Opcode.SYNC)) > 20, "the driver's Syncs")
+        self.until(
+            lambda: len(self.listener.read_frames_of(Opcode.SYNC)) > 20, "the driver's Syncs"
+        )
         control = self.control()
         self.until(self._is_armed, "ready to arm")
         self.listener.forget()
         armed = [ModuleState.ARMED] * JOINTS
         self.until(lambda: self.listener.states() == armed, "every module armed")
-        self.until(lambda: len(self.listener.of(Opcode.SET_POINT)) > 10 * JOINTS, "setpoints")
+        self.until(
+            lambda: len(self.listener.read_frames_of(Opcode.SET_POINT)) > 10 * JOINTS, "setpoints"
+        )
         return host, control
 
 
@@ -209,26 +224,42 @@ def bench(folder: Path, channel: str) -> Iterator[RobotOnBus]:
 
 
 def stop_commands(received: Sequence[ReceivedFrame]) -> list[ReceivedFrame]:
-    return [h for h in received if h.opcode == Opcode.COMMAND and h.decode()["action"] == CommandAction.STOP]
+    return [
+        h
+        for h in received
+        if h.opcode == Opcode.COMMAND and h.decode()["action"] == CommandAction.STOP
+    ]
 
 
-def first_in(received: Sequence[ReceivedFrame], states: set[ModuleState], since_ns: int) -> dict[int, ReceivedFrame]:
+def first_in(
+    received: Sequence[ReceivedFrame], states: set[ModuleState], since_ns: int
+) -> dict[int, ReceivedFrame]:
     """Each module's first frame after a time that reports one of these states."""
     first: dict[int, ReceivedFrame] = {}
     for h in received:
-        if h.at_ns >= since_ns and h.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE) and h.decode()["state"] in states:
+        if (
+            h.at_ns >= since_ns
+            and h.opcode in (Opcode.HEARTBEAT, Opcode.JOINT_STATE)
+            and h.decode()["state"] in states
+        ):
             first.setdefault(parse_node(h.frame.id), h)
     return first
 
 
 def uptimes_ms(received: Sequence[ReceivedFrame], node_id: int) -> list[tuple[int, float]]:
     """(kernel's time, module's uptime) of its heartbeats."""
-    beats = [h for h in received if h.opcode == Opcode.HEARTBEAT and parse_node(h.frame.id) == node_id]
+    beats = [
+        h for h in received if h.opcode == Opcode.HEARTBEAT and parse_node(h.frame.id) == node_id
+    ]
     return [(h.at_ns, 1e3 * h.decode()["uptime"]) for h in beats]
 
 
-def passed_for_module_ms(received: Sequence[ReceivedFrame], node_id: int, from_ns: int, to_ns: int) -> float:
+def passed_for_module_ms(
+    received: Sequence[ReceivedFrame], node_id: int, from_ns: int, to_ns: int
+) -> float:
     """How long a stretch of the kernel's time took in a module's own; heartbeats around it give both."""
     at_ns, uptime_ms = zip(*uptimes_ms(received, node_id), strict=True)
-    from_ms, to_ms = np.interp([from_ns - at_ns[0], to_ns - at_ns[0]], [ns - at_ns[0] for ns in at_ns], uptime_ms)
+    from_ms, to_ms = np.interp(
+        [from_ns - at_ns[0], to_ns - at_ns[0]], [ns - at_ns[0] for ns in at_ns], uptime_ms
+    )
     return float(to_ms - from_ms)

@@ -38,7 +38,11 @@ QUIET = ModuleReadings(0, 0, 0)
 
 
 def setpoint(
-    count: int, mode: JointMode = JointMode.TORQUE, target: float = 1.0, limit: float = 3.0, node_id: int = NODE
+    count: int,
+    mode: JointMode = JointMode.TORQUE,
+    target: float = 1.0,
+    limit: float = 3.0,
+    node_id: int = NODE,
 ) -> CanFrame:
     signal = {
         JointMode.POSITION: "position",
@@ -46,7 +50,12 @@ def setpoint(
         JointMode.TORQUE: "torque",
         JointMode.PASSIVE: "torque",
     }[mode]
-    values: dict[str, float] = {"mode": mode, "count": count % 16, signal: target, "torque_limit": limit}
+    values: dict[str, float] = {
+        "mode": mode,
+        "count": count % 16,
+        signal: target,
+        "torque_limit": limit,
+    }
     return load_layouts()[Opcode.SET_POINT].encode(node_id, **values)
 
 
@@ -54,17 +63,24 @@ def parameter(
     index: int, value: float = 0.0, operation: int = ParameterOperation.WRITE, node_id: int = NODE
 ) -> CanFrame:
     frame = load_layouts()[Opcode.PARAMETER_REQUEST].encode(node_id, index=index, value=value)
-    return CanFrame(
-        frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:]
-    )  # also operations that there are not
+    # Also operations that there are not.
+    return CanFrame(frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:])
 
 
-def only(frames: Sequence[CanFrame], opcode: Opcode, node_id: int | None = None) -> list[dict[str, float]]:
-    return [read(f) for f in frames if parse_opcode(f.id) == opcode and node_id in (None, parse_node(f.id))]
+def only(
+    frames: Sequence[CanFrame], opcode: Opcode, node_id: int | None = None
+) -> list[dict[str, float]]:
+    return [
+        read(f)
+        for f in frames
+        if parse_opcode(f.id) == opcode and node_id in (None, parse_node(f.id))
+    ]
 
 
 def new_module(**flash: float) -> ModuleFirmware:
-    values = make_factory_defaults(5.0, 6.0) | {ModuleParameter[name.upper()]: value for name, value in flash.items()}
+    values = make_factory_defaults(5.0, 6.0) | {
+        ModuleParameter[name.upper()]: value for name, value in flash.items()
+    }
     return ModuleFirmware(NODE, SERIAL, ParameterStore(values), HEAT)
 
 
@@ -88,7 +104,9 @@ def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -
     """On the inertia physics model, with the robot's gains in every flash."""
     run = run or config()
     physics_model = given.pop("physics_model", None) or InertiaModel(run, InertiaSettings())
-    settings = CanSettings(**{k: given.pop(k) for k in list(given) if k in CanSettings.__struct_fields__})
+    settings = CanSettings(
+        **{k: given.pop(k) for k in list(given) if k in CanSettings.__struct_fields__}
+    )
     made = ModuleChain(run, settings, physics_model, stepped=stepped, **given)
     motor = run.robot.motor
     for slot in made.slots:
@@ -111,7 +129,9 @@ class RigHost:
         self.tick()
         self.chain.receive(0, make_command(CommandAction.ARM))
 
-    def tick(self, target: float | None = None, mode: JointMode = JointMode.POSITION) -> list[CanFrame]:
+    def tick(
+        self, target: float | None = None, mode: JointMode = JointMode.POSITION
+    ) -> list[CanFrame]:
         self.count += 1
         self.chain.receive(0, make_sync(self.count, self.count * 10_000))
         frames = self.chain.pop_frames(0)
@@ -120,7 +140,9 @@ class RigHost:
                 self.chain.receive(0, setpoint(self.count, mode, target, 4.0, node))
         return frames
 
-    def ticks(self, count: int, target: float | None = None, mode: JointMode = JointMode.POSITION) -> list[CanFrame]:
+    def ticks(
+        self, count: int, target: float | None = None, mode: JointMode = JointMode.POSITION
+    ) -> list[CanFrame]:
         """So many; the frames of the last."""
         return [self.tick(target, mode) for _ in range(count)][-1]
 
@@ -145,7 +167,10 @@ def measure_bus_traffic(
     emulators = chain(config(joint_count, rate_hz=rate_hz), stepped=False)
     emulators.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
     for slot in emulators.slots:
-        slot.module.parameters.values |= {ModuleParameter.CONTACT_EVERY: 1.0, ModuleParameter.IMU_EVERY: 20.0}
+        slot.module.parameters.values |= {
+            ModuleParameter.CONTACT_EVERY: 1.0,
+            ModuleParameter.IMU_EVERY: 20.0,
+        }
     emulators.advance_to(ARMED_AT_US)
     emulators.receive(0, make_command(CommandAction.ARM))
     traffic_before = emulators.traffic()[0]
@@ -161,6 +186,8 @@ def measure_bus_traffic(
         emulators.receive(0, make_sync(tick, 0))
         for node in range(1, joint_count + 1):
             emulators.receive(0, setpoint(tick, node_id=node, target=0.0))
-        waiting_frames = sum(map(len, emulators.buses[0]._waiting_frame_by_mailbox_by_sender.values()))
+        waiting_frames = sum(
+            map(len, emulators.buses[0]._waiting_frame_by_mailbox_by_sender.values())
+        )
         max_waiting_frames = max(max_waiting_frames, waiting_frames)
     return lateness_periods, traffic_before, emulators.traffic()[0], max_waiting_frames

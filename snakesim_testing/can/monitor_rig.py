@@ -25,7 +25,9 @@ class MonitorRig:
 
     def __init__(self) -> None:
         self.reading = ModuleReports(JOINTS)
-        self.watch = ModuleMonitor(["joint_1", "joint_2", "joint_3"], ["can0", "can0", "can1"], PERIOD_S)
+        self.watch = ModuleMonitor(
+            ["joint_1", "joint_2", "joint_3"], ["can0", "can0", "can1"], PERIOD_S
+        )
         self.lifecycle: LifecycleState = "disarmed"
         self.state = ModuleState.DISARMED
         self.isolated: set[int] = set()
@@ -40,7 +42,9 @@ class MonitorRig:
         if speak is not None:
             speak(self.reading)
         unsent_on = [unsent] if unsent else []
-        return self.watch.find_faults(self.reading, self.lifecycle, errors or (), unsent_on, isolated=self.isolated)
+        return self.watch.find_faults(
+            self.reading, self.lifecycle, errors or (), unsent_on, isolated=self.isolated
+        )
 
     def ticks(self, count: int, speak: Speak | None = None) -> list[FaultFinding]:
         return [found for _ in range(count) for found in self.tick(speak)]
@@ -66,7 +70,9 @@ def reporting(state: ModuleState = ModuleState.DISARMED, **values: float) -> Spe
 
 
 HOT = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1)
-HOT_AND_WET = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1, fault_leak=1)
+HOT_AND_WET = reporting(
+    ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1, fault_leak=1
+)
 
 
 def list_findings(findings: list[FaultFinding]) -> list[tuple[str, int | None]]:

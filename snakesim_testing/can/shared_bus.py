@@ -54,7 +54,8 @@ class SharedWire(SocketCanWire):
 class SharedBus(DriverLoop):
     """A loop whose modules have time until the end of each period."""
 
-    true_state_at: dict[int, set[ModuleState]] = field(default_factory=dict[int, set[ModuleState]])  # at ends of ticks
+    # At ends of ticks.
+    true_state_at: dict[int, set[ModuleState]] = field(default_factory=dict[int, set[ModuleState]])
 
     def run(self, ticks: int, wish: Callable[[int], SafeSetpoints] | None = None) -> None:
         """So many periods, each as long for the modules as for the driver."""
@@ -99,7 +100,9 @@ def open_shared_bus(channel: str) -> Iterator[SharedBus]:
     module_wire = SocketCanWire(channel, FROM_HOST)
     server = EmulatorServer(
         [module_wire],
-        ModuleChain(run_config, settings, make_physics_model(run_config, settings, "can"), stepped=False),
+        ModuleChain(
+            run_config, settings, make_physics_model(run_config, settings, "can"), stepped=False
+        ),
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "open_wire", lambda name, bit_rate: SharedWire(name, server))

@@ -12,8 +12,18 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 
 from snakesim_hal.backend import Backend
-from snakesim_hal.model.scenario import KeyOverride, RunConfig, ServiceSchedule, load_scenario, parse_set_option
-from snakesim_hal.programs.preflight import apply_backend_modes, decode_backend_settings, load_backend_class
+from snakesim_hal.model.scenario import (
+    KeyOverride,
+    RunConfig,
+    ServiceSchedule,
+    load_scenario,
+    parse_set_option,
+)
+from snakesim_hal.programs.preflight import (
+    apply_backend_modes,
+    decode_backend_settings,
+    load_backend_class,
+)
 from snakesim_hal.wire.messages import ClockMode
 from snakesim_testing.contract.loopback import HostedBackend
 from snakesim_testing.contract.rig import LEASE_HOLDER, BackendRig
@@ -96,7 +106,8 @@ class Bench:
         self._overrides = overrides
         # The open backend: in a rig without a network, or in a host; None if it is closed.
         self._rig: BackendRig | None = None
-        self._open_backend_and_drives: tuple[Backend, EmulatedDrives] | None = None  # the pair that belongs together
+        # The pair that belongs together.
+        self._open_backend_and_drives: tuple[Backend, EmulatedDrives] | None = None
         self.was_opened = False  # whether the backend was ever opened
         self._hosted_backend: HostedBackend | None = None
         # Measurements that several tests share.
@@ -115,13 +126,22 @@ class Bench:
     def config(self) -> RunConfig:
         """The scenario with the backend, at the clock mode of the bench. Raises ConfigError."""
         backend = self._backend if isinstance(self._backend, str) else self.name
-        overrides = [KeyOverride("backend", backend, "--snakesim-backend"), *map(parse_set_option, self._overrides)]
-        config = apply_backend_modes(load_scenario(self._scenario, overrides).config, self.backend_type)
+        overrides = [
+            KeyOverride("backend", backend, "--snakesim-backend"),
+            *map(parse_set_option, self._overrides),
+        ]
+        config = apply_backend_modes(
+            load_scenario(self._scenario, overrides).config, self.backend_type
+        )
         # The tests' own controller is the only service.
-        clock_modes = self.backend_type.check(config, decode_backend_settings(config, self.backend_type))
+        clock_modes = self.backend_type.check(
+            config, decode_backend_settings(config, self.backend_type)
+        )
         # Lockstep is preferred: it is quick, and the same on every machine.
         clock_mode = "lockstep" if "lockstep" in clock_modes else "realtime"
-        return msgspec.structs.replace(config, clock_mode=clock_mode, services={LEASE_HOLDER: ServiceSchedule()})
+        return msgspec.structs.replace(
+            config, clock_mode=clock_mode, services={LEASE_HOLDER: ServiceSchedule()}
+        )
 
     @property
     def clock_mode(self) -> ClockMode:
@@ -138,7 +158,9 @@ class Bench:
         """Open the backend, and return it. A backend that is still open is closed first."""
         self.close()
         self.was_opened = True
-        return self.backend_type(self.config, decode_backend_settings(self.config, self.backend_type))
+        return self.backend_type(
+            self.config, decode_backend_settings(self.config, self.backend_type)
+        )
 
     def open_rig(self) -> BackendRig:
         """Open the backend, and return a rig that drives it without a network."""

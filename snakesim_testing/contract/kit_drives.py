@@ -29,7 +29,9 @@ class KitDrives:
         for bus in self._buses:
             emulator = self.find_emulator(bus.drives)
             is_on = self.list_enabled_of_bus(emulator)
-            emulator.body.add_step_callback(partial(self._log_switches, emulator, bus.spec.joints, is_on))
+            emulator.body.add_step_callback(
+                partial(self._log_switches, emulator, bus.spec.joints, is_on)
+            )
 
     def find_emulator(self, drives: Any) -> Any:
         """Return the emulated drives of a bus."""
@@ -43,7 +45,13 @@ class KitDrives:
         """Return for each joint whether its drive would follow a setpoint now."""
         enabled: dict[int, bool] = {}
         for bus in self._buses:
-            enabled |= dict(zip(bus.spec.joints, self.list_enabled_of_bus(self.find_emulator(bus.drives)), strict=True))
+            enabled |= dict(
+                zip(
+                    bus.spec.joints,
+                    self.list_enabled_of_bus(self.find_emulator(bus.drives)),
+                    strict=True,
+                )
+            )
         return [enabled[joint] for joint in range(len(enabled))]
 
     def freeze_driver(self, seconds: float, sleep: Callable[[float], None]) -> None:
@@ -65,7 +73,9 @@ class KitDrives:
         """Return when each drive has switched its torque on and off, by the drives' own time."""
         return list(self._log)
 
-    def _log_switches(self, emulator: Any, joints: tuple[int, ...], is_on: list[bool], now_us: float) -> None:
+    def _log_switches(
+        self, emulator: Any, joints: tuple[int, ...], is_on: list[bool], now_us: float
+    ) -> None:
         for i, enabled in enumerate(self.list_enabled_of_bus(emulator)):
             if enabled != is_on[i]:
                 is_on[i] = enabled

@@ -31,7 +31,8 @@ from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_testing.contract.rig import LEASE_HOLDER, JointTargets
 
 TIMEOUT_S = 60.0  # for operations of a tenth of a second; a slow machine is not a failure
-Plan = Callable[[int], "JointTargets | None"]  # ticks since arming -> commanded joints; None: send nothing
+# Ticks since arming -> commanded joints; None: send nothing.
+Plan = Callable[[int], "JointTargets | None"]
 
 
 def hold_all_joints(_ticks: int) -> JointTargets:
@@ -123,7 +124,8 @@ class PlannedController:
             client.announce()
             current_arm_session = -1  # the session that `armed_tick` is about
             armed_tick = -1  # first tick of that session
-            held_setpoints: RequestedSetpoints | None = None  # that hold the newest positions from before the arming
+            # That hold the newest positions from before the arming.
+            held_setpoints: RequestedSetpoints | None = None
             for clock in client.iterate_ticks(silence_timeout_s=0.05):
                 if self.stop_event.is_set():
                     return
@@ -182,7 +184,9 @@ class HostedBackend:
             backend: The backend under test, whose joint states are recorded.
             config: Configuration of the run.
         """
-        link = ConnectionSettings(f"tcp/127.0.0.1:{find_free_port()}", f"contract/{config.robot.name}")
+        link = ConnectionSettings(
+            f"tcp/127.0.0.1:{find_free_port()}", f"contract/{config.robot.name}"
+        )
         self.backend = RecordingBackend(backend)
         self.controller = PlannedController()
         self.config = config
@@ -191,18 +195,22 @@ class HostedBackend:
         self._exit_stack = contextlib.ExitStack()
         self._exit_stack.callback(self.backend.close)
         self._exit_stack.callback(sys.setswitchinterval, sys.getswitchinterval())
-        sys.setswitchinterval(0.0005)  # host and controller share one interpreter here; otherwise they are processes
+        # Host and controller share one interpreter here; otherwise they are processes.
+        sys.setswitchinterval(0.0005)
         try:
             host_session = self._exit_stack.enter_context(open_session(replace(link, listen=True)))
             self.host = Host(config, GuardedBackend(self.backend), host_session)
             self.robot = self.host.description
             self.session: Session = self._exit_stack.enter_context(open_session(link))
-            self._command_publisher = self.session.declare_publisher(keys.JOINT_COMMAND, JointCommand)
-            wait_until(
-                self._command_publisher.has_subscriber, "the host receives our commands"
-            )  # earlier ones are lost
+            self._command_publisher = self.session.declare_publisher(
+                keys.JOINT_COMMAND, JointCommand
+            )
+            # Earlier ones are lost.
+            wait_until(self._command_publisher.has_subscriber, "the host receives our commands")
             self._start_thread("host", self.host.run, self.host.request_stop)
-            self._start_thread("controller", lambda: self.controller.run(link), self.controller.stop_event.set)
+            self._start_thread(
+                "controller", lambda: self.controller.run(link), self.controller.stop_event.set
+            )
         except BaseException:
             self._exit_stack.close()
             raise
@@ -253,7 +261,10 @@ class HostedBackend:
         """Wait until the host has run some more ticks, and return the joint states of these ticks."""
         first_index = len(self.backend.joint_states)
         wait_until(
-            lambda: len(self.backend.joint_states) >= first_index + tick_count or not self._are_threads_alive(),
+            lambda: (
+                len(self.backend.joint_states) >= first_index + tick_count
+                or not self._are_threads_alive()
+            ),
             f"{tick_count} ticks",
         )
         assert len(self.backend.joint_states) >= first_index + tick_count, (

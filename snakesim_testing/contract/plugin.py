@@ -13,14 +13,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
-if TYPE_CHECKING:  # nothing else of SnakeSIM is imported before it is used: every pytest run loads this module
+if (
+    TYPE_CHECKING
+):  # nothing else of SnakeSIM is imported before it is used: every pytest run loads this module
     from snakesim_hal.wire.messages import JointMode
     from snakesim_testing.contract.bench import Bench, EmulatedDrives
     from snakesim_testing.contract.loopback import HostedBackend
     from snakesim_testing.contract.recordings import PushRecording
     from snakesim_testing.contract.rig import BackendRig, Floats, RigRecord
 
-pytest.register_assert_rewrite("snakesim_testing.contract.loopback", "snakesim_testing.contract.rig")
+pytest.register_assert_rewrite(
+    "snakesim_testing.contract.loopback", "snakesim_testing.contract.rig"
+)
 
 # Properties of a test's report; pytest-xdist sends them from its workers, too.
 CLAUSE_PROPERTY = "snakesim_clause"
@@ -60,13 +64,25 @@ def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of the contract suite to pytest: the backend to test, its scenario, and its table of results."""
-    group = parser.getgroup("snakesim", "contract tests of SnakeSIM backends (--pyargs snakesim_testing.contract)")
-    group.addoption("--snakesim-backend", metavar="NAME", help="backend to test: an installed one, or ./file.py:Class")
-    group.addoption(
-        "--snakesim-scenario", metavar="FILE", help="scenario instead of the shipped bench; a name or a path"
+    group = parser.getgroup(
+        "snakesim", "contract tests of SnakeSIM backends (--pyargs snakesim_testing.contract)"
     )
     group.addoption(
-        "--snakesim-set", action="append", default=[], metavar="KEY=VALUE", help="change a value of the scenario"
+        "--snakesim-backend",
+        metavar="NAME",
+        help="backend to test: an installed one, or ./file.py:Class",
+    )
+    group.addoption(
+        "--snakesim-scenario",
+        metavar="FILE",
+        help="scenario instead of the shipped bench; a name or a path",
+    )
+    group.addoption(
+        "--snakesim-set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="change a value of the scenario",
     )
     group.addoption(
         "--snakesim-mute",
@@ -78,7 +94,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="./FILE.py:CLASS",
         help="CLASS(backend) has a backend's emulated drives: see EmulatedDrives in docs/hardware/contract-suite.md",
     )
-    group.addoption("--snakesim-table", metavar="FILE.md", help="write the table of tests and benches as Markdown")
+    group.addoption(
+        "--snakesim-table",
+        metavar="FILE.md",
+        help="write the table of tests and benches as Markdown",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -101,7 +121,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         raise pytest.UsageError(
             "contract tests need a backend: give --snakesim-backend NAME or --snakesim-backend ./file.py:Class"
         )
-    metafunc.parametrize("bench", benches, ids=[bench.name for bench in benches], indirect=True, scope="session")
+    metafunc.parametrize(
+        "bench", benches, ids=[bench.name for bench in benches], indirect=True, scope="session"
+    )
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -109,7 +131,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sort contract tests into the order of `SECTION_ORDER`; all other tests keep their positions."""
     positions = [i for i, item in enumerate(items) if _find_test_module(item).startswith(PACKAGE)]
     contract_tests = [items[i] for i in positions]
-    contract_tests.sort(key=lambda item: _compute_sort_position(_find_test_module(item).removeprefix(PACKAGE)))
+    contract_tests.sort(
+        key=lambda item: _compute_sort_position(_find_test_module(item).removeprefix(PACKAGE))
+    )
     for i, item in zip(positions, contract_tests, strict=True):
         items[i] = item
 
@@ -128,7 +152,9 @@ def _get_benches_from_hook(metafunc: pytest.Metafunc) -> "list[Bench]":
 
     The hook makes new benches for every test. Of those with the same name, the first one is used by all tests.
     """
-    results: list[list[Bench] | None] = metafunc.definition.ihook.pytest_snakesim_benches(config=metafunc.config)
+    results: list[list[Bench] | None] = metafunc.definition.ihook.pytest_snakesim_benches(
+        config=metafunc.config
+    )
     known = metafunc.config.stash[_bench_by_name]
     benches: list[Bench] = []
     for result in results:
@@ -243,11 +269,15 @@ def pushing(bench: "Bench", request: pytest.FixtureRequest) -> "PushRecording":
 
 
 @pytest.fixture
-def switching(bench: "Bench", request: pytest.FixtureRequest) -> "dict[tuple[JointMode, JointMode], Floats]":
+def switching(
+    bench: "Bench", request: pytest.FixtureRequest
+) -> "dict[tuple[JointMode, JointMode], Floats]":
     """Return one joint through every change of mode; recorded once for all tests."""
     from snakesim_testing.contract.recordings import record_mode_switches
 
-    return bench.record_once("switching", lambda: record_mode_switches(request.getfixturevalue("rig")))
+    return bench.record_once(
+        "switching", lambda: record_mode_switches(request.getfixturevalue("rig"))
+    )
 
 
 # --- outcomes --------------------------------------------------------------------------------------------------
@@ -260,7 +290,11 @@ def pytest_runtest_makereport(
     """Add clause and bench to the report of a contract test, and mark the item if the test failed."""
     report = yield
     module = _find_test_module(item)
-    if module.startswith(PACKAGE) and isinstance(item, pytest.Function) and hasattr(item, "callspec"):
+    if (
+        module.startswith(PACKAGE)
+        and isinstance(item, pytest.Function)
+        and hasattr(item, "callspec")
+    ):
         clause = f"{module.removeprefix(PACKAGE)}::{item.originalname}"
         bench: Any = item.callspec.params["bench"]
         for name, value in ((CLAUSE_PROPERTY, clause), (BENCH_PROPERTY, bench.name)):
@@ -290,7 +324,9 @@ class OutcomeTable:
         if outcome not in outcomes:
             outcomes.append(outcome)
 
-    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    def pytest_terminal_summary(
+        self, terminalreporter: pytest.TerminalReporter, config: pytest.Config
+    ) -> None:
         """Print the table of clauses with their outcome on each bench, and write it to the requested file.
 
         Args:
@@ -300,18 +336,27 @@ class OutcomeTable:
         if not self._outcomes_by_clause:
             return
         clauses = sorted(
-            self._outcomes_by_clause, key=lambda module_and_clause: _compute_sort_position(module_and_clause[0])
+            self._outcomes_by_clause,
+            key=lambda module_and_clause: _compute_sort_position(module_and_clause[0]),
         )
-        bench_names = list(dict.fromkeys(name for by_bench in self._outcomes_by_clause.values() for name in by_bench))
+        bench_names = list(
+            dict.fromkeys(
+                name for by_bench in self._outcomes_by_clause.values() for name in by_bench
+            )
+        )
         rows: list[ClauseRow] = []
         skip_reasons: list[str] = []
         for module, clause in clauses:
             outcomes_by_bench = self._outcomes_by_clause[module, clause]
             clause_text = _describe_clause(clause)
-            worst_outcomes = [_find_worst_outcome(outcomes_by_bench.get(name, [])) for name in bench_names]
+            worst_outcomes = [
+                _find_worst_outcome(outcomes_by_bench.get(name, [])) for name in bench_names
+            ]
             rows.append(ClauseRow(module, clause_text, worst_outcomes))
             for bench_name, outcomes in outcomes_by_bench.items():
-                skip_reasons += [f"{clause_text}, on {bench_name}: {reason}" for _, reason in outcomes if reason]
+                skip_reasons += [
+                    f"{clause_text}, on {bench_name}: {reason}" for _, reason in outcomes if reason
+                ]
         skip_reasons = _merge_skip_reasons(skip_reasons)
         terminalreporter.section("contract")
         for line in format_plain_table(bench_names, rows):
@@ -346,19 +391,26 @@ def format_plain_table(bench_names: list[str], rows: list[ClauseRow]) -> list[st
     """
     clause_width = max(len(row.clause) for row in rows)
     column_widths = [max(len(name), MIN_COLUMN_WIDTH) for name in bench_names]
-    heading = "".join(f"  {name:>{width}}" for name, width in zip(bench_names, column_widths, strict=True))
+    heading = "".join(
+        f"  {name:>{width}}" for name, width in zip(bench_names, column_widths, strict=True)
+    )
     lines = [" " * clause_width + heading]
     previous_module = ""
     for row in rows:
         if row.module != previous_module:
             lines.append(_format_section_title(row.module).upper())
             previous_module = row.module
-        cells = "".join(f"  {outcome:>{width}}" for outcome, width in zip(row.outcomes, column_widths, strict=True))
+        cells = "".join(
+            f"  {outcome:>{width}}"
+            for outcome, width in zip(row.outcomes, column_widths, strict=True)
+        )
         lines.append(f"{row.clause:<{clause_width}}{cells}")
     return lines
 
 
-def format_markdown_table(bench_names: list[str], rows: list[ClauseRow], skip_reasons: list[str]) -> str:
+def format_markdown_table(
+    bench_names: list[str], rows: list[ClauseRow], skip_reasons: list[str]
+) -> str:
     """Format the table of results as Markdown, with the reasons of skipped clauses below.
 
     Args:
@@ -380,7 +432,8 @@ def format_markdown_table(bench_names: list[str], rows: list[ClauseRow], skip_re
 def _get_outcome(report: pytest.TestReport) -> tuple[str, str]:
     """Return the outcome of a test, and the reason if it was skipped."""
     if report.skipped:
-        details: Any = report.longrepr  # (file, line, reason) of a skip; something else of an expected failure
+        # (file, line, reason) of a skip; something else of an expected failure.
+        details: Any = report.longrepr
         if isinstance(details, tuple):
             return "skip", details[2].removeprefix("Skipped: ")
         return "skip", "expected to fail"

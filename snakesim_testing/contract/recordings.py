@@ -21,7 +21,8 @@ MODE_DURATION_S = 0.16  # of a mode before the next change
 class PushRecording:
     """Records of joint 0 pushing against its upper end stop, and joint 1 against its lower one."""
 
-    torque_mode: RigRecord | None  # end of the push in torque mode; None if a joint has no torque mode
+    # End of the push in torque mode; None if a joint has no torque mode.
+    torque_mode: RigRecord | None
     requested_nm: float
     torque_limited: RigRecord
     limit_nm: float
@@ -35,7 +36,8 @@ def record_sway(rig: BackendRig) -> RigRecord:
     for tick in range(rig.count_periods(1.0)):
         sway_rad = 0.3 * tolerances.STEP_RAD * math.sin(2 * math.pi * tick * rig.period_ns * 1e-9)
         targets: JointTargets = {
-            i: (JointMode.POSITION, rig.home_rad[i] + sway_rad * (-1) ** i) for i in range(rig.joint_count)
+            i: (JointMode.POSITION, rig.home_rad[i] + sway_rad * (-1) ** i)
+            for i in range(rig.joint_count)
         }
         rig.command_joints(targets)
     rig.assert_armed()
@@ -65,10 +67,12 @@ def record_push(rig: BackendRig) -> PushRecording:
     torque_mode_record = None
     if rig.supports_mode(0, JointMode.TORQUE) and rig.supports_mode(1, JointMode.TORQUE):
         rig.command_without_limiter(
-            make_targets(JointMode.TORQUE, requested_nm, -requested_nm), rig.count_periods(tolerances.PUSH_DURATION_S)
+            make_targets(JointMode.TORQUE, requested_nm, -requested_nm),
+            rig.count_periods(tolerances.PUSH_DURATION_S),
         )
         torque_mode_record = rig.command_without_limiter(
-            make_targets(JointMode.TORQUE, requested_nm, -requested_nm), tolerances.TRANSPORT_PERIODS
+            make_targets(JointMode.TORQUE, requested_nm, -requested_nm),
+            tolerances.TRANSPORT_PERIODS,
         )
     limit_nm = tolerances.TORQUE_LIMIT_FRACTION * upper_stop_joint.torque_limit_nm
     speed_rad_s = min(
@@ -86,13 +90,17 @@ def record_push(rig: BackendRig) -> PushRecording:
             lower_stop_joint.angle_min_rad - tolerances.BEYOND_STOP_RAD,
         )
     rig.command_without_limiter(
-        beyond_stops, rig.count_periods(tolerances.PUSH_DURATION_S), torque_limit_nm=torque_limits_nm
+        beyond_stops,
+        rig.count_periods(tolerances.PUSH_DURATION_S),
+        torque_limit_nm=torque_limits_nm,
     )
     limited_record = rig.command_without_limiter(
         beyond_stops, tolerances.TRANSPORT_PERIODS, torque_limit_nm=torque_limits_nm
     )
     rig.assert_armed()
-    return PushRecording(torque_mode_record, requested_nm, limited_record, limit_nm, rig.record_since(first_tick))
+    return PushRecording(
+        torque_mode_record, requested_nm, limited_record, limit_nm, rig.record_since(first_tick)
+    )
 
 
 def record_mode_switches(rig: BackendRig) -> dict[tuple[JointMode, JointMode], Floats]:
@@ -121,11 +129,14 @@ def record_mode_switches(rig: BackendRig) -> dict[tuple[JointMode, JointMode], F
     for before, after in MODE_SWITCHES:
         if not (rig.supports_mode(0, before) and rig.supports_mode(0, after)):
             rig.command_joints(
-                {0: (JointMode.POSITION, rig.newest_joints.angle_rad[0])}, rig.count_periods(MODE_DURATION_S)
+                {0: (JointMode.POSITION, rig.newest_joints.angle_rad[0])},
+                rig.count_periods(MODE_DURATION_S),
             )
             continue
         torque_before_nm = rig.newest_joints.torque_nm[0]
-        record = rig.command_joints({0: (after, make_target_by_mode[after]())}, rig.count_periods(MODE_DURATION_S))
+        record = rig.command_joints(
+            {0: (after, make_target_by_mode[after]())}, rig.count_periods(MODE_DURATION_S)
+        )
         torques_by_switch[before, after] = np.array([torque_before_nm, *record.torque_nm[:, 0]])
     rig.assert_armed()
     return torques_by_switch

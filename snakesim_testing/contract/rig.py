@@ -82,9 +82,8 @@ class BackendRig:
     is_closed: bool = False
     tick: int = 0
     late_periods: float = 0.0  # how far this machine fell behind real time at worst
-    _position_targets_rad: dict[int, float] = field(
-        default_factory=dict[int, float]
-    )  # by joint: last position of a joint without velocity mode, which follows a speed
+    # By joint: last position of a joint without velocity mode, which follows a speed.
+    _position_targets_rad: dict[int, float] = field(default_factory=dict[int, float])
     _faults_by_tick: list[tuple[int, Fault]] = field(default_factory=list[tuple[int, Fault]])
 
     def __post_init__(self) -> None:
@@ -142,7 +141,9 @@ class BackendRig:
 
     def _next_position_rad(self, joint_index: int, speed_rad_s: float) -> float:
         """Return the next position target of a joint that follows a speed, for joints without velocity mode."""
-        position_rad = self._position_targets_rad.get(joint_index, self.newest_joints.angle_rad[joint_index])
+        position_rad = self._position_targets_rad.get(
+            joint_index, self.newest_joints.angle_rad[joint_index]
+        )
         position_rad = position_rad + speed_rad_s * self.period_ns * 1e-9
         self._position_targets_rad[joint_index] = position_rad
         return position_rad
@@ -163,7 +164,9 @@ class BackendRig:
         """Return the record of all joint states, setpoints and faults since a tick."""
         first_index = len(self._sample_history) - (self.tick - tick)
         faults = [fault for fault_tick, fault in self._faults_by_tick if fault_tick >= tick]
-        return RigRecord(self._sample_history[first_index:], self._setpoint_history[first_index - 1 :], faults)
+        return RigRecord(
+            self._sample_history[first_index:], self._setpoint_history[first_index - 1 :], faults
+        )
 
     def count_periods(self, seconds: float) -> int:
         """Return the number of periods in a time, rounded up."""
@@ -200,7 +203,11 @@ class BackendRig:
         return self.record_since(first_tick)
 
     def command_joints(
-        self, targets: JointTargets, period_count: int = 1, *, torque_limit_nm: list[float] | None = None
+        self,
+        targets: JointTargets,
+        period_count: int = 1,
+        *,
+        torque_limit_nm: list[float] | None = None,
     ) -> RigRecord:
         """Command some joints while the others hold the start pose, through lease, command limiter and lifecycle.
 
@@ -226,7 +233,11 @@ class BackendRig:
         return self.record_since(first_tick)
 
     def command_without_limiter(
-        self, targets: JointTargets, period_count: int = 1, *, torque_limit_nm: list[float] | None = None
+        self,
+        targets: JointTargets,
+        period_count: int = 1,
+        *,
+        torque_limit_nm: list[float] | None = None,
     ) -> RigRecord:
         """Command some joints without the command limiter, which would not drive a joint against its end stop.
 
@@ -247,7 +258,9 @@ class BackendRig:
             )
         return self.record_since(first_tick)
 
-    def make_setpoints(self, targets: JointTargets, torque_limit_nm: list[float] | None = None) -> RequestedSetpoints:
+    def make_setpoints(
+        self, targets: JointTargets, torque_limit_nm: list[float] | None = None
+    ) -> RequestedSetpoints:
         """Return setpoints of all joints; those without a command hold the start pose.
 
         A joint without velocity mode gets a position instead, which moves on at the speed with each call.
@@ -257,14 +270,18 @@ class BackendRig:
         for joint in self._position_targets_rad.keys() - targets.keys():
             del self._position_targets_rad[joint]
         for joint, (joint_mode, joint_target) in targets.items():
-            if joint_mode is JointMode.VELOCITY and not self.supports_mode(joint, JointMode.VELOCITY):
+            if joint_mode is JointMode.VELOCITY and not self.supports_mode(
+                joint, JointMode.VELOCITY
+            ):
                 joint_mode = JointMode.POSITION
                 joint_target = self._next_position_rad(joint, joint_target)
             mode[joint] = joint_mode
             target[joint] = joint_target
         return RequestedSetpoints(mode, target, torque_limit_nm or self.full_torque_nm)
 
-    def freeze_host(self, seconds: float, freeze_driver: Callable[[float, Callable[[float], None]], None]) -> None:
+    def freeze_host(
+        self, seconds: float, freeze_driver: Callable[[float, Callable[[float], None]], None]
+    ) -> None:
         """Let time pass in which the host does nothing, as when its process is stopped and continued later.
 
         Args:
@@ -283,9 +300,13 @@ class BackendRig:
         if self.authority.state != "disarmed":
             self.disarm()
             self.wait_periods(tolerances.TRANSPORT_PERIODS)
-        measured_targets = {i: (JointMode.POSITION, angle) for i, angle in enumerate(self.newest_joints.angle_rad)}
+        measured_targets = {
+            i: (JointMode.POSITION, angle) for i, angle in enumerate(self.newest_joints.angle_rad)
+        }
         self._send(self.make_setpoints(measured_targets))
-        response = self.authority.handle_lifecycle_request(make_arm_request(self.robot, "conformance"), self._now_ns)
+        response = self.authority.handle_lifecycle_request(
+            make_arm_request(self.robot, "conformance"), self._now_ns
+        )
         assert response.ok, f"the robot cannot be armed: {response.reason}"
         self.command_joints(measured_targets, tolerances.ARMING_PERIODS)
         self.assert_armed()
@@ -311,7 +332,9 @@ class BackendRig:
 
     def report_fault(self) -> None:
         """Report a fault to the authority that the backend itself has not reported."""
-        self.authority.latch_fault(Fault(tick=self.tick, what="bench", cause="planted by the contract tests"))
+        self.authority.latch_fault(
+            Fault(tick=self.tick, what="bench", cause="planted by the contract tests")
+        )
 
     @contextlib.contextmanager
     def with_isolation_allowed(self) -> Iterator[None]:
@@ -320,7 +343,9 @@ class BackendRig:
         The robot is disarmed at the begin and at the end of the context.
         """
         usual_cycle = self._control_cycle
-        tolerant_authority = CommandAuthority(msgspec.structs.replace(self.robot, max_isolated_joints=1))
+        tolerant_authority = CommandAuthority(
+            msgspec.structs.replace(self.robot, max_isolated_joints=1)
+        )
         self._control_cycle = ControlCycle(self.backend, tolerant_authority)
         self.wait_periods()
         yield
@@ -333,7 +358,9 @@ class BackendRig:
         """Isolate a joint, by reporting a fault of this joint alone."""
         name = self.robot.joints[joint_index].name
         cause = f"the contract tests isolate {name}"
-        self.authority.latch_fault(Fault(tick=self.tick, what="bench", cause=cause, joint=name, reach="joint"))
+        self.authority.latch_fault(
+            Fault(tick=self.tick, what="bench", cause=cause, joint=name, reach="joint")
+        )
 
     def arm_and_move_joint(self, joint_index: int = 0) -> RigRecord:
         """Arm the robot, and move one joint at constant speed. Fails if the joint does not move.
@@ -390,7 +417,9 @@ class BackendRig:
     def _send(self, setpoints: RequestedSetpoints) -> None:
         """Send a command to the authority; the clause sees a rejection in the joint states."""
         if self.authority.state == "disarmed" and not self.authority.lease.is_held(self._now_ns):
-            self.authority.handle_lease_request(LeaseRequest(action="acquire", holder=LEASE_HOLDER), self._now_ns)
+            self.authority.handle_lease_request(
+                LeaseRequest(action="acquire", holder=LEASE_HOLDER), self._now_ns
+            )
         self._sequence += 1
         command = JointCommand(
             tick=self.tick,

@@ -38,8 +38,13 @@ def test_a_closed_backend_drives_nothing(bench: Bench, rig: BackendRig) -> None:
     rig.arm_and_move_joint()
     start_angle_rad = rig.newest_joints.angle_rad[0]
     rig.close()
-    moved_rad = max((abs(joints.angle_rad[0] - start_angle_rad) for joints in use_closed_backend(rig)), default=0.0)
-    max_coasting_rad = 0.5 * tolerances.MOTION_SPEED_RAD_S * tolerances.CLOSING_PERIODS * rig.period_ns * 1e-9
+    moved_rad = max(
+        (abs(joints.angle_rad[0] - start_angle_rad) for joints in use_closed_backend(rig)),
+        default=0.0,
+    )
+    max_coasting_rad = (
+        0.5 * tolerances.MOTION_SPEED_RAD_S * tolerances.CLOSING_PERIODS * rig.period_ns * 1e-9
+    )
     assert moved_rad < max_coasting_rad, f"it went on by {moved_rad:.3f} rad"
 
 
@@ -68,7 +73,10 @@ def test_in_lockstep_same_seed_and_commands_give_same_samples(bench: Bench) -> N
         rig = bench.open_rig()
         rig.arm_and_move_joint()
         rig.command_joints(
-            {0: (JointMode.TORQUE, -0.1), 1: (JointMode.POSITION, rig.home_rad[1] + tolerances.STEP_RAD)},
+            {
+                0: (JointMode.TORQUE, -0.1),
+                1: (JointMode.POSITION, rig.home_rad[1] + tolerances.STEP_RAD),
+            },
             rig.count_periods(tolerances.MOTION_DURATION_S),
         )
         rig.trigger_estop()

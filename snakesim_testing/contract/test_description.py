@@ -19,13 +19,27 @@ def test_the_description_matches_the_robot_file(bench: Bench, rig: BackendRig) -
     """The description has the joints, links, period, lease and safety settings of the robot file and the scenario."""
     robot = rig.robot
     expected_robot = describe_run_robot(bench.config)
-    assert [joint.name for joint in robot.joints] == [joint.name for joint in expected_robot.joints], "names and order"
+    assert [joint.name for joint in robot.joints] == [
+        joint.name for joint in expected_robot.joints
+    ], "names and order"
     for joint, expected in zip(robot.joints, expected_robot.joints, strict=True):
         # These are from the drive, not from the file.
-        drive_fields = {"serial": joint.serial, "firmware": joint.firmware, "watchdog": joint.watchdog}
+        drive_fields = {
+            "serial": joint.serial,
+            "firmware": joint.firmware,
+            "watchdog": joint.watchdog,
+        }
         assert joint == msgspec.structs.replace(expected, **drive_fields)
     assert robot.links == expected_robot.links
-    for name in ("robot", "config_hash", "period_ns", "lease_ns", "max_step_rad", "stop_mode", "custom"):
+    for name in (
+        "robot",
+        "config_hash",
+        "period_ns",
+        "lease_ns",
+        "max_step_rad",
+        "stop_mode",
+        "custom",
+    ):
         assert getattr(robot, name) == getattr(expected_robot, name), name
 
 
@@ -34,7 +48,9 @@ def test_the_layout_is_the_hash_of_the_joints(rig: BackendRig) -> None:
     assert rig.robot.layout == compute_layout_hash(rig.robot.joints)
 
 
-def test_the_description_is_readable_at_once_and_stays(bench: Bench, rig: BackendRig, healthy: RigRecord) -> None:
+def test_the_description_is_readable_at_once_and_stays(
+    bench: Bench, rig: BackendRig, healthy: RigRecord
+) -> None:
     """The description is available before the first sample, when the rig reads it, and the same after a motion."""
     assert healthy.samples
     assert rig.backend.describe() == rig.robot
@@ -44,7 +60,10 @@ def test_the_description_survives_the_wire(rig: BackendRig) -> None:
     """The description is unchanged by the HAL's encoder and decoder, which check the bounds of its fields."""
     description = rig.robot
     assert (
-        MessageDecoder(RobotDescription).decode(encode(description), format_encoding(RobotDescription)) == description
+        MessageDecoder(RobotDescription).decode(
+            encode(description), format_encoding(RobotDescription)
+        )
+        == description
     )
 
 
@@ -52,14 +71,20 @@ def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: BackendRig) -> None:
     """Every sensor is listed once, at a sensor key, with a rate up to the control rate; the joints are listed."""
     listed_keys = [sensor.key for sensor in rig.robot.sensors]
     assert len(set(listed_keys)) == len(listed_keys), f"listed twice: {listed_keys}"
-    assert find_custom_messages(rig.robot).keys() == rig.robot.custom.keys(), "a schema of `custom` fits no message"
+    assert find_custom_messages(rig.robot).keys() == rig.robot.custom.keys(), (
+        "a schema of `custom` fits no message"
+    )
     assert keys.JOINTS in listed_keys
     for sensor in rig.robot.sensors:
         assert sensor.key.startswith("sensor/") and keys.find_message(sensor.key), sensor.key
-        assert sensor.rate_hz <= 1.001e9 / rig.period_ns, f"{sensor.key}: faster than the control rate"
+        assert sensor.rate_hz <= 1.001e9 / rig.period_ns, (
+            f"{sensor.key}: faster than the control rate"
+        )
 
 
-def test_every_sensor_listed_delivers_at_about_its_rate(rig: BackendRig, healthy: RigRecord) -> None:
+def test_every_sensor_listed_delivers_at_about_its_rate(
+    rig: BackendRig, healthy: RigRecord
+) -> None:
     """Every listed sensor delivers samples at about its stated rate."""
     duration_s = len(healthy.samples) * rig.period_ns * 1e-9
     for sensor in rig.robot.sensors:
@@ -68,7 +93,9 @@ def test_every_sensor_listed_delivers_at_about_its_rate(rig: BackendRig, healthy
         sample_count = count_readings(sensor.key, healthy)
         expected_count = duration_s * sensor.rate_hz
         tolerance = 1 + tolerances.RATE_TOLERANCE_FRACTION * expected_count
-        assert sample_count >= 1 or expected_count < 2, f"{sensor.key} is listed but never published"
+        assert sample_count >= 1 or expected_count < 2, (
+            f"{sensor.key} is listed but never published"
+        )
         assert abs(sample_count - expected_count) <= tolerance, (
             f"{sensor.key}: {sample_count} in {duration_s} s, stated are {sensor.rate_hz} Hz"
         )
@@ -80,7 +107,9 @@ def count_readings(key: str, record: RigRecord) -> int:
     IMUs may report in turns, so their number is that of the link with the most samples.
     """
     messages = [sample.by_key[key] for sample in record.samples if key in sample.by_key]
-    links = Counter(link for message in messages if isinstance(message, Imu) for link in message.link)
+    links = Counter(
+        link for message in messages if isinstance(message, Imu) for link in message.link
+    )
     return max(links.values()) if links else len(messages)
 
 
@@ -90,4 +119,6 @@ def test_nothing_comes_that_is_not_listed(rig: BackendRig, healthy: RigRecord) -
     for sample in healthy.samples:
         for key, message in sample.by_key.items():
             assert key in listed_keys, f"{key} is published but not listed"
-            assert isinstance(message, keys.find_message(key) or ()), f"{key}: {type(message).__name__}"
+            assert isinstance(message, keys.find_message(key) or ()), (
+                f"{key}: {type(message).__name__}"
+            )

@@ -16,7 +16,9 @@ def do_nothing(_rig: BackendRig) -> None:
 
 
 @pytest.mark.parametrize(
-    "act_after_freeze", [do_nothing, BackendRig.disarm, BackendRig.trigger_estop], ids=["goes_on", "disarm", "estop"]
+    "act_after_freeze",
+    [do_nothing, BackendRig.disarm, BackendRig.trigger_estop],
+    ids=["goes_on", "disarm", "estop"],
 )
 def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     rig: BackendRig, drives: EmulatedDrives, act_after_freeze: Callable[[BackendRig], None]
@@ -28,7 +30,9 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     """
     joints_without_watchdog = rig.joints_without_watchdog
     if joints_without_watchdog:
-        pytest.skip(f"described without a watchdog, so they hold while the host is frozen: {joints_without_watchdog}")
+        pytest.skip(
+            f"described without a watchdog, so they hold while the host is frozen: {joints_without_watchdog}"
+        )
     rig.arm_and_move_joint()
     rig.must_reopen = True
     assert all(drives.list_enabled()), f"armed, and enabled are {drives.list_enabled()}"
@@ -41,8 +45,12 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
     record = rig.record_since(start_tick)
     reported_joints = {fault.joint for fault in record.faults if fault.cause}
-    unreported_joints = [joint.name for joint in rig.robot.joints if joint.name not in reported_joints]
-    assert not unreported_joints, f"their stop was never reported: {unreported_joints}; reported were {record.faults}"
+    unreported_joints = [
+        joint.name for joint in rig.robot.joints if joint.name not in reported_joints
+    ]
+    assert not unreported_joints, (
+        f"their stop was never reported: {unreported_joints}; reported were {record.faults}"
+    )
     assert rig.authority.state in ("fault", "estop"), rig.authority.state
     rig.reset()
     assert_drives_stay_off(rig, drives, tolerances.ARMING_PERIODS)
@@ -52,7 +60,9 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     assert not rig.record_since(reset_tick).faults, rig.record_since(reset_tick).faults
 
 
-def test_drives_without_watchdog_are_off_once_frozen_host_resumes(rig: BackendRig, drives: EmulatedDrives) -> None:
+def test_drives_without_watchdog_are_off_once_frozen_host_resumes(
+    rig: BackendRig, drives: EmulatedDrives
+) -> None:
     """Drives that are described without a watchdog hold while the host does nothing.
 
     Once it resumes, the backend switches each of them off at once, reports it as a fault of its joint, and enables none
@@ -81,10 +91,14 @@ def assert_drives_stay_off(rig: BackendRig, drives: EmulatedDrives, period_count
     """Fail if a drive is enabled after any of some periods without a command."""
     for _ in range(period_count):
         rig.wait_periods()
-        assert not any(drives.list_enabled()), f"enabled again, in state {rig.authority.state}: {drives.list_enabled()}"
+        assert not any(drives.list_enabled()), (
+            f"enabled again, in state {rig.authority.state}: {drives.list_enabled()}"
+        )
 
 
-def test_drives_brake_after_fault_and_are_off_after_watchdog(rig: BackendRig, drives: EmulatedDrives) -> None:
+def test_drives_brake_after_fault_and_are_off_after_watchdog(
+    rig: BackendRig, drives: EmulatedDrives
+) -> None:
     """A fault while a joint moves: its drive brakes the joint, but no longer than the drive's watchdog lasts."""
     rig.arm_and_move_joint()
     rig.report_fault()

@@ -29,7 +29,10 @@ def test_an_isolated_joint_is_passive_while_others_continue(rig: BackendRig) -> 
         rig.isolate_joint(ISOLATED_JOINT)
         targets = {
             0: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S),
-            ISOLATED_JOINT: (JointMode.POSITION, rig.home_rad[ISOLATED_JOINT] + tolerances.STEP_RAD),
+            ISOLATED_JOINT: (
+                JointMode.POSITION,
+                rig.home_rad[ISOLATED_JOINT] + tolerances.STEP_RAD,
+            ),
         }
         record = rig.command_joints(targets, rig.count_periods(tolerances.MOTION_DURATION_S))
         rig.assert_armed()
@@ -39,7 +42,8 @@ def test_an_isolated_joint_is_passive_while_others_continue(rig: BackendRig) -> 
         moved_rad = np.ptp(record.angle_rad[tolerances.TRANSPORT_PERIODS :, ISOLATED_JOINT])
         assert moved_rad < tolerances.POSITION_TOLERANCE_RAD, f"it was moved by {moved_rad:.3f} rad"
         assert (
-            record.velocity_rad_s[-1, 0] > (1 - tolerances.SPEED_TOLERANCE_FRACTION) * tolerances.MOTION_SPEED_RAD_S
+            record.velocity_rad_s[-1, 0]
+            > (1 - tolerances.SPEED_TOLERANCE_FRACTION) * tolerances.MOTION_SPEED_RAD_S
         ), "the others stop, too"
         rig.disarm()
         rig.wait_periods(tolerances.TRANSPORT_PERIODS)
@@ -70,7 +74,8 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Backend
     bench.mute_joint(rig.backend, MUTED_JOINT)
     lease_periods = math.ceil(rig.robot.lease_ns / rig.period_ns)
     record = rig.command_joints(
-        {0: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)}, lease_periods + tolerances.TRANSPORT_PERIODS + 2
+        {0: (JointMode.VELOCITY, tolerances.MOTION_SPEED_RAD_S)},
+        lease_periods + tolerances.TRANSPORT_PERIODS + 2,
     )
     for joints in record.joints[tolerances.TRANSPORT_PERIODS :]:
         silent_ns = (joints.tick - mute_tick - tolerances.TRANSPORT_PERIODS) * rig.period_ns
@@ -79,7 +84,9 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Backend
             f"silent for {silent_ns * 1e-6} ms, reported as {joints.age_ns[MUTED_JOINT] * 1e-6} ms old"
         )
         others = [i for i in range(rig.joint_count) if i != MUTED_JOINT]
-        assert all(joints.valid[i] and joints.age_ns[i] <= rig.period_ns for i in others), "the others are fresh"
+        assert all(joints.valid[i] and joints.age_ns[i] <= rig.period_ns for i in others), (
+            "the others are fresh"
+        )
     assert rig.authority.state == "fault", "the robot goes on with a joint of unknown state"
     assert_others_at_rest(rig)
     fault_count = len(rig.faults)

@@ -27,10 +27,13 @@ def arm_and_move_by_controller(falls_silent: bool, hosted: HostedBackend) -> int
     """
     wait_until(lambda: hosted.backend.joint_states, "a first sample")
     start_angle_rad = hosted.backend.joint_states[-1].angle_rad[0]
-    speed_rad_s = -math.copysign(tolerances.MOTION_SPEED_RAD_S, start_angle_rad)  # away from the nearer stop
+    # Away from the nearer stop.
+    speed_rad_s = -math.copysign(tolerances.MOTION_SPEED_RAD_S, start_angle_rad)
     has_velocity_mode = hosted.robot.joints[0].supports_mode(JointMode.VELOCITY)
     period_s = hosted.config.period_ns * 1e-9
-    motion_ticks = tolerances.ARMING_PERIODS + math.ceil(tolerances.MOTION_DURATION_S * 1e9 / hosted.config.period_ns)
+    motion_ticks = tolerances.ARMING_PERIODS + math.ceil(
+        tolerances.MOTION_DURATION_S * 1e9 / hosted.config.period_ns
+    )
 
     def plan(ticks_since_arming: int) -> JointTargets | None:
         if ticks_since_arming < tolerances.ARMING_PERIODS:
@@ -39,7 +42,9 @@ def arm_and_move_by_controller(falls_silent: bool, hosted: HostedBackend) -> int
             return None
         if has_velocity_mode:
             return {0: (JointMode.VELOCITY, speed_rad_s)}
-        position_rad = start_angle_rad + speed_rad_s * period_s * (ticks_since_arming - tolerances.ARMING_PERIODS)
+        position_rad = start_angle_rad + speed_rad_s * period_s * (
+            ticks_since_arming - tolerances.ARMING_PERIODS
+        )
         return {0: (JointMode.POSITION, position_rad)}
 
     hosted.arm(plan)
@@ -49,16 +54,26 @@ def arm_and_move_by_controller(falls_silent: bool, hosted: HostedBackend) -> int
 def assert_moved_before(fault: Fault, hosted: HostedBackend) -> None:
     """Fail if joint 0 was still until the fault: then its stopping would prove nothing."""
     since = fault.tick - 2 * tolerances.ARMING_PERIODS
-    speeds = [abs(state.velocity_rad_s[0]) for state in hosted.backend.joint_states if since < state.tick <= fault.tick]
-    assert max(speeds) > tolerances.STANDSTILL_RAD_S, "the joint did not move, so stopping cannot be tested"
+    speeds = [
+        abs(state.velocity_rad_s[0])
+        for state in hosted.backend.joint_states
+        if since < state.tick <= fault.tick
+    ]
+    assert max(speeds) > tolerances.STANDSTILL_RAD_S, (
+        "the joint did not move, so stopping cannot be tested"
+    )
 
 
 def assert_rest_after(fault: Fault, hosted: HostedBackend) -> None:
     """Fail if a joint still moves SETTLING_TIME_S after the fault, in ticks of the robot."""
-    settled_tick = fault.tick + math.ceil(tolerances.SETTLING_TIME_S * 1e9 / hosted.config.period_ns) + 1
+    settled_tick = (
+        fault.tick + math.ceil(tolerances.SETTLING_TIME_S * 1e9 / hosted.config.period_ns) + 1
+    )
     while hosted.tick < settled_tick:
         hosted.wait_for_ticks(1)
-    states = [state for state in hosted.backend.joint_states if fault.tick < state.tick <= settled_tick]
+    states = [
+        state for state in hosted.backend.joint_states if fault.tick < state.tick <= settled_tick
+    ]
     assert np.abs(states[-1].velocity_rad_s).max() < tolerances.STANDSTILL_RAD_S, (
         f"still moving: {states[-1].velocity_rad_s} rad/s"
     )
@@ -92,7 +107,9 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: HostedBac
 
     def all_refused() -> bool:
         missing = [
-            values for word, values in invalid_fields_by_rejection.items() if rejected[word] <= rejected_before[word]
+            values
+            for word, values in invalid_fields_by_rejection.items()
+            if rejected[word] <= rejected_before[word]
         ]
         for values in missing:  # again, because a burst of samples may lose some
             hosted.send_forged_command(**values)
@@ -102,7 +119,9 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: HostedBac
     states_after = hosted.wait_for_ticks(tolerances.ARMING_PERIODS)
     assert hosted.host.authority.state == "armed", hosted.host.authority.reason
     moved_rad = np.array([state.angle_rad for state in states_after]) - start_angles_rad
-    assert np.abs(moved_rad).max() < tolerances.STANDSTILL_RAD, f"it moved by {np.abs(moved_rad).max():.3f} rad"
+    assert np.abs(moved_rad).max() < tolerances.STANDSTILL_RAD, (
+        f"it moved by {np.abs(moved_rad).max():.3f} rad"
+    )
 
 
 def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: HostedBackend) -> None:
@@ -122,7 +141,9 @@ def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: HostedBacke
     assert answer.ok and answer.lifecycle == "disarmed", answer
 
 
-def test_a_controller_that_falls_silent_stops_joints_within_lease(bench: Bench, hosted: HostedBackend) -> None:
+def test_a_controller_that_falls_silent_stops_joints_within_lease(
+    bench: Bench, hosted: HostedBackend
+) -> None:
     """When the controller falls silent, its command lease expires, which is a fault, and the joints come to rest."""
     try:
         let_lease_expire_and_check_time(hosted)
@@ -139,7 +160,9 @@ def let_lease_expire_and_check_time(hosted: HostedBackend) -> None:
     lease_periods = math.ceil(hosted.robot.lease_ns / hosted.robot.period_ns)
     assert_moved_before(expired, hosted)
     late_periods = expired.tick - hosted.controller.last_sent_tick - lease_periods
-    assert late_periods <= tolerances.TRANSPORT_PERIODS, f"{late_periods} periods after the end of the lease"
+    assert late_periods <= tolerances.TRANSPORT_PERIODS, (
+        f"{late_periods} periods after the end of the lease"
+    )
 
 
 def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: HostedBackend) -> None:
@@ -158,6 +181,8 @@ def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: HostedB
     tick = hosted.tick
     time.sleep(2 * hosted.robot.lease_ns * 1e-9)
     assert hosted.tick == tick, "time goes on in a pause"
-    assert hosted.session.send_request(keys.SIMULATOR, SimulatorRequest(action="resume"), timeout_s=10.0).ok
+    assert hosted.session.send_request(
+        keys.SIMULATOR, SimulatorRequest(action="resume"), timeout_s=10.0
+    ).ok
     hosted.wait_for_ticks(tolerances.ARMING_PERIODS)
     assert hosted.host.authority.state == "armed", hosted.host.authority.reason

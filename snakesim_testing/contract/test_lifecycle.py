@@ -27,7 +27,10 @@ def assert_at_rest(record: RigRecord, rig: BackendRig) -> None:
 
 def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: BackendRig) -> None:
     """A disarmed robot that receives commands: no joint moves or has torque."""
-    targets = {i: (JointMode.POSITION, rig.home_rad[i] + tolerances.STEP_RAD) for i in range(rig.joint_count)}
+    targets = {
+        i: (JointMode.POSITION, rig.home_rad[i] + tolerances.STEP_RAD)
+        for i in range(rig.joint_count)
+    }
     start_angles_rad = np.array(rig.newest_joints.angle_rad)
     record = rig.command_joints(targets, rig.count_periods(tolerances.MOTION_DURATION_S))
     moved_rad = np.abs(record.angle_rad - start_angles_rad).max()
@@ -43,7 +46,10 @@ def test_a_robot_with_modules_stops_them_itself_when_not_armed(
 
     This is a second line of defense. A simulator need not do this (see `Backend.enact`): the host hands it none.
     """
-    targets = {i: (JointMode.POSITION, rig.home_rad[i] + 0.5 * tolerances.STEP_RAD) for i in range(rig.joint_count)}
+    targets = {
+        i: (JointMode.POSITION, rig.home_rad[i] + 0.5 * tolerances.STEP_RAD)
+        for i in range(rig.joint_count)
+    }
     start_angles_rad = np.array(rig.newest_joints.angle_rad)
     first_tick = rig.tick
     for _ in range(rig.count_periods(tolerances.MOTION_DURATION_S)):
@@ -51,29 +57,40 @@ def test_a_robot_with_modules_stops_them_itself_when_not_armed(
     rig.wait_periods(tolerances.TRANSPORT_PERIODS)  # disarmed: the only state after a stop
     moved_rad = float(np.abs(rig.record_since(first_tick).angle_rad - start_angles_rad).max())
     if moved_rad >= tolerances.STANDSTILL_RAD and bench.clock_mode == "lockstep":
-        pytest.skip("a simulator may follow setpoints in every state; the host hands it safe ones only")
+        pytest.skip(
+            "a simulator may follow setpoints in every state; the host hands it safe ones only"
+        )
     assert moved_rad < tolerances.STANDSTILL_RAD, f"{state}, and it moved by {moved_rad:.3f} rad"
 
 
 @pytest.mark.parametrize(
-    "stop", [BackendRig.disarm, BackendRig.trigger_estop, BackendRig.report_fault], ids=["disarm", "estop", "fault"]
+    "stop",
+    [BackendRig.disarm, BackendRig.trigger_estop, BackendRig.report_fault],
+    ids=["disarm", "estop", "fault"],
 )
-def test_leaving_armed_brings_a_moving_joint_to_rest(rig: BackendRig, stop: Callable[[BackendRig], None]) -> None:
+def test_leaving_armed_brings_a_moving_joint_to_rest(
+    rig: BackendRig, stop: Callable[[BackendRig], None]
+) -> None:
     """A robot that is disarmed, stopped or at fault in motion: its joints come to rest, and commands move none."""
     rig.arm_and_move_joint()
     stop(rig)
-    assert_at_rest(rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.SETTLING_TIME_S)), rig)
+    assert_at_rest(
+        rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.SETTLING_TIME_S)), rig
+    )
 
 
 def test_disarmed_joints_have_no_torque(rig: BackendRig) -> None:
     """The joints of a disarmed robot have no torque, also away from the start pose."""
     rig.arm()
     rig.command_joints(
-        {0: (JointMode.POSITION, rig.home_rad[0] + tolerances.STEP_RAD)}, rig.count_periods(tolerances.SETTLING_TIME_S)
+        {0: (JointMode.POSITION, rig.home_rad[0] + tolerances.STEP_RAD)},
+        rig.count_periods(tolerances.SETTLING_TIME_S),
     )
     rig.disarm()
     record = rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.SETTLING_TIME_S))
-    assert np.abs(record.torque_nm[-1]).max() < tolerances.TORQUE_TOLERANCE_NM, f"{record.torque_nm[-1]} N·m"
+    assert np.abs(record.torque_nm[-1]).max() < tolerances.TORQUE_TOLERANCE_NM, (
+        f"{record.torque_nm[-1]} N·m"
+    )
     assert_at_rest(record, rig)
 
 
@@ -91,7 +108,10 @@ def test_arming_again_goes_on_from_where_the_robot_is(rig: BackendRig) -> None:
     assert np.abs(record.angle_rad - angles_before_arming_rad).max() < tolerances.STANDSTILL_RAD, (
         f"{record.angle_rad[-1] - angles_before_arming_rad} rad"
     )
-    assert np.abs(np.diff(record.torque_nm, axis=0)).max() < tolerances.MAX_TORQUE_STEP_FRACTION * rig.full_torque_nm[0]
+    assert (
+        np.abs(np.diff(record.torque_nm, axis=0)).max()
+        < tolerances.MAX_TORQUE_STEP_FRACTION * rig.full_torque_nm[0]
+    )
 
 
 def test_after_reset_and_arm_it_moves_again(rig: BackendRig) -> None:

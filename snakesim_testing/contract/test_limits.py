@@ -13,21 +13,28 @@ def test_the_torque_limit_of_the_setpoints_is_kept(rig: BackendRig, pushing: Pus
     rig.skip_without(torque=True)
     measured_nm = abs(pushing.torque_limited.torque_nm[-1, :2])
     limit_nm = pushing.limit_nm
-    assert max(measured_nm) < (1 + tolerances.TORQUE_TOLERANCE_FRACTION) * limit_nm + tolerances.TORQUE_TOLERANCE_NM, (
-        f"{measured_nm} N·m, limit is {limit_nm:.2f} N·m"
-    )
-    assert min(measured_nm) > (1 - tolerances.TORQUE_TOLERANCE_FRACTION) * limit_nm - tolerances.TORQUE_TOLERANCE_NM, (
-        f"{measured_nm} N·m does not use the limit of {limit_nm:.2f}"
-    )
+    assert (
+        max(measured_nm)
+        < (1 + tolerances.TORQUE_TOLERANCE_FRACTION) * limit_nm + tolerances.TORQUE_TOLERANCE_NM
+    ), f"{measured_nm} N·m, limit is {limit_nm:.2f} N·m"
+    assert (
+        min(measured_nm)
+        > (1 - tolerances.TORQUE_TOLERANCE_FRACTION) * limit_nm - tolerances.TORQUE_TOLERANCE_NM
+    ), f"{measured_nm} N·m does not use the limit of {limit_nm:.2f}"
 
 
 def test_a_torque_limit_of_zero_lets_nothing_move(rig: BackendRig) -> None:
     """With a torque limit of zero, no joint moves toward a position target that is far away."""
     rig.arm()
-    targets = {i: (JointMode.POSITION, rig.home_rad[i] + tolerances.STEP_RAD) for i in range(rig.joint_count)}
+    targets = {
+        i: (JointMode.POSITION, rig.home_rad[i] + tolerances.STEP_RAD)
+        for i in range(rig.joint_count)
+    }
     start_angles_rad = np.array(rig.newest_joints.angle_rad)
     record = rig.command_joints(
-        targets, rig.count_periods(tolerances.MOTION_DURATION_S), torque_limit_nm=[0.0] * rig.joint_count
+        targets,
+        rig.count_periods(tolerances.MOTION_DURATION_S),
+        torque_limit_nm=[0.0] * rig.joint_count,
     )
     moved_rad = np.abs(record.angle_rad - start_angles_rad).max()
     assert moved_rad < tolerances.STANDSTILL_RAD, f"it moved by {moved_rad:.3f} rad"

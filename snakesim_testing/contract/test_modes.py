@@ -35,10 +35,12 @@ def test_velocity_mode_turns_at_the_speed_that_is_asked(rig: BackendRig) -> None
         record = rig.command_joints(
             {0: (JointMode.VELOCITY, speed_rad_s)}, rig.count_periods(tolerances.MOTION_DURATION_S)
         )
-        mean_speed_rad_s = record.velocity_rad_s[-rig.count_periods(tolerances.MOTION_DURATION_S / 3) :, 0].mean()
-        assert abs(mean_speed_rad_s - speed_rad_s) < tolerances.SPEED_TOLERANCE_FRACTION * abs(speed_rad_s), (
-            f"asked for {speed_rad_s} rad/s: {mean_speed_rad_s:.3f} rad/s"
-        )
+        mean_speed_rad_s = record.velocity_rad_s[
+            -rig.count_periods(tolerances.MOTION_DURATION_S / 3) :, 0
+        ].mean()
+        assert abs(mean_speed_rad_s - speed_rad_s) < tolerances.SPEED_TOLERANCE_FRACTION * abs(
+            speed_rad_s
+        ), f"asked for {speed_rad_s} rad/s: {mean_speed_rad_s:.3f} rad/s"
 
 
 def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: BackendRig) -> None:
@@ -46,25 +48,32 @@ def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: BackendR
     rig.arm()
     joint = rig.joint_count - 1
     record = rig.command_joints(
-        {joint: (JointMode.VELOCITY, -tolerances.MOTION_SPEED_RAD_S)}, rig.count_periods(tolerances.MOTION_DURATION_S)
+        {joint: (JointMode.VELOCITY, -tolerances.MOTION_SPEED_RAD_S)},
+        rig.count_periods(tolerances.MOTION_DURATION_S),
     )
     velocity = record.velocity_rad_s
     angle = record.angle_rad
     integral = 0.5 * (velocity[1:] + velocity[:-1]).sum(axis=0) * rig.period_ns * 1e-9
     turned = angle[-1] - angle[0]
-    assert turned[joint] < -tolerances.STANDSTILL_RAD, "the joint did not move, so nothing can be compared"
+    assert turned[joint] < -tolerances.STANDSTILL_RAD, (
+        "the joint did not move, so nothing can be compared"
+    )
     assert np.abs(integral - turned).max() < tolerances.INTEGRATION_TOLERANCE_RAD, (
         f"turned {integral} rad by velocity, {turned} by angle"
     )
 
 
-def test_torque_mode_pushes_with_the_torque_that_is_asked(rig: BackendRig, pushing: PushRecording) -> None:
+def test_torque_mode_pushes_with_the_torque_that_is_asked(
+    rig: BackendRig, pushing: PushRecording
+) -> None:
     """A joint in torque mode against its end stop reports the requested torque in N·m, with its sign."""
     rig.skip_without(JointMode.TORQUE, torque=True)
     assert pushing.torque_mode is not None
     measured_nm = pushing.torque_mode.torque_nm[-1]
     requested_nm = pushing.requested_nm
-    tolerance_nm = tolerances.TORQUE_TOLERANCE_FRACTION * requested_nm + tolerances.TORQUE_TOLERANCE_NM
+    tolerance_nm = (
+        tolerances.TORQUE_TOLERANCE_FRACTION * requested_nm + tolerances.TORQUE_TOLERANCE_NM
+    )
     assert abs(measured_nm[0] - requested_nm) < tolerance_nm, (
         f"asked for {requested_nm:.2f} N·m: {measured_nm[0]:.3f} N·m"
     )
@@ -77,12 +86,19 @@ def test_a_passive_joint_has_no_torque_and_stays(rig: BackendRig) -> None:
     """An armed joint that becomes passive away from the start pose has no torque, and stays where it is."""
     rig.arm()
     rig.command_joints(
-        {0: (JointMode.POSITION, rig.home_rad[0] + tolerances.STEP_RAD)}, rig.count_periods(tolerances.SETTLING_TIME_S)
+        {0: (JointMode.POSITION, rig.home_rad[0] + tolerances.STEP_RAD)},
+        rig.count_periods(tolerances.SETTLING_TIME_S),
     )
-    record = rig.command_joints({0: (JointMode.PASSIVE, 0.0)}, rig.count_periods(tolerances.SETTLING_TIME_S))
-    assert abs(record.torque_nm[-1, 0]) < tolerances.TORQUE_TOLERANCE_NM, f"{record.torque_nm[-1, 0]:.3f} N·m"
+    record = rig.command_joints(
+        {0: (JointMode.PASSIVE, 0.0)}, rig.count_periods(tolerances.SETTLING_TIME_S)
+    )
+    assert abs(record.torque_nm[-1, 0]) < tolerances.TORQUE_TOLERANCE_NM, (
+        f"{record.torque_nm[-1, 0]:.3f} N·m"
+    )
     settled = record.angle_rad[tolerances.TRANSPORT_PERIODS :, 0]
-    assert np.ptp(settled) < tolerances.POSITION_TOLERANCE_RAD, f"it moved by {np.ptp(settled):.3f} rad"
+    assert np.ptp(settled) < tolerances.POSITION_TOLERANCE_RAD, (
+        f"it moved by {np.ptp(settled):.3f} rad"
+    )
 
 
 def test_joints_may_be_in_different_modes_at_once(rig: BackendRig) -> None:
@@ -96,10 +112,16 @@ def test_joints_may_be_in_different_modes_at_once(rig: BackendRig) -> None:
         rig.joint_count - 1: (JointMode.PASSIVE, 0.0),
     }
     record = rig.command_joints(targets, rig.count_periods(tolerances.MOTION_DURATION_S))
-    assert abs(record.angle_rad[-1, 0] - target_rad) < 2 * tolerances.POSITION_TOLERANCE_RAD  # still on its way
-    assert abs(record.velocity_rad_s[-1, 1] - speed_rad_s) < tolerances.SPEED_TOLERANCE_FRACTION * speed_rad_s
+    # Still on its way.
+    assert abs(record.angle_rad[-1, 0] - target_rad) < 2 * tolerances.POSITION_TOLERANCE_RAD
+    assert (
+        abs(record.velocity_rad_s[-1, 1] - speed_rad_s)
+        < tolerances.SPEED_TOLERANCE_FRACTION * speed_rad_s
+    )
     moved_rad = record.angle_rad[-1] - rig.home_rad
-    assert abs(moved_rad[-1]) < tolerances.POSITION_TOLERANCE_RAD, f"the passive joint moved by {moved_rad[-1]:.3f} rad"
+    assert abs(moved_rad[-1]) < tolerances.POSITION_TOLERANCE_RAD, (
+        f"the passive joint moved by {moved_rad[-1]:.3f} rad"
+    )
 
 
 def test_setpoints_hold_until_the_next_ones(rig: BackendRig) -> None:
@@ -133,7 +155,9 @@ def test_a_mode_that_a_joint_lacks_is_refused(rig: BackendRig) -> None:
         assert rig.authority.rejected_counts["wrong_mode"] == rejected_count + 1, (
             f"{mode.name.lower()} mode was accepted"
         )
-        assert np.abs(record.angle_rad - rig.home_rad).max() < tolerances.POSITION_TOLERANCE_RAD, "it moved"
+        assert np.abs(record.angle_rad - rig.home_rad).max() < tolerances.POSITION_TOLERANCE_RAD, (
+            "it moved"
+        )
         assert all(mode not in points.mode for points in record.setpoints)
 
 

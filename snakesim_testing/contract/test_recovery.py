@@ -22,7 +22,9 @@ BUS_1_LOST = "cut:bus_1@0-9"
 JOINT_2_DUPLICATED = "duplicate:joint_2@0-9"
 
 
-@pytest.mark.parametrize("stop", [BackendRig.disarm, BackendRig.trigger_estop], ids=["disarm", "estop"])
+@pytest.mark.parametrize(
+    "stop", [BackendRig.disarm, BackendRig.trigger_estop], ids=["disarm", "estop"]
+)
 def test_torque_is_off_in_time_by_the_drives_own_log(
     rig: BackendRig, drives: EmulatedDrives, stop: Callable[[BackendRig], None]
 ) -> None:
@@ -34,7 +36,9 @@ def test_torque_is_off_in_time_by_the_drives_own_log(
     assert_switched_off(rig, drives, start_s, tolerances.TORQUE_OFF_PERIODS * rig.period_ns * 1e-9)
 
 
-def test_torque_is_off_after_watchdog_by_the_drives_own_log(rig: BackendRig, drives: EmulatedDrives) -> None:
+def test_torque_is_off_after_watchdog_by_the_drives_own_log(
+    rig: BackendRig, drives: EmulatedDrives
+) -> None:
     """A host that does nothing while a joint moves: every drive switches its torque off by its watchdog, in time."""
     joints_without_watchdog = rig.joints_without_watchdog
     if joints_without_watchdog:
@@ -48,7 +52,9 @@ def test_torque_is_off_after_watchdog_by_the_drives_own_log(rig: BackendRig, dri
     assert_switched_off(rig, drives, start_s, tolerances.MAX_WATCHDOG_OFF_S)
 
 
-def test_a_drive_restarted_in_motion_stays_off_until_reset(rig: BackendRig, drives: EmulatedDrives) -> None:
+def test_a_drive_restarted_in_motion_stays_off_until_reset(
+    rig: BackendRig, drives: EmulatedDrives
+) -> None:
     """The drive of a moving joint restarts: a fault names the joint, and all drives are off until reset and arming."""
     rig.arm_and_move_joint()
     rig.must_reopen = True
@@ -67,17 +73,21 @@ def test_two_drives_with_one_id_stop_the_robot(rig: BackendRig, drives: Emulated
     inject_or_skip(rig, JOINT_2_DUPLICATED)
     rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.SETTLING_TIME_S))
     assert_fault_names_joint(rig, start_tick, 1)
-    assert "duplicate_node" in {fault.what for fault in rig.record_since(start_tick).faults}, rig.record_since(
-        start_tick
-    ).faults
+    assert "duplicate_node" in {fault.what for fault in rig.record_since(start_tick).faults}, (
+        rig.record_since(start_tick).faults
+    )
     rig.reset()
     rig.wait_periods(rig.count_periods(tolerances.SETTLING_TIME_S))
-    assert rig.authority.state == "fault", "reset while the second drive is still there, and the robot may be armed"
+    assert rig.authority.state == "fault", (
+        "reset while the second drive is still there, and the robot may be armed"
+    )
     rig.backend.inject(parse_injection(JOINT_2_DUPLICATED), begins=False)  # ends the fault
     assert_recovers_by_reset_alone(rig, drives)
 
 
-def test_a_bus_that_is_lost_and_restored_enables_no_drive(rig: BackendRig, drives: EmulatedDrives) -> None:
+def test_a_bus_that_is_lost_and_restored_enables_no_drive(
+    rig: BackendRig, drives: EmulatedDrives
+) -> None:
     """A bus loses all frames in motion: the drives on it are disabled, and stay disabled once frames pass again.
 
     Drives with a watchdog switch their torque off by themselves while the bus is lost. Drives that are described
@@ -98,7 +108,10 @@ def test_a_bus_that_is_lost_and_restored_enables_no_drive(rig: BackendRig, drive
     has_drive_time_passed = drives.read_time_s() > start_s + tolerances.MAX_WATCHDOG_OFF_S
     if not joints_without_watchdog and has_drive_time_passed:
         assert_switched_off(
-            rig, drives, start_s, tolerances.MAX_WATCHDOG_OFF_S + tolerances.TRANSPORT_PERIODS * rig.period_ns * 1e-9
+            rig,
+            drives,
+            start_s,
+            tolerances.MAX_WATCHDOG_OFF_S + tolerances.TRANSPORT_PERIODS * rig.period_ns * 1e-9,
         )
     rig.backend.inject(parse_injection(BUS_1_LOST), begins=False)  # ends the fault
     if joints_without_watchdog:
@@ -119,14 +132,18 @@ def assert_recovers_by_reset_alone(rig: BackendRig, drives: EmulatedDrives) -> N
     assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
     rig.reset()
     assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.DRIVE_RESTART_TIME_S))
-    if rig.authority.state == "fault":  # a fault that was detected again while its cause was still there
+    if (
+        rig.authority.state == "fault"
+    ):  # a fault that was detected again while its cause was still there
         rig.reset()
         assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.DRIVE_RESTART_TIME_S))
     rig.arm_and_move_joint()
     assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
 
 
-def assert_switched_off(rig: BackendRig, drives: EmulatedDrives, start_s: float, max_duration_s: float) -> None:
+def assert_switched_off(
+    rig: BackendRig, drives: EmulatedDrives, start_s: float, max_duration_s: float
+) -> None:
     """Fail unless every drive's own log shows that its torque was switched off in time, and has been off since then.
 
     Args:
@@ -137,7 +154,11 @@ def assert_switched_off(rig: BackendRig, drives: EmulatedDrives, start_s: float,
     """
     assert not any(drives.list_enabled()), f"still enabled are {drives.list_enabled()}"
     for i, joint in enumerate(rig.robot.joints):
-        off_times_s = [entry.time_s for entry in drives.list_torque_switches() if entry.joint == i and not entry.is_on]
+        off_times_s = [
+            entry.time_s
+            for entry in drives.list_torque_switches()
+            if entry.joint == i and not entry.is_on
+        ]
         assert off_times_s and off_times_s[-1] >= start_s, (
             f"the log of {joint.name} does not show when its torque went off"
         )

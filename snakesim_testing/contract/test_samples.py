@@ -22,7 +22,9 @@ from snakesim_testing.contract.rig import BackendRig, RigRecord
 JOINT_STATE_VECTORS = ("angle_rad", "velocity_rad_s", "torque_nm", "valid", "age_ns")
 
 
-def test_joints_carry_the_tick_and_stamp_that_were_asked_for(rig: BackendRig, healthy: RigRecord) -> None:
+def test_joints_carry_the_tick_and_stamp_that_were_asked_for(
+    rig: BackendRig, healthy: RigRecord
+) -> None:
     """There is one joint state for each tick, and its timestamp is the robot time of the tick."""
     ticks = [joints.tick for joints in healthy.joints]
     assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
@@ -34,7 +36,10 @@ def test_other_sensors_are_stamped_when_they_were_read(rig: BackendRig, healthy:
     for sensor in rig.robot.sensors:
         if sensor.key == keys.JOINTS:
             continue
-        max_age_ns = 1e9 * (sensor.delay_s + 1 / sensor.rate_hz) + tolerances.SENSOR_START_PERIODS * rig.period_ns
+        max_age_ns = (
+            1e9 * (sensor.delay_s + 1 / sensor.rate_hz)
+            + tolerances.SENSOR_START_PERIODS * rig.period_ns
+        )
         timestamps_ns: list[int] = []
         for sample in healthy.samples:
             if (message := sample.by_key.get(sensor.key)) is not None:
@@ -42,7 +47,9 @@ def test_other_sensors_are_stamped_when_they_were_read(rig: BackendRig, healthy:
                 timestamps_ns.append(timestamp_ns)
                 age_ns = sample.joints.timestamp_ns - timestamp_ns
                 assert 0 <= age_ns <= max_age_ns, f"{sensor.key}: {age_ns * 1e-6} ms old"
-        assert all(before < after for before, after in pairwise(timestamps_ns)), f"{sensor.key}: out of order"
+        assert all(before < after for before, after in pairwise(timestamps_ns)), (
+            f"{sensor.key}: out of order"
+        )
 
 
 def test_every_vector_has_one_entry_a_joint(rig: BackendRig, healthy: RigRecord) -> None:
@@ -60,13 +67,19 @@ def test_every_sample_survives_the_wire(rig: BackendRig, healthy: RigRecord) -> 
     for sample in healthy.samples:
         for key, message in ((keys.JOINTS, sample.joints), *sample.by_key.items()):
             custom_message = find_custom_message(key, rig.robot)
-            decoder = MessageDecoder(type(message) if custom_message is None else custom_message.message)
+            decoder = MessageDecoder(
+                type(message) if custom_message is None else custom_message.message
+            )
             try:
                 decoded = decoder.decode(encode(message), format_encoding(type(message)))
             except WireError as error:
                 pytest.fail(f"{key}: {describe_invalid_field(message) or error}")
             assert msgspec.to_builtins(decoded) == msgspec.to_builtins(message)
-        assert all(math.isfinite(number) for name in JOINT_STATE_VECTORS[:3] for number in getattr(sample.joints, name))
+        assert all(
+            math.isfinite(number)
+            for name in JOINT_STATE_VECTORS[:3]
+            for number in getattr(sample.joints, name)
+        )
 
 
 def test_every_sample_fits_the_robot(rig: BackendRig, healthy: RigRecord) -> None:
@@ -81,7 +94,9 @@ def test_no_sample_contradicts_itself(healthy: RigRecord) -> None:
     for sample in healthy.samples:
         for key, message in sample.by_key.items():
             if isinstance(message, MountedSample):
-                assert not (contradiction := message.find_contradiction()), f"{key}: {contradiction}"
+                assert not (contradiction := message.find_contradiction()), (
+                    f"{key}: {contradiction}"
+                )
 
 
 def test_every_joint_is_valid_and_fresh_at_every_tick(rig: BackendRig, healthy: RigRecord) -> None:
@@ -142,7 +157,9 @@ def test_a_sagging_supply_is_reported_at_its_joint(rig: BackendRig) -> None:
     assert before_v[1] - sagging_v[1] > tolerances.MIN_SUPPLY_SAG_V, (
         f"it sags from {before_v[1]} V, and is reported as {sagging_v[1]} V"
     )
-    assert rig.authority.state == "fault", "a supply below `min_voltage_v`, and the robot may be armed"
+    assert rig.authority.state == "fault", (
+        "a supply below `min_voltage_v`, and the robot may be armed"
+    )
 
 
 def wait_for_power_sample(rig: BackendRig) -> Power:
@@ -153,7 +170,9 @@ def wait_for_power_sample(rig: BackendRig) -> Power:
     if not any(sensor.key == keys.POWER for sensor in rig.robot.sensors):
         pytest.skip("this robot has no power sensor")
     record = rig.wait_periods(rig.count_periods(tolerances.POWER_REPORT_TIME_S))
-    samples = [sample.by_key[keys.POWER] for sample in record.samples if keys.POWER in sample.by_key]
+    samples = [
+        sample.by_key[keys.POWER] for sample in record.samples if keys.POWER in sample.by_key
+    ]
     assert samples, f"no power sample in {tolerances.POWER_REPORT_TIME_S} s"
     newest = samples[-1]
     assert isinstance(newest, Power)

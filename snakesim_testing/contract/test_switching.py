@@ -13,7 +13,10 @@ SWITCH_NAMES = [f"{before.name}_to_{after.name}".lower() for before, after in MO
 
 @pytest.mark.parametrize(("before", "after"), MODE_SWITCHES, ids=SWITCH_NAMES)
 def test_a_mode_switch_makes_no_jump(
-    rig: BackendRig, switching: dict[tuple[JointMode, JointMode], Floats], before: JointMode, after: JointMode
+    rig: BackendRig,
+    switching: dict[tuple[JointMode, JointMode], Floats],
+    before: JointMode,
+    after: JointMode,
 ) -> None:
     """When a joint changes its mode, with small targets, its torque jumps by less than a quarter of the maximum."""
     for mode in (before, after):

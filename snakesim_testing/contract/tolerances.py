@@ -6,25 +6,28 @@ degrees, a wrong order or sign, a missing limit, or a joint that goes on moving 
 
 # --- transport, in control periods -----------------------------------------------------------------------------
 
-TRANSPORT_PERIODS = 2  # setpoints act from the next sample's synchronisation on; the sample after that shows it
+# Setpoints act from the next sample's synchronisation on; the sample after that shows it.
+TRANSPORT_PERIODS = 2
 ARMING_PERIODS = 15  # modules change their state one after another, and confirm it
-MAX_READING_AGE_PERIODS = 1  # every joint is read every tick: a reading is of this tick, or of the one before
+# Every joint is read every tick: a reading is of this tick, or of the one before.
+MAX_READING_AGE_PERIODS = 1
 COMMAND_GAP_PERIODS = 3  # without commands, when setpoints have to hold; less than a lease of five
-SENSOR_START_PERIODS = 3  # a sensor with its own rate may start late by this much, besides its delay and one interval
+# A sensor with its own rate may start late by this much, besides its delay and one interval.
+SENSOR_START_PERIODS = 3
 HOLD_PERIODS = 5  # how long setpoints have to hold without being handed over again: a lease
 TORQUE_OFF_PERIODS = 4  # from a stop to torque off: transport, and a command that drives confirm
 CLOSING_PERIODS = 5  # for how long a closed backend is observed
 
 # --- mechanics, in seconds -------------------------------------------------------------------------------------
 
-SETTLING_TIME_S = (
-    0.6  # bench4, released at MOTION_SPEED_RAD_S, is at rest after 0.3 s; a reached target has settled after 0.4 s
-)
+# Bench4, released at MOTION_SPEED_RAD_S, is at rest after 0.3 s; a reached target has settled after 0.4 s.
+SETTLING_TIME_S = 0.6
 MOTION_DURATION_S = 0.3  # long enough to reach MOTION_SPEED_RAD_S, short enough to stay inside the limits of the joint
 PUSH_DURATION_S = 0.5  # against a stop: the impact is over
 FREEZE_DURATION_S = 1.0  # that a host does nothing: ten times a watchdog
 DRIVE_RESTART_TIME_S = 1.0  # a drive that restarts answers again after half a second
-MAX_WATCHDOG_OFF_S = 0.25  # from the last setpoint: the watchdog, as long again for modules that brake, and a period
+# From the last setpoint: the watchdog, as long again for modules that brake, and a period.
+MAX_WATCHDOG_OFF_S = 0.25
 MAX_BRAKING_S = 0.1  # after a fault: the greatest watchdog of the bench's drives
 
 # --- commands --------------------------------------------------------------------------------------------------
@@ -46,13 +49,17 @@ MIN_SUPPLY_SAG_V = 1.0  # by which a reported supply drops at least if it sags b
 
 # --- tolerances ------------------------------------------------------------------------------------------------
 
-POSITION_TOLERANCE_RAD = 0.03  # friction of joint and ground over stiffness, noise, quantisation (1e-4 rad)
+# Friction of joint and ground over stiffness, noise, quantisation (1e-4 rad).
+POSITION_TOLERANCE_RAD = 0.03
 STANDSTILL_RAD = 0.02  # has not moved: a tenth of STEP_RAD, several times the noise and the vibration from neighbors
 STANDSTILL_RAD_S = 0.05  # is at rest: a tenth of MOTION_SPEED_RAD_S; quantisation is 1e-3 rad/s
 MAX_OVERSHOOT_RAD = 0.08  # beyond the joint's limit: a stop gives a little
-SPEED_TOLERANCE_FRACTION = 0.35  # velocity mode is a gain, not an integrator: friction reduces the speed
-INTEGRATION_TOLERANCE_RAD = 0.03  # angle against integrated velocity: sampling, and a period of disagreement
-TORQUE_TOLERANCE_FRACTION = 0.15  # of the commanded torque; gauges and motor constants are not better
+# Velocity mode is a gain, not an integrator: friction reduces the speed.
+SPEED_TOLERANCE_FRACTION = 0.35
+# Angle against integrated velocity: sampling, and a period of disagreement.
+INTEGRATION_TOLERANCE_RAD = 0.03
+# Of the commanded torque; gauges and motor constants are not better.
+TORQUE_TOLERANCE_FRACTION = 0.15
 TORQUE_TOLERANCE_NM = 0.06  # besides: friction between motor and gauge, noise, quantisation (1e-3 N·m, limits 1e-2 N·m)
 # Of full torque, in a tick, with small targets. The limiter's start is up to two periods old on a bus: at
 # these speeds that is a tenth. A target that is not bumpless, or a motor that restarts, makes several tenths.

@@ -32,7 +32,10 @@ class DriveRig:
             count = len(self.joints.angle_rad)
             mode, target = self._setpoint(lifecycle)
             self.backend.enact(
-                SafeSetpoints([mode] * count, [target] * count, [self.limit_nm] * count, self.isolated), lifecycle
+                SafeSetpoints(
+                    [mode] * count, [target] * count, [self.limit_nm] * count, self.isolated
+                ),
+                lifecycle,
             )
             self.backend.advance()
             found += self.backend.faults()

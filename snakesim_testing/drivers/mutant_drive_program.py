@@ -34,7 +34,10 @@ def enable_again() -> None:
     EmulatedMoteus.on_step = on_step
 
 
-MUTANTS: dict[str, Callable[[], None]] = {"no_watchdog": disable_watchdog, "enables_again": enable_again}
+MUTANTS: dict[str, Callable[[], None]] = {
+    "no_watchdog": disable_watchdog,
+    "enables_again": enable_again,
+}
 
 
 if __name__ == "__main__":

@@ -18,18 +18,31 @@ DEPTH_RANGE_M = (0.05, 3.0)
 DEPTH_UNIT_M = 0.001
 
 
-def make_cylinder(name: str, x: float, y: float, radius_m: float = 0.05, height_m: float = 0.2) -> KnownObstacle:
+def make_cylinder(
+    name: str, x: float, y: float, radius_m: float = 0.05, height_m: float = 0.2
+) -> KnownObstacle:
     """Return an upright cylinder."""
     return KnownObstacle(
-        name=name, shape="cylinder", position_w=(x, y, height_m / 2), radius_m=radius_m, height_m=height_m
+        name=name,
+        shape="cylinder",
+        position_w=(x, y, height_m / 2),
+        radius_m=radius_m,
+        height_m=height_m,
     )
 
 
-def make_box(name: str, x: float, y: float, size_m: tuple[float, float], yaw_rad: float = 0.0) -> KnownObstacle:
+def make_box(
+    name: str, x: float, y: float, size_m: tuple[float, float], yaw_rad: float = 0.0
+) -> KnownObstacle:
     """Return an upright box."""
     half = (size_m[0] / 2, size_m[1] / 2, 0.1)
     return KnownObstacle(
-        name=name, shape="box", position_w=(x, y, 0.1), yaw_rad=yaw_rad, half_size_m=half, height_m=0.2
+        name=name,
+        shape="box",
+        position_w=(x, y, 0.1),
+        yaw_rad=yaw_rad,
+        half_size_m=half,
+        height_m=0.2,
     )
 
 
@@ -56,8 +69,12 @@ class SensorErrors:
     def apply(self, distance_m: Floats) -> Floats:
         """Return measured distances, with errors; infinite where nothing is measured."""
         with np.errstate(invalid="ignore"):
-            noise = (self.floor_m + self.per_m2 * distance_m**2) * self.random.standard_normal(distance_m.shape)
-            seen = np.where(self.random.random(distance_m.shape) < self.dropout, np.inf, distance_m + noise)
+            noise = (self.floor_m + self.per_m2 * distance_m**2) * self.random.standard_normal(
+                distance_m.shape
+            )
+            seen = np.where(
+                self.random.random(distance_m.shape) < self.dropout, np.inf, distance_m + noise
+            )
         return np.where(np.isfinite(distance_m), seen, np.inf)
 
 
@@ -78,7 +95,9 @@ def compute_ray_distances(
         t = np.minimum(t, 50.0)
         for _ in range(8):  # towards the hills
             at = origin + t[:, None] * rays
-            t = np.where(rays[:, 2] < -1e-3, t - (at[:, 2] - ground(at[:, 0], at[:, 1])) / rays[:, 2], np.inf)
+            t = np.where(
+                rays[:, 2] < -1e-3, t - (at[:, 2] - ground(at[:, 0], at[:, 1])) / rays[:, 2], np.inf
+            )
             t = np.clip(t, 0.0, 50.0)
         nearest = np.where(t < 50.0, t, nearest)
         for o in obstacles:
@@ -98,7 +117,10 @@ def _on_upright(origin: Floats, rays: Floats, o: KnownObstacle) -> Floats:
         cos, sin = math.cos(o.yaw_rad), math.sin(o.yaw_rad)
         turn = np.array([[cos, sin], [-sin, cos]])
         local, along = turn @ to, rays[:, :2] @ turn.T
-        one, two = (-np.array(o.half_size_m[:2]) - local) / along, (np.array(o.half_size_m[:2]) - local) / along
+        one, two = (
+            (-np.array(o.half_size_m[:2]) - local) / along,
+            (np.array(o.half_size_m[:2]) - local) / along,
+        )
         enter, leave = np.minimum(one, two).max(1), np.maximum(one, two).min(1)
         t = np.where(enter <= leave, enter, np.inf)
     height = origin[2] + t * rays[:, 2]
@@ -169,9 +191,13 @@ def render_lidar_scan(
     """
     max_range_m = 4.0
     angles_rad = np.linspace(-math.pi / 2, math.pi / 2, beam_count)
-    rays = np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(beam_count)], axis=1) @ world_from_lidar.T
+    rays = (
+        np.stack([np.cos(angles_rad), np.sin(angles_rad), np.zeros(beam_count)], axis=1)
+        @ world_from_lidar.T
+    )
     distances_m = compute_ray_distances(position_w, rays, obstacles)
-    angle_step_rad = float(angles_rad[1] - angles_rad[0]) if beam_count > 1 else 0.01  # a message needs a step above 0
+    # A message needs a step above 0.
+    angle_step_rad = float(angles_rad[1] - angles_rad[0]) if beam_count > 1 else 0.01
     return RangeScan(
         tick=0,
         timestamp_ns=timestamp_ns,
@@ -182,7 +208,9 @@ def render_lidar_scan(
         angle_step_rad=angle_step_rad,
         range_min_m=0.02,
         range_max_m=max_range_m,
-        range_m=[float(distance_m) if distance_m < max_range_m else None for distance_m in distances_m],
+        range_m=[
+            float(distance_m) if distance_m < max_range_m else None for distance_m in distances_m
+        ],
     )
 
 
@@ -191,7 +219,9 @@ def make_lidar_scan(
 ) -> AzimuthScan:
     """Return the scan of a lidar near the ground that looks along x, with the given obstacles around it."""
     position, ahead = np.array([*at, 0.05]), make_rotation(0.0)
-    ranges = render_lidar_scan(obstacles, position, ahead, beam_count=361, timestamp_ns=timestamp_ns)
+    ranges = render_lidar_scan(
+        obstacles, position, ahead, beam_count=361, timestamp_ns=timestamp_ns
+    )
     return make_scan(ranges, position, ahead, 0.0, RangeNoise(0.002, 0.0))
 
 

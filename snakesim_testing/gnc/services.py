@@ -21,7 +21,11 @@ from snakesim_testing.hal.local_network import RunningHost, running_host
 from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.harness.wait import wait_until
 
-SCHEDULE: dict[str, Any] = {"guidance": {"decimation": 2}, "navigation": {"decimation": 5}, "control": {}}
+SCHEDULE: dict[str, Any] = {
+    "guidance": {"decimation": 2},
+    "navigation": {"decimation": 5},
+    "control": {},
+}
 POSE = {"robot__sensors__pose": {"rate_hz": 10.0}}  # as the host's backend of the tests gives it
 
 
@@ -29,7 +33,8 @@ class ObservationRecorder(HoldPose):
     """A controller that records its observations, and holds the joints unless a test sets another response."""
 
     observations: list[Observation]
-    answers: list[Callable[["ObservationRecorder", Observation], Any]]  # its only entry is how it answers
+    # Its only entry is how it answers.
+    answers: list[Callable[["ObservationRecorder", Observation], Any]]
 
     def update(self, observation: Observation) -> ControllerCommand:
         """Record the observation, and return the command that the test has set, or else one that holds the joints."""
@@ -42,7 +47,9 @@ class ServiceThread:
 
     def __init__(self, name: str, config: RunConfig, connection: ConnectionSettings) -> None:
         self.stopped, self.error = threading.Event(), None
-        self.thread = threading.Thread(target=self._run_service, args=(name, config, connection), name=name)
+        self.thread = threading.Thread(
+            target=self._run_service, args=(name, config, connection), name=name
+        )
         self.thread.start()
 
     def _run_service(self, name: str, config: RunConfig, connection: ConnectionSettings) -> None:
@@ -79,12 +86,15 @@ class RunningServices:
     def wait_for_reason(self, words: str) -> ControlState:
         """Wait until control has reported a reason that contains some words, and return that report."""
 
-        def found() -> list[ControlState]:
+        def list_states_with_reason() -> list[ControlState]:
             self.read_newest_state()
             return [state for state in self.reported if words in state.reason]
 
-        wait_until(found, f"{words!r} reported; last: {self.reported[-1].reason if self.reported else 'nothing'}")
-        return found()[0]
+        wait_until(
+            list_states_with_reason,
+            f"{words!r} reported; last: {self.reported[-1].reason if self.reported else 'nothing'}",
+        )
+        return list_states_with_reason()[0]
 
 
 @contextmanager

@@ -11,11 +11,27 @@ from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.scan import RangeNoise
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.kinematics import (
+    compute_link_frames,
+    quaternion_from_yaw,
+    rotation_from_quaternion,
+)
 from snakesim_hal.model.outlines import compute_outline_distance_m
-from snakesim_hal.model.route import Route, compute_yaw_segments_m, place_chain_on_route, sample_sine_curve
+from snakesim_hal.model.route import (
+    Route,
+    compute_yaw_segments_m,
+    place_chain_on_route,
+    sample_sine_curve,
+)
 from snakesim_hal.wire.messages import DepthImage, Imu, JointState, KnownObstacle, Pose
-from snakesim_testing.gnc.rendered import Ground, SensorErrors, flat_ground, make_box, make_cylinder, render_depth_image
+from snakesim_testing.gnc.rendered import (
+    Ground,
+    SensorErrors,
+    flat_ground,
+    make_box,
+    make_cylinder,
+    render_depth_image,
+)
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_robot
 from snakesim_testing.hal.small_robots import make_joint_state, make_pose
 
@@ -56,7 +72,9 @@ class SlidingSnake:
     obstacles: Sequence[KnownObstacle]
     speed_m_s: float = 0.2
     ground: Ground = flat_ground
-    eye: SensorErrors = field(default_factory=lambda: SensorErrors(NOISE.floor_m, NOISE.per_m2, 0.01))
+    eye: SensorErrors = field(
+        default_factory=lambda: SensorErrors(NOISE.floor_m, NOISE.per_m2, 0.01)
+    )
     seed: int = 0
     turn: int = 0
 
@@ -73,14 +91,20 @@ class SlidingSnake:
     def compute_pose(self, turn: int) -> SnakePose:
         """Return the true pose of the snake in a guidance cycle."""
         lay = place_chain_on_route(
-            ROUTE, 0.02 + self.speed_m_s * turn * STEP_NS * 1e-9, compute_yaw_segments_m(self.axes, self.lengths)
+            ROUTE,
+            0.02 + self.speed_m_s * turn * STEP_NS * 1e-9,
+            compute_yaw_segments_m(self.axes, self.lengths),
         )
         rotation = rotation_from_quaternion(quaternion_from_yaw(lay.heading_rad))
         tail = (*lay.tail_w, BODY_RADIUS_M)
-        origins, rotations = compute_link_frames(tail, rotation, lay.angles_rad, self.axes, self.lengths)
+        origins, rotations = compute_link_frames(
+            tail, rotation, lay.angles_rad, self.axes, self.lengths
+        )
         headings = lay.heading_rad + np.concatenate([[0.0], np.cumsum(lay.angles_rad)])
         head = origins[-1] + self.lengths[-1] * rotations[-1][:, 0]
-        return SnakePose((*lay.tail_w, lay.heading_rad), lay.angles_rad, origins, rotations, headings, head)
+        return SnakePose(
+            (*lay.tail_w, lay.heading_rad), lay.angles_rad, origins, rotations, headings, head
+        )
 
     def run_cycles(
         self, count: int, *, pose: bool = True, images: bool = True, imu: bool = True
@@ -100,12 +124,16 @@ class SlidingSnake:
             here, before = self.compute_pose(self.turn), self.compute_pose(self.turn - 1)
             timestamp_ns = self.turn * STEP_NS
             self.world.add_joints(
-                self.make_joint_state(here, before), None, self.make_imu(here, before) if imu else None
+                self.make_joint_state(here, before),
+                None,
+                self.make_imu(here, before) if imu else None,
             )
             if pose:
                 self.world.add_pose(self.make_pose(here))
             if images and self.turn % IMAGE_EVERY == 0:
-                self.delayed_images.append((self.turn + DELAY_TURNS, self.make_depth_image(here, timestamp_ns)))
+                self.delayed_images.append(
+                    (self.turn + DELAY_TURNS, self.make_depth_image(here, timestamp_ns))
+                )
             while self.delayed_images and self.delayed_images[0][0] <= self.turn:
                 self.world.add_ranging_sample(self.delayed_images.pop(0)[1], NOISE)
             self.world.make_world(self.turn, timestamp_ns)
@@ -117,7 +145,11 @@ class SlidingSnake:
         angles = here.angles_rad + 0.0005 * self.random.standard_normal(len(here.angles_rad))
         speeds = (here.angles_rad - before.angles_rad) / (STEP_NS * 1e-9)
         return make_joint_state(
-            self.robot, angles.tolist(), speeds.tolist(), tick=self.turn, timestamp_ns=self.turn * STEP_NS
+            self.robot,
+            angles.tolist(),
+            speeds.tolist(),
+            tick=self.turn,
+            timestamp_ns=self.turn * STEP_NS,
         )
 
     def make_imu(self, here: SnakePose, before: SnakePose) -> Imu:
@@ -139,11 +171,19 @@ class SlidingSnake:
             here: True pose of the snake.
             off_m: Error along x that is added, as of a jump of the measurement.
         """
-        x, y, turn = self.random.standard_normal(3) * [POSE_NOISE.position_m, POSE_NOISE.position_m, 0.001]
+        x, y, turn = self.random.standard_normal(3) * [
+            POSE_NOISE.position_m,
+            POSE_NOISE.position_m,
+            0.001,
+        ]
         return make_pose(
             self.turn,
             self.turn * STEP_NS,
-            position_w=(here.base_w[0] + float(x) + off_m, here.base_w[1] + float(y), BODY_RADIUS_M),
+            position_w=(
+                here.base_w[0] + float(x) + off_m,
+                here.base_w[1] + float(y),
+                BODY_RADIUS_M,
+            ),
             orientation_wxyz=quaternion_from_yaw(here.base_w[2] + float(turn)),
         )
 
@@ -151,7 +191,11 @@ class SlidingSnake:
         """Return the image of a depth camera at the front end of the head."""
         mount, link = (self.lengths[-1], 0.0, 0.0), len(self.lengths) - 1
         ahead = here.rotations[-1][:2, 0]
-        in_view = [o for o in self.obstacles if -0.2 < (np.array(o.position_w[:2]) - here.head_w[:2]) @ ahead < 2.5]
+        in_view = [
+            o
+            for o in self.obstacles
+            if -0.2 < (np.array(o.position_w[:2]) - here.head_w[:2]) @ ahead < 2.5
+        ]
         return render_depth_image(
             in_view,
             here.head_w,
@@ -184,15 +228,15 @@ def make_random_obstacles(seed: int, count: int = 60) -> list[KnownObstacle]:
         is_box = rng.random() < BOX_FRACTION
         bounding_radius_m = math.hypot(length_m, width_m) / 2 if is_box else radius_m
         has_free_place = all(
-            compute_outline_distance_m(other, np.array([x, y])) > bounding_radius_m + MIN_GAP_M for other in obstacles
+            compute_outline_distance_m(other, np.array([x, y])) > bounding_radius_m + MIN_GAP_M
+            for other in obstacles
         )
         is_clear_of_wave = abs(y) > bounding_radius_m + WAVE_HALF_WIDTH_M
         if not (has_free_place and is_clear_of_wave):
             continue
         name = f"{len(obstacles)}"
-        yaw_rad = float(
-            rng.uniform(0, MAX_YAW_RAD)
-        )  # also drawn for cylinders, so that the shape does not change the next obstacle
+        # Also drawn for cylinders, so that the shape does not change the next obstacle.
+        yaw_rad = float(rng.uniform(0, MAX_YAW_RAD))
         if is_box:
             obstacles.append(make_box(name, x, y, (length_m, width_m), yaw_rad))
         else:

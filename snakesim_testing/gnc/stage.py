@@ -15,7 +15,14 @@ from snakesim_hal.model.route import (
     place_chain_on_route,
     sample_sine_curve,
 )
-from snakesim_hal.wire.messages import Axis, KnownObstacle, RobotDescription, Trajectory, WorldContact, WorldModel
+from snakesim_hal.wire.messages import (
+    Axis,
+    KnownObstacle,
+    RobotDescription,
+    Trajectory,
+    WorldContact,
+    WorldModel,
+)
 from snakesim_testing.hal.small_robots import make_description, make_joint_state
 
 T = TypeVar("T")
@@ -36,10 +43,21 @@ def require_value(value: T | None) -> T:
     return value
 
 
-def make_robot(module_count: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> RobotDescription:
+def make_robot(
+    module_count: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0
+) -> RobotDescription:
     """A chain of modules of 0.11 m."""
-    limits = {"speed_rad_s": 7.5, "acceleration_rad_s2": 400, "torque_nm": torque_nm, "torque_rate_nm_s": 200}
-    gains = {"stiffness_nm_per_rad": 60, "damping_nm_s_per_rad": 1.5, "velocity_gain_nm_s_per_rad": 1.5}
+    limits = {
+        "speed_rad_s": 7.5,
+        "acceleration_rad_s2": 400,
+        "torque_nm": torque_nm,
+        "torque_rate_nm_s": 200,
+    }
+    gains = {
+        "stiffness_nm_per_rad": 60,
+        "damping_nm_s_per_rad": 1.5,
+        "velocity_gain_nm_s_per_rad": 1.5,
+    }
     return make_description(
         chain={"modules": module_count, "axes": list(axes)},
         module={"length_m": 0.11, "radius_m": BODY_RADIUS_M, "mass_kg": 0.3},
@@ -89,10 +107,16 @@ def make_pegs(route: Route) -> list[KnownObstacle]:
         tangent = route.tangent_w(s)
         left = np.array([-tangent[1], tangent[0]])
         push = left if left[0] > 0 else -left
-        x, y = (route.compute_positions_w(s) - push * (BODY_RADIUS_M + CLEARANCE_M + PEG_RADIUS_M)).tolist()
+        x, y = (
+            route.compute_positions_w(s) - push * (BODY_RADIUS_M + CLEARANCE_M + PEG_RADIUS_M)
+        ).tolist()
         pegs.append(
             KnownObstacle(
-                name=f"peg_{k}", shape="cylinder", position_w=(x, y, 0.1), radius_m=PEG_RADIUS_M, height_m=0.2
+                name=f"peg_{k}",
+                shape="cylinder",
+                position_w=(x, y, 0.1),
+                radius_m=PEG_RADIUS_M,
+                height_m=0.2,
             )
         )
     return pegs
@@ -129,19 +153,31 @@ class ObservationStage:
         angles = expand_yaw_angles(axes, lay.angles_rad)
         for joint, by in (turned or {}).items():
             angles[joint] += by
-        seen = lay if world_tail_s_m is None else place_chain_on_route(self.route, world_tail_s_m, segments)
+        seen = (
+            lay
+            if world_tail_s_m is None
+            else place_chain_on_route(self.route, world_tail_s_m, segments)
+        )
         world = make_world(
             tick=tick - world_age_ticks,
             timestamp_ns=tick_to_time_ns(tick - world_age_ticks),
-            pose_timestamp_ns=tick_to_time_ns(tick - (world_age_ticks if pose_age_ticks is None else pose_age_ticks)),
+            pose_timestamp_ns=tick_to_time_ns(
+                tick - (world_age_ticks if pose_age_ticks is None else pose_age_ticks)
+            ),
             base_position_w=(*seen.tail_w, BODY_RADIUS_M),
             base_orientation_wxyz=quaternion_from_yaw(seen.heading_rad),
             contacts=contacts or [],
-            contacts_timestamp_ns=None if contacts is None else tick_to_time_ns(tick - world_age_ticks),
+            contacts_timestamp_ns=None
+            if contacts is None
+            else tick_to_time_ns(tick - world_age_ticks),
             obstacles=self.pegs,
         )
         joints = make_joint_state(
-            self.robot, angles.tolist(), torque=torque_nm, tick=tick, timestamp_ns=tick_to_time_ns(tick)
+            self.robot,
+            angles.tolist(),
+            torque=torque_nm,
+            tick=tick,
+            timestamp_ns=tick_to_time_ns(tick),
         )
         trajectory = Trajectory(
             tick=0,
@@ -163,7 +199,9 @@ class ObservationStage:
         )
 
 
-def make_stage(module_count: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0) -> ObservationStage:
+def make_stage(
+    module_count: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0
+) -> ObservationStage:
     """A robot among pegs."""
     route = make_route()
     return ObservationStage(make_robot(module_count, axes, torque_nm), route, make_pegs(route))

@@ -13,7 +13,8 @@ from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS
 
 JOINTS = 3
 ALL = list(range(JOINTS))
-WORDS = ("overheated", "leak", "undervoltage")  # in the order in which they are reported for a joint
+# In the order in which they are reported for a joint.
+WORDS = "overheated", "leak", "undervoltage"
 PERIOD_S = PERIOD_NS * 1e-9
 
 # Limits of every joint of the test robot, as in `ROBOT` of `small_robots`. Angles are limited to both sides of 0.
@@ -61,7 +62,9 @@ def compute_max_stopping_speed_rad_s(distance_rad: float) -> float:
     return ACCELERATION_LIMIT_RAD_S2 * (total_time_s - REACTION_S)
 
 
-def compute_torque_bounds_nm(angle_rad: float, velocity_rad_s: float, torque_limit_nm: float) -> tuple[float, float]:
+def compute_torque_bounds_nm(
+    angle_rad: float, velocity_rad_s: float, torque_limit_nm: float
+) -> tuple[float, float]:
     """Return the lowest and the highest torque with which a joint can still stop at its end stops.
 
     A torque may accelerate the joint up to the speed from which it stops in time. Above that speed the bound has the
@@ -93,7 +96,9 @@ def compute_torque_bounds_nm(angle_rad: float, velocity_rad_s: float, torque_lim
     )
 
 
-def compute_holding_position_rad(angle_rad: float, velocity_rad_s: float, torque_nm: float) -> float:
+def compute_holding_position_rad(
+    angle_rad: float, velocity_rad_s: float, torque_nm: float
+) -> float:
     """Return the position target with which a drive would produce the torque that was measured.
 
     A drive in position mode produces torque = stiffness (target - angle) - damping velocity. A joint that enters
@@ -157,24 +162,32 @@ class AuthorityModel(RuleBasedStateMachine):
         self.epoch = 0
         self.priority = 0
         self.expires_ns = 0
-        self.newest_command: tuple[int, JointCommand] | None = None  # when it came; only of this holder
+        # When it came; only of this holder.
+        self.newest_command: tuple[int, JointCommand] | None = None
         self.commands_since_arming: list[JointCommand] = []
-        self.active_command: JointCommand | None = None  # of those, what the last tick was decided by
+        # Of those, what the last tick was decided by.
+        self.active_command: JointCommand | None = None
         self.last_sequence = -1
-        self.measured: tuple[list[float], list[float], list[float]] = ([0.0] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS)
-        self.doubtful_joints: set[int] | None = set(
-            ALL
-        )  # joints whose newest state is not believed; None: whatever their number
+        self.measured: tuple[list[float], list[float], list[float]] = (
+            [0.0] * JOINTS,
+            [0.0] * JOINTS,
+            [0.0] * JOINTS,
+        )
+        # Joints whose newest state is not believed; None: whatever their number.
+        self.doubtful_joints: set[int] | None = set(ALL)
         self.isolated: set[int] = set()  # joints that have failed
         self.offered = 0
         self.rejected = 0
         self.faults = 0  # kept since the last reset
         self.hold_angles_rad = [0.0] * JOINTS
-        self.braking_states: list[list[float]] | None = None  # wanted angle, its velocity, target: of every joint
+        # Wanted angle, its velocity, target: of every joint.
+        self.braking_states: list[list[float]] | None = None
         self.timestamp_ns = 0
-        self.last_plausible_angles: list[tuple[float, float] | None] = [None] * JOINTS  # angle and when it was taken
+        # Angle and when it was taken.
+        self.last_plausible_angles: list[tuple[float, float] | None] = [None] * JOINTS
         self.implausible_angles: list[list[tuple[float, float]]] = [[] for _ in range(JOINTS)]
-        self.unchanged_states: list[list[tuple[Any, float, float]]] = [[] for _ in range(JOINTS)]  # state, time, target
+        # State, time, target.
+        self.unchanged_states: list[list[tuple[Any, float, float]]] = [[] for _ in range(JOINTS)]
         self.healths = [ModeledHealth() for _ in range(JOINTS)]
         self.health_faults: set[tuple[str, int]] = set()  # at the last tick
         self.silent: set[int] = set()
@@ -190,7 +203,9 @@ class AuthorityModel(RuleBasedStateMachine):
         if following != self.state:
             self.hold_angles_rad = self.measured[0]
             self.braking_states = (
-                [self.compute_braking_start(i) for i in range(JOINTS)] if self.state == "armed" else None
+                [self.compute_braking_start(i) for i in range(JOINTS)]
+                if self.state == "armed"
+                else None
             )
             self.is_stop_sent = self.is_stop_sent and following != "disarmed"
         if self.state == "armed":
@@ -221,9 +236,15 @@ class AuthorityModel(RuleBasedStateMachine):
         """Brake joint i for one period with the acceleration limit, and return its next position target in rad."""
         assert self.braking_states is not None
         wanted, velocity, target = self.braking_states[i]
-        slower = math.copysign(max(abs(velocity) - ACCELERATION_LIMIT_RAD_S2 * PERIOD_S, 0.0), velocity)
-        wanted = clamp(wanted + (velocity + slower) / 2 * PERIOD_S, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD)
-        target = clamp(wanted, target - SPEED_LIMIT_RAD_S * PERIOD_S, target + SPEED_LIMIT_RAD_S * PERIOD_S)
+        slower = math.copysign(
+            max(abs(velocity) - ACCELERATION_LIMIT_RAD_S2 * PERIOD_S, 0.0), velocity
+        )
+        wanted = clamp(
+            wanted + (velocity + slower) / 2 * PERIOD_S, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD
+        )
+        target = clamp(
+            wanted, target - SPEED_LIMIT_RAD_S * PERIOD_S, target + SPEED_LIMIT_RAD_S * PERIOD_S
+        )
         self.braking_states[i] = [wanted, slower, target]
         return target
 
@@ -242,7 +263,10 @@ class AuthorityModel(RuleBasedStateMachine):
         def reachable(before: tuple[float, float]) -> bool:
             angle_before, taken_before_s = before
             passed_s = max(taken_s - taken_before_s, 0.0)
-            return abs(angle - angle_before) <= BELIEVED_ERROR_RAD + MAX_BELIEVED_SPEED_RAD_S * passed_s
+            return (
+                abs(angle - angle_before)
+                <= BELIEVED_ERROR_RAD + MAX_BELIEVED_SPEED_RAD_S * passed_s
+            )
 
         good, strays = self.last_plausible_angles[i], self.implausible_angles[i]
         if good is None or reachable(good):
@@ -262,11 +286,15 @@ class AuthorityModel(RuleBasedStateMachine):
         if self.unchanged_states[i] and self.unchanged_states[i][-1][0] != state_:
             self.unchanged_states[i] = []
         self.unchanged_states[i].append((state_, taken_s, self.target_before(i)))
-        limit = self.last_output.setpoints.torque_limit_nm[i] if self.last_output else TORQUE_LIMIT_NM
+        limit = (
+            self.last_output.setpoints.torque_limit_nm[i] if self.last_output else TORQUE_LIMIT_NM
+        )
         targets = [target for _, _, target in self.unchanged_states[i]]
         ways = [max(targets[: k + 1]) - min(targets[: k + 1]) for k in range(len(targets))]
         far = [
-            taken for (_, taken, _), way in zip(self.unchanged_states[i], ways, strict=True) if way > MAX_STEP_RAD / 4
+            taken
+            for (_, taken, _), way in zip(self.unchanged_states[i], ways, strict=True)
+            if way > MAX_STEP_RAD / 4
         ]
         return bool(far) and taken_s - min(far) > LEASE_NS * 1e-9 and abs(state_[2]) < 0.95 * limit
 
@@ -324,17 +352,23 @@ class AuthorityModel(RuleBasedStateMachine):
         return [value for i, value in enumerate(values) if i not in self.isolated]
 
     def torques(self) -> Any:
-        return pytest.approx(self.select_connected([TORQUE_LIMIT_NM * share for share in self.torque_fractions]))
+        return pytest.approx(
+            self.select_connected([TORQUE_LIMIT_NM * share for share in self.torque_fractions])
+        )
 
     def check_safe(self, decision: TickOutput) -> None:
         assert decision.command_sequence is None
         assert not decision.limit_by_joint
-        action = self.action if self.state == "fault" and self.braking_states is not None else "passive"
+        action = (
+            self.action if self.state == "fault" and self.braking_states is not None else "passive"
+        )
         assert self.select_connected(decision.setpoints.torque_limit_nm) == self.torques()
         if action == "hold":
             assert set(self.select_connected(decision.setpoints.mode)) <= {JointMode.POSITION}
             held = [self.brake_for_a_period(i) for i in range(JOINTS)]
-            assert self.select_connected(decision.setpoints.target) == pytest.approx(self.select_connected(held))
+            assert self.select_connected(decision.setpoints.target) == pytest.approx(
+                self.select_connected(held)
+            )
             assert all(abs(target) <= ANGLE_LIMIT_RAD for target in decision.setpoints.target)
             return
         mode = JointMode.VELOCITY if action == "damp" else JointMode.PASSIVE
@@ -359,12 +393,20 @@ class AuthorityModel(RuleBasedStateMachine):
             sent: The active command.
         """
         for i in self.isolated:
-            assert decision.limit_by_joint.get(i) == (None if sent.mode[i] is JointMode.PASSIVE else "isolated")
+            assert decision.limit_by_joint.get(i) == (
+                None if sent.mode[i] is JointMode.PASSIVE else "isolated"
+            )
         assert self.select_connected(decision.setpoints.mode) == self.select_connected(sent.mode)
         for i in self.select_connected(ALL):
             applied_nm = decision.setpoints.torque_limit_nm[i]
-            previous_nm = TORQUE_LIMIT_NM if self.last_output is None else self.last_output.setpoints.torque_limit_nm[i]
-            commanded_nm = TORQUE_LIMIT_NM if sent.torque_limit_nm is None else sent.torque_limit_nm[i]
+            previous_nm = (
+                TORQUE_LIMIT_NM
+                if self.last_output is None
+                else self.last_output.setpoints.torque_limit_nm[i]
+            )
+            commanded_nm = (
+                TORQUE_LIMIT_NM if sent.torque_limit_nm is None else sent.torque_limit_nm[i]
+            )
             derated_nm = TORQUE_LIMIT_NM * self.torque_fractions[i] + TINY
             assert 0.0 <= applied_nm <= min(derated_nm, commanded_nm)
             assert applied_nm <= previous_nm + TORQUE_RATE_LIMIT_NM_S * PERIOD_S + TINY
@@ -375,7 +417,9 @@ class AuthorityModel(RuleBasedStateMachine):
                 assert decision.setpoints.target[i] == 0.0
                 assert i not in decision.limit_by_joint
 
-    def check_target(self, i: int, decision: TickOutput, mode: JointMode, wanted: float, *, is_derated: bool) -> None:
+    def check_target(
+        self, i: int, decision: TickOutput, mode: JointMode, wanted: float, *, is_derated: bool
+    ) -> None:
         """Check the target that the authority applied to one joint.
 
         It must be inside the limits, change no faster than allowed, and be as near to the command as both permit. A
@@ -398,12 +442,18 @@ class AuthorityModel(RuleBasedStateMachine):
                 max_change = SPEED_LIMIT_RAD_S * PERIOD_S
                 previous = compute_holding_position_rad(angle, velocity, torque)
             case JointMode.VELOCITY:
-                low = max(-SPEED_LIMIT_RAD_S, -compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD + angle))
-                high = min(SPEED_LIMIT_RAD_S, compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD - angle))
+                low = max(
+                    -SPEED_LIMIT_RAD_S, -compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD + angle)
+                )
+                high = min(
+                    SPEED_LIMIT_RAD_S, compute_max_stopping_speed_rad_s(ANGLE_LIMIT_RAD - angle)
+                )
                 max_change = ACCELERATION_LIMIT_RAD_S2 * PERIOD_S
                 previous = compute_holding_velocity_rad_s(velocity, torque)
             case _:
-                low, high = compute_torque_bounds_nm(angle, velocity, decision.setpoints.torque_limit_nm[i])
+                low, high = compute_torque_bounds_nm(
+                    angle, velocity, decision.setpoints.torque_limit_nm[i]
+                )
                 max_change = TORQUE_RATE_LIMIT_NM_S * PERIOD_S
                 previous = torque
         if self.last_output is not None and self.last_output.setpoints.mode[i] is mode:

@@ -4,7 +4,13 @@ from typing import Any
 
 from snakesim_hal.safety.authority import CommandAuthority, TickOutput
 from snakesim_hal.safety.cables import CableTracker
-from snakesim_hal.wire.messages import Answer, EstopRequest, JointMode, LeaseRequest, LifecycleRequest
+from snakesim_hal.wire.messages import (
+    Answer,
+    EstopRequest,
+    JointMode,
+    LeaseRequest,
+    LifecycleRequest,
+)
 from snakesim_testing.hal.small_robots import (
     PERIOD_NS,
     make_description,
@@ -16,14 +22,18 @@ from snakesim_testing.hal.small_robots import (
 ROBOT = make_description()
 JOINTS = len(ROBOT.joints)
 ARM = LifecycleRequest(action="arm", robot="worm", backend="lag", config_hash=ROBOT.config_hash)
-DISARM, CLEAR, FINISH = (LifecycleRequest(action=action) for action in ("disarm", "reset", "finish"))
+DISARM, CLEAR, FINISH = (
+    LifecycleRequest(action=action) for action in ("disarm", "reset", "finish")
+)
 ESTOP = EstopRequest(requester="a person")
 
 
 class AuthorityRig:
     """An authority with a clock; every step is one a host would take."""
 
-    def __init__(self, *, unchecked: str = "", cables: CableTracker | None = None, **robot: Any) -> None:
+    def __init__(
+        self, *, unchecked: str = "", cables: CableTracker | None = None, **robot: Any
+    ) -> None:
         self.robot = make_description(**robot)
         self.authority = CommandAuthority(self.robot, unchecked_reason=unchecked, cables=cables)
         self.now_ns = 0
@@ -34,7 +44,9 @@ class AuthorityRig:
     def observe(self, *values: Any, **other: Any) -> None:
         """A state so much later than the one before that the joints may have come from anywhere."""
         self.timestamp_ns += 10**9
-        self.authority.observe_joints(make_joint_state(self.robot, *values, timestamp_ns=self.timestamp_ns, **other))
+        self.authority.observe_joints(
+            make_joint_state(self.robot, *values, timestamp_ns=self.timestamp_ns, **other)
+        )
 
     def acquire(self, holder: str = "control", priority: int = 100) -> Answer:
         return self.authority.handle_lease_request(
@@ -69,7 +81,9 @@ class AuthorityRig:
         return self.pass_tick()
 
 
-def make_commanded_rig(target: Any = 0.1, mode: Any = JointMode.POSITION, **robot: Any) -> AuthorityRig:
+def make_commanded_rig(
+    target: Any = 0.1, mode: Any = JointMode.POSITION, **robot: Any
+) -> AuthorityRig:
     """Not armed yet: its joints are at 0.1 rad, and a holder of the lease commands it."""
     rig = AuthorityRig(**robot)
     rig.observe(0.1)
@@ -88,5 +102,7 @@ def list_modes(decision: TickOutput) -> set[JointMode]:
     return set(decision.setpoints.mode)
 
 
-def report_power(rig: AuthorityRig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None) -> None:
+def report_power(
+    rig: AuthorityRig, motor_c: list[float], volts: float = 24.0, valid: list[bool] | None = None
+) -> None:
     rig.authority.observe_power(make_power(motor_c, volts, valid=valid or True), rig.now_ns)

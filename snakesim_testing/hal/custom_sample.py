@@ -28,4 +28,10 @@ PLACE: dict[str, Any] = {
 }
 
 
-GOOD: dict[str, Any] = {"pressed_n": [1.5, None], "flow_m_s": (1.0, 2.0, 3.0), "wet": True, "count": 4, "state": "warm"}
+GOOD: dict[str, Any] = {
+    "pressed_n": [1.5, None],
+    "flow_m_s": (1.0, 2.0, 3.0),
+    "wet": True,
+    "count": 4,
+    "state": "warm",
+}

@@ -41,15 +41,25 @@ def before(mode: JointMode, target: float = 0.0) -> AppliedSetpoints:
 
 
 def limited(
-    asked: JointCommand, measured: MeasuredState, last: AppliedSetpoints, torque_fraction: Any = COOL
+    asked: JointCommand,
+    measured: MeasuredState,
+    last: AppliedSetpoints,
+    torque_fraction: Any = COOL,
 ) -> AppliedSetpoints:
-    return limit_command(asked, measured=measured, last=last, limits=LIMITS, torque_fraction=torque_fraction)
+    return limit_command(
+        asked, measured=measured, last=last, limits=LIMITS, torque_fraction=torque_fraction
+    )
 
 
 def words(
-    asked: JointCommand, applied: AppliedSetpoints, measured: MeasuredState, torque_fraction: Any = COOL
+    asked: JointCommand,
+    applied: AppliedSetpoints,
+    measured: MeasuredState,
+    torque_fraction: Any = COOL,
 ) -> dict[int, str]:
-    return find_active_limits(asked, applied, measured=measured, limits=LIMITS, torque_fraction=torque_fraction)
+    return find_active_limits(
+        asked, applied, measured=measured, limits=LIMITS, torque_fraction=torque_fraction
+    )
 
 
 def applied_for(

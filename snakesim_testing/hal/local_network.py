@@ -66,7 +66,9 @@ def connected_sessions(*namespaces: str | None) -> Iterator[list[Session]]:
     """Sessions on a network of their own; the first one listens."""
     with ExitStack() as stack:
         endpoint = find_free_endpoint()
-        links = [ConnectionSettings(endpoint, name, listen=not i) for i, name in enumerate(namespaces)]
+        links = [
+            ConnectionSettings(endpoint, name, listen=not i) for i, name in enumerate(namespaces)
+        ]
         yield [stack.enter_context(open_session(each)) for each in links]
 
 
@@ -91,10 +93,14 @@ class LagBackend(Backend):
 
     def describe(self) -> RobotDescription:
         """From the robot file, and the pose."""
-        described = msgspec.structs.replace(describe_run_robot(self._config, "lag"), simulated_time=True)
+        described = msgspec.structs.replace(
+            describe_run_robot(self._config, "lag"), simulated_time=True
+        )
         if any(sensor.key == keys.POSE for sensor in described.sensors):
             return described
-        pose_sensor = SensorDescription(key=keys.POSE, rate_hz=0.2e9 / self._config.period_ns, delay_s=0.0)
+        pose_sensor = SensorDescription(
+            key=keys.POSE, rate_hz=0.2e9 / self._config.period_ns, delay_s=0.0
+        )
         return msgspec.structs.replace(described, sensors=[*described.sensors, pose_sensor])
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
@@ -113,7 +119,9 @@ class LagBackend(Backend):
         )
         if tick % 5:
             return Samples(joints)
-        return Samples(joints, {keys.POSE: make_pose(tick, timestamp_ns, position_w=(0.001 * tick, 0.0, 0.0))})
+        return Samples(
+            joints, {keys.POSE: make_pose(tick, timestamp_ns, position_w=(0.001 * tick, 0.0, 0.0))}
+        )
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """From now on."""
@@ -125,7 +133,9 @@ class LagBackend(Backend):
         """One period."""
         self._fail("advance")
         self.advanced += 1
-        for i, (mode, target) in enumerate(zip(self._points.mode, self._points.target, strict=True)):
+        for i, (mode, target) in enumerate(
+            zip(self._points.mode, self._points.target, strict=True)
+        ):
             if mode == JointMode.POSITION:
                 self.angles[i] += 0.5 * (target - self.angles[i])
             elif mode == JointMode.VELOCITY:
@@ -154,7 +164,8 @@ class SineFollower:
     ticks_seen: list[int] = field(default_factory=list[int])
     armed_ticks: list[int] = field(default_factory=list[int])
     stopped: threading.Event = field(default_factory=threading.Event)
-    silent: threading.Event = field(default_factory=threading.Event)  # receives everything, sends nothing
+    # Receives everything, sends nothing.
+    silent: threading.Event = field(default_factory=threading.Event)
 
     def run(self, connection: ConnectionSettings) -> None:
         """Until stopped."""
@@ -172,7 +183,12 @@ class SineFollower:
                 self._act(clock, client, commander, client.read(joints), robot)
 
     def _act(
-        self, clock: Clock, client: HostClient, commander: Commander, joints: JointState | None, robot: RobotDescription
+        self,
+        clock: Clock,
+        client: HostClient,
+        commander: Commander,
+        joints: JointState | None,
+        robot: RobotDescription,
     ) -> None:
         self.ticks_seen.append(clock.tick)
         if joints is not None and commander.ensure_lease(clock):
@@ -180,7 +196,9 @@ class SineFollower:
             if clock.lifecycle == "armed":
                 self.armed_ticks.append(clock.tick)
                 wave = self.amplitude_rad * math.sin(2 * math.pi * clock.timestamp_ns * 1e-9)
-                points = RequestedSetpoints(points.mode, [wave] * len(robot.joints), points.torque_limit_nm)
+                points = RequestedSetpoints(
+                    points.mode, [wave] * len(robot.joints), points.torque_limit_nm
+                )
             commander.send_command(clock, joints, points)
         client.report_done(clock.tick)
 
@@ -216,7 +234,9 @@ class RunningHost:
     def request_lifecycle(self, action: Any) -> Answer:
         """Arm (naming the robot rightly), disarm, reset or finish."""
         config_hash = self.host.description.config_hash
-        request = LifecycleRequest(action=action, robot="worm", backend="lag", config_hash=config_hash)
+        request = LifecycleRequest(
+            action=action, robot="worm", backend="lag", config_hash=config_hash
+        )
         return self.request(keys.LIFECYCLE, request)
 
     def arm(self) -> None:
@@ -237,7 +257,10 @@ def running_host(config: RunConfig, **host: Any) -> Iterator[RunningHost]:
     """A host of a `LagBackend`, and a client that watches it. The host is stopped at the end."""
     endpoint, backend = find_free_endpoint(), LagBackend(config)
     link = ConnectionSettings(endpoint, "lab/worm")
-    with open_session(ConnectionSettings(endpoint, "lab/worm", listen=True)) as own, open_session(link) as watcher:
+    with (
+        open_session(ConnectionSettings(endpoint, "lab/worm", listen=True)) as own,
+        open_session(link) as watcher,
+    ):
         faulty, faults = create_host_faults(config, GuardedBackend(backend), own)
         made = Host(config, faulty, own, HostOptions(faults=faults, **host))
         thread = threading.Thread(target=made.run, name="host")
@@ -263,7 +286,9 @@ def running_commanded_host(
 
 
 @contextmanager
-def running_follower(connection: ConnectionSettings, follower: SineFollower) -> Iterator[SineFollower]:
+def running_follower(
+    connection: ConnectionSettings, follower: SineFollower
+) -> Iterator[SineFollower]:
     """A follower in a thread of its own."""
     thread = threading.Thread(target=follower.run, args=(connection,), name=follower.name)
     thread.start()

@@ -48,7 +48,10 @@ armature_kg_m2 = 0.005
 [sensors.pose]
 rate_hz = 50.0
 """
-ROBOT: dict[str, Any] = {**tomllib.loads(ROBOT_TOML), "safety": {"action": "damp", "max_step_rad": 0.3}}
+ROBOT: dict[str, Any] = {
+    **tomllib.loads(ROBOT_TOML),
+    "safety": {"action": "damp", "max_step_rad": 0.3},
+}
 del ROBOT["sensors"]
 SCENE: dict[str, Any] = {"name": "plain", "ground": {"friction": 0.1}}
 RUN: dict[str, Any] = {
@@ -117,7 +120,12 @@ def make_run_config(**dotted: Any) -> RunConfig:
 
 def make_description(*, simulated_time: bool = False, **dotted: Any) -> RobotDescription:
     """Return the description of the test robot, as a host publishes it, with changes."""
-    reported = {"backend": "lag", "period_ns": PERIOD_NS, "lease_ns": LEASE_NS, "config_hash": "0" * 16}
+    reported = {
+        "backend": "lag",
+        "period_ns": PERIOD_NS,
+        "lease_ns": LEASE_NS,
+        "config_hash": "0" * 16,
+    }
     return describe_robot(make_robot_file(**dotted), simulated_time=simulated_time, **reported)
 
 
@@ -130,8 +138,16 @@ def make_joint_state(
     def column(value: Any) -> list[Any]:
         return list(value) if isinstance(value, list | tuple) else [value] * count
 
-    values: dict[str, Any] = {"tick": 0, "timestamp_ns": 0, "valid": [True] * count, "age_ns": [0] * count, **other}
-    return JointState(angle_rad=column(angle), velocity_rad_s=column(velocity), torque_nm=column(torque), **values)
+    values: dict[str, Any] = {
+        "tick": 0,
+        "timestamp_ns": 0,
+        "valid": [True] * count,
+        "age_ns": [0] * count,
+        **other,
+    }
+    return JointState(
+        angle_rad=column(angle), velocity_rad_s=column(velocity), torque_nm=column(torque), **values
+    )
 
 
 def make_joint_command(
@@ -166,7 +182,13 @@ def make_power(
     def column(value: Any) -> list[Any]:
         return value if isinstance(value, list) else [value] * joint_count
 
-    values: dict[str, Any] = {"motor_c": motor_c, "voltage_v": voltage_v, "leak": leak, "valid": valid, **other}
+    values: dict[str, Any] = {
+        "motor_c": motor_c,
+        "voltage_v": voltage_v,
+        "leak": leak,
+        "valid": valid,
+        **other,
+    }
     columns = {name: column(value) for name, value in values.items()}
     return Power(tick=0, timestamp_ns=0, current_a=column(0.0), board_c=column(20.0), **columns)
 
@@ -182,7 +204,12 @@ def make_pose(tick: int = 0, timestamp_ns: int = 0, **other: Any) -> Pose:
 def make_link_contact(link_index: int = 0, **other: Any) -> Contact:
     """Return a contact on the left of a link without force, with changes."""
     still = (0.0, 0.0, 0.0)
-    values = {"position_l": still, "normal_l": (0.0, -1.0, 0.0), "force_l": still, "torque_l": still}
+    values = {
+        "position_l": still,
+        "normal_l": (0.0, -1.0, 0.0),
+        "force_l": still,
+        "torque_l": still,
+    }
     values |= {"tangent_1_l": (1.0, 0.0, 0.0), "tangent_2_l": (0.0, 0.0, 1.0)}
     return Contact(link=link_index, **{"obstacle": None, **values, **other})
 
@@ -196,7 +223,11 @@ def make_clock(tick: int, *, arm_session: int = 0, **other: Any) -> Clock:
         "newest": {},
     }
     return Clock(
-        tick=tick, timestamp_ns=tick * PERIOD_NS, period_ns=PERIOD_NS, arm_session=arm_session, **{**values, **other}
+        tick=tick,
+        timestamp_ns=tick * PERIOD_NS,
+        period_ns=PERIOD_NS,
+        arm_session=arm_session,
+        **{**values, **other},
     )
 
 

@@ -41,7 +41,11 @@ def _make_strategy(type_info: inspect.Type) -> st.SearchStrategy[Any]:  # noqa: 
         case inspect.IntType():
             return st.integers(find_min_integer(type_info), find_max_integer(type_info))
         case inspect.StrType():
-            return st.text(NAMES, min_size=type_info.min_length or 0, max_size=min(type_info.max_length or 20, 20))
+            return st.text(
+                NAMES,
+                min_size=type_info.min_length or 0,
+                max_size=min(type_info.max_length or 20, 20),
+            )
         case inspect.BytesType():
             return st.binary(max_size=20)
         case inspect.BoolType():
@@ -55,20 +59,28 @@ def _make_strategy(type_info: inspect.Type) -> st.SearchStrategy[Any]:  # noqa: 
         case inspect.ListType():
             min_length = type_info.min_length or 0
             return st.lists(
-                _make_strategy(type_info.item_type), min_size=min_length, max_size=min_length + MAX_EXTRA_ENTRIES
+                _make_strategy(type_info.item_type),
+                min_size=min_length,
+                max_size=min_length + MAX_EXTRA_ENTRIES,
             )
         case inspect.TupleType():
             return st.tuples(*(_make_strategy(item) for item in type_info.item_types))
         case inspect.DictType():
             return st.dictionaries(
-                _make_strategy(type_info.key_type), _make_strategy(type_info.value_type), max_size=MAX_EXTRA_ENTRIES
+                _make_strategy(type_info.key_type),
+                _make_strategy(type_info.value_type),
+                max_size=MAX_EXTRA_ENTRIES,
             )
         case inspect.UnionType():
             return st.one_of([_make_strategy(option) for option in type_info.types])
         case inspect.StructType():
-            return st.builds(type_info.cls, **{f.name: _make_strategy(f.type) for f in type_info.fields})
+            return st.builds(
+                type_info.cls, **{f.name: _make_strategy(f.type) for f in type_info.fields}
+            )
         case _:
-            raise NotImplementedError(f"no strategy for {type_info}; write one, so that the message stays tested")
+            raise NotImplementedError(
+                f"no strategy for {type_info}; write one, so that the message stays tested"
+            )
 
 
 def find_min_integer(info: inspect.IntType) -> int | None:
@@ -115,13 +127,19 @@ def _make_example(type_info: inspect.Type) -> Any:  # noqa: C901 - one case a ty
         case inspect.EnumType():
             return next(iter(type_info.cls)).value
         case inspect.ListType():
-            return [_make_example(type_info.item_type) for _ in range(max(type_info.min_length or 0, 1))]
+            return [
+                _make_example(type_info.item_type) for _ in range(max(type_info.min_length or 0, 1))
+            ]
         case inspect.TupleType():
             return [_make_example(item) for item in type_info.item_types]
         case inspect.DictType():
             return {_make_example(type_info.key_type): _make_example(type_info.value_type)}
         case inspect.UnionType():
-            return _make_example(next(option for option in type_info.types if not isinstance(option, inspect.NoneType)))
+            return _make_example(
+                next(
+                    option for option in type_info.types if not isinstance(option, inspect.NoneType)
+                )
+            )
         case inspect.StructType():
             return {f.encode_name: _make_example(f.type) for f in type_info.fields}
         case _:
@@ -131,7 +149,9 @@ def _make_example(type_info: inspect.Type) -> Any:  # noqa: C901 - one case a ty
 Place = tuple[str | int, ...]
 
 
-def iter_places(value: Any, type_info: inspect.Type, place: Place = ()) -> Iterator[tuple[Place, inspect.Type]]:
+def iter_places(
+    value: Any, type_info: inspect.Type, place: Place = ()
+) -> Iterator[tuple[Place, inspect.Type]]:
     """Yield every place inside an example, with the declared type of the value there.
 
     Args:
@@ -142,14 +162,18 @@ def iter_places(value: Any, type_info: inspect.Type, place: Place = ()) -> Itera
     if isinstance(type_info, inspect.Metadata):
         type_info = type_info.type
     if isinstance(type_info, inspect.UnionType):
-        type_info = next(option for option in type_info.types if not isinstance(option, inspect.NoneType))
+        type_info = next(
+            option for option in type_info.types if not isinstance(option, inspect.NoneType)
+        )
         yield from iter_places(value, type_info, place)
         return
     yield place, type_info
     match type_info:
         case inspect.StructType():
             for field in type_info.fields:
-                yield from iter_places(value[field.encode_name], field.type, (*place, field.encode_name))
+                yield from iter_places(
+                    value[field.encode_name], field.type, (*place, field.encode_name)
+                )
         case inspect.ListType():
             yield from iter_places(value[0], type_info.item_type, (*place, 0))
         case inspect.TupleType():
@@ -214,7 +238,8 @@ def _invalid_floats(info: inspect.FloatType) -> list[Any]:
     """Return numbers that are not finite or out of bounds, and values of other types."""
     invalid: list[Any] = [float("nan"), float("inf"), float("-inf"), "1.0", [1.0]]
     if info.ge is not None:
-        invalid.append(info.ge - 1e-3 - abs(info.ge) * 1e-9)  # the second term: large bounds absorb the first
+        # The second term: large bounds absorb the first.
+        invalid.append(info.ge - 1e-3 - abs(info.ge) * 1e-9)
     if info.gt is not None:
         invalid.append(info.gt)
     if info.le is not None:

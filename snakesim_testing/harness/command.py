@@ -52,7 +52,10 @@ def snakesim(
 ) -> CompletedRun:
     """Run a command to its end. more: of the environment. inside: a prefix that runs it somewhere else."""
     return run_to_end(
-        [*command_prefix, *SNAKESIM_COMMAND, *arguments], cwd, make_environment(cwd, **(extra_env or {})), limit_s
+        [*command_prefix, *SNAKESIM_COMMAND, *arguments],
+        cwd,
+        make_environment(cwd, **(extra_env or {})),
+        limit_s,
     )
 
 
@@ -92,7 +95,10 @@ def run_to_end(
         out = timeout.stdout or b""
         err = (timeout.stderr or b"") + b"\n[did not end within %g s]" % limit_s
     return CompletedRun(
-        code, out.decode(errors="replace"), err.decode(errors="replace"), took_s=time.monotonic() - start_s
+        code,
+        out.decode(errors="replace"),
+        err.decode(errors="replace"),
+        took_s=time.monotonic() - start_s,
     )
 
 
@@ -122,7 +128,8 @@ class RunningCommand:
 
     def _find_printed(self, pattern: str) -> str:
         wait_until(
-            lambda: re.search(pattern, self.printed()) or self.process.poll() is not None, f"{pattern!r} from the run"
+            lambda: re.search(pattern, self.printed()) or self.process.poll() is not None,
+            f"{pattern!r} from the run",
         )
         found = re.search(pattern, self.printed())
         assert found is not None, self.describe_ending()
@@ -138,13 +145,19 @@ class RunningCommand:
 
     def wait_for(self, text: str, limit_s: float = TIMEOUT_S) -> None:
         """Wait until the run has printed a text. Fails if the run ends without it."""
-        wait_until(lambda: text in self.printed() or self.process.poll() is not None, f"{text!r} from the run", limit_s)
+        wait_until(
+            lambda: text in self.printed() or self.process.poll() is not None,
+            f"{text!r} from the run",
+            limit_s,
+        )
         assert text in self.printed(), self.describe_ending()
 
     def run_tool(self, *arguments: str, limit_s: float = TIMEOUT_S) -> CompletedRun:
         """Run a tool on the same machine with the endpoint of this run."""
         where = (*arguments, "--endpoint", self.endpoint)
-        return snakesim(*where, cwd=self.home, limit_s=limit_s, extra_env=self.more, command_prefix=self.inside)
+        return snakesim(
+            *where, cwd=self.home, limit_s=limit_s, extra_env=self.more, command_prefix=self.inside
+        )
 
     def part(self, name: str) -> int:
         """Return the process id of one part of the run, such as `host` or `control`."""
@@ -186,7 +199,16 @@ def running_snakesim(
     network = ["--endpoint", asked] if asked is not None and "--router" not in arguments else []
     with output_path.with_suffix(".printed").open("wb") as output:
         process = subprocess.Popen(
-            [*command_prefix, *WITH_TESTS, *SNAKESIM_COMMAND, "run", *arguments, "--out", str(output_path), *network],
+            [
+                *command_prefix,
+                *WITH_TESTS,
+                *SNAKESIM_COMMAND,
+                "run",
+                *arguments,
+                "--out",
+                str(output_path),
+                *network,
+            ],
             cwd=output_path.parent,
             env=make_environment(output_path.parent, **(extra_env or {})),
             stdin=subprocess.DEVNULL,

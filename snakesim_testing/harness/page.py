@@ -53,7 +53,7 @@ class ViewerPage:
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         if draws:
-            self.say(CAMERA)
+            self.send_message(CAMERA)
 
     def __enter__(self) -> "ViewerPage":
         return self
@@ -61,7 +61,7 @@ class ViewerPage:
     def __exit__(self, *_: object) -> None:
         self._socket.close()
 
-    def say(self, message: Any) -> None:
+    def send_message(self, message: Any) -> None:
         """Send a message; bytes and text as they are."""
         raw = message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message)
         with contextlib.suppress(ConnectionClosed):
@@ -69,11 +69,11 @@ class ViewerPage:
 
     def find(self, label: str) -> str:
         """The id of the control with a label, once it is there."""
-        return wait_until(lambda: self._found(label), f"{label!r} on the page", 60.0)
+        return wait_until(lambda: self._find_control_id(label), f"{label!r} on the page", 60.0)
 
     def change(self, control: str, updates: Any) -> None:
         """Say that a control, by its id, has other values."""
-        self.say({"type": "GuiUpdateMessage", "uuid": control, "updates": updates})
+        self.send_message({"type": "GuiUpdateMessage", "uuid": control, "updates": updates})
 
     def click(self, label: str) -> None:
         """Press a button."""
@@ -84,8 +84,11 @@ class ViewerPage:
         self._reader.join(10.0)
         return self.closed_by
 
-    def _found(self, label: str) -> str | None:
-        return next((uuid for uuid, props in list(self.controls.items()) if props.get("label") == label), None)
+    def _find_control_id(self, label: str) -> str | None:
+        return next(
+            (uuid for uuid, props in list(self.controls.items()) if props.get("label") == label),
+            None,
+        )
 
     def _read(self) -> None:
         unzip = zstandard.ZstdDecompressor()
@@ -93,20 +96,25 @@ class ViewerPage:
             while True:
                 data = self._socket.recv()
                 assert isinstance(data, bytes)
-                size, packed = int.from_bytes(data[:8], "little"), int.from_bytes(data[8:16], "little")
-                for message in msgspec.msgpack.decode(unzip.decompress(data[16 : 16 + packed], size))["messages"]:
-                    self._take(message)
+                size, packed = (
+                    int.from_bytes(data[:8], "little"),
+                    int.from_bytes(data[8:16], "little"),
+                )
+                for message in msgspec.msgpack.decode(
+                    unzip.decompress(data[16 : 16 + packed], size)
+                )["messages"]:
+                    self._handle_message(message)
         except ConnectionClosed as closed:
             self.closed_by = None if closed.rcvd is None else closed.rcvd.code
 
-    def _take(self, message: dict[str, Any]) -> None:
+    def _handle_message(self, message: dict[str, Any]) -> None:
         if "props" in message and "uuid" in message:
             self.controls[message["uuid"]] = dict(message["props"])
         elif message["type"] == "GuiUpdateMessage":
             self.controls.setdefault(message["uuid"], {}).update(message["updates"])
         elif message["type"] == "LocalStorageGetItemRequestMessage":
             answer = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
-            self.say({"type": "LocalStorageGetItemResponseMessage", **answer})
+            self.send_message({"type": "LocalStorageGetItemResponseMessage", **answer})
 
 
 def origin_of(address: str) -> str:
@@ -115,7 +123,9 @@ def origin_of(address: str) -> str:
     return f"{parts.scheme}://{parts.netloc}"
 
 
-def ask(address: str, method: str, path: str = "/stop", **headers: str) -> tuple[int, str]:
+def send_http_request(
+    address: str, method: str, path: str = "/stop", **headers: str
+) -> tuple[int, str]:
     """Status and text of an HTTP request. path: behind the token that ends the address."""
     parts = urlsplit(address)
     connection = http.client.HTTPConnection(parts.netloc, timeout=20.0)
@@ -130,6 +140,6 @@ def flood(address: str, message: Any, seconds: float) -> int:
     sent, end_s = 0, time.monotonic() + seconds
     with ViewerPage(address) as page:
         while time.monotonic() < end_s:
-            page.say(message)
+            page.send_message(message)
             sent += 1
     return sent

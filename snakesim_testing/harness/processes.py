@@ -27,7 +27,9 @@ def find_processes_with(file: str, content: str) -> list[tuple[int, str]]:
         with contextlib.suppress(OSError, IndexError):  # gone in the meantime, or of another user
             state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
             if state != "Z" and content.encode() in (entry / file).read_bytes():
-                found.append((int(entry.name), (entry / "cmdline").read_bytes().decode(errors="replace")))
+                found.append(
+                    (int(entry.name), (entry / "cmdline").read_bytes().decode(errors="replace"))
+                )
     return found
 
 
@@ -41,7 +43,11 @@ def find_run_processes(out: Path) -> dict[str, int]:
     found: dict[str, int] = {}
     for pid, line in sorted(find_processes_of_run(out)):
         service = SERVICE.search(line)
-        name = service[1] if service else next((name for module, name in PROGRAMS.items() if module in line), "run")
+        name = (
+            service[1]
+            if service
+            else next((name for module, name in PROGRAMS.items() if module in line), "run")
+        )
         found[f"{name} again" if name in found else name] = pid
     return found
 

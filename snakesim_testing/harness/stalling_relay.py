@@ -36,7 +36,10 @@ class StallingRelay:
 
     async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         behind, to_behind = await asyncio.open_connection(*self._behind)
-        ways = [asyncio.create_task(self._copy(reader, to_behind)), asyncio.create_task(self._copy(behind, writer))]
+        ways = [
+            asyncio.create_task(self._copy(reader, to_behind)),
+            asyncio.create_task(self._copy(behind, writer)),
+        ]
         self._ways.update(ways)
         await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
         for end in (writer, to_behind):

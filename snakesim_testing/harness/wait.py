@@ -4,11 +4,14 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-TIMEOUT_S = 90.0  # long enough for a process to start on a busy machine; a caller may give another limit
+# Long enough for a process to start on a busy machine; a caller may give another limit.
+TIMEOUT_S = 90.0
 FoundT = TypeVar("FoundT")
 
 
-def wait_until(condition: Callable[[], FoundT | None], what: str, limit_s: float = TIMEOUT_S) -> FoundT:
+def wait_until(
+    condition: Callable[[], FoundT | None], what: str, limit_s: float = TIMEOUT_S
+) -> FoundT:
     """Wait until a condition returns a true value, and return this value.
 
     Args:

@@ -24,7 +24,9 @@ class NamespaceMachine:
 
     def __init__(self, stack: ExitStack, name: str = "a machine") -> None:
         self.name, self._stack = name, stack
-        self._holder = self._started(["unshare", "--net", "sh", "-c", "echo ready; exec sleep infinity"])
+        self._holder = self._started(
+            ["unshare", "--net", "sh", "-c", "echo ready; exec sleep infinity"]
+        )
         assert self._holder.stdout is not None
         assert self._holder.stdout.readline() == b"ready\n"
         self.run("ip", "link", "set", "lo", "up")
@@ -39,12 +41,24 @@ class NamespaceMachine:
         return ["nsenter", "--target", self.pid, "--net", *command]
 
     def run(
-        self, *command: str, check: bool = True, cwd: Path | None = None, env: Mapping[str, str] | None = None
+        self,
+        *command: str,
+        check: bool = True,
+        cwd: Path | None = None,
+        env: Mapping[str, str] | None = None,
     ) -> str:
         """Run a command in it to its end, and return its output."""
         output, env = subprocess.PIPE, {**os.environ, **(env or {})}
         inside = self.wrap_command(*command)
-        done = subprocess.run(inside, stdout=output, stderr=subprocess.STDOUT, text=True, check=False, cwd=cwd, env=env)
+        done = subprocess.run(
+            inside,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+            cwd=cwd,
+            env=env,
+        )
         assert done.returncode == 0 or not check, f"{self.name}: {' '.join(command)}: {done.stdout}"
         return f"{done.stdout}(exit code {done.returncode})"
 
@@ -65,10 +79,16 @@ class NamespaceMachine:
             inherits: File descriptors that the program inherits.
             hurried: Whether the program gets a real-time priority, as on a machine that has nothing else to do.
         """
-        return self._started(self.wrap_command(*(HURRIED if hurried else ()), *command), log, env or {}, inherits)
+        return self._started(
+            self.wrap_command(*(HURRIED if hurried else ()), *command), log, env or {}, inherits
+        )
 
     def start_module(
-        self, *module_and_arguments: str, log: Path, inherits: Sequence[int] = (), hurried: bool = False
+        self,
+        *module_and_arguments: str,
+        log: Path,
+        inherits: Sequence[int] = (),
+        hurried: bool = False,
     ) -> subprocess.Popen[bytes]:
         """Start a Python module in the namespace, with one thread for numeric libraries. See `start`."""
         return self.start(
@@ -133,7 +153,9 @@ def connect_machines(names: Sequence[str], stack: ExitStack) -> dict[str, Namesp
     middle.set_address("lo", f"{NET}.1/32")
     for number, name in enumerate(names[1:], 2):
         machine, port, own = machines[name], f"port{number}", f"{NET}.{number}"
-        middle.run("ip", "link", "add", port, "type", "veth", "peer", "name", "lab0", "netns", machine.pid)
+        middle.run(
+            "ip", "link", "add", port, "type", "veth", "peer", "name", "lab0", "netns", machine.pid
+        )
         middle.run("ip", "link", "set", port, "up")
         middle.run("ip", "route", "add", own, "dev", port, "src", f"{NET}.1")
         machine.set_address("lab0", f"{own}/32")
@@ -154,7 +176,9 @@ class RadioLink:
 
     _relay: subprocess.Popen[bytes]
 
-    def set_quality(self, *, loss: float = 0.0, delay_s: float = 0.0, jitter_s: float = 0.0, cut: bool = False) -> None:
+    def set_quality(
+        self, *, loss: float = 0.0, delay_s: float = 0.0, jitter_s: float = 0.0, cut: bool = False
+    ) -> None:
         """Set the quality of the link. A property that is not named becomes perfect."""
         assert self._relay.stdin is not None
         order = {"loss": loss, "delay_s": delay_s, "jitter_s": jitter_s, "cut": cut}
@@ -163,12 +187,16 @@ class RadioLink:
 
 
 @contextmanager
-def connect_by_radio(a: NamespaceMachine, b: NamespaceMachine, name: str, net: str) -> Iterator[RadioLink]:
+def connect_by_radio(
+    a: NamespaceMachine, b: NamespaceMachine, name: str, net: str
+) -> Iterator[RadioLink]:
     """Connect two machines by a radio link, with the addresses `net`.1 and `net`.2, within the context."""
     command = [sys.executable, "-m", "verification.links.relay", a.pid, b.pid, name]
     relay = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     try:
-        assert relay.stdout is not None and relay.stdout.readline() == b"ready\n", "no TAP interface"
+        assert relay.stdout is not None and relay.stdout.readline() == b"ready\n", (
+            "no TAP interface"
+        )
         a.set_address(name, f"{net}.1/24")
         b.set_address(name, f"{net}.2/24")
         yield RadioLink(relay)

@@ -44,7 +44,9 @@ def format_lab_file(folder: Path, port: int) -> str:
         folder: Folder that gets a subfolder for each machine.
         port: Port of the router `main`. The next port is that of the router `spare`, which is never started.
     """
-    machines = [f'[machines.{name}]\naddress = "127.0.0.1"\nfolder = "{folder}/{name}"' for name in MACHINES]
+    machines = [
+        f'[machines.{name}]\naddress = "127.0.0.1"\nfolder = "{folder}/{name}"' for name in MACHINES
+    ]
     routers = [
         f'[routers.main]\nmachine = "hub"\nport = {port}',
         f'[routers.spare]\nmachine = "hub"\nport = {port + 1}',
@@ -81,11 +83,19 @@ class RunningLab:
 
     def find_identity_by_name(self, common_name: str) -> CertificateIdentity:
         """Return the identity whose certificate has this common name."""
-        return next(identity for identity in iterate_identities(self.lab) if identity.common_name == common_name)
+        return next(
+            identity
+            for identity in iterate_identities(self.lab)
+            if identity.common_name == common_name
+        )
 
     def find_identity_by_role(self, role: Role, robot: str) -> CertificateIdentity:
         """Return the first identity that has a role for a robot."""
-        return next(found for found in iterate_identities(self.lab) if found.role == role and found.subject == robot)
+        return next(
+            found
+            for found in iterate_identities(self.lab)
+            if found.role == role and found.subject == robot
+        )
 
     def make_session_settings(self, identity: CertificateIdentity, **more: Any) -> dict[str, Any]:
         """Return the Zenoh configuration of a session with the certificate of an identity.
@@ -152,7 +162,9 @@ def running_test_lab(folder: Path) -> Iterator[RunningLab]:
     try:
         # A router that has ended will never run, so its end also ends the wait, and fails here.
         wait_until(
-            lambda: "router running" in log_path.read_text() or router.poll() is not None, "a router", ROUTER_TIMEOUT_S
+            lambda: "router running" in log_path.read_text() or router.poll() is not None,
+            "a router",
+            ROUTER_TIMEOUT_S,
         )
         has_ended = router.poll() is not None
         assert not has_ended, log_path.read_text()

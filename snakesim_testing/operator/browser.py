@@ -15,7 +15,12 @@ from typing import Any
 from websockets.sync.client import ClientConnection, connect
 
 CHROMIUM = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+    (
+        path
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (path := shutil.which(name))
+    ),
+    None,
 )
 MISSING = "needs a browser: install the Debian package chromium"
 FLAGS = (
@@ -44,7 +49,8 @@ class BrowserTab:
         self.errors: list[str] = []  # of the page's console
         for domain in ("Page", "Runtime", "Log"):
             self.send(f"{domain}.enable")
-        self.send("Emulation.setFocusEmulationEnabled", enabled=True)  # a page in the background draws nothing
+        # A page in the background draws nothing.
+        self.send("Emulation.setFocusEmulationEnabled", enabled=True)
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
         """A command of the protocol, and its result."""
@@ -60,17 +66,27 @@ class BrowserTab:
     def _note(self, event: dict[str, Any]) -> None:
         kind, reported = event.get("method"), event.get("params", {})
         if kind == "Runtime.exceptionThrown":
-            self.errors.append(str(reported["exceptionDetails"].get("exception", reported["exceptionDetails"]))[:500])
+            self.errors.append(
+                str(reported["exceptionDetails"].get("exception", reported["exceptionDetails"]))[
+                    :500
+                ]
+            )
         elif kind == "Log.entryAdded" and reported["entry"]["level"] == "error":
-            self.errors.append(f"{reported['entry']['text']} {reported['entry'].get('url', '')}"[:500])
+            self.errors.append(
+                f"{reported['entry']['text']} {reported['entry'].get('url', '')}"[:500]
+            )
         elif kind == "Runtime.consoleAPICalled" and reported["type"] == "error":
             self.errors.append(
-                " ".join(str(part.get("value", part.get("description"))) for part in reported["args"])[:500]
+                " ".join(
+                    str(part.get("value", part.get("description"))) for part in reported["args"]
+                )[:500]
             )
 
     def value(self, script: str) -> Any:
         """The value of a JavaScript expression."""
-        return self.send("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+        return self.send("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
+            "value"
+        )
 
     def text(self) -> str:
         """All visible text."""
@@ -80,7 +96,9 @@ class BrowserTab:
         """Until the page shows a text; returns how long it took in seconds."""
         began = time.monotonic()
         while text not in (shown := self.text()):
-            assert time.monotonic() - began < limit_s, f"{text!r} is not on the page:\n{shown[:3000]}"
+            assert time.monotonic() - began < limit_s, (
+                f"{text!r} is not on the page:\n{shown[:3000]}"
+            )
             time.sleep(0.02)
         return time.monotonic() - began
 
@@ -121,12 +139,23 @@ class BrowserTab:
     def press(self, key: str, code: int, **more: str) -> None:
         """Press a key. more: such as the `text` that it types."""
         for kind, typed in (("keyDown", more), ("keyUp", {})):
-            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code, **typed)
+            self.send(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=key,
+                code=key,
+                windowsVirtualKeyCode=code,
+                **typed,
+            )
 
     def size(self, width: int, height: int, *, scale: float = 1.0, mobile: bool = False) -> None:
         """The size of the window."""
         self.send(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=mobile
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=scale,
+            mobile=mobile,
         )
 
     def picture(self, **more: Any) -> bytes:
@@ -141,7 +170,9 @@ class ChromiumBrowser:
         self._port = port
         self._sockets: list[ClientConnection] = []
 
-    def open(self, address: str, width: int = 1440, height: int = 900, scale: float = 1.0) -> BrowserTab:
+    def open(
+        self, address: str, width: int = 1440, height: int = 900, scale: float = 1.0
+    ) -> BrowserTab:
         """A new page; each is a viewer of its own."""
         root = f"127.0.0.1:{self._port}/"
         with urllib.request.urlopen(f"http://{root}json/version", timeout=ANSWER_S) as answer:
@@ -183,7 +214,9 @@ def open_chromium(*, with_webgl: bool = True) -> Iterator[ChromiumBrowser]:
         try:
             port_file, deadline = Path(profile) / "DevToolsActivePort", time.monotonic() + START_S
             while not port_file.is_file() or not port_file.read_text().strip():
-                assert process.poll() is None and time.monotonic() < deadline, "chromium did not start"
+                assert process.poll() is None and time.monotonic() < deadline, (
+                    "chromium did not start"
+                )
                 time.sleep(0.05)
             browser = ChromiumBrowser(int(port_file.read_text().split()[0]))
             try:

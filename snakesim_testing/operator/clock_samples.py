@@ -10,4 +10,6 @@ from snakesim_testing.hal import small_robots as rig
 
 
 def clock(tick: int) -> ReceivedSample:
-    return ReceivedSample(keys.CLOCK, encode(rig.make_clock(tick)), format_encoding(Clock), time.monotonic_ns())
+    return ReceivedSample(
+        keys.CLOCK, encode(rig.make_clock(tick)), format_encoding(Clock), time.monotonic_ns()
+    )

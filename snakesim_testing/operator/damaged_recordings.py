@@ -50,7 +50,9 @@ def recorded(out: Path, duration_s: float, chunk_bytes: int) -> Path:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(mcap_file, "CHUNK_BYTES", chunk_bytes)
         patched.setattr(writer, "FLUSH_S", 3600.0)  # chunks by size alone, however busy the machine
-        simulate(load_scenario("peg_row", [parse_set_option(f"duration_s={duration_s}")]).config, out)
+        simulate(
+            load_scenario("peg_row", [parse_set_option(f"duration_s={duration_s}")]).config, out
+        )
     return out
 
 

@@ -2,7 +2,13 @@
 
 from typing import Any
 
-from snakesim_hal.wire.messages import ControlState, JointState, KnownObstacle, WorldContact, WorldModel
+from snakesim_hal.wire.messages import (
+    ControlState,
+    JointState,
+    KnownObstacle,
+    WorldContact,
+    WorldModel,
+)
 from snakesim_testing.hal.small_robots import make_description, make_joint_state
 
 ROBOT = make_description()
@@ -16,7 +22,11 @@ def joints(*angles_rad: float) -> JointState:
 
 
 def contact(
-    force_w: tuple[float, float, float], obstacle: str = "peg", *, x_m: float = 0.1, body_s_m: float = 0.1
+    force_w: tuple[float, float, float],
+    obstacle: str = "peg",
+    *,
+    x_m: float = 0.1,
+    body_s_m: float = 0.1,
 ) -> WorldContact:
     return WorldContact(
         link=0, obstacle=obstacle, body_s_m=body_s_m, position_w=(x_m, 0.0, 0.0), normal_w=(0.0, 1.0, 0.0),

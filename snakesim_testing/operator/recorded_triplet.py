@@ -32,10 +32,15 @@ def triplet() -> RunRecord:
     record = simulate(load_scenario("triplet").config).record
     later_ns = round(ARMED_S * 1e9)
     reported = {
-        name: [msgspec.structs.replace(one, timestamp_ns=one.timestamp_ns + later_ns) for one in getattr(record, name)]
+        name: [
+            msgspec.structs.replace(one, timestamp_ns=one.timestamp_ns + later_ns)
+            for one in getattr(record, name)
+        ]
         for name in ("control_states", "worlds")
     }
-    return dataclasses.replace(record, host=finished(1000), time_s=record.time_s + ARMED_S, **reported)
+    return dataclasses.replace(
+        record, host=finished(1000), time_s=record.time_s + ARMED_S, **reported
+    )
 
 
 def first_seconds(record: RunRecord, seconds: float) -> RunRecord:
@@ -128,7 +133,9 @@ def read(record: RunRecord, ended: str = "complete") -> ReportReader:
     reader = ReportReader(page)
     assert [i for i in reader.ids if i in SECTIONS] == SECTIONS
     assert len(page.encode()) < 3_000_000
-    assert not [a for a in reader.attributes if a[2] is not None and re.search(r"\b(nan|inf|None)\b", a[2])]
+    assert not [
+        a for a in reader.attributes if a[2] is not None and re.search(r"\b(nan|inf|None)\b", a[2])
+    ]
     assert not re.search(r"\b(None|nan|inf)\b", reader.text)
     assert not [a for a in reader.attributes if a[1] in ("src", "href")]
     ours = page.replace(PLOTLY, "")

@@ -20,4 +20,6 @@ SERVICE_HASHES = {  # of ListParameters as `ros2 service info -v` prints it, els
 def of_robot(name: str) -> RobotDescription:
     """Description of a shipped robot."""
     file = msgspec.convert(read_table_with_base(name, "robots").values, RobotFile)
-    return describe_robot(file, backend="sim", period_ns=10_000_000, lease_ns=50_000_000, config_hash="0" * 16)
+    return describe_robot(
+        file, backend="sim", period_ns=10_000_000, lease_ns=50_000_000, config_hash="0" * 16
+    )

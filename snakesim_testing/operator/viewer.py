@@ -42,14 +42,16 @@ class ConsoleViewer:
 
     async def come(self) -> None:
         """Send the first message of a page: from then on it counts as a viewer."""
-        await self.say(CAMERA)
+        await self.send_message(CAMERA)
 
     async def batch(self) -> list[dict[str, Any]]:
         """The next messages."""
         data = await self._socket.recv()
         assert isinstance(data, bytes)
         size, packed = int.from_bytes(data[:8], "little"), int.from_bytes(data[8:16], "little")
-        messages = msgspec.msgpack.decode(self._unzip.decompress(data[16 : 16 + packed], size))["messages"]
+        messages = msgspec.msgpack.decode(self._unzip.decompress(data[16 : 16 + packed], size))[
+            "messages"
+        ]
         for message in messages:
             if "props" in message and "uuid" in message:
                 self._of[message["uuid"]] = dict(message["props"])
@@ -62,7 +64,7 @@ class ConsoleViewer:
         for message in batch:
             if message["type"] == ASKED:
                 reported = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
-                await self.say({"type": "LocalStorageGetItemResponseMessage", **reported})
+                await self.send_message({"type": "LocalStorageGetItemResponseMessage", **reported})
 
     async def watch(self) -> None:
         """Show all that comes, until the connection ends."""
@@ -76,7 +78,10 @@ class ConsoleViewer:
 
     def visible(self, label: str) -> bool:
         """Whether a button or an input with this label is there, and not hidden."""
-        return any(props.get("label") == label and props.get("visible", True) for props in self._of.values())
+        return any(
+            props.get("label") == label and props.get("visible", True)
+            for props in self._of.values()
+        )
 
     def shows(self, text: str) -> bool:
         """Whether a text is on the page, as HTML."""
@@ -84,19 +89,29 @@ class ConsoleViewer:
 
     async def click(self, button: str) -> None:
         """Press a button."""
-        await self.say(
-            {"type": "GuiUpdateMessage", "uuid": await self.wait_for_uuid(button), "updates": {"value": True}}
+        await self.send_message(
+            {
+                "type": "GuiUpdateMessage",
+                "uuid": await self.wait_for_uuid(button),
+                "updates": {"value": True},
+            }
         )
 
     async def choose(self, label: str, value: str | bool | int) -> None:
         """Set the value of an input: press a button, choose from a list, or enter a number."""
-        await self.say(
-            {"type": "GuiUpdateMessage", "uuid": await self.wait_for_uuid(label), "updates": {"value": value}}
+        await self.send_message(
+            {
+                "type": "GuiUpdateMessage",
+                "uuid": await self.wait_for_uuid(label),
+                "updates": {"value": value},
+            }
         )
 
     async def trigger(self, command: str) -> None:
         """Press the key of a command."""
-        await self.say({"type": "CommandTriggerMessage", "uuid": await self.wait_for_uuid(command)})
+        await self.send_message(
+            {"type": "CommandTriggerMessage", "uuid": await self.wait_for_uuid(command)}
+        )
 
     async def wait_for_uuid(self, label: str) -> str:
         """Return the id of the button, input or command with a label, as soon as the page has received it.
@@ -112,7 +127,7 @@ class ConsoleViewer:
             await asyncio.sleep(POLL_S)
         raise AssertionError(f"no {label!r} on the page within {TIMEOUT_S:g} s")
 
-    async def say(self, message: dict[str, Any]) -> None:
+    async def send_message(self, message: dict[str, Any]) -> None:
         """Send any message."""
         await self._socket.send(msgspec.msgpack.encode(message))
 
@@ -120,7 +135,14 @@ class ConsoleViewer:
 def viewing(address: str) -> connect:
     """The connection of a page; `async with` it."""
     socket = address.replace("http", "ws")
-    return connect(socket, subprotocols=[PROTOCOL], compression=None, max_size=None, proxy=None, open_timeout=TIMEOUT_S)
+    return connect(
+        socket,
+        subprotocols=[PROTOCOL],
+        compression=None,
+        max_size=None,
+        proxy=None,
+        open_timeout=TIMEOUT_S,
+    )
 
 
 async def watch(address: str) -> None:

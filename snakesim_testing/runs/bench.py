@@ -15,7 +15,9 @@ from snakesim_testing.runs.in_process_command import snakesim
 def lab_folder(folder: Path, joint_count: int, scenario: str, files: Mapping[str, str]) -> Path:
     """A shorter `planar13` as snake.toml, its bench.toml, and more files by their names."""
     snake = (
-        (SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text().replace("modules = 13", f"modules = {joint_count}")
+        (SHIPPED_FILES_DIR / "robots" / "planar13.toml")
+        .read_text()
+        .replace("modules = 13", f"modules = {joint_count}")
     )
     for name, text in {"snake.toml": snake, "bench.toml": scenario, **files}.items():
         (folder / name).write_text(text)
@@ -26,10 +28,23 @@ def lab_folder(folder: Path, joint_count: int, scenario: str, files: Mapping[str
 def host(home: Path, backend: str) -> Iterator[str]:
     """A host, disarmed; its endpoint."""
     endpoint = find_free_endpoint()
-    program = [*SNAKESIM_COMMAND, "start", "host", "bench.toml", "--backend", backend, "--endpoint", endpoint]
-    with subprocess.Popen(program, cwd=home, env=make_environment(home), stdin=subprocess.DEVNULL) as process:
+    program = [
+        *SNAKESIM_COMMAND,
+        "start",
+        "host",
+        "bench.toml",
+        "--backend",
+        backend,
+        "--endpoint",
+        endpoint,
+    ]
+    with subprocess.Popen(
+        program, cwd=home, env=make_environment(home), stdin=subprocess.DEVNULL
+    ) as process:
         try:
-            wait_until(lambda: snakesim("status", "--endpoint", endpoint, cwd=home).code == 0, "the host")
+            wait_until(
+                lambda: snakesim("status", "--endpoint", endpoint, cwd=home).code == 0, "the host"
+            )
             yield endpoint
         finally:
             process.terminate()

@@ -13,7 +13,10 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import decode_table, read_table_with_base
 from snakesim_hal.model.robot import RobotFile
-from snakesim_operator.features.commissioning.shape.design import PLACEMENT_TOLERANCE_RAD, design_poses
+from snakesim_operator.features.commissioning.shape.design import (
+    PLACEMENT_TOLERANCE_RAD,
+    design_poses,
+)
 from snakesim_testing.runs.bench import lab_folder
 from snakesim_testing.runs.command import run_in_background
 
@@ -60,7 +63,9 @@ def make_bent_folder(folder: Path, backend: str) -> Path:
 class ScriptedOperator:
     """Bends the emulated robot as `snakesim robot shape check` asks, within the tolerance of a person."""
 
-    def __init__(self, home: Path, endpoint: str, drive_order: Sequence[int] = range(JOINTS)) -> None:
+    def __init__(
+        self, home: Path, endpoint: str, drive_order: Sequence[int] = range(JOINTS)
+    ) -> None:
         """Prepare to check the robot of a folder.
 
         Args:
@@ -91,7 +96,9 @@ class ScriptedOperator:
             return process.wait(20), "".join(printed)
 
     def _bend(self, drawn_rad: Floats) -> None:
-        placed_rad = drawn_rad + self._rng.uniform(-1.0, 1.0, len(drawn_rad)) * 0.9 * PLACEMENT_TOLERANCE_RAD
+        placed_rad = (
+            drawn_rad + self._rng.uniform(-1.0, 1.0, len(drawn_rad)) * 0.9 * PLACEMENT_TOLERANCE_RAD
+        )
         text = " ".join(f"{placed_rad[joint]:.4f}" for joint in self._drive_order)
         (self._home / "new.txt").write_text(text)
         (self._home / "new.txt").replace(self._home / POSE_FILE)

@@ -53,7 +53,12 @@ def run_in_background(
         program: Command line of the program.
     """
     with subprocess.Popen(
-        [*program, *arguments], cwd=home, env=make_environment(home), stdin=stdin, stdout=subprocess.PIPE, text=True
+        [*program, *arguments],
+        cwd=home,
+        env=make_environment(home),
+        stdin=stdin,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as process:
         try:
             yield process

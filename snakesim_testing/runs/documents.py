@@ -57,8 +57,10 @@ class DocumentSection:
     """A heading, and what is to be typed below it."""
 
     title: str
-    blocks: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])  # (words behind the fence, content)
-    files: dict[str, str] = field(default_factory=dict[str, str])  # to be saved: here, or in a section before
+    # (words behind the fence, content).
+    blocks: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
+    # To be saved: here, or in a section before.
+    files: dict[str, str] = field(default_factory=dict[str, str])
 
     @property
     def has_commands(self) -> bool:
@@ -102,9 +104,15 @@ def make_bash_script(section: DocumentSection) -> str:
     for number, (info, content) in enumerate(section.blocks):
         if info == "sh background":
             log = f"background-{number}.log"
-            parts.append(f"end_background\n( {content.rstrip()} ) >{log} 2>&1 &\nrunning=$!\nawait_running {log}\n")
+            parts.append(
+                f"end_background\n( {content.rstrip()} ) >{log} 2>&1 &\nrunning=$!\nawait_running {log}\n"
+            )
         elif info == "sh":
-            parts += [_expecting(command) for command in re.split(r"(?<!\\)\n", content) if command.strip()]
+            parts += [
+                _expecting(command)
+                for command in re.split(r"(?<!\\)\n", content)
+                if command.strip()
+            ]
     return "\n".join(parts)
 
 
@@ -113,7 +121,9 @@ def _expecting(command: str) -> str:
     reported = f"echo '$' {shlex.quote(command)}"
     if code is None:
         return f"{reported}\n{command}"
-    return f"{reported}\ncode=0; {command.partition('#')[0].strip()} || code=$?; [ $code = {code[1]} ]"
+    return (
+        f"{reported}\ncode=0; {command.partition('#')[0].strip()} || code=$?; [ $code = {code[1]} ]"
+    )
 
 
 def clone(folder: Path) -> None:
@@ -121,7 +131,9 @@ def clone(folder: Path) -> None:
     shutil.copytree(REPOSITORY, folder, ignore=leave_out, symlinks=True)
     (folder / ".tools").symlink_to(REPOSITORY / ".tools")
     venv = folder / ".venv"
-    subprocess.run([UV, "venv", "--quiet", "--offline", "--python", sys.executable, venv], check=True)
+    subprocess.run(
+        [UV, "venv", "--quiet", "--offline", "--python", sys.executable, venv], check=True
+    )
     library = next((venv / "lib").glob("python*/site-packages"))
     lent = sysconfig.get_path("purelib")
     (library / "lent.pth").write_text(f"import site; site.addsitedir({lent!r})\n")

@@ -58,11 +58,13 @@ def robot(home: Path) -> RobotFile:
     return decode_table(read_table_with_base(str(home / "snake.toml"), "robots"), RobotFile)
 
 
-def seen(home: Path, endpoint: str, angle_rad: float) -> None:
+def wait_for_published_angle(home: Path, endpoint: str, angle_rad: float) -> None:
     """Wait until the host publishes an angle of joint_1."""
 
     def published() -> bool:
-        output = snakesim("topic", "echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home).out
+        output = snakesim(
+            "topic", "echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home
+        ).out
         return abs(json.loads(output)["message"]["angle_rad"][0] - angle_rad) < 1e-3
 
     wait_until(published, f"joint_1 at {angle_rad} rad")

@@ -21,7 +21,7 @@ def snakesim(*arguments: str, cwd: Path) -> CompletedRun:
     return CompletedRun(code, out.getvalue(), err.getvalue())
 
 
-def tell(run: RunningCommand, *arguments: str) -> CompletedRun:
+def run_command_for_robot(run: RunningCommand, *arguments: str) -> CompletedRun:
     """The same, with the endpoint of a run."""
     return snakesim(*arguments, "--endpoint", run.endpoint, cwd=run.home)
 

@@ -21,12 +21,18 @@ class LabPrograms:
         endpoint = find_free_endpoint()
         quiet = "scouting: {multicast: {enabled: false}, gossip: {enabled: false}}"
         self.router_file, self.session = folder / "router.json5", folder / "session.json5"
-        self.router_file.write_text(ROUTER_CONFIG_PATH.read_text().replace("tcp/127.0.0.1:7447", endpoint))
-        self.session.write_text(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {quiet}}}')
+        self.router_file.write_text(
+            ROUTER_CONFIG_PATH.read_text().replace("tcp/127.0.0.1:7447", endpoint)
+        )
+        self.session.write_text(
+            f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, {quiet}}}'
+        )
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         """One of them."""
-        log = self._stack.enter_context((self.folder / f"{arguments[1]}-{Path(arguments[2]).stem}.log").open("a"))
+        log = self._stack.enter_context(
+            (self.folder / f"{arguments[1]}-{Path(arguments[2]).stem}.log").open("a")
+        )
         process = subprocess.Popen(
             [*SNAKESIM_COMMAND, *arguments],
             cwd=self.folder,
@@ -42,17 +48,31 @@ class LabPrograms:
     def host(self, out: str, *arguments: str) -> subprocess.Popen[str]:
         """A HAL host."""
         return self.start(
-            "start", "host", *SCENARIO, "--end-after-duration", *arguments, "--session", str(self.session), "--out", out
+            "start",
+            "host",
+            *SCENARIO,
+            "--end-after-duration",
+            *arguments,
+            "--session",
+            str(self.session),
+            "--out",
+            out,
         )
 
     def service(self, name: str, *arguments: str) -> subprocess.Popen[str]:
         """A service."""
-        return self.start("start", "service", name, *SCENARIO, *arguments, "--session", str(self.session))
+        return self.start(
+            "start", "service", name, *SCENARIO, *arguments, "--session", str(self.session)
+        )
 
-    def tell(self, *arguments: str) -> CompletedRun:
+    def run_operator_command(self, *arguments: str) -> CompletedRun:
         """An operator's command, on another machine."""
         return command.snakesim(*arguments, "--session", str(self.session), cwd=self.folder)
 
     def until_armed(self) -> None:
         """As a person does it: until the answer is yes."""
-        wait_until(lambda: self.tell("robot", "arm", "planar13", "sim").code == 0, "armed", 60.0)
+        wait_until(
+            lambda: self.run_operator_command("robot", "arm", "planar13", "sim").code == 0,
+            "armed",
+            60.0,
+        )

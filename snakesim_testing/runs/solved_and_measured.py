@@ -16,7 +16,10 @@ import snakesim
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.measured_force import FORCE_WINDOW_S
 from snakesim_hal.wire.messages import ControlState
-from snakesim_operator.results.metrics.force_tracking import MIN_CONTACT_FORCE_N, MIN_DESIRED_FORCE_N
+from snakesim_operator.results.metrics.force_tracking import (
+    MIN_CONTACT_FORCE_N,
+    MIN_DESIRED_FORCE_N,
+)
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.state.contacts import GeomPair, ObstacleContactReader
 
@@ -30,7 +33,8 @@ SHIPPED = (
     "compliant_undulation",
     "hold",
 )
-WITHOUT_PATH = ("lateral_undulation", "compliant_undulation", "hold")  # a mission's speed does not change them
+# A mission's speed does not change them.
+WITHOUT_PATH = "lateral_undulation", "compliant_undulation", "hold"
 AMPLITUDES_RAD = (0.2, 0.3, 0.4, 0.5, 0.6)  # of the wave
 FASTER_M_S = 0.3
 STEP_S = 0.002
@@ -48,13 +52,19 @@ Forces = Mapping[str, Floats]  # of each obstacle, in every physics step
 def wave(amplitude_rad: float) -> Callable[[float, int], Floats]:
     """A wave that grows from straight, wherever the joints are."""
     lag_rad = 0.9 * np.arange(13)[::-1]
-    return lambda time_s, joints: min(time_s, 1.0) * amplitude_rad * np.sin(np.pi * time_s - lag_rad)
+    return lambda time_s, joints: (
+        min(time_s, 1.0) * amplitude_rad * np.sin(np.pi * time_s - lag_rad)
+    )
 
 
-def run_and_measure_forces(scenario: str, controller: Any, **options: Any) -> tuple[snakesim.Result, Forces]:
+def run_and_measure_forces(
+    scenario: str, controller: Any, **options: Any
+) -> tuple[snakesim.Result, Forces]:
     """A run of 8 s, and the forces of all obstacles in it."""
     with recording_contact_forces() as steps:
-        result = snakesim.run(scenario, controller=controller, duration=options.pop("duration", 8), set=options)
+        result = snakesim.run(
+            scenario, controller=controller, duration=options.pop("duration", 8), set=options
+        )
     names = dict.fromkeys(name for found in steps for name in found)
     return result, {name: np.array([found.get(name, 0.0) for found in steps]) for name in names}
 
@@ -86,7 +96,9 @@ def recording_contact_forces() -> Iterator[list[dict[str, float]]]:
         yield steps
 
 
-def _sum_by_obstacle(forces_n: Mapping[GeomPair, float], obstacle_of_geom: list[str | None]) -> dict[str, float]:
+def _sum_by_obstacle(
+    forces_n: Mapping[GeomPair, float], obstacle_of_geom: list[str | None]
+) -> dict[str, float]:
     """Return the force on each obstacle, from the forces between geoms of links and obstacles."""
     force_of_obstacle: dict[str, float] = {}
     for (first, second), force_n in forces_n.items():
@@ -119,10 +131,14 @@ def iter_cases(scenario: str) -> Iterator[str]:
         if name not in WITHOUT_PATH:
             label = f"`{name}`, {FASTER_M_S} m/s asked for"
             yield measure_case(scenario, label, name, **{"mission.speed_m_s": FASTER_M_S})[1]
-    waves = [(rad, *measure_case(scenario, f"wave, {rad} rad", wave(rad))) for rad in AMPLITUDES_RAD]
+    waves = [
+        (rad, *measure_case(scenario, f"wave, {rad} rad", wave(rad))) for rad in AMPLITUDES_RAD
+    ]
     best = max(waves, key=lambda found: found[1])
     yield next(row for rad, _, row in waves if rad == 0.3)
-    yield best[2].replace(f"{best[0]} rad", f"{best[0]} rad (of {len(waves)} tried the one that goes furthest)")
+    yield best[2].replace(
+        f"{best[0]} rad", f"{best[0]} rad (of {len(waves)} tried the one that goes furthest)"
+    )
 
 
 def measure_difference_causes(scenario: str, controller: str, **options: Any) -> str:
@@ -141,7 +157,10 @@ def measure_difference_causes(scenario: str, controller: str, **options: Any) ->
     measured_n = measured_n[requests_force]
     parts_n = _decompose_force_error(desired_n, measured_n)
     fractions = " | ".join(f"{part_n / sum(parts_n):.0%}" for part_n in parts_n)
-    correlations = [compute_correlation(*tabulate_forces(states, forces, float(shift_s))) for shift_s in SHIFTS_S]
+    correlations = [
+        compute_correlation(*tabulate_forces(states, forces, float(shift_s)))
+        for shift_s in SHIFTS_S
+    ]
     best = int(np.argmax(correlations))
     return (
         f"| `{scenario}` | `{controller}` | {desired_n.sum(axis=1).mean():.1f} | {measured_n.sum(axis=1).mean():.1f} "
@@ -151,7 +170,9 @@ def measure_difference_causes(scenario: str, controller: str, **options: Any) ->
     )
 
 
-def _decompose_force_error(desired_n: Floats, measured_n: Floats) -> tuple[float, float, float, float]:
+def _decompose_force_error(
+    desired_n: Floats, measured_n: Floats
+) -> tuple[float, float, float, float]:
     """Decompose the difference between desired and measured contact forces (in N) by its causes.
 
     Args:
@@ -176,7 +197,9 @@ def _decompose_force_error(desired_n: Floats, measured_n: Floats) -> tuple[float
     return without_contact_n, undesired_n, total_error_n, distribution_error_n
 
 
-def tabulate_forces(states: Sequence[ControlState], forces: Forces, shift_s: float) -> tuple[Floats, Floats]:
+def tabulate_forces(
+    states: Sequence[ControlState], forces: Forces, shift_s: float
+) -> tuple[Floats, Floats]:
     """Tabulate desired and measured contact forces by state and obstacle.
 
     Args:
@@ -187,7 +210,9 @@ def tabulate_forces(states: Sequence[ControlState], forces: Forces, shift_s: flo
     Returns:
         Desired and measured forces in N, (n_states, n_obstacles) each. Measured forces are means over FORCE_WINDOW_S.
     """
-    names = sorted({*forces, *(p.obstacle for s in states for p in s.push_points if p.obstacle is not None)})
+    names = sorted(
+        {*forces, *(p.obstacle for s in states for p in s.push_points if p.obstacle is not None)}
+    )
     window = round(FORCE_WINDOW_S / STEP_S)
     desired_n, measured_n = np.zeros((len(states), len(names))), np.zeros((len(states), len(names)))
     for j, name in enumerate(names):

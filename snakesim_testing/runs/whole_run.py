@@ -10,7 +10,13 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, load_controller
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    Observation,
+    Telemetry,
+    load_controller,
+)
 from snakesim_hal.model.plugins import CONTROLLERS, register_plugin_temporarily
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_operator.results.run_log import RunRecord
@@ -53,7 +59,9 @@ class RecordedTicks:
         return [state.reason for state in self._reported()]
 
     def _reported(self) -> list[Any]:
-        reported = [state for state in self.record.control_states if state.tick in range(len(self.reports))]
+        reported = [
+            state for state in self.record.control_states if state.tick in range(len(self.reports))
+        ]
         by_tick = {state.tick: state for state in reported}
         now = by_tick[0]
         return [now := by_tick.get(tick, now) for tick in range(len(self.reports))]
@@ -124,7 +132,11 @@ def run_controller(
     telemetry: list[Telemetry] = []
     update_us: list[float] = []
     watched = _make_recording_controller(
-        load_controller(config.controller), ticks_without_world, ticks_without_trajectory, telemetry, update_us
+        load_controller(config.controller),
+        ticks_without_world,
+        ticks_without_trajectory,
+        telemetry,
+        update_us,
     )
     with register_plugin_temporarily(CONTROLLERS, config.controller, watched):
         result = simulate(config)

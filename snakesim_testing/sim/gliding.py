@@ -26,11 +26,20 @@ SURFACES: dict[str, dict[str, Any]] = {
     "level hills": {"ground": {"friction": FRICTION, "heightfield": LEVEL_HILLS}},
     "step": {
         "ground": {"friction": 0.9},
-        "step": [{"position_m": [FAR_M, 0.0], "size_m": [16.0, 16.0], "height_m": HEIGHT_M, "friction": FRICTION}],
+        "step": [
+            {
+                "position_m": [FAR_M, 0.0],
+                "size_m": [16.0, 16.0],
+                "height_m": HEIGHT_M,
+                "friction": FRICTION,
+            }
+        ],
     },
     "top of an obstacle": {
         "ground": {"friction": 0.9},
-        "box": [{"position_m": [FAR_M, 0.0], "size_m": [16.0, 16.0, HEIGHT_M], "friction": FRICTION}],
+        "box": [
+            {"position_m": [FAR_M, 0.0], "size_m": [16.0, 16.0, HEIGHT_M], "friction": FRICTION}
+        ],
     },
 }
 
@@ -39,11 +48,17 @@ class GlidingSnake:
     """A straight snake of 8 modules at rest on one of `SURFACES`, which does not bend, roll or turn."""
 
     def __init__(
-        self, surface: str, robot: dict[str, Any], step_s: float = 0.002, slope: dict[str, float] | None = None
+        self,
+        surface: str,
+        robot: dict[str, Any],
+        step_s: float = 0.002,
+        slope: dict[str, float] | None = None,
     ) -> None:
         scene = merge_tables(SURFACES[surface], {"ground": slope or {}})
         config = make_config({"chain": {"modules": 8}} | robot, scene)
-        self.sim, self.data, self.physics = make_resting_body(config, SimSettings(timestep_s=step_s))
+        self.sim, self.data, self.physics = make_resting_body(
+            config, SimSettings(timestep_s=step_s)
+        )
         self.model = self.sim.model
         first = self.sim.first_link_body
         links = len(self.sim.link_geoms)
@@ -80,7 +95,8 @@ class GlidingSnake:
         """Drag the body at a constant velocity, and return the mean force on it in the second half, (2,) in N."""
         step_s = self.model.opt.timestep
         forces_n: list[Floats] = []
-        change = np.zeros(2)  # of the velocity in one step; the body moves with the velocity after it
+        # Of the velocity in one step; the body moves with the velocity after it.
+        change = np.zeros(2)
         for _ in range(round(time_s / step_s)):
             before = velocity_w - change
             self.throw(before)
@@ -120,10 +136,15 @@ def glide_without_mujoco(
     is_held = np.linalg.norm(along_ground_m_s2) < normal_m_s2 * min(coefficients)
 
     def accelerate(velocity_m_s: Floats) -> Floats:
-        return along_ground_m_s2 + normal_m_s2 * _compute_friction_per_weight(velocity_m_s, coefficients)
+        return along_ground_m_s2 + normal_m_s2 * _compute_friction_per_weight(
+            velocity_m_s, coefficients
+        )
 
     for _ in range(round(duration_s / step_s)):
-        if is_held and np.linalg.norm(velocity_m_s) < 2.0 * normal_m_s2 * max(coefficients) * step_s:
+        if (
+            is_held
+            and np.linalg.norm(velocity_m_s) < 2.0 * normal_m_s2 * max(coefficients) * step_s
+        ):
             break
         first = accelerate(velocity_m_s)
         second = accelerate(velocity_m_s + 0.5 * step_s * first)
@@ -147,7 +168,9 @@ def make_tilted_gravity(slope_rad: float, towards_rad: float) -> Vector:
 
 def _compute_friction_per_weight(velocity_m_s: Floats, coefficients: DirectionalFriction) -> Floats:
     """Return the friction over the normal force, along the body and across it, (2,)."""
-    longitudinal_coefficient = coefficients.forward if velocity_m_s[0] > 0 else coefficients.backward
+    longitudinal_coefficient = (
+        coefficients.forward if velocity_m_s[0] > 0 else coefficients.backward
+    )
     return (
         -np.array([longitudinal_coefficient, coefficients.sideways])
         * velocity_m_s

@@ -74,7 +74,10 @@ class SimulatorRig:
         self.tick = 0
 
     def command(
-        self, mode: JointMode | list[JointMode], target: float | list[float] = 0.0, limit: float | None = None
+        self,
+        mode: JointMode | list[JointMode],
+        target: float | list[float] = 0.0,
+        limit: float | None = None,
     ) -> None:
         """The same for all joints, or one each."""
         modes = mode if isinstance(mode, list) else [mode] * self.count
@@ -88,7 +91,9 @@ class SimulatorRig:
 
     def sample_only_sensor(self, kind: type[MessageT]) -> MessageT:
         """The message of the only sensor with such messages at the present tick."""
-        (message,) = (message for message in self.sample().by_key.values() if isinstance(message, kind))
+        (message,) = (
+            message for message in self.sample().by_key.values() if isinstance(message, kind)
+        )
         return message
 
     def advance(self, seconds: float = 0.0) -> None:

@@ -49,7 +49,9 @@ class Ellipsoids:
         self.volume_m3 = 4.0 / 3.0 * np.pi * radii.prod(axis=1, keepdims=True)
         self.largest_m2 = np.pi * half_lengths_m[:, None] * radius_m
         # Moments of the bodies that the rotating ellipsoids sweep.
-        others_m = np.column_stack([np.full_like(half_lengths_m, radius_m), half_lengths_m, half_lengths_m])
+        others_m = np.column_stack(
+            [np.full_like(half_lengths_m, radius_m), half_lengths_m, half_lengths_m]
+        )
         moments = 8 * np.pi / 15 * radii * others_m**4
         self.swept = fluid.angular_drag * moments
         self.swept += fluid.slender_drag * (moments.max(axis=1, keepdims=True) - moments)
@@ -75,8 +77,12 @@ class Ellipsoids:
         projected_m2 = self.find_projected_areas_m2(velocities)
 
         # Drag and viscous resistance.
-        drag_m2 = fluid.blunt_drag * projected_m2 + fluid.slender_drag * (self.largest_m2 - projected_m2)
-        resistance = density * drag_m2 * speeds + 6 * np.pi * self.sphere_radius_m * fluid.viscosity_pa_s
+        drag_m2 = fluid.blunt_drag * projected_m2 + fluid.slender_drag * (
+            self.largest_m2 - projected_m2
+        )
+        resistance = (
+            density * drag_m2 * speeds + 6 * np.pi * self.sphere_radius_m * fluid.viscosity_pa_s
+        )
         forces = -resistance * velocities
         turning = density * np.linalg.norm(self.swept * rates, axis=1, keepdims=True)
         turning += 8 * np.pi * self.sphere_radius_m**3 * fluid.viscosity_pa_s
@@ -86,8 +92,12 @@ class Ellipsoids:
         forces += fluid.magnus_lift * density * self.volume_m3 * np.cross(rates, velocities)
         normals = velocities / self.radii_m**2
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), MIN_SPEED)
-        cosines = np.sum(normals * velocities, axis=1, keepdims=True) / np.maximum(speeds, MIN_SPEED)
-        circulations = fluid.kutta_lift * density * projected_m2 * cosines * np.cross(normals, velocities)
+        cosines = np.sum(normals * velocities, axis=1, keepdims=True) / np.maximum(
+            speeds, MIN_SPEED
+        )
+        circulations = (
+            fluid.kutta_lift * density * projected_m2 * cosines * np.cross(normals, velocities)
+        )
         forces += np.cross(circulations, velocities)
 
         # Added mass, without the parts in proportion to acceleration.
@@ -108,14 +118,22 @@ class Ellipsoids:
         change = squares * (ratio / (1.0 - place) ** 2 * weights)
         factors = radii[:, :, None] ** 2 + lambdas[:, None, :]  # (links, 3, points)
         root = np.sqrt(factors.prod(axis=1))
-        kappa = radii.prod(axis=1, keepdims=True) * np.sum(change[:, None] / (factors * root[:, None]), axis=2)
+        kappa = radii.prod(axis=1, keepdims=True) * np.sum(
+            change[:, None] / (factors * root[:, None]), axis=2
+        )
         displaced_kg = self.fluid.density_kg_m3 * self.volume_m3
         added_kg = displaced_kg * kappa / (2.0 - kappa)
         # About y and z, the added moments are equal, and about the long axis the fluid does not move.
         difference = radii[:, 1:2] ** 2 - radii[:, 0:1] ** 2
         total = radii[:, 1:2] ** 2 + radii[:, 0:1] ** 2
         kappa_difference = kappa[:, 0:1] - kappa[:, 1:2]
-        moments = displaced_kg / 5 * difference**2 * kappa_difference / (2 * difference - total * kappa_difference)
+        moments = (
+            displaced_kg
+            / 5
+            * difference**2
+            * kappa_difference
+            / (2 * difference - total * kappa_difference)
+        )
         return added_kg, np.column_stack([np.zeros_like(moments), moments, moments])
 
 
@@ -125,7 +143,9 @@ class Swimmer:
     def __init__(self, fluid: dict[str, Any], step_s: float = 0.002) -> None:
         config = make_config({"chain": {"modules": 8}}, {"fluid": fluid})
         assert config.scene.fluid is not None
-        self.sim, self.data, self.physics = make_resting_body(config, SimSettings(timestep_s=step_s))
+        self.sim, self.data, self.physics = make_resting_body(
+            config, SimSettings(timestep_s=step_s)
+        )
         self.model = self.sim.model
         self.mass_kg = float(self.model.body_mass[self.sim.first_link_body :].sum())
         self.ellipsoids = Ellipsoids(config.robot, config.scene.fluid)
@@ -144,7 +164,9 @@ class Swimmer:
     def compute_force_n(self, velocity_m_s: Floats) -> Floats:
         """Return the same by the formulas, without MuJoCo."""
         links = len(self.ellipsoids.radii_m)
-        forces_n, _ = self.ellipsoids.compute_forces(np.tile(velocity_m_s, (links, 1)), np.zeros((links, 3)))
+        forces_n, _ = self.ellipsoids.compute_forces(
+            np.tile(velocity_m_s, (links, 1)), np.zeros((links, 3))
+        )
         return forces_n.sum(axis=0)
 
     def glide(self, velocity_m_s: Floats, time_s: float) -> Floats:
@@ -154,7 +176,9 @@ class Swimmer:
         self.physics.step(round(time_s / self.model.opt.timestep))
         return self.data.qpos[:3] - before_m
 
-    def glide_without_mujoco(self, velocity_m_s: Floats, time_s: float, step_s: float = 2e-3) -> Floats:
+    def glide_without_mujoco(
+        self, velocity_m_s: Floats, time_s: float, step_s: float = 2e-3
+    ) -> Floats:
         """Return the same by the classical Runge-Kutta method, from the formulas."""
         displacement_m = np.zeros(3)
         for _ in range(round(time_s / step_s)):
@@ -163,11 +187,15 @@ class Swimmer:
             third = self.compute_force_n(velocity_m_s + 0.5 * step_s * second) / self.mass_kg
             fourth = self.compute_force_n(velocity_m_s + step_s * third) / self.mass_kg
             displacement_m += step_s * (velocity_m_s + step_s / 6.0 * (first + second + third))
-            velocity_m_s = velocity_m_s + step_s / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+            velocity_m_s = velocity_m_s + step_s / 6.0 * (
+                first + 2.0 * second + 2.0 * third + fourth
+            )
         return displacement_m
 
 
-def swim_wave(wave: JointWave, fluid: dict[str, Any], step_s: float = 0.002, stiffness: float = 1.0) -> BodyTrack:
+def swim_wave(
+    wave: JointWave, fluid: dict[str, Any], step_s: float = 0.002, stiffness: float = 1.0
+) -> BodyTrack:
     """Simulate `planar13` in a fluid, with joints that follow a wave by stiff servos.
 
     Args:
@@ -185,7 +213,9 @@ def swim_wave(wave: JointWave, fluid: dict[str, Any], step_s: float = 0.002, sti
     return follow_wave(sim, data, physics, wave, stiffness)
 
 
-def swim_without_mujoco(wave: JointWave, fluid: dict[str, Any], step_s: float = BALANCE_STEP_S) -> BodyTrack:
+def swim_without_mujoco(
+    wave: JointWave, fluid: dict[str, Any], step_s: float = BALANCE_STEP_S
+) -> BodyTrack:
     """Compute the same by a momentum balance of links in the plane, with prescribed joint angles."""
     config = make_config(scene={"fluid": fluid})
     assert config.scene.fluid is not None
@@ -218,7 +248,9 @@ def swim_without_mujoco(wave: JointWave, fluid: dict[str, Any], step_s: float = 
         end_rates = np.append(0.0, np.cumsum(1j * relative_rates * lengths_m * tangents))
         middle_rates = 0.5 * (end_rates[:-1] + end_rates[1:])
         arms = middles - center
-        joint_spin = masses_kg @ (np.conj(arms) * middle_rates).imag + inertias_kg_m2 @ relative_rates
+        joint_spin = (
+            masses_kg @ (np.conj(arms) * middle_rates).imag + inertias_kg_m2 @ relative_rates
+        )
         inertia_kg_m2 = masses_kg @ np.abs(arms) ** 2 + inertias_kg_m2.sum()
         yaw_rate = float((spin - joint_spin) / inertia_kg_m2)
         center_velocity = (momentum - masses_kg @ middle_rates) / masses_kg.sum()

@@ -20,7 +20,8 @@ SERVO_NM_PER_RAD = 300.0
 SERVO_NM_S_PER_RAD = 10.0
 PERIODS = 6
 SKIPPED_PERIODS = 2  # at the start
-SMOOTHING_SPEED_M_S = 0.002  # in the momentum balance, friction decreases toward 0 below this sliding speed
+# In the momentum balance, friction decreases toward 0 below this sliding speed.
+SMOOTHING_SPEED_M_S = 0.002
 BALANCE_STEP_S = 0.0005
 
 
@@ -70,8 +71,12 @@ class BodyTrack:
         period_drifts_mm_s: list[float] = []
         for k in range(SKIPPED_PERIODS, PERIODS - 1):
             axis = self.axis[k * steps_per_period : (k + 1) * steps_per_period].mean(axis=0)
-            displacement_m = self.center[(k + 1) * steps_per_period] - self.center[k * steps_per_period]
-            period_drifts_mm_s.append(float(displacement_m @ axis / np.linalg.norm(axis)) / self.period_s * 1e3)
+            displacement_m = (
+                self.center[(k + 1) * steps_per_period] - self.center[k * steps_per_period]
+            )
+            period_drifts_mm_s.append(
+                float(displacement_m @ axis / np.linalg.norm(axis)) / self.period_s * 1e3
+            )
         return float(np.mean(period_drifts_mm_s))
 
 
@@ -104,7 +109,11 @@ def simulate_wave(
 
 
 def follow_wave(
-    sim: SimModel, data: mujoco.MjData, physics: PhysicsStepper, wave: JointWave, stiffness: float = 1.0
+    sim: SimModel,
+    data: mujoco.MjData,
+    physics: PhysicsStepper,
+    wave: JointWave,
+    stiffness: float = 1.0,
 ) -> BodyTrack:
     """Let the joints of a snake follow a wave by stiff servos.
 
@@ -133,7 +142,9 @@ def follow_wave(
     center_m, axis_m = np.empty((step_count, 2)), np.empty((step_count, 2))
     for k in range(step_count):
         end_time_s = (k + 1) * step_s
-        position_torques_nm = servo_nm_per_rad * (wave.at(end_time_s, joint_count) - data.qpos[FREE_QPOS:])
+        position_torques_nm = servo_nm_per_rad * (
+            wave.at(end_time_s, joint_count) - data.qpos[FREE_QPOS:]
+        )
         data.qfrc_applied[FREE_DOFS:] = position_torques_nm + servo_nm_s_per_rad * wave.rates_at(
             end_time_s, joint_count
         )
@@ -171,8 +182,12 @@ def integrate_momentum_balance(
 
     def find_friction(slips: NDArray[np.complex128]) -> NDArray[np.complex128]:
         if separate_limits:
-            along = find_friction_per_load(slips.real.astype(np.complex128), friction, SMOOTHING_SPEED_M_S)
-            across = find_friction_per_load((1j * slips.imag).astype(np.complex128), friction, SMOOTHING_SPEED_M_S)
+            along = find_friction_per_load(
+                slips.real.astype(np.complex128), friction, SMOOTHING_SPEED_M_S
+            )
+            across = find_friction_per_load(
+                (1j * slips.imag).astype(np.complex128), friction, SMOOTHING_SPEED_M_S
+            )
             return along + across
         return find_friction_per_load(slips, friction, SMOOTHING_SPEED_M_S)
 

@@ -28,13 +28,15 @@ IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs
 )
 WHISKER = Path(__file__).parents[2] / "examples" / "whisker.py"
 MINIMAL_DRIVER = Path(__file__).parents[2] / "examples" / "minimal_driver.py"
-OF_SENSORS = ("sensor", "sample", "contradicts_itself", "listed")  # clauses that a camera may concern
+# Clauses that a camera may concern.
+OF_SENSORS = "sensor", "sample", "contradicts_itself", "listed"
 LOOKS_AHEAD = (
     'robot.sensors.depth=[{name="head", width=32, height=24, pitch_rad=0.4}]',
     'robot.sensors.range=[{name="front", beams=9, fov_rad=2.0}]',
     f'robot.sensors.custom=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
-AS_ANOTHER = ("moteus", "sim-position", "threads")  # ODrive has the same kit, Dynamixel no velocity mode
+# ODrive has the same kit, Dynamixel no velocity mode.
+AS_ANOTHER = "moteus", "sim-position", "threads"
 # moteus does it otherwise; for buses in threads see tests/system/drives/test_buses.py
 WITHOUT_THE_DRIVER = "test_drives_"
 POSITION_ONLY = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
@@ -85,14 +87,25 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench("odrive", "odrive", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
         Bench("moteus", "moteus", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
         Bench("cia402", "cia402", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
-        Bench("dynamixel", "dynamixel", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
+        Bench(
+            "dynamixel", "dynamixel", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType
+        ),
         Bench("feetech", "feetech", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
         Bench(
-            "minimal-driver", f"{MINIMAL_DRIVER}:MinimalBackend", mute_joint=mute_joint, make_emulated_drives=KitDrives
+            "minimal-driver",
+            f"{MINIMAL_DRIVER}:MinimalBackend",
+            mute_joint=mute_joint,
+            make_emulated_drives=KitDrives,
         ),
-        Bench("homing-driver", HomingBackend, mute_joint=mute_joint, make_emulated_drives=KitDrives),
         Bench(
-            "mixed", "mixed", overrides=HEAD_OF_SERVOS, mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType
+            "homing-driver", HomingBackend, mute_joint=mute_joint, make_emulated_drives=KitDrives
+        ),
+        Bench(
+            "mixed",
+            "mixed",
+            overrides=HEAD_OF_SERVOS,
+            mute_joint=cut_drive_off,
+            make_emulated_drives=DrivesOfAnyType,
         ),
         Bench(
             "threads",
@@ -115,7 +128,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if os.environ.get(VCAN) != "guest":
         return
     for item in items:
-        if item.path.name == "test_contract.py" and not any(words in item.name for words in IN_AN_EMULATED_MACHINE):
+        if item.path.name == "test_contract.py" and not any(
+            words in item.name for words in IN_AN_EMULATED_MACHINE
+        ):
             item.add_marker(pytest.mark.slow)
 
 

@@ -123,10 +123,17 @@ class Robot(DriveRig):
 
     def __init__(self, driver_type: Family, **settings: Any) -> None:
         self.driver_type = driver_type
-        config = make_run_config(backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=100)
+        config = make_run_config(
+            backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=100
+        )
         config = apply_backend_modes(config, driver_type.backend)
-        fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": driver_type.bring_up_s}
-        super().__init__(config, driver_type.backend(config, driver_type.backend.Settings(**fixed | settings)))
+        fixed: dict[str, Any] = {
+            "physics_model": "inertia",
+            "bring_up_limit_s": driver_type.bring_up_s,
+        }
+        super().__init__(
+            config, driver_type.backend(config, driver_type.backend.Settings(**fixed | settings))
+        )
 
     @property
     def emulator(self) -> Any:
@@ -150,7 +157,9 @@ def driver_type(request: pytest.FixtureRequest) -> Family:
 def with_watchdog(driver_type: Family) -> None:
     """Only for driver types whose drives stop by themselves."""
     if not driver_type.backend.has_watchdog:
-        pytest.skip(f"the driver type {driver_type.backend.name} declares that its drives have no watchdog")
+        pytest.skip(
+            f"the driver type {driver_type.backend.name} declares that its drives have no watchdog"
+        )
 
 
 @pytest.fixture
@@ -162,7 +171,9 @@ def robot(driver_type: Family) -> Iterator[Robot]:
 
 def test_driver_describes_the_drives_where_they_report_themselves(robot: Robot) -> None:
     joints = robot.backend.describe().joints
-    assert [joint.serial for joint in joints] == [robot.driver_type.serial.format(i + 1) for i in range(JOINTS)]
+    assert [joint.serial for joint in joints] == [
+        robot.driver_type.serial.format(i + 1) for i in range(JOINTS)
+    ]
     assert {joint.firmware for joint in joints} == {robot.driver_type.firmware}
 
 
@@ -179,7 +190,9 @@ def test_drive_error_persists_until_reset_and_is_reported_again(
     assert robot.run(50, "fault") == []
     assert robot.run(50, "estop") == []
     assert robot.following() == [False] * JOINTS
-    assert [fault.joint for fault in robot.run(CLEARED, "disarmed")] == ["joint_2"], "reset while it was still hot"
+    assert [fault.joint for fault in robot.run(CLEARED, "disarmed")] == ["joint_2"], (
+        "reset while it was still hot"
+    )
     robot.go_wrong("overheat:joint_2@0-9", begins=False)
     robot.emulator.body.thermal.winding_temperature_c[:] = 20.0
     robot.run(5, "fault")
@@ -208,11 +221,15 @@ def test_drive_restarted_in_motion_stays_off_until_reset(robot: Robot) -> None:
     assert law_of(robot.emulator, 2)[1] == pytest.approx(1.0, abs=0.01)
 
 
-def test_drive_restarted_between_ticks_does_not_continue(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_restarted_between_ticks_does_not_continue(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("snakesim_drivers.emulation.emulated_body.BOOT_US", 10_000.0)
     robot.run(30, "armed")
     robot.go_wrong("reboot:joint_3@0")
-    assert [(fault.what, fault.joint) for fault in robot.run(SHOWN, "armed")] == [("drive_not_armed", "joint_3")]
+    assert [(fault.what, fault.joint) for fault in robot.run(SHOWN, "armed")] == [
+        ("drive_not_armed", "joint_3")
+    ]
 
 
 def test_joint_lost_while_armed_is_ignored_until_used_again(robot: Robot) -> None:
@@ -221,7 +238,9 @@ def test_joint_lost_while_armed_is_ignored_until_used_again(robot: Robot) -> Non
     robot.isolated = frozenset({0})
     assert robot.run(60, "armed") == []
     assert robot.following() == [False, True, True, True]
-    assert robot.joints is not None and max(robot.joints.age_ns[1:]) == 0, "it silences nobody behind it"
+    assert robot.joints is not None and max(robot.joints.age_ns[1:]) == 0, (
+        "it silences nobody behind it"
+    )
     robot.go_wrong("mute:joint_1@0", begins=False)
     robot.isolated = frozenset()
     assert robot.run(30, "disarmed") == []
@@ -257,7 +276,9 @@ def test_drives_stopped_behind_cut_bus_are_read_before_clearing(robot: Robot) ->
     robot.go_wrong("cut:bus_1@0-9", begins=False)
     robot.damps = True
     faults = robot.run(SHOWN, "fault")
-    assert {(fault.what, fault.joint) for fault in faults} == {("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)}
+    assert {(fault.what, fault.joint) for fault in faults} == {
+        ("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)
+    }
     assert all(robot.driver_type.expired in fault.cause for fault in faults)
     assert robot.following() == [False] * JOINTS
     assert robot.run(10, "disarmed") == []
@@ -278,7 +299,9 @@ def test_unreadable_stop_is_not_cleared_meanwhile(robot: Robot) -> None:
     assert named == {"joint_1", "joint_3", "joint_4"}, first
     robot.go_wrong("mute:joint_2@0-9", begins=False)
     found = robot.run(SHOWN, "fault")
-    assert [fault.joint for fault in found if robot.driver_type.expired in fault.cause] == ["joint_2"], found
+    assert [fault.joint for fault in found if robot.driver_type.expired in fault.cause] == [
+        "joint_2"
+    ], found
     assert robot.following() == [False] * JOINTS
 
 
@@ -297,11 +320,16 @@ def test_damping_before_start_enables_no_drive(robot: Robot) -> None:
 
 
 @on_can
-def test_drive_with_other_id_is_missing_then_a_stranger(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_with_other_id_is_missing_then_a_stranger(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     renamed = robot.driver_type.drives(robot.emulator)[0]
     setattr(renamed, "node" if hasattr(renamed, "node") else "id", 9)
     faults = robot.run(40, "disarmed")
-    assert {(fault.what, fault.joint) for fault in faults} == {("drive_silent", "joint_1"), ("unknown_node", None)}
+    assert {(fault.what, fault.joint) for fault in faults} == {
+        ("drive_silent", "joint_1"),
+        ("unknown_node", None),
+    }
     assert any("node 9 is on the bus" in fault.cause for fault in faults)
     twin_class = type(robot.emulator)
     made = twin_class.__init__
@@ -328,7 +356,9 @@ def test_duplicate_drive_ids_stop_the_robot_and_block_start(robot: Robot) -> Non
     assert fault.reach == "robot"
     assert serials[1] in fault.cause
     assert robot.following() == [False] * JOINTS
-    assert [fault.what for fault in robot.run(SHOWN, "disarmed")] == ["duplicate_node"], "reset while it is there"
+    assert [fault.what for fault in robot.run(SHOWN, "disarmed")] == ["duplicate_node"], (
+        "reset while it is there"
+    )
     with raises_error(BackendError, code="drive/not-complete"):
         robot.backend._drives.bring_up()
     robot.go_wrong("duplicate:joint_2@0-9", begins=False)
@@ -346,7 +376,9 @@ def test_another_program_that_commands_drives_stops_the_robot(robot: Robot) -> N
     if robot.driver_type.backend is MoteusBackend:
         command = can.Message(arbitration_id=2, data=[1, 0, 10], is_fd=True, is_extended_id=False)
     if robot.driver_type.backend is Cia402Backend:
-        command = can.Message(arbitration_id=0x602, data=[0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0], is_extended_id=False)
+        command = can.Message(
+            arbitration_id=0x602, data=[0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0], is_extended_id=False
+        )
     protocol = can.CanProtocol.CAN_FD if command.is_fd else can.CanProtocol.CAN_20
     with can.Bus(interface="virtual", channel=channel, protocol=protocol) as bus:
         bus.send(command)
@@ -376,14 +408,23 @@ def test_bus_log_is_read_by_python_can_as_sent(driver_type: Family, tmp_path: Pa
         {"robot__joints": {"joint_2": {"port": "can7"}}},
     ],
 )
-def test_what_drives_cannot_do_is_refused_before_the_start(driver_type: Family, dotted: dict[str, Any]) -> None:
+def test_what_drives_cannot_do_is_refused_before_the_start(
+    driver_type: Family, dotted: dict[str, Any]
+) -> None:
     name = driver_type.backend.name
     fixed = {"backend": name, "robot__chain__modules": JOINTS, "rate_hz": 100}
     config = make_run_config(
-        **fixed | dotted | ({"rate_hz": driver_type.too_fast_hz} if dotted.get("rate_hz") == 0 else {})
+        **fixed
+        | dotted
+        | ({"rate_hz": driver_type.too_fast_hz} if dotted.get("rate_hz") == 0 else {})
     )
     with raises_error(
         ConfigError,
-        code=("bus/invalid-channel", "bus/overloaded", "drive/unsupported-setting", "drive/watchdog-too-short"),
+        code=(
+            "bus/invalid-channel",
+            "bus/overloaded",
+            "drive/unsupported-setting",
+            "drive/watchdog-too-short",
+        ),
     ):
         driver_type.backend.check(config, driver_type.backend.Settings())

@@ -27,13 +27,17 @@ BUS = "./snakesim_testing/benches/workbench.py"
 def python(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     environment = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"}
     command = [sys.executable, *arguments]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=800, check=False)
+    return subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=800, check=False
+    )
 
 
 def run_suite(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run the suite in a process of its own, as a user runs it."""
     plugins = ["-p", "no:cacheprovider", "-p", "snakesim_testing"]
-    return python("-m", "pytest", "--pyargs", "snakesim_testing.contract", *plugins, *arguments, cwd=cwd)
+    return python(
+        "-m", "pytest", "--pyargs", "snakesim_testing.contract", *plugins, *arguments, cwd=cwd
+    )
 
 
 def clauses() -> set[str]:
@@ -54,14 +58,29 @@ def test_every_clause_has_a_backend_that_breaks_it() -> None:
 def find_unnoticed(mutants: Sequence[Mutant], report: Path) -> list[tuple[str, str, set[str]]]:
     """Run each of these mutants against its clauses, in one process; return what did not fail."""
     names = " or ".join(mutant.name for mutant in mutants)
-    ran = run_suite("-p", "snakesim_testing.benches.mutants", "-k", names, f"--junitxml={report}", "--tb=no", "-q")
+    ran = run_suite(
+        "-p",
+        "snakesim_testing.benches.mutants",
+        "-k",
+        names,
+        f"--junitxml={report}",
+        "--tb=no",
+        "-q",
+    )
     assert report.is_file(), ran.stdout + ran.stderr
-    outcomes: dict[tuple[str, str], set[str]] = defaultdict(set)  # (mutant, clause) -> what came of it
+    # (mutant, clause) -> what came of it.
+    outcomes: dict[tuple[str, str], set[str]] = defaultdict(set)
     for case in ElementTree.parse(report).getroot().iter("testcase"):
         clause, _, rest = case.attrib["name"].partition("[")
         children = [child.tag for child in case if child.tag in ("failure", "error", "skipped")]
-        outcomes[rest.rstrip("]").partition("-")[0], clause].add(children[0] if children else "passed")
-    tried = [(mutant.name, clause, outcomes[mutant.name, clause]) for mutant in mutants for clause in mutant.breaks]
+        outcomes[rest.rstrip("]").partition("-")[0], clause].add(
+            children[0] if children else "passed"
+        )
+    tried = [
+        (mutant.name, clause, outcomes[mutant.name, clause])
+        for mutant in mutants
+        for clause in mutant.breaks
+    ]
     return [(name, clause, found) for name, clause, found in tried if not found or found - NOTICED]
 
 
@@ -79,19 +98,30 @@ def test_a_backend_that_breaks_a_clause_fails_it(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
     (tmp_path / "workbench.py").write_text(read_example_from_docs())
-    given = ["--snakesim-backend", "./workbench.py:Workbench", "--snakesim-mute", "./workbench.py:mute"]
+    given = [
+        "--snakesim-backend",
+        "./workbench.py:Workbench",
+        "--snakesim-mute",
+        "./workbench.py:mute",
+    ]
     ran = run_suite(*given, "--snakesim-table", "table.md", "-q", cwd=tmp_path)
     assert ran.returncode == 0, ran.stdout
     assert ran.stdout.count("skipped:") == 3
     assert "joint_1 is described with every mode" in ran.stdout  # so there is none that it lacks
     assert "7 clauses, on Workbench: this bench has no emulated drives" in ran.stdout
     assert "2 clauses, on Workbench: this robot has no power sensor" in ran.stdout
-    rows = [line for line in (tmp_path / "table.md").read_text().splitlines() if line.endswith("| pass |")]
+    rows = [
+        line
+        for line in (tmp_path / "table.md").read_text().splitlines()
+        if line.endswith("| pass |")
+    ]
     assert len(rows) == len(clauses()) - 10
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("backend", "said"), [("BusWorkbench", ""), ("RealTimeWorkbench", "not exactly repeatable")])
+@pytest.mark.parametrize(
+    ("backend", "said"), [("BusWorkbench", ""), ("RealTimeWorkbench", "not exactly repeatable")]
+)
 def test_contract_passes_late_coarse_slow_or_realtime_backend(backend: str, said: str) -> None:
     looks = ("--snakesim-mute", f"{BUS}:mute", "--snakesim-drives", f"{BUS}:WorkbenchDrives")
     ran = run_suite("--snakesim-backend", f"{BUS}:{backend}", *looks, "-q")
@@ -107,7 +137,10 @@ def test_contract_passes_late_coarse_slow_or_realtime_backend(backend: str, said
             "no backend called 'nothing_of_that_name' is installed",
             marks=pytest.mark.slow,
         ),
-        (("--snakesim-backend", "sim", "--snakesim-set", "robot.limits.torque_nm=-1"), "robot.limits.torque_nm"),
+        (
+            ("--snakesim-backend", "sim", "--snakesim-set", "robot.limits.torque_nm=-1"),
+            "robot.limits.torque_nm",
+        ),
     ],
 )
 def test_a_wrong_call_is_said_once(given, said) -> None:
@@ -131,4 +164,6 @@ def test_contract_project_may_define_options_of_usual_names(tmp_path: Path) -> N
 
 def test_the_plugin_loads_nothing_of_ours_until_it_is_used() -> None:
     code = f"import sys, {PLUGIN}; print([name for name in sys.modules if name.startswith('snakesim_')])"
-    assert python("-c", code).stdout.strip() == str(["snakesim_testing", "snakesim_testing.contract", PLUGIN])
+    assert python("-c", code).stdout.strip() == str(
+        ["snakesim_testing", "snakesim_testing.contract", PLUGIN]
+    )

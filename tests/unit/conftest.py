@@ -22,7 +22,9 @@ _running: list[str] = []  # the test that runs; Python calls the hook also betwe
 
 def _refuse(event: str, _arguments: object) -> None:
     if _running and event in FORBIDDEN:
-        raise RuntimeError(f"{_running[0]} {FORBIDDEN[event]}: such a test belongs into tests/system")
+        raise RuntimeError(
+            f"{_running[0]} {FORBIDDEN[event]}: such a test belongs into tests/system"
+        )
 
 
 sys.addaudithook(_refuse)
@@ -35,7 +37,9 @@ def pure(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
 
     def short_sleep(seconds: float) -> None:
         if seconds > MAX_SLEEP_S:
-            raise RuntimeError(f"{request.node.nodeid} sleeps {seconds} s: such a test belongs into tests/system")
+            raise RuntimeError(
+                f"{request.node.nodeid} sleeps {seconds} s: such a test belongs into tests/system"
+            )
         sleep(seconds)
 
     monkeypatch.setattr(time, "sleep", short_sleep)

@@ -14,7 +14,11 @@ HOPS = [(name, path, line.strip("`")) for number, name, path, line in ROWS if nu
 def sources(path: str, name: str) -> list[str]:
     """Of the functions of this name in a file."""
     text = (ROOT / path).read_text()
-    functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef) and node.name == name]
+    functions = [
+        node
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.FunctionDef) and node.name == name
+    ]
     return [ast.get_source_segment(text, node) or "" for node in functions]
 
 
@@ -30,6 +34,8 @@ def test_readme_walk_reaches_the_line_that_limits_torque() -> None:
     assert len(HOPS) < 5
     assert HOPS[-1][1] == "snakesim_hal/safety/limiter.py"
     for (name, path, line), following in zip(HOPS, [*HOPS[1:], None], strict=True):
-        assert any(line in source for source in sources(path, name)), f"{line!r} is not in {name} of {path}"
+        assert any(line in source for source in sources(path, name)), (
+            f"{line!r} is not in {name} of {path}"
+        )
         if following is not None:
             assert following[0] in line, f"{line!r} does not lead to {following}"

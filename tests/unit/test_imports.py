@@ -11,7 +11,8 @@ PACKAGES = ["snakesim", *sorted(path.name for path in ROOT.glob("snakesim_*"))]
 
 
 def test_tests_import_no_benchmark() -> None:
-    imports = re.compile(r"^\s*(?:from|import) benchmarks\b", re.MULTILINE)  # most folders of tests are no packages
+    # Most folders of tests are no packages.
+    imports = re.compile(r"^\s*(?:from|import) benchmarks\b", re.MULTILINE)
     assert not [path for path in (ROOT / "tests").rglob("*.py") if imports.search(path.read_text())]
 
 

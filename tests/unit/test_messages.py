@@ -22,7 +22,9 @@ def test_every_stored_message_is_of_a_test() -> None:
     assert list(stored) == sorted(stored)
 
 
-def test_a_changed_or_additional_message_is_an_error(request: pytest.FixtureRequest, tmp_path: Path) -> None:
+def test_a_changed_or_additional_message_is_an_error(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
     messages = StoredMessages(request.node, ["TMP/a.toml: one"], updating=False)
     messages.check(f"{tmp_path}/a.toml: one")
     with pytest.raises(AssertionError, match="--update-messages"):
@@ -37,7 +39,9 @@ def test_an_error_has_its_code_and_names_its_field() -> None:
     def fail() -> None:
         raise ConfigError("a.toml: `rate_hz` = 5 Hz is not allowed", code="config/out-of-range")
 
-    with raises_error(ConfigError, code="config/out-of-range", field=("a.toml", "rate_hz"), value=5, stored=False):
+    with raises_error(
+        ConfigError, code="config/out-of-range", field=("a.toml", "rate_hz"), value=5, stored=False
+    ):
         fail()
     for wrong in ({"code": "config/conflict"}, {"field": "rate"}, {"value": 50}):
         with (

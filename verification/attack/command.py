@@ -22,13 +22,21 @@ def _machine(home: Path) -> dict[str, str]:
     return {"HOME": str(home), **{name: str(folder) for name, folder in folders.items()}}
 
 
-def snakesim(home: Path, *arguments: str, limit_s: float = LIMIT_S, inside: Sequence[str] = ()) -> CompletedRun:
+def snakesim(
+    home: Path, *arguments: str, limit_s: float = LIMIT_S, inside: Sequence[str] = ()
+) -> CompletedRun:
     """Run a command to its end. inside: a prefix that runs it somewhere else."""
-    return command.snakesim(*arguments, cwd=home, limit_s=limit_s, extra_env=_machine(home), command_prefix=inside)
+    return command.snakesim(
+        *arguments, cwd=home, limit_s=limit_s, extra_env=_machine(home), command_prefix=inside
+    )
 
 
 def running(
-    home: Path, *arguments: str, name: str = "run", endpoint: str | None = "free", inside: Sequence[str] = ()
+    home: Path,
+    *arguments: str,
+    name: str = "run",
+    endpoint: str | None = "free",
+    inside: Sequence[str] = (),
 ) -> AbstractContextManager[Run]:
     """A run in the background, as `snakesim_testing.harness.command.running` has it."""
     return command.running_snakesim(

@@ -4,7 +4,8 @@ import os
 from collections.abc import Callable
 
 FULL = os.environ.get("SNAKESIM_ATTACK") == "full"
-Record = Callable[[str, object], None]  # pytest's `record_property`: what was measured is told at the end
+# Pytest's `record_property`: what was measured is told at the end.
+Record = Callable[[str, object], None]
 
 
 def effort(quick: int, full: int) -> int:

@@ -22,10 +22,18 @@ def beyond_limits(robot: dict[str, Any], applied: list[dict[str, Any]]) -> list[
                 TORQUE: (-joint["torque_limit_nm"], joint["torque_limit_nm"]),
             }[mode]
             if not low - ROUNDING <= target <= high + ROUNDING:
-                found.append(f"{where}: target {target:g} in mode {mode}, allowed are {low:g} to {high:g}")
+                found.append(
+                    f"{where}: target {target:g} in mode {mode}, allowed are {low:g} to {high:g}"
+                )
             if not 0 <= limit_nm <= joint["torque_limit_nm"] + ROUNDING:
-                found.append(f"{where}: torque limit {limit_nm:g}, at most {joint['torque_limit_nm']:g}")
-            if before is not None and before["tick"] == row["tick"] - 1 and before["mode"][i] == mode == POSITION:
+                found.append(
+                    f"{where}: torque limit {limit_nm:g}, at most {joint['torque_limit_nm']:g}"
+                )
+            if (
+                before is not None
+                and before["tick"] == row["tick"] - 1
+                and before["mode"][i] == mode == POSITION
+            ):
                 # A joint that is pushed takes the target along, by as much as a target may be away from it.
                 step = abs(target - before["target"][i])
                 most = joint["speed_limit_rad_s"] * period_s + robot["max_step_rad"]

@@ -38,14 +38,17 @@ class AttackedRobot:
 
     def health(self) -> RunHealth:
         """Its processes, and how much they have written down."""
-        return RunHealth(self.run.parts(), {path: path.stat().st_size for path in self.run.out.glob("*.log")})
+        return RunHealth(
+            self.run.parts(), {path: path.stat().st_size for path in self.run.out.glob("*.log")}
+        )
 
     def unharmed(self, before: RunHealth, what: str = "") -> None:
         """Fail unless all its processes are those of before, and none has complained since."""
         complaints = [
             f"{path.stem}: {news[-300:]}"
             for path in sorted(self.run.out.glob("*.log"))
-            if "Traceback" in (news := path.read_text(errors="replace")[before.written.get(path, 0) :])
+            if "Traceback"
+            in (news := path.read_text(errors="replace")[before.written.get(path, 0) :])
         ]
         assert not complaints, f"{what}: {'; '.join(complaints)}"
         assert self.run.parts() == before.parts, f"{what}: {self.run.printed()[-1000:]}"
@@ -78,9 +81,14 @@ def joined(run: Run) -> NetworkStranger:
 
 
 @contextmanager
-def standing(home: Path, *arguments: str, name: str = "run", inside: Sequence[str] = ()) -> Iterator[AttackedRobot]:
+def standing(
+    home: Path, *arguments: str, name: str = "run", inside: Sequence[str] = ()
+) -> Iterator[AttackedRobot]:
     """A robot of its own, armed. inside: a prefix that runs it somewhere else."""
-    with running(home, *(arguments or STANDING), name=name, inside=inside) as run, joined(run) as operator:
+    with (
+        running(home, *(arguments or STANDING), name=name, inside=inside) as run,
+        joined(run) as operator,
+    ):
         operator.recover()
         yield AttackedRobot(run, operator)
 
@@ -106,7 +114,9 @@ class Victim:
         self._number += 1
         home = self._home / str(self._number)
         home.mkdir()
-        self._robot = self._stack.enter_context(standing(home, *self._arguments, inside=self._inside))
+        self._robot = self._stack.enter_context(
+            standing(home, *self._arguments, inside=self._inside)
+        )
         return self._robot
 
     def close(self) -> None:

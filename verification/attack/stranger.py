@@ -36,12 +36,20 @@ def settings(
     receive_buffer: int | None = None,
 ) -> zenoh.Config:
     """No scouting: a stranger finds the robot by its endpoint. receive_buffer: of its connection, in bytes."""
-    buffers = {} if receive_buffer is None else {"transport": {"link": {"tcp": {"so_rcvbuf": receive_buffer}}}}
+    buffers = (
+        {}
+        if receive_buffer is None
+        else {"transport": {"link": {"tcp": {"so_rcvbuf": receive_buffer}}}}
+    )
     return zenoh.Config.from_json5(
         json.dumps(
             {
                 "mode": mode,
-                "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+                "scouting": {
+                    "delay": 0,
+                    "multicast": {"enabled": False},
+                    "gossip": {"enabled": False},
+                },
                 "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
                 "listen": {"endpoints": [] if listen is None else [listen]},
                 "connect": {
@@ -91,9 +99,16 @@ class NetworkStranger:
             if key in self._heard:
                 continue
             kept = self._heard[key] = deque(maxlen=KEPT)
-            latched, must_have = wire.ROWS[key].kind == "latched", wire.required(wire.message_of(key))
+            latched, must_have = (
+                wire.ROWS[key].kind == "latched",
+                wire.required(wire.message_of(key)),
+            )
 
-            def take(sample: zenoh.Sample, kept: deque[StampedSample] = kept, must_have: set[str] = must_have) -> None:
+            def take(
+                sample: zenoh.Sample,
+                kept: deque[StampedSample] = kept,
+                must_have: set[str] = must_have,
+            ) -> None:
                 at_s = time.monotonic()
                 with contextlib.suppress(Exception):  # others may send noise there
                     message = wire.decode(sample.payload.to_bytes())
@@ -103,7 +118,9 @@ class NetworkStranger:
             if latched:
                 history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
                 self._declared.append(
-                    ext.declare_advanced_subscriber(self.session, self.key(key), take, history=history)
+                    ext.declare_advanced_subscriber(
+                        self.session, self.key(key), take, history=history
+                    )
                 )
             else:
                 self._declared.append(self.session.declare_subscriber(self.key(key), take))
@@ -128,7 +145,11 @@ class NetworkStranger:
         """A message at a key that comes from now on."""
         self.receive(key)
         now = time.monotonic()
-        self.until(lambda: self._heard[key] and self._heard[key][-1].at_s > now, f"something new on {key}", limit_s)
+        self.until(
+            lambda: self._heard[key] and self._heard[key][-1].at_s > now,
+            f"something new on {key}",
+            limit_s,
+        )
         return self._heard[key][-1].message
 
     until = staticmethod(wait_until)
@@ -140,7 +161,9 @@ class NetworkStranger:
         payload = message if isinstance(message, bytes) else wire.encode(message)
         self.session.put(self.key(key), payload, encoding=encoding or wire.encoding_of(key))
 
-    def ask(self, key: str, request: Any, timeout_s: float = 3.0, encoding: str | None = None) -> list[Any]:
+    def ask(
+        self, key: str, request: Any, timeout_s: float = 3.0, encoding: str | None = None
+    ) -> list[Any]:
         """Every answer to a query."""
         payload = request if isinstance(request, bytes) else wire.encode(request)
         replies = self.session.get(
@@ -151,7 +174,9 @@ class NetworkStranger:
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
-        return [wire.decode(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+        return [
+            wire.decode(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None
+        ]
 
     def pretend(self, key: str, answer: dict[str, Any]) -> list[bytes]:
         """Answer queries at a key as if one were the robot, and claim to know everything there. What was asked."""
@@ -206,7 +231,9 @@ class NetworkStranger:
             named = {name: about[name] for name in ("robot", "backend", "config_hash")}
             request = {**named, "unchecked": True, **request}
         answers = self.ask("hal/lifecycle", request)
-        return answers[0] if answers else {"ok": False, "reason": "no answer", "refusal": "no_answer"}
+        return (
+            answers[0] if answers else {"ok": False, "reason": "no answer", "refusal": "no_answer"}
+        )
 
     def command(self, clock: dict[str, Any], **changes: Any) -> dict[str, Any]:
         """As the controller might send it, a little off: epoch and arming are in the clock, for anybody to read."""
@@ -227,7 +254,9 @@ class NetworkStranger:
     def recover(self, limit_s: float = TIMEOUT_S) -> None:
         """Have the robot armed and following its controller, whatever happened to it."""
         self.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
-        if self.lifecycle() == "armed" and self.follows():  # the next status may take a fifth of a second
+        if (
+            self.lifecycle() == "armed" and self.follows()
+        ):  # the next status may take a fifth of a second
             return
         deadline = time.monotonic() + limit_s
         last: Any = None
@@ -259,7 +288,11 @@ class NetworkStranger:
         first = time.monotonic()
 
         def enough() -> bool:
-            seen = {heard.message["sequence"] for heard in self.heard("hal/applied") if heard.at_s > first}
+            seen = {
+                heard.message["sequence"]
+                for heard in self.heard("hal/applied")
+                if heard.at_s > first
+            }
             return len(seen - {None}) >= command_count
 
         with contextlib.suppress(AssertionError):
@@ -300,4 +333,7 @@ class HostTime:
         return self._offset(operator) - self._began_s
 
     def _offset(self, operator: NetworkStranger) -> float:
-        return min(heard.at_s - heard.message["tick"] * self._period_s for heard in operator.heard("hal/clock"))
+        return min(
+            heard.at_s - heard.message["tick"] * self._period_s
+            for heard in operator.heard("hal/clock")
+        )

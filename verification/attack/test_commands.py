@@ -21,7 +21,9 @@ def applied_of_strangers(operator: NetworkStranger) -> list[int]:
 
 @pytest.mark.parametrize("_time", TIMES)
 @pytest.mark.parametrize("kind", ["left_out", "none", "before", "after"])
-def test_a6_command_of_no_or_another_arming_is_never_applied(robot: AttackedRobot, kind: str, _time: int) -> None:
+def test_a6_command_of_no_or_another_arming_is_never_applied(
+    robot: AttackedRobot, kind: str, _time: int
+) -> None:
     operator = robot.operator
     operator.receive("sensor/joints")
     operator.stand_by()
@@ -48,9 +50,13 @@ def lives_on(robot: AttackedRobot) -> None:
     """The right controller is not blocked as a replayer: what it sends goes on being applied."""
     operator = robot.operator
     rejected = operator.next("hal/status")["commands_rejected"].get("replayed", 0)
-    assert operator.follows(), f"{operator.status()['reason']}; {operator.status()['commands_rejected']}"
+    assert operator.follows(), (
+        f"{operator.status()['reason']}; {operator.status()['commands_rejected']}"
+    )
     now = operator.next("hal/status")
-    assert now["lifecycle"] == "armed" and now["commands_rejected"].get("replayed", 0) == rejected, now
+    assert (
+        now["lifecycle"] == "armed" and now["commands_rejected"].get("replayed", 0) == rejected
+    ), now
 
 
 WRONG: tuple[dict[str, Any], ...] = (
@@ -93,5 +99,7 @@ def test_a6_perfect_forgery_stays_within_limits_and_ends_with_sender(robot: Atta
     assert applied_of_strangers(operator), "the attack itself did not work"
     assert beyond_limits(about, rows) == []
     # The controller was kept out by the higher sequence; when the stranger falls silent, the lease runs out.
-    operator.until(lambda: operator.lifecycle() != "armed" or applied_of_strangers(operator), "an end", 1.0)
+    operator.until(
+        lambda: operator.lifecycle() != "armed" or applied_of_strangers(operator), "an end", 1.0
+    )
     operator.recover()

@@ -16,7 +16,9 @@ POSE = {"timestamp_ns": 0, "position_w": [0.0, 0.0, 0.0], "orientation_wxyz": [1
 
 def frame(timestamp_ns: int | None = None) -> bytes:
     """A good one, captured now."""
-    return json.dumps({**POSE, "timestamp_ns": time.monotonic_ns() if timestamp_ns is None else timestamp_ns}).encode()
+    return json.dumps(
+        {**POSE, "timestamp_ns": time.monotonic_ns() if timestamp_ns is None else timestamp_ns}
+    ).encode()
 
 
 def wrong_poses() -> list[bytes]:

@@ -29,13 +29,21 @@ ASKED = (
 
 
 @pytest.fixture(scope="module")
-def real(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[AttackedRobot, NetworkStranger]]:
+def real(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[AttackedRobot, NetworkStranger]]:
     """A robot that really moves, and a stranger who says from its first moment on that it does not."""
     home = tmp_path_factory.mktemp("real")
-    with running(home, *STANDING, "--backend", f"{BENCH}:Bench", "--unchecked") as run, joined(run) as operator:
+    with (
+        running(home, *STANDING, "--backend", f"{BENCH}:Bench", "--unchecked") as run,
+        joined(run) as operator,
+    ):
         about = operator.newest("hal/description")
         assert about["emulated"] is False
-        with NetworkStranger(run.endpoint) as stranger, forging(stranger, {**about, "emulated": True}):
+        with (
+            NetworkStranger(run.endpoint) as stranger,
+            forging(stranger, {**about, "emulated": True}),
+        ):
             operator.recover()
             # A service that is started again learns what robot it has from what the stranger says.
             os.kill(run.part("control"), signal.SIGKILL)
@@ -55,7 +63,9 @@ def forging(stranger: NetworkStranger, about: dict[str, Any]) -> AbstractContext
     return repeating(forge, EVERY_S)
 
 
-def test_a3_forged_description_causes_no_fault_on_real_robot(real: tuple[AttackedRobot, NetworkStranger]) -> None:
+def test_a3_forged_description_causes_no_fault_on_real_robot(
+    real: tuple[AttackedRobot, NetworkStranger],
+) -> None:
     robot, stranger = real
     before = robot.health()
     for key, request in ASKED:

@@ -25,13 +25,26 @@ SERVICES = ("control", "guidance", "navigation")
 def moving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AttackedRobot]:
     """A robot that goes where navigation says."""
     home = tmp_path_factory.mktemp("moving")
-    arguments = ("triplet", "--clock-mode", "realtime", "--set", "rate_hz=50", "--duration", "3600", "--stay")
+    arguments = (
+        "triplet",
+        "--clock-mode",
+        "realtime",
+        "--set",
+        "rate_hz=50",
+        "--duration",
+        "3600",
+        "--stay",
+    )
     with standing(home, *arguments) as robot:
-        robot.operator.receive("sensor/joints", "guidance/world", "navigation/trajectory", "actuator/joints")
+        robot.operator.receive(
+            "sensor/joints", "guidance/world", "navigation/trajectory", "actuator/joints"
+        )
         yield robot
 
 
-def holds(robot: AttackedRobot, key: str, variants: dict[str, dict[str, Any]], each_s: float = FORGED_S) -> None:
+def holds(
+    robot: AttackedRobot, key: str, variants: dict[str, dict[str, Any]], each_s: float = FORGED_S
+) -> None:
     """Under each forgery nothing leaves its limits and nobody dies; afterwards the robot can be used as before.
 
     What is forged is the newest honest message with these changes, and the clock's tick and time unless they change.
@@ -45,7 +58,10 @@ def holds(robot: AttackedRobot, key: str, variants: dict[str, dict[str, Any]], e
 
             def forge(changes: dict[str, Any] = changes) -> None:
                 now = honest if key == "hal/clock" else operator.newest("hal/clock")
-                stranger.put(key, {**honest, "tick": now["tick"], "timestamp_ns": now["timestamp_ns"], **changes})
+                stranger.put(
+                    key,
+                    {**honest, "tick": now["tick"], "timestamp_ns": now["timestamp_ns"], **changes},
+                )
 
             with repeating(forge, EVERY_S):
                 time.sleep(each_s)
@@ -60,7 +76,12 @@ def holds(robot: AttackedRobot, key: str, variants: dict[str, dict[str, Any]], e
 
 
 def intent(timestamp_ns: int, speed_m_s: float, valid_s: float | None = None) -> dict[str, Any]:
-    said: dict[str, Any] = {"timestamp_ns": timestamp_ns, "requester": "stranger", "speed_m_s": speed_m_s, "go": True}
+    said: dict[str, Any] = {
+        "timestamp_ns": timestamp_ns,
+        "requester": "stranger",
+        "speed_m_s": speed_m_s,
+        "go": True,
+    }
     return said if valid_s is None else {**said, "valid_for_ns": round(valid_s * NS)}
 
 
@@ -69,9 +90,15 @@ def speeds(operator: NetworkStranger, from_ns: int, to_ns: int) -> set[float]:
 
     def told() -> list[dict[str, Any]]:
         messages = [heard.message for heard in operator.heard("navigation/trajectory")]
-        return [one for one in messages if one["timestamp_ns"] is not None and one["timestamp_ns"] >= from_ns]
+        return [
+            one
+            for one in messages
+            if one["timestamp_ns"] is not None and one["timestamp_ns"] >= from_ns
+        ]
 
-    operator.until(lambda: any(one["timestamp_ns"] >= to_ns for one in told()), "trajectories of later")
+    operator.until(
+        lambda: any(one["timestamp_ns"] >= to_ns for one in told()), "trajectories of later"
+    )
     return {one["speed_m_s"] for one in told() if one["timestamp_ns"] < to_ns}
 
 
@@ -79,10 +106,14 @@ def speeds(operator: NetworkStranger, from_ns: int, to_ns: int) -> set[float]:
 def test_a9_an_intent_of_another_time_is_not_followed(moving: AttackedRobot, age_s: float) -> None:
     operator = moving.operator
     operator.recover()
-    while (now_ns := operator.next("hal/clock")["timestamp_ns"]) < 3 * NS:  # what is as old as the robot must be old
+    while (
+        now_ns := operator.next("hal/clock")["timestamp_ns"]
+    ) < 3 * NS:  # what is as old as the robot must be old
         time.sleep(0.1)
     operator.put("operator/intent", intent(max(now_ns - round(age_s * NS), 0), 0.0123))
-    assert 0.0123 not in speeds(operator, now_ns, now_ns + NS), f"an intent that is {age_s:g} s old is followed"
+    assert 0.0123 not in speeds(operator, now_ns, now_ns + NS), (
+        f"an intent that is {age_s:g} s old is followed"
+    )
 
 
 def test_a9_an_intent_ends_after_its_validity(moving: AttackedRobot) -> None:
@@ -94,7 +125,10 @@ def test_a9_an_intent_ends_after_its_validity(moving: AttackedRobot) -> None:
         if (now_ns := operator.newest("hal/clock")["timestamp_ns"]) > said_ns[-1] + NS // 2:
             said_ns.append(now_ns)
             operator.put("operator/intent", intent(now_ns, 0.0321, valid_s=1.0))
-        return any(heard.message["speed_m_s"] == 0.0321 for heard in operator.heard("navigation/trajectory"))
+        return any(
+            heard.message["speed_m_s"] == 0.0321
+            for heard in operator.heard("navigation/trajectory")
+        )
 
     operator.until(followed, "an intent that is followed")
     after = speeds(operator, said_ns[-1] + 3 * NS // 2, said_ns[-1] + 5 * NS // 2)
@@ -111,7 +145,11 @@ def test_a8_a_forged_trajectory_is_followed_within_the_limits(moving: AttackedRo
     variants = {
         "elsewhere": {"path_id": 7, "path_w": CIRCLE, "speed_m_s": ABSURD_M_S},
         "far": {"path_id": 8, "path_w": [[1e6, -1e6], [-1e6, 1e6]], "speed_m_s": 1e5},
-        "long": {"path_id": 9, "path_w": [[i / 1e3, 0.0] for i in range(20_000)], "speed_m_s": -1e5},
+        "long": {
+            "path_id": 9,
+            "path_w": [[i / 1e3, 0.0] for i in range(20_000)],
+            "speed_m_s": -1e5,
+        },
         "nan": {"path_w": [[float("nan"), 0.0], [0.0, 0.0]]},
         "one point": {"path_id": 10, "path_w": [[0.0, 0.0]] * 20_000},
         "hardly any length": {"path_id": 11, "path_w": [[0.0, 0.0], [1e-300, 0.0]]},
@@ -170,13 +208,18 @@ def test_a8_a_clock_of_another_pace_ends_nobody(moving: AttackedRobot) -> None:
     holds(moving, "hal/clock", {"lockstep": {"clock_mode": "lockstep"}}, each_s=max(FORGED_S, 3.0))
 
 
-@pytest.mark.parametrize("lifecycle", ["armed", "fault", "estop", "disarmed"] if FULL else ["estop"])
+@pytest.mark.parametrize(
+    "lifecycle", ["armed", "fault", "estop", "disarmed"] if FULL else ["estop"]
+)
 def test_a8_a_forged_status_moves_nothing(robot: AttackedRobot, lifecycle: str) -> None:
     operator = robot.operator
     operator.stand_by()
     armings = operator.next("hal/clock")["arm_session"]
     forged = {**operator.status(), "lifecycle": lifecycle, "ready_to_arm": True, "reason": "forged"}
-    with NetworkStranger(robot.endpoint) as stranger, repeating(lambda: stranger.put("hal/status", forged), EVERY_S):
+    with (
+        NetworkStranger(robot.endpoint) as stranger,
+        repeating(lambda: stranger.put("hal/status", forged), EVERY_S),
+    ):
         time.sleep(FORGED_S)
         assert operator.next("hal/clock")["arm_session"] == armings
         stopped = robot.run.run_tool("estop")
@@ -185,7 +228,16 @@ def test_a8_a_forged_status_moves_nothing(robot: AttackedRobot, lifecycle: str) 
 
 
 def test_a8_forged_service_answers_at_most_stop_lockstep_run(tmp_path: Path) -> None:
-    arguments = ("triplet", "--controller", "hold", "--clock-mode", "lockstep", "--duration", "3600", "--stay")
+    arguments = (
+        "triplet",
+        "--controller",
+        "hold",
+        "--clock-mode",
+        "lockstep",
+        "--duration",
+        "3600",
+        "--stay",
+    )
     with standing(tmp_path, *arguments) as robot:
         before, operator = robot.health(), robot.operator
 

@@ -62,17 +62,27 @@ def test_a2_a_second_answer_is_an_impostor(
     elif before == "disarmed":
         operator.stand_by()
     operator.until(lambda: operator.lifecycle() == before, before)
-    arguments = {"arm": ["robot", "arm", "planar13", "sim"], "estop": ["estop"]}.get(tool, ["robot", tool])
+    arguments = {"arm": ["robot", "arm", "planar13", "sim"], "estop": ["estop"]}.get(
+        tool, ["robot", tool]
+    )
     with impostor(routed, "hal/estop" if tool == "estop" else "hal/lifecycle", lies):
         ended = routed.run.run_tool(*arguments)
-    if tool == "estop" and ended.code == 0:  # confirmed past the network, by the stop port of a run of this user
+    if (
+        tool == "estop" and ended.code == 0
+    ):  # confirmed past the network, by the stop port of a run of this user
         assert operator.next("hal/clock")["lifecycle"] == "estop", ended.printed
         return
-    assert ended.code == 1, f"exit code {ended.code} with the robot in {operator.lifecycle()}: {ended.printed}"
+    assert ended.code == 1, (
+        f"exit code {ended.code} with the robot in {operator.lifecycle()}: {ended.printed}"
+    )
     assert "impostor" in ended.printed, ended.printed
     if tool != "arm":  # whoever sees an impostor may well refuse to arm
         # Not armed in any case: a busy machine may have stopped it before it was asked.
-        operator.until(lambda: operator.lifecycle() in (after, "fault"), f"{after}, as the robot was asked, too", 3.0)
+        operator.until(
+            lambda: operator.lifecycle() in (after, "fault"),
+            f"{after}, as the robot was asked, too",
+            3.0,
+        )
 
 
 def test_a2_forged_answer_and_status_do_not_confirm_a_disarm(robot: AttackedRobot) -> None:
@@ -82,15 +92,23 @@ def test_a2_forged_answer_and_status_do_not_confirm_a_disarm(robot: AttackedRobo
         forged = {**operator.status(), "lifecycle": "disarmed", "reason": "disarmed on request"}
         stranger.latch("hal/status", forged)
         ended = robot.run.run_tool("robot", "disarm")
-    assert ended.code == 1 and "impostor" in ended.printed, f"the robot is {operator.lifecycle()}: {ended.printed}"
+    assert ended.code == 1 and "impostor" in ended.printed, (
+        f"the robot is {operator.lifecycle()}: {ended.printed}"
+    )
 
 
 @pytest.mark.parametrize("_time", TIMES)
 @pytest.mark.parametrize(
     ("tool", "key", "lies", "word"),
     [
-        ("estop", "hal/estop", lie("estop", "emergency stop by root; reset it to continue"), "planar13: stopped"),
-        *[("disarm", "hal/lifecycle", lie("disarmed", "disarmed on request"), "planar13: disarmed")] * FULL,
+        (
+            "estop",
+            "hal/estop",
+            lie("estop", "emergency stop by root; reset it to continue"),
+            "planar13: stopped",
+        ),
+        *[("disarm", "hal/lifecycle", lie("disarmed", "disarmed on request"), "planar13: disarmed")]
+        * FULL,
     ],
     ids=["estop", "disarm"][: 1 + FULL],
 )
@@ -102,7 +120,9 @@ def test_a2_frozen_host_is_not_stopped_by_another_answer(
     assert ended.code == 1 and word not in ended.printed, f"exit code {ended.code}: {ended.printed}"
 
 
-@pytest.mark.parametrize("how", ["false_stop_port_and_frozen_host", *["impostor", "impostor_and_frozen_host"] * FULL])
+@pytest.mark.parametrize(
+    "how", ["false_stop_port_and_frozen_host", *["impostor", "impostor_and_frozen_host"] * FULL]
+)
 def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(tmp_path: Path, how: str) -> None:
     """The command is typed on another computer: all that it knows is the router's address, where anybody may answer."""
     endpoint = find_free_endpoint()
@@ -128,4 +148,6 @@ def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(tmp_path: Path, 
 def test_a2_a_frozen_host_gives_no_answer(routed: AttackedRobot) -> None:
     with frozen_host(routed):
         ended = routed.run.run_tool("estop")
-    assert ended.code == 1 and "planar13" in ended.printed and "planar13: stopped" not in ended.printed, ended.printed
+    assert (
+        ended.code == 1 and "planar13" in ended.printed and "planar13: stopped" not in ended.printed
+    ), ended.printed

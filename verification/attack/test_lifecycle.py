@@ -31,7 +31,9 @@ def test_a12_a_run_that_a_stranger_finishes_is_not_complete(tmp_path: Path) -> N
         code = run.end()
         summary = json.loads((run.out / "summary.json").read_text())
     assert code == 1, f"exit code {code}, answered {answer}: {run.printed()}"
-    assert "finished on request" in summary["ended"] and summary["ended"].endswith("of 20 s"), summary["ended"]
+    assert "finished on request" in summary["ended"] and summary["ended"].endswith("of 20 s"), (
+        summary["ended"]
+    )
     assert "mallory" in run.printed(), run.printed()
 
 

@@ -35,7 +35,9 @@ def payloads() -> list[bytes]:
         dice.randbytes(1_100_000),
         dice.randbytes(5_000_000),
         wire.encode({str(i): [i] * 10 for i in range(10_000)}),
-        wire.encode({"action": "arm" * 100_000, "requester": "x" * 100_000, "holder": "x" * 100_000}),
+        wire.encode(
+            {"action": "arm" * 100_000, "requester": "x" * 100_000, "holder": "x" * 100_000}
+        ),
         wire.encode({"action": "arm", "robot": "x" * 65}),
         wire.encode({"action": "acquire", "holder": "", "priority": 10**9}),
         wire.encode({"action": "acquire", "holder": "x", "epoch": -1}),
@@ -49,11 +51,15 @@ def payloads() -> list[bytes]:
 def test_no_payload_of_a_query_harms_the_robot(robot: AttackedRobot, key: str) -> None:
     before, operator = robot.health(), robot.operator
     operator.forget()
-    targets = [key.replace("*", part) for part in ("run", "control", "hal")] if "*" in key else [key]
+    targets = (
+        [key.replace("*", part) for part in ("run", "control", "hal")] if "*" in key else [key]
+    )
     small = [payload for payload in payloads() if len(payload) < MUCH_BYTES]
     large = [[payload] for payload in payloads() if len(payload) >= MUCH_BYTES]
     for target, group in itertools.product(targets, [small, *large]):
-        with NetworkStranger(robot.endpoint) as stranger:  # one that sends too much may lose its connection
+        with NetworkStranger(
+            robot.endpoint
+        ) as stranger:  # one that sends too much may lose its connection
             for payload in group:
                 for answer in stranger.ask(target, payload, 0.3):
                     assert not answer["ok"], f"{payload[:40]!r} at {target}: {answer}"
@@ -62,13 +68,25 @@ def test_no_payload_of_a_query_harms_the_robot(robot: AttackedRobot, key: str) -
     robot.unharmed(before)
 
 
-def test_queries_without_payload_with_patterns_and_never_read_are_harmless(robot: AttackedRobot) -> None:
+def test_queries_without_payload_with_patterns_and_never_read_are_harmless(
+    robot: AttackedRobot,
+) -> None:
     before = robot.health()
     with NetworkStranger(robot.endpoint) as stranger:
-        for selector in ("**", "*/**", f"{NAMESPACE}/**", f"{NAMESPACE}/hal/*", f"{NAMESPACE}/hal/estop?_time=[..]"):
-            for _ in range(effort(20, 300)):  # more at once may hold Zenoh up for longer than a lease
+        for selector in (
+            "**",
+            "*/**",
+            f"{NAMESPACE}/**",
+            f"{NAMESPACE}/hal/*",
+            f"{NAMESPACE}/hal/estop?_time=[..]",
+        ):
+            for _ in range(
+                effort(20, 300)
+            ):  # more at once may hold Zenoh up for longer than a lease
                 stranger.session.get(selector, zenoh.handlers.RingChannel(1), timeout=0.5)
-                stranger.session.get(selector, zenoh.handlers.RingChannel(1), payload=b"\xc1", timeout=0.5)
+                stranger.session.get(
+                    selector, zenoh.handlers.RingChannel(1), payload=b"\xc1", timeout=0.5
+                )
     robot.stays("armed", 0.5)
     robot.unharmed(before)
 
@@ -79,11 +97,14 @@ def test_queries_without_payload_with_patterns_and_never_read_are_harmless(robot
 def printed_safely(robot: AttackedRobot, before: str) -> None:
     """Nothing that a person reads has control characters, or lines that a stranger has written."""
     told = {
-        f"snakesim {tool}": robot.run.run_tool(*tool.split()).printed for tool in ("status", "estop", "robot reset")
+        f"snakesim {tool}": robot.run.run_tool(*tool.split()).printed
+        for tool in ("status", "estop", "robot reset")
     }
     for who, said in {**told, "the run": robot.run.printed()[len(before) :]}.items():
         assert not steering(said), f"{who} prints {said!r}"
-        assert not any(line.startswith("planar13: armed - all is well") for line in said.splitlines()), said
+        assert not any(
+            line.startswith("planar13: armed - all is well") for line in said.splitlines()
+        ), said
 
 
 def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: AttackedRobot) -> None:
@@ -94,7 +115,9 @@ def test_control_characters_of_who_stops_the_robot_reach_no_terminal(robot: Atta
     robot.run.wait_for("evil")
     assert "evil" in robot.run.run_tool("status").out
     echoed = robot.run.run_tool("topic", "echo", "hal/status", "--count", "1")
-    assert EVIL in json.loads(echoed.out)["message"]["reason"] and not steering(echoed.printed), echoed.printed
+    assert EVIL in json.loads(echoed.out)["message"]["reason"] and not steering(echoed.printed), (
+        echoed.printed
+    )
     printed_safely(robot, said)
 
 
@@ -111,9 +134,26 @@ def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: Atta
 def test_control_characters_in_forged_streams_reach_no_terminal(robot: AttackedRobot) -> None:
     said, operator = robot.run.printed(), robot.operator
     fault = {"tick": 1, "what": EVIL[:60], "cause": EVIL, "joint": EVIL[:60], "reach": "robot"}
-    status = {**operator.status(), "lifecycle": "fault", "reason": EVIL, "faults": [fault], "injected": [EVIL]}
-    status |= {"robot": EVIL, "backend": EVIL, "lease_holder": EVIL, "alive": [EVIL], "waiting_for": [EVIL]}
-    status |= {"isolated": [EVIL], "derated": {EVIL: 0.5}, "realtime_warnings": [EVIL], "commands_rejected": {EVIL: 1}}
+    status = {
+        **operator.status(),
+        "lifecycle": "fault",
+        "reason": EVIL,
+        "faults": [fault],
+        "injected": [EVIL],
+    }
+    status |= {
+        "robot": EVIL,
+        "backend": EVIL,
+        "lease_holder": EVIL,
+        "alive": [EVIL],
+        "waiting_for": [EVIL],
+    }
+    status |= {
+        "isolated": [EVIL],
+        "derated": {EVIL: 0.5},
+        "realtime_warnings": [EVIL],
+        "commands_rejected": {EVIL: 1},
+    }
     clock = operator.next("hal/clock")
     state = {
         "tick": clock["tick"],
@@ -135,7 +175,9 @@ def test_control_characters_in_a_namespace_reach_no_terminal(robot: AttackedRobo
     said = robot.run.printed()
     with NetworkStranger(robot.endpoint, "evil\x1b[2J\rplanar13: armed - all is well") as stranger:
         stranger.seem_alive("alive/hal")
-        stranger.pretend("hal/estop", {"ok": True, "reason": EVIL, "epoch": 0, "lifecycle": "estop"})
+        stranger.pretend(
+            "hal/estop", {"ok": True, "reason": EVIL, "epoch": 0, "lifecycle": "estop"}
+        )
         stranger.latch("hal/status", {**robot.operator.status(), "reason": EVIL})
         printed_safely(robot, said)
 
@@ -144,7 +186,8 @@ def test_control_characters_in_a_namespace_reach_no_terminal(robot: AttackedRobo
 
 
 def test_many_tokens_of_services_change_nothing(robot: AttackedRobot) -> None:
-    before, count = robot.health(), effort(200, 1000)  # 5000 at once hold Zenoh up for longer than a lease
+    # 5000 at once hold Zenoh up for longer than a lease.
+    before, count = robot.health(), effort(200, 1000)
     with NetworkStranger(robot.endpoint) as stranger:
         for i in range(count):
             stranger.seem_alive(f"alive/service_{i}")
@@ -166,16 +209,23 @@ def test_service_token_that_flaps_stops_nothing(robot: AttackedRobot) -> None:
     operator.recover()
 
 
-def test_false_robots_do_not_keep_a_stop_from_real_one(robot: AttackedRobot, record_property: Record) -> None:
+def test_false_robots_do_not_keep_a_stop_from_real_one(
+    robot: AttackedRobot, record_property: Record
+) -> None:
     operator = robot.operator
     with NetworkStranger(robot.endpoint) as stranger:
-        tokens = [stranger.session.liveliness().declare_token(f"robot_{i}/alive/hal") for i in range(effort(100, 1000))]
+        tokens = [
+            stranger.session.liveliness().declare_token(f"robot_{i}/alive/hal")
+            for i in range(effort(100, 1000))
+        ]
         asked_s = time.monotonic()
         ended = robot.run.run_tool("estop", limit_s=STATUS_S)
         took_s = operator.stopped_at(asked_s, 5.0) - asked_s
         for token in tokens:
             token.undeclare()
-    record_property("stopped after", f"{took_s:.2f} s, the command ended after {ended.took_s:.2f} s")
+    record_property(
+        "stopped after", f"{took_s:.2f} s, the command ended after {ended.took_s:.2f} s"
+    )
     assert took_s < 3.0 and ended.took_s < STATUS_S
     assert "planar13: stopped" in ended.printed, ended.printed
     assert ended.code == 1, "robots that do not answer are no success"
@@ -185,7 +235,9 @@ def test_false_robots_do_not_keep_a_stop_from_real_one(robot: AttackedRobot, rec
 
 
 @pytest.mark.parametrize("mode", ["router", pytest.param("peer", marks=pytest.mark.slow)])
-def test_stranger_joining_as_router_or_peer_changes_nothing(robot: AttackedRobot, mode: str) -> None:
+def test_stranger_joining_as_router_or_peer_changes_nothing(
+    robot: AttackedRobot, mode: str
+) -> None:
     before = robot.health()
     with NetworkStranger(robot.endpoint, mode=mode, listen=find_free_endpoint()) as stranger:
         stranger.receive("hal/clock")
@@ -202,7 +254,9 @@ def test_the_hosts_zenoh_cannot_be_configured_by_a_stranger(robot: AttackedRobot
     bait = find_free_endpoint()
     with NetworkStranger(robot.endpoint) as stranger:
         answers = [
-            str(reply.ok.key_expr) for reply in stranger.session.get("@/**", timeout=1.0) if reply.ok is not None
+            str(reply.ok.key_expr)
+            for reply in stranger.session.get("@/**", timeout=1.0)
+            if reply.ok is not None
         ]
         for zid in stranger.session.info.routers_zid():
             for what, value in (
@@ -229,7 +283,9 @@ def test_false_hosts_neither_stop_robot_nor_hide_a_stop(robot: AttackedRobot) ->
         operator.until(lambda: operator.lifecycle() == "estop", "estop")
         status = operator.next("hal/status")
         assert "mallory" in status["reason"], status["reason"]
-        assert "estop" in [fault["what"] for fault in status["faults"]], "what stopped it is not among the faults"
+        assert "estop" in [fault["what"] for fault in status["faults"]], (
+            "what stopped it is not among the faults"
+        )
         printed_safely(robot, "")
     robot.unharmed(before)
 

@@ -36,7 +36,9 @@ QUICK = {("controller", "hangs"), ("controller", "closes"), ("backend", "exits")
 # What `hangs` does is in `make test`, too: tests/system/runs/test_faults_in_processes.py, test_beside.py.
 SLOW = {("controller", "hangs")}
 DEEDS = [
-    pytest.param(who, deed, words, id=f"{who}-{deed}", marks=[pytest.mark.slow] * ((who, deed) in SLOW))
+    pytest.param(
+        who, deed, words, id=f"{who}-{deed}", marks=[pytest.mark.slow] * ((who, deed) in SLOW)
+    )
     for who, deeds in (("controller", BY_CONTROLLER), ("backend", BY_BACKEND))
     for deed, words in deeds.items()
     if FULL or (who, deed) in QUICK
@@ -44,7 +46,9 @@ DEEDS = [
 
 
 @pytest.mark.parametrize(("who", "deed", "words"), DEEDS)
-def test_a_plugin_that_misbehaves_stops_its_robot_only(tmp_path: Path, who: str, deed: str, words: str) -> None:
+def test_a_plugin_that_misbehaves_stops_its_robot_only(
+    tmp_path: Path, who: str, deed: str, words: str
+) -> None:
     (tmp_path / "bad.py").write_text(BAD.replace("%s", deed))
     chosen = {"controller": "hold", "backend": "sim"} | {who: f"./bad.py:{who.capitalize()}"}
     out = tmp_path / "out"

@@ -44,7 +44,9 @@ def test_a5_frozen_readers_do_not_stop_the_robot(
             except AssertionError:
                 clocks = [heard.at_s for heard in operator.heard("hal/clock")]
                 gap_s = max(b - a for a, b in itertools.pairwise(clocks))
-                record_property("armed all the time", f"{WATCHED_S} s; longest silence {1000 * gap_s:.0f} ms")
+                record_property(
+                    "armed all the time", f"{WATCHED_S} s; longest silence {1000 * gap_s:.0f} ms"
+                )
                 return
             last = operator.newest("hal/clock")
             after_s = (last["timestamp_ns"] - first["timestamp_ns"]) * 1e-9

@@ -27,19 +27,25 @@ def stays_disarmed(operator: NetworkStranger, home: Path, *network: str) -> None
     out = str(home / "second")
     second = snakesim(home, "run", *SHORT, "--backend", "sim", "--out", out, *network)
     seen = {heard.message["lifecycle"] for heard in operator.heard("hal/clock")}
-    assert "armed" not in seen and operator.next("hal/clock")["arm_session"] == armings, second.printed
+    assert "armed" not in seen and operator.next("hal/clock")["arm_session"] == armings, (
+        second.printed
+    )
     assert second.code in (1, 2), second.printed
     assert "planar13" in second.printed, f"the live robot is not named: {second.printed}"
     assert "Traceback" not in second.printed
 
 
 @pytest.mark.parametrize("_time", TIMES)
-def test_a1_second_run_on_a_router_does_not_arm_robot(routed: AttackedRobot, tmp_path: Path, _time: int) -> None:
+def test_a1_second_run_on_a_router_does_not_arm_robot(
+    routed: AttackedRobot, tmp_path: Path, _time: int
+) -> None:
     routed.operator.stand_by()
     stays_disarmed(routed.operator, tmp_path, "--router", routed.endpoint)
 
 
-def test_a1_second_run_at_same_endpoint_does_not_arm_robot(robot: AttackedRobot, tmp_path: Path) -> None:
+def test_a1_second_run_at_same_endpoint_does_not_arm_robot(
+    robot: AttackedRobot, tmp_path: Path
+) -> None:
     robot.operator.stand_by()
     stays_disarmed(robot.operator, tmp_path, "--endpoint", robot.endpoint)
 
@@ -59,7 +65,9 @@ def test_a1_second_run_at_router_endpoint_does_not_arm_robot(tmp_path: Path) -> 
         operator.recover()
 
 
-def test_a1_phantom_robot_only_keeps_a_run_from_starting(routed: AttackedRobot, tmp_path: Path) -> None:
+def test_a1_phantom_robot_only_keeps_a_run_from_starting(
+    routed: AttackedRobot, tmp_path: Path
+) -> None:
     operator = routed.operator
     with NetworkStranger(routed.endpoint, "mamba") as stranger:
         stranger.seem_alive("alive/hal")
@@ -98,10 +106,15 @@ def test_a14_stop_without_arguments_names_every_robot_and_its_result(tmp_path: P
         os.kill(frozen, signal.SIGSTOP)
         stopped = snakesim(tmp_path, "estop", inside=machine)
         assert lifecycles(machine, one.endpoint) == ["estop"], stopped.printed
-        assert stopped.code == 1 and named(one, stopped.printed) and named(two, stopped.printed), stopped.printed
+        assert stopped.code == 1 and named(one, stopped.printed) and named(two, stopped.printed), (
+            stopped.printed
+        )
         os.kill(frozen, signal.SIGCONT)
         stopped = snakesim(tmp_path, "estop", inside=machine)
-        assert [lifecycles(machine, run.endpoint) for run in (one, two)] == [["estop"], ["estop"]], stopped.printed
+        assert [lifecycles(machine, run.endpoint) for run in (one, two)] == [
+            ["estop"],
+            ["estop"],
+        ], stopped.printed
         assert stopped.code == 0 and stopped.printed.count("stopped") == 2, stopped.printed
         assert named(one, stopped.printed) and named(two, stopped.printed), stopped.printed
         status = snakesim(tmp_path, "status", inside=machine)

@@ -32,10 +32,14 @@ def flooding(kind: str, amount: int, process_count: int = 1) -> Flood:
 FLOODS: dict[str, Flood] = {
     "half_open": lambda robot: half_open(robot.endpoint, effort(150, 2000)),
     "idle_sessions": flooding("idle", 300, 4),
-    "half_open_and_idle": lambda robot: _both(FLOODS["half_open"](robot), FLOODS["idle_sessions"](robot)),
+    "half_open_and_idle": lambda robot: _both(
+        FLOODS["half_open"](robot), FLOODS["idle_sessions"](robot)
+    ),
     "lease_queries": flooding("lease", 10_000, 2),
     "noise_queries": flooding("noise", 10_000, 2),
-    "all_queries": lambda robot: _both(FLOODS["lease_queries"](robot), FLOODS["noise_queries"](robot)),
+    "all_queries": lambda robot: _both(
+        FLOODS["lease_queries"](robot), FLOODS["noise_queries"](robot)
+    ),
     "garbage": flooding("garbage", effort(10_000, 30_000)),
     "readers": flooding("readers", 1000),
 }
@@ -43,7 +47,9 @@ SHUTS = ("half_open", "idle_sessions", "half_open_and_idle")  # new connections 
 
 
 @contextmanager
-def _both(one: AbstractContextManager[object], two: AbstractContextManager[object]) -> Iterator[None]:
+def _both(
+    one: AbstractContextManager[object], two: AbstractContextManager[object]
+) -> Iterator[None]:
     with one, two:
         yield
 
@@ -62,10 +68,14 @@ def test_a4_the_command_stops_the_robot_under(
             took_s = operator.stopped_at(asked_s, COMMAND_S) - asked_s
         except AssertionError:
             raise AssertionError(f"not stopped, exit code {ended.code}: {ended.printed}") from None
-    record_property("stopped after", f"{took_s:.2f} s from `snakesim estop`, {before} before, exit {ended.code}")
+    record_property(
+        "stopped after", f"{took_s:.2f} s from `snakesim estop`, {before} before, exit {ended.code}"
+    )
     assert took_s < COMMAND_S, ended.printed
     assert "nobody listens" not in ended.printed, ended.printed
-    if name not in SHUTS:  # there the robot is stopped, and the tool may have had no status to confirm it by
+    if (
+        name not in SHUTS
+    ):  # there the robot is stopped, and the tool may have had no status to confirm it by
         assert ended.code == 0 and "planar13: stopped" in ended.printed, ended.printed
 
 
@@ -88,12 +98,19 @@ def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
         else:
             assert datagrams.ask(robot.endpoint, datagrams.stop(), 10.0) is not None, "no answer"
         operator.stopped_at(asked_s, 10.0)
-    faults = [fault for fault in operator.next("hal/status")["faults"] if fault["tick"] not in known]
-    stopped_s = min(host.of(fault["tick"]) for fault in faults if fault["what"] == "estop") - asked_s
-    safe_s = min(host.of(fault["tick"]) for fault in faults if fault["what"] != "service_lost") - asked_s
+    faults = [
+        fault for fault in operator.next("hal/status")["faults"] if fault["tick"] not in known
+    ]
+    stopped_s = (
+        min(host.of(fault["tick"]) for fault in faults if fault["what"] == "estop") - asked_s
+    )
+    safe_s = (
+        min(host.of(fault["tick"]) for fault in faults if fault["what"] != "service_lost") - asked_s
+    )
     lost_s = host.lost_s(operator)
     record_property(
-        "safe after", f"{1000 * safe_s:.0f} ms, stopped after {1000 * stopped_s:.0f} ms, {1000 * lost_s:.0f} ms lost"
+        "safe after",
+        f"{1000 * safe_s:.0f} ms, stopped after {1000 * stopped_s:.0f} ms, {1000 * lost_s:.0f} ms lost",
     )
     assert safe_s < QUERY_S, faults
     assert by == "query" or stopped_s < QUERY_S, faults
@@ -103,7 +120,9 @@ def test_a4_a_stop_is_immediate_while_a_thousand_readers_leave(
 # --- by UDP, beside the endpoint ------------------------------------------------------------------------------------
 
 
-def test_a4_datagram_stops_the_robot_and_names_its_sender(robot: AttackedRobot, record_property: Record) -> None:
+def test_a4_datagram_stops_the_robot_and_names_its_sender(
+    robot: AttackedRobot, record_property: Record
+) -> None:
     asked_s = time.monotonic()
     answer = datagrams.ask(robot.endpoint, datagrams.stop("the bench's red button"), 2.0)
     assert answer is not None, "no answer at the endpoint's UDP port"
@@ -115,7 +134,9 @@ def test_a4_datagram_stops_the_robot_and_names_its_sender(robot: AttackedRobot, 
 
 
 @pytest.mark.parametrize("name", FLOODS if FULL else ("lease_queries",))
-def test_a4_a_datagram_stops_the_robot_under(robot: AttackedRobot, name: str, record_property: Record) -> None:
+def test_a4_a_datagram_stops_the_robot_under(
+    robot: AttackedRobot, name: str, record_property: Record
+) -> None:
     with FLOODS[name](robot):
         time.sleep(FLOODED_S)
         asked_s = time.monotonic()
@@ -125,33 +146,50 @@ def test_a4_a_datagram_stops_the_robot_under(robot: AttackedRobot, name: str, re
     assert answer is not None and took_s < QUERY_S
 
 
-def test_a4_flood_of_wrong_datagrams_blocks_no_right_one(robot: AttackedRobot, record_property: Record) -> None:
+def test_a4_flood_of_wrong_datagrams_blocks_no_right_one(
+    robot: AttackedRobot, record_property: Record
+) -> None:
     before = robot.health()
     with datagrams.flood(robot.endpoint) as sent:
         time.sleep(float(effort(2, 10)))
-        assert not robot.operator.status()["reason"].startswith("emergency stop"), robot.operator.status()["reason"]
+        assert not robot.operator.status()["reason"].startswith("emergency stop"), (
+            robot.operator.status()["reason"]
+        )
         asked_s = time.monotonic()
         answer = datagrams.ask(robot.endpoint, datagrams.stop(), 3.0)
         assert answer is not None, f"no answer after {sent[0]} wrong datagrams"
         took_s = robot.operator.stopped_at(asked_s, 2.0) - asked_s
-    record_property("stopped after", f"{1000 * took_s:.0f} ms from the datagram, {sent[0]} wrong ones beside it")
+    record_property(
+        "stopped after", f"{1000 * took_s:.0f} ms from the datagram, {sent[0]} wrong ones beside it"
+    )
     assert took_s < 2 * QUERY_S  # it may be among those that the kernel drops, and is sent again
     robot.unharmed(before)
 
 
 def test_a4_datagram_sender_name_is_harmless_and_printed_safely(robot: AttackedRobot) -> None:
     before = robot.health()
-    for who in (b"", b"\xff\xfe\x80", b"\x1b[2J\r\nplanar13: armed", b"x" * 65, b"x" * 60_000, "é".encode() * 64):
+    for who in (
+        b"",
+        b"\xff\xfe\x80",
+        b"\x1b[2J\r\nplanar13: armed",
+        b"x" * 65,
+        b"x" * 60_000,
+        "é".encode() * 64,
+    ):
         datagrams.ask(robot.endpoint, datagrams.stop(who), 0.2)
     printed = robot.run.run_tool("status").printed + robot.run.printed()
     assert not steering(printed), printed
     assert "\nplanar13: armed" not in printed.partition("planar13: ")[2], printed
-    assert datagrams.ask(robot.endpoint, datagrams.stop("after it"), 2.0) is not None, "no answer any more"
+    assert datagrams.ask(robot.endpoint, datagrams.stop("after it"), 2.0) is not None, (
+        "no answer any more"
+    )
     robot.unharmed(before)
 
 
 @pytest.mark.parametrize("knows_nonce", [False, True], ids=["wrong_nonce", "right_nonce"])
-def test_a4_false_answer_by_datagram_does_not_confirm_a_stop(robot: AttackedRobot, knows_nonce: bool) -> None:
+def test_a4_false_answer_by_datagram_does_not_confirm_a_stop(
+    robot: AttackedRobot, knows_nonce: bool
+) -> None:
     endpoint = find_free_endpoint()
     with datagrams.false_port(endpoint, knows_nonce=knows_nonce):
         ended = snakesim(robot.run.home, "estop", "--endpoint", endpoint)

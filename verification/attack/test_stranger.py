@@ -35,7 +35,9 @@ def test_nothing_of_ours_is_imported(path: Path) -> None:
         allowed = any(f"{name}.".startswith(f"{module}.") for module in ALLOWED)
         assert root in sys.stdlib_module_names or allowed or ours, f"{path.name} imports {name}"
     code = path.read_text(encoding="utf-8")
-    assert path.name == Path(__file__).name or ("import_module" not in code and "__import__" not in code)
+    assert path.name == Path(__file__).name or (
+        "import_module" not in code and "__import__" not in code
+    )
 
 
 @pytest.mark.parametrize(("page", "min_tests"), [("open-network.md", 20), ("lab-attackers.md", 10)])
@@ -45,6 +47,8 @@ def test_every_test_that_a_page_on_attacks_names_exists(page: str, min_tests: in
     for named, test in re.findall(r"`(test_\w+\.py)?::(test_\w+)`", text):
         file = named or file
         path = next(folder / file for folder in (HERE, LAB) if (folder / file).exists())
-        assert f"def {test}(" in path.read_text(encoding="utf-8"), f"docs/concepts/{page} names {file}::{test}"
+        assert f"def {test}(" in path.read_text(encoding="utf-8"), (
+            f"docs/concepts/{page} names {file}::{test}"
+        )
         count += 1
     assert count >= min_tests, count

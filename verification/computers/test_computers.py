@@ -13,7 +13,12 @@ import pytest
 
 from snakesim_hal.base import arithmetic
 from snakesim_testing.harness.endpoint import find_free_endpoint
-from snakesim_testing.runs.command import SNAKESIM_COMMAND, CompletedRun, make_environment, run_to_end
+from snakesim_testing.runs.command import (
+    SNAKESIM_COMMAND,
+    CompletedRun,
+    make_environment,
+    run_to_end,
+)
 from verification.golden import GOLDEN, SECONDS
 
 pytestmark = pytest.mark.e2e
@@ -31,9 +36,23 @@ common = pytest.mark.skipif(
     not arithmetic.make_common_arithmetic_env() or bool(OWN),
     reason=f"the digests of this computer are its own: {' and '.join(OWN) or 'without AVX2 and FMA'}",
 )
-IN_ONE_PROCESS = ["tests/system/runs", "tests/system/recordings", "tests/system/commands", "-m", "not slow and not e2e"]
-OF_THIS_PROCESS = ["tests/system/recordings/test_recordings.py", "tests/system/commands/test_compare.py"]
-IN_REAL_TIME = ["tests/system/runs/test_run.py", "tests/system/recordings/test_record.py", "-k", "not no_slow_computer"]
+IN_ONE_PROCESS = [
+    "tests/system/runs",
+    "tests/system/recordings",
+    "tests/system/commands",
+    "-m",
+    "not slow and not e2e",
+]
+OF_THIS_PROCESS = [
+    "tests/system/recordings/test_recordings.py",
+    "tests/system/commands/test_compare.py",
+]
+IN_REAL_TIME = [
+    "tests/system/runs/test_run.py",
+    "tests/system/recordings/test_record.py",
+    "-k",
+    "not no_slow_computer",
+]
 
 PROGRAM = """
 import sys
@@ -49,13 +68,24 @@ print(result.summary.command_digest, len(result.record.time_s))
 def on(computer: Mapping[str, str], folder: Path) -> dict[str, str]:
     """The environment of a user there, who has heard nothing of ours."""
     ours = make_environment(folder)
-    return {name: value for name, value in ours.items() if name not in arithmetic.make_common_arithmetic_env()} | dict(
-        computer
-    )
+    return {
+        name: value
+        for name, value in ours.items()
+        if name not in arithmetic.make_common_arithmetic_env()
+    } | dict(computer)
 
 
 def run(folder: Path, *arguments: str, computer: Mapping[str, str] | None = None) -> CompletedRun:
-    typed = [*SNAKESIM_COMMAND, "run", *arguments, "--duration", str(SECONDS), "--no-record", "--out", "run"]
+    typed = [
+        *SNAKESIM_COMMAND,
+        "run",
+        *arguments,
+        "--duration",
+        str(SECONDS),
+        "--no-record",
+        "--out",
+        "run",
+    ]
     return run_to_end(typed, folder, on(computer or {}, folder))
 
 
@@ -81,22 +111,34 @@ def test_a_scenario_has_its_digest(tmp_path: Path, scenario: str) -> None:
     ],
 )
 def test_it_is_that_of_every_computer(tmp_path: Path, computer: str) -> None:
-    assert digest_in(run(tmp_path, "peg_row", "--in-process", computer=COMPUTERS[computer])) == GOLDEN["peg_row"]
+    assert (
+        digest_in(run(tmp_path, "peg_row", "--in-process", computer=COMPUTERS[computer]))
+        == GOLDEN["peg_row"]
+    )
 
 
 @common
-@pytest.mark.parametrize("computer", ["SkylakeX", pytest.param("plain NumPy", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "computer", ["SkylakeX", pytest.param("plain NumPy", marks=pytest.mark.slow)]
+)
 def test_and_that_of_five_processes(tmp_path: Path, computer: str) -> None:
-    ended = run(tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer])
-    if " is gone: " in ended.out:  # a computer that stands for seconds loses a process, and the run is no whole one
-        ended = run(tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer])
+    ended = run(
+        tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer]
+    )
+    if (
+        " is gone: " in ended.out
+    ):  # a computer that stands for seconds loses a process, and the run is no whole one
+        ended = run(
+            tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer]
+        )
     assert digest_in(ended) == GOLDEN["triplet"], ended.out + ended.err
 
 
 @common
 # No processor lacks what these need.
 @pytest.mark.parametrize(
-    "computer", ["Nehalem", *(pytest.param(n, marks=pytest.mark.slow) for n in ("Haswell", "plain NumPy"))]
+    "computer",
+    ["Nehalem", *(pytest.param(n, marks=pytest.mark.slow) for n in ("Haswell", "plain NumPy"))],
 )
 def test_and_that_of_a_program_that_imported_numpy_first(tmp_path: Path, computer: str) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
@@ -109,25 +151,43 @@ def test_and_that_of_a_program_that_imported_numpy_first(tmp_path: Path, compute
 @common
 def test_what_such_a_program_did_wrong_is_raised_there(tmp_path: Path) -> None:
     wrong = PROGRAM.replace(
-        '[parse_set_option(f"duration_s={sys.argv[2]}")]', '[parse_set_option("clock_mode=realtime")]'
+        '[parse_set_option(f"duration_s={sys.argv[2]}")]',
+        '[parse_set_option("clock_mode=realtime")]',
     )
     (tmp_path / "program.py").write_text(wrong)
-    ended = run_to_end([sys.executable, "program.py", "triplet"], tmp_path, on(COMPUTERS["Nehalem"], tmp_path))
-    assert ended.code == 1 and "errors.ConfigError" in ended.err and "must be 'lockstep'" in ended.err
+    ended = run_to_end(
+        [sys.executable, "program.py", "triplet"], tmp_path, on(COMPUTERS["Nehalem"], tmp_path)
+    )
+    assert (
+        ended.code == 1 and "errors.ConfigError" in ended.err and "must be 'lockstep'" in ended.err
+    )
 
 
 @common
 def test_other_c_library_marks_digest_as_local(tmp_path: Path) -> None:
     """glibc has sines for processors with FMA, and others."""
     other = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"}
-    typed = [*SNAKESIM_COMMAND, "run", "triplet", "--in-process", "--duration", "0.3", "--out", "run"]
+    typed = [
+        *SNAKESIM_COMMAND,
+        "run",
+        "triplet",
+        "--in-process",
+        "--duration",
+        "0.3",
+        "--out",
+        "run",
+    ]
     ended = run_to_end(typed, tmp_path, on(other, tmp_path))
-    own = "its own: NumPy and C library round otherwise than on most computers with NumPy 2.2 to 2.4"
+    own = (
+        "its own: NumPy and C library round otherwise than on most computers with NumPy 2.2 to 2.4"
+    )
     assert ended.code == 0 and digest_in(ended).endswith(f", {own}"), ended.out + ended.err
     told = run_to_end([*SNAKESIM_COMMAND, "recording", "info", "run"], tmp_path, on({}, tmp_path))
     assert own in told.out
     assert run_to_end([*typed[:-1], "usual"], tmp_path, on({}, tmp_path)).code == 0
-    compared = run_to_end([*SNAKESIM_COMMAND, "study", "compare", "run", "usual"], tmp_path, on({}, tmp_path))
+    compared = run_to_end(
+        [*SNAKESIM_COMMAND, "study", "compare", "run", "usual"], tmp_path, on({}, tmp_path)
+    )
     assert "description.arithmetic.C library" in compared.out, compared.out + compared.err
 
 
@@ -136,9 +196,23 @@ def test_other_c_library_marks_digest_as_local(tmp_path: Path) -> None:
 
 def suite(folder: Path, env: Mapping[str, str], *chosen: str, before: tuple[str, ...] = ()) -> None:
     """Run tests as a contributor there does, from this repository."""
-    typed = [*before, sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--timeout", "900", *chosen]
+    typed = [
+        *before,
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-p",
+        "no:cacheprovider",
+        "--timeout",
+        "900",
+        *chosen,
+    ]
     root = Path(__file__).parents[2]
-    done = subprocess.run(typed, cwd=root, env=on(env, folder), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        typed, cwd=root, env=on(env, folder), capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
 
 
@@ -172,7 +246,9 @@ def half_a_core() -> Iterator[Path]:
     try:
         group.mkdir()
         if v1.is_dir():
-            (group / "cpu.cfs_quota_us").write_text(str(int((group / "cpu.cfs_period_us").read_text()) // 2))
+            (group / "cpu.cfs_quota_us").write_text(
+                str(int((group / "cpu.cfs_period_us").read_text()) // 2)
+            )
         else:
             (group / "cpu.max").write_text("50000 100000")
     except OSError as error:
@@ -183,7 +259,9 @@ def half_a_core() -> Iterator[Path]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("chosen", [IN_ONE_PROCESS, IN_REAL_TIME], ids=["one process", "in real time"])
+@pytest.mark.parametrize(
+    "chosen", [IN_ONE_PROCESS, IN_REAL_TIME], ids=["one process", "in real time"]
+)
 def test_half_a_core_is_enough(tmp_path: Path, half_a_core: Path, chosen: list[str]) -> None:
     joining = ("sh", "-c", f'echo $$ > {half_a_core}/cgroup.procs; exec "$@"', "sh")
     suite(tmp_path, {}, *chosen, before=joining)

@@ -38,9 +38,11 @@ EVALUATION = [
     for section in typed_in(f"docs/how-to/{page}.md")
 ]
 JOINT_MODULES = REPOSITORY / "docs" / "hardware" / "joint-modules.md"
-HIL = [section for section in parse_sections(JOINT_MODULES) if section.title == "1. Anywhere"]  # needs no CAN
+# Needs no CAN.
+HIL = [section for section in parse_sections(JOINT_MODULES) if section.title == "1. Anywhere"]
 CONTROLLERS, ROBOTS, SCENES, URDF = (
-    typed_in(f"docs/{page}.md") for page in ("reference/controllers", "how-to/robots", "how-to/scenes", "how-to/urdf")
+    typed_in(f"docs/{page}.md")
+    for page in ("reference/controllers", "how-to/robots", "how-to/scenes", "how-to/urdf")
 )
 PAGES = ("first-controller", "train-a-policy", "your-robot", "your-sensor", "lab-on-your-desk")
 LESSONS = [section for page in PAGES for section in typed_in(f"docs/tutorials/{page}.md")]
@@ -56,7 +58,9 @@ def named(section: DocumentSection) -> str:
 def apart() -> list[str]:
     """A network of the script's own, in which the default port is free; nothing where the kernel grants none."""
     command = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--map-root-user"]
-    granted = shutil.which("unshare") and subprocess.run([*command, "true"], capture_output=True, check=False)
+    granted = shutil.which("unshare") and subprocess.run(
+        [*command, "true"], capture_output=True, check=False
+    )
     return command if granted and granted.returncode == 0 else []
 
 
@@ -88,7 +92,9 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 @needs_uv
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "section", [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS, *SCENES, *URDF, *LESSONS], ids=named
+    "section",
+    [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS, *SCENES, *URDF, *LESSONS],
+    ids=named,
 )
 def test_a_section_as_printed(section: DocumentSection, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
@@ -134,5 +140,9 @@ def test_the_documents_ask_for_something() -> None:
     )
     every = [info for section in [*TUTORIAL, *EVALUATION, *README] for info, _ in section.blocks]
     assert {info.split()[0] for info in every if info} <= {"sh", "python", "toml", "text"}
-    commands = "\n".join(content for section in TUTORIAL for info, content in section.blocks if info.startswith("sh"))
-    assert not re.search(r"\bpip\b(?! install --python)|pgrep|kill -9|killall|pkill|step:clock", commands)
+    commands = "\n".join(
+        content for section in TUTORIAL for info, content in section.blocks if info.startswith("sh")
+    )
+    assert not re.search(
+        r"\bpip\b(?! install --python)|pgrep|kill -9|killall|pkill|step:clock", commands
+    )

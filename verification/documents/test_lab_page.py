@@ -23,7 +23,11 @@ pytestmark = [
     pytest.mark.timeout(600),
     pytest.mark.skipif(os.geteuid() != 0, reason="network namespaces need root"),
 ]
-BLOCKS = [block for section in parse_sections(REPOSITORY / "docs" / "how-to" / "lab.md") for block in section.blocks]
+BLOCKS = [
+    block
+    for section in parse_sections(REPOSITORY / "docs" / "how-to" / "lab.md")
+    for block in section.blocks
+]
 LIMIT_S = 120.0
 
 
@@ -34,7 +38,9 @@ def test_a_new_lab_step_by_step(tmp_path: Path) -> None:
             where = info.rpartition(" on ")[2]
             if info == "sh by hand":
                 for machine in machines:  # as rsync does
-                    shutil.copytree(tmp_path / "lab" / machine, tmp_path / "etc" / machine, dirs_exist_ok=True)
+                    shutil.copytree(
+                        tmp_path / "lab" / machine, tmp_path / "etc" / machine, dirs_exist_ok=True
+                    )
             elif info.startswith("sh background on"):
                 line = f"cd {tmp_path}; exec env {here(script, tmp_path, where)}"
                 log, env = tmp_path / f"{number}.log", environment(tmp_path, where)
@@ -54,8 +60,14 @@ def typed(machine: NamespaceMachine, script: str, folder: Path) -> None:
         code = (re.search(r"# \(exit code (\d)\)$", line) or ["", "0"])[1]
         deadline = time.monotonic() + LIMIT_S
         while True:
-            said = machine.run("bash", "-c", "\n".join([*exported, line]), check=False, cwd=folder, env=env)
-            if said.endswith(f"(exit code {code})") and "host: not running" not in said and "control: not" not in said:
+            said = machine.run(
+                "bash", "-c", "\n".join([*exported, line]), check=False, cwd=folder, env=env
+            )
+            if (
+                said.endswith(f"(exit code {code})")
+                and "host: not running" not in said
+                and "control: not" not in said
+            ):
                 break
             assert time.monotonic() < deadline, f"{line}: {said}\n{logs(folder)}"
             time.sleep(0.5)
@@ -73,7 +85,9 @@ def here(script: str, folder: Path, machine: str) -> str:
 def own_places(folder: Path) -> None:
     """What a reader edits in step 1."""
     lab = folder / "lab.toml"
-    text = re.sub(r"^\[machines\.(\w+)\]$", rf'\g<0>\nfolder = "{folder}/etc/\1"', lab.read_text(), flags=re.M)
+    text = re.sub(
+        r"^\[machines\.(\w+)\]$", rf'\g<0>\nfolder = "{folder}/etc/\1"', lab.read_text(), flags=re.M
+    )
     lab.write_text(text.replace("10.0.0.1", f"{NET}.1"))
 
 
@@ -83,4 +97,6 @@ def environment(folder: Path, machine: str) -> dict[str, str]:
 
 
 def logs(folder: Path) -> str:
-    return "\n".join(f"{path.name}: {path.read_text()[-500:]}" for path in sorted(folder.glob("*.log")))
+    return "\n".join(
+        f"{path.name}: {path.read_text()[-500:]}" for path in sorted(folder.glob("*.log"))
+    )

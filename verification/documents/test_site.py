@@ -15,7 +15,9 @@ SITE = REPOSITORY / "build" / "docs"
 def test_the_menu_has_every_page() -> None:
     menu = (REPOSITORY / "docs" / "site" / "mkdocs.yml").read_text()
     pages = [
-        page.relative_to(REPOSITORY) for folder in ("docs", "schemas") for page in (REPOSITORY / folder).rglob("*.md")
+        page.relative_to(REPOSITORY)
+        for folder in ("docs", "schemas")
+        for page in (REPOSITORY / folder).rglob("*.md")
     ]
     assert not [page for page in pages if f"{page}\n" not in menu]
 
@@ -28,7 +30,8 @@ def test_the_site_is_searched_from_a_folder_without_a_network() -> None:
     subprocess.run([sys.executable, "docs/site/build.py"], cwd=REPOSITORY, check=True)
     loaded = re.compile(r"""<(?:script|link|img|iframe)[^>]*(?:src|href)=["']?(?:https?:)?//""")
     assert not [page for page in SITE.rglob("*.html") if loaded.search(page.read_text())]
-    assert not [page for page in SITE.rglob("*.html") if "<code>``" in page.read_text()]  # a block taken for a text
+    # A block taken for a text.
+    assert not [page for page in SITE.rglob("*.html") if "<code>``" in page.read_text()]
     with open_chromium() as browser:
         tab = browser.open(f"file://{SITE}/docs/concepts/safety.html")
         tab.wait_for("Safety")

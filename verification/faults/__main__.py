@@ -77,7 +77,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 1 if not_met else 0
 
 
-def _select_measurements(row_names: Sequence[str], only_backends: Sequence[str] | None) -> list[Measurement]:
+def _select_measurements(
+    row_names: Sequence[str], only_backends: Sequence[str] | None
+) -> list[Measurement]:
     """Return rows with each backend on which they are measured. only_backends: None or empty: all."""
     measurements: list[Measurement] = []
     for name in row_names:
@@ -135,14 +137,23 @@ def _print_error(error: Exception, folder: Path) -> None:
 
 
 def _measure_in_environment(
-    environment: Environment, measurements: Sequence[Measurement], trial_count: int, store: FaultResults
+    environment: Environment,
+    measurements: Sequence[Measurement],
+    trial_count: int,
+    store: FaultResults,
 ) -> None:
     """Measure rows by a process in another environment, which writes its results into the same file."""
     before = store.read()
     command = [*ENVIRONMENT_COMMANDS[environment]]
     if environment == "guest":
         command += [*_writable_folder_options(store), "--"]
-    command += ["env", f"{ENVIRONMENT_VARIABLE}={environment}", sys.executable, "-m", "verification.faults"]
+    command += [
+        "env",
+        f"{ENVIRONMENT_VARIABLE}={environment}",
+        sys.executable,
+        "-m",
+        "verification.faults",
+    ]
     command += ["--rows", *dict.fromkeys(row.name for row, _ in measurements)]
     command += ["--backends", *dict.fromkeys(backend for _, backend in measurements)]
     command += ["--trials", str(trial_count), "--json", str(store.path)]
@@ -154,7 +165,9 @@ def _measure_in_environment(
     after = store.read()
     for row, backend in measurements:
         if after.get((row.name, backend)) == before.get((row.name, backend)):
-            store.save(_make_result(row, backend, broken=f"no result from the environment {environment!r}"))
+            store.save(
+                _make_result(row, backend, broken=f"no result from the environment {environment!r}")
+            )
 
 
 def _writable_folder_options(store: FaultResults) -> list[str]:
@@ -170,7 +183,11 @@ def _make_result(row: FaultRow, backend: Backend, **measured: Any) -> RowResult:
     values: dict[str, Any] = {"took_s": 0.0, "load": _machine_load(), "trials": []}
     values |= measured
     return RowResult(
-        row=row.name, backend=backend, when=f"{datetime.now():%Y-%m-%d %H:%M}", machine=machine(), **values
+        row=row.name,
+        backend=backend,
+        when=f"{datetime.now():%Y-%m-%d %H:%M}",
+        machine=machine(),
+        **values,
     )
 
 
@@ -190,14 +207,25 @@ def _print_result(row: FaultRow, backend: Backend, store: FaultResults) -> list[
 
 def _parse_arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m verification.faults", description=__doc__)
-    parser.add_argument("--rows", nargs="+", choices=list(ROWS), metavar="NAME", help=f"of {', '.join(ROWS)}")
-    parser.add_argument("--backends", nargs="+", choices=get_args(Backend), metavar="NAME", help="only on these")
-    parser.add_argument("--trials", type=int, default=TRIALS, help=f"of each row and backend ({TRIALS})")
     parser.add_argument(
-        "--write", action="store_true", help="write docs/benchmarks/faults.md and docs/fault-table.csv from all results"
+        "--rows", nargs="+", choices=list(ROWS), metavar="NAME", help=f"of {', '.join(ROWS)}"
     )
     parser.add_argument(
-        "--json", type=Path, default=FaultResults().path, help="raw results (docs/benchmarks/faults.json)"
+        "--backends", nargs="+", choices=get_args(Backend), metavar="NAME", help="only on these"
+    )
+    parser.add_argument(
+        "--trials", type=int, default=TRIALS, help=f"of each row and backend ({TRIALS})"
+    )
+    parser.add_argument(
+        "--write",
+        action="store_true",
+        help="write docs/benchmarks/faults.md and docs/fault-table.csv from all results",
+    )
+    parser.add_argument(
+        "--json",
+        type=Path,
+        default=FaultResults().path,
+        help="raw results (docs/benchmarks/faults.json)",
     )
     return parser.parse_args(argv)
 

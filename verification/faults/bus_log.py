@@ -19,7 +19,11 @@ def read(path: Path) -> list[CanFrame]:
 def commands(frames: list[CanFrame], action: CommandAction) -> int:
     """How many Commands of a kind the driver sent."""
     layout = load_layouts()[Opcode.COMMAND]
-    sent = [layout.decode(frame.data)["action"] for frame in frames if parse_opcode(frame.id) == Opcode.COMMAND]
+    sent = [
+        layout.decode(frame.data)["action"]
+        for frame in frames
+        if parse_opcode(frame.id) == Opcode.COMMAND
+    ]
     return sent.count(action)
 
 

@@ -106,13 +106,17 @@ def open_drives(config: RunConfig, pose: str, opened: ExitStack) -> DriveProcess
     return DriveProcesses(run, enabled)
 
 
-def _emulator(part: DriverTypePart, body: EmulatedBody, clock: DriverClock, opened: ExitStack) -> Any:
+def _emulator(
+    part: DriverTypePart, body: EmulatedBody, clock: DriverClock, opened: ExitStack
+) -> Any:
     """The emulated drives of one driver type, all on its first bus."""
     driver_type: type[DriverTypeBackend] = part.driver_type
     joints = list(part.joints.values())
     if issubclass(driver_type, CanDriveBackend):
         wire = open_wire(part.ports[0], None, part.settings.bit_rate, part.settings.fd_rate)
-        context = CanEmulatorContext(joints, part.settings, body, [wire] * len(joints), clock.now_ns)
+        context = CanEmulatorContext(
+            joints, part.settings, body, [wire] * len(joints), clock.now_ns
+        )
         return opened.enter_context(closing(driver_type.emulator_class(context)))
     assert issubclass(driver_type, ServoBackend), f"no emulator of {driver_type.name} as a process"
     ptys: list[PseudoTerminal] = opened.enter_context(create_named_ptys([Path(part.ports[0])]))
@@ -120,13 +124,17 @@ def _emulator(part: DriverTypePart, body: EmulatedBody, clock: DriverClock, open
 
 
 def _modules(config: RunConfig, settings: Any, pose: str, opened: ExitStack) -> DriveProcesses:
-    wires = [opened.enter_context(closing(open_wire(c, FROM_HOST, settings.bit_rate))) for c in settings.channels]
+    wires = [
+        opened.enter_context(closing(open_wire(c, FROM_HOST, settings.bit_rate)))
+        for c in settings.channels
+    ]
     send_pose = opened.enter_context(closing(PoseSender(pose)))
     physics_model = make_physics_model(config, settings, config.backend)
     chain = ModuleChain(config, settings, physics_model, stepped=False, send_pose=send_pose)
     server = EmulatorServer(wires, chain)
     return DriveProcesses(
-        lambda: server.run_due(time.monotonic_ns()), lambda: [slot.module.state in DRIVEN for slot in chain.slots]
+        lambda: server.run_due(time.monotonic_ns()),
+        lambda: [slot.module.state in DRIVEN for slot in chain.slots],
     )
 
 

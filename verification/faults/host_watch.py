@@ -59,7 +59,9 @@ class HostWatch:
         """Return the newest status."""
         return self._statuses[-1].message.lifecycle if self._statuses else None
 
-    def first(self, condition: Callable[[RobotStatus], bool], since_ns: int, what: str) -> ReceivedMessage[RobotStatus]:
+    def first(
+        self, condition: Callable[[RobotStatus], bool], since_ns: int, what: str
+    ) -> ReceivedMessage[RobotStatus]:
         """The first status after a time of which a condition holds. Raises TrialError when none comes."""
         deadline = time.monotonic() + LIMIT_S
         while time.monotonic() < deadline:
@@ -67,7 +69,9 @@ class HostWatch:
                 if received.at_ns >= since_ns and condition(received.message):
                     return received
             time.sleep(LOOK_S)
-        raise TrialError(f"the host did not say within {LIMIT_S:g} s: {what}; last: {self.lifecycle()}")
+        raise TrialError(
+            f"the host did not say within {LIMIT_S:g} s: {what}; last: {self.lifecycle()}"
+        )
 
     def _listen(self) -> None:
         decoder = msgspec.msgpack.Decoder(HostMessage)

@@ -115,7 +115,9 @@ class Observer:
         for messages in (self.statuses, self.applied, self.clocks, self.joints, self.commands):
             messages.clear()
 
-    def until(self, condition: Callable[[], FoundT | None], what: str, limit_s: float = LIMIT_S) -> FoundT:
+    def until(
+        self, condition: Callable[[], FoundT | None], what: str, limit_s: float = LIMIT_S
+    ) -> FoundT:
         """Listen until a condition holds; what it found. Raises TrialError with its name when it does not in time."""
         deadline = time.monotonic() + limit_s
         while True:
@@ -135,7 +137,9 @@ class Observer:
 
     def in_words(self) -> str:
         """Return the newest status in words."""
-        return "no status" if self.status is None else f"{self.status.lifecycle}: {self.status.reason}"
+        return (
+            "no status" if self.status is None else f"{self.status.lifecycle}: {self.status.reason}"
+        )
 
     def state(self) -> str | None:
         """Return the newest lifecycle state."""
@@ -154,17 +158,25 @@ class Observer:
 
     def first_safe(self, since_ns: int) -> ReceivedMessage[AppliedCommand] | None:
         """Return the first setpoints after a time that are the host's own stop mode."""
-        return next((h for h in self.applied if h.at_ns >= since_ns and h.message.sequence is None), None)
+        return next(
+            (h for h in self.applied if h.at_ns >= since_ns and h.message.sequence is None), None
+        )
 
     def safe_after_ms(self, since_ns: int) -> float:
         """How long until then."""
-        return (self.until(lambda: self.first_safe(since_ns), "the stop mode", 3.0).at_ns - since_ns) / 1e6
+        return (
+            self.until(lambda: self.first_safe(since_ns), "the stop mode", 3.0).at_ns - since_ns
+        ) / 1e6
 
     def first_fault(self, since_ns: int) -> RobotStatus:
         """The first status after a time that tells a fault."""
 
         def found() -> list[RobotStatus]:
-            return [h.message for h in self.statuses if h.at_ns >= since_ns and h.message.lifecycle == "fault"]
+            return [
+                h.message
+                for h in self.statuses
+                if h.at_ns >= since_ns and h.message.lifecycle == "fault"
+            ]
 
         return self.until(found, "a fault in the status", 3.0)[0]
 
@@ -220,15 +232,22 @@ class Observer:
         self.forget()
         if self.state() != "armed":
             request = LifecycleRequest(
-                action="arm", robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
+                action="arm",
+                robot=robot.robot,
+                backend=robot.backend,
+                config_hash=robot.config_hash,
             )
             if not self.ask(keys.LIFECYCLE, request).ok:
                 return False
 
         def follows() -> bool:
-            return self.state() == "armed" and any(h.message.sequence is not None for h in self.applied)
+            return self.state() == "armed" and any(
+                h.message.sequence is not None for h in self.applied
+            )
 
-        self.until(lambda: follows() or self.state() == "fault", "commands applied after arm_session", 5.0)
+        self.until(
+            lambda: follows() or self.state() == "fault", "commands applied after arm_session", 5.0
+        )
         return self.state() != "fault"
 
     def _make_ready(self, limit_s: float) -> None:
@@ -259,7 +278,11 @@ class Observer:
             for i, mode in enumerate(now.mode):
                 if mode is not JointMode.POSITION:
                     continue
-                if before is not None and before.tick == now.tick - 1 and before.mode[i] is JointMode.POSITION:
+                if (
+                    before is not None
+                    and before.tick == now.tick - 1
+                    and before.mode[i] is JointMode.POSITION
+                ):
                     within = max(within, abs(now.target[i] - before.target[i]))
                 elif measured is not None:
                     first = max(first, abs(now.target[i] - measured.angle_rad[i]))

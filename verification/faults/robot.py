@@ -20,7 +20,8 @@ from verification.faults.host_watch import HostWatch, urgently
 from verification.faults.observer import Observer, TrialError
 from verification.faults.row import InjectionTrial, MeasurementRequest
 
-START_LIMIT_S = 240.0 if os.environ.get("SNAKESIM_VCAN") == "guest" else 60.0  # an emulated machine is slow
+# An emulated machine is slow.
+START_LIMIT_S = 240.0 if os.environ.get("SNAKESIM_VCAN") == "guest" else 60.0
 MOVING_S = 0.25  # from arming to the injection
 SETTLED_S = 0.3  # how long steps are watched after a recovery
 PERIOD_S = 0.01
@@ -29,14 +30,18 @@ PERIOD_S = 0.01
 def configuration(backend: str, **dotted: Any) -> RunConfig:
     """The triplet in real time at 100 Hz, for as long as anybody likes; `__` in a name stands for the dot."""
     values = {"backend": backend, "clock_mode": "realtime", "duration_s": 3600.0, **dotted}
-    overrides = [KeyOverride(name.replace("__", "."), value, f"--{name}") for name, value in values.items()]
+    overrides = [
+        KeyOverride(name.replace("__", "."), value, f"--{name}") for name, value in values.items()
+    ]
     return load_scenario("triplet", overrides).config
 
 
 class ProcessRobot:
     """Host, guidance, navigation and control, each a process of its own; any can be killed, frozen, started again."""
 
-    def __init__(self, folder: Path, config: RunConfig, *, endpoint: str | None = None, router: bool = False) -> None:
+    def __init__(
+        self, folder: Path, config: RunConfig, *, endpoint: str | None = None, router: bool = False
+    ) -> None:
         """router: another process listens at the endpoint."""
         self.folder, self.config, self.router = folder, config, router
         self.endpoint = endpoint or find_free_endpoint()
@@ -77,8 +82,11 @@ class ProcessRobot:
         else:
             module = ["snakesim_hal.programs.service_program", name, *common]
         log = self._stack.enter_context((self.folder / f"{name}.log").open("ab", buffering=0))
-        state = {"XDG_STATE_HOME": str(self.folder)}  # what outlives a run must not outlive this one
-        self.running[name] = children.start_child(name, module, log.write, pass_fds=inherits, extra_env=state)
+        # What outlives a run must not outlive this one.
+        state = {"XDG_STATE_HOME": str(self.folder)}
+        self.running[name] = children.start_child(
+            name, module, log.write, pass_fds=inherits, extra_env=state
+        )
         return self.running[name]
 
     def start_all(self) -> None:
@@ -97,11 +105,17 @@ class ProcessRobot:
                 return Observer(session)
             except NotConnectedError:
                 if time.monotonic() > deadline or self.ended():
-                    raise TrialError(f"no network: {'; '.join(self.ended())}; {self.last_words()}") from None
+                    raise TrialError(
+                        f"no network: {'; '.join(self.ended())}; {self.last_words()}"
+                    ) from None
 
     def ended(self) -> list[str]:
         """Which of its processes are gone, and how."""
-        return [ending for child in self.running.values() if (ending := child.describe_exit()) is not None]
+        return [
+            ending
+            for child in self.running.values()
+            if (ending := child.describe_exit()) is not None
+        ]
 
     def last_words(self) -> str:
         """Of those that are gone."""
@@ -129,7 +143,11 @@ class ProcessRobot:
 
 @contextlib.contextmanager
 def robot(
-    request: MeasurementRequest, config: RunConfig | None = None, *, router: bool = False, **dotted: Any
+    request: MeasurementRequest,
+    config: RunConfig | None = None,
+    *,
+    router: bool = False,
+    **dotted: Any,
 ) -> Iterator[tuple[ProcessRobot, Observer]]:
     """A robot with all its processes, and who watches it. config: other than `configuration` with these values."""
     with ProcessRobot(
@@ -150,10 +168,14 @@ def recovered(observer: Observer, value: float | None, failure: str = "") -> Inj
     try:
         observer.arm(START_LIMIT_S)
     except TrialError as error:
-        return InjectionTrial(value=value, failure="; ".join(filter(None, (failure, str(error)))), recovered=False)
+        return InjectionTrial(
+            value=value, failure="; ".join(filter(None, (failure, str(error)))), recovered=False
+        )
     observer.watch(SETTLED_S)
     steps = observer.steps()
     bound = observer.description().max_step_rad
     if max(steps.values()) > bound + 1e-9:
-        failure = "; ".join(filter(None, (failure, f"a target jumped by more than {bound} rad at recovery")))
+        failure = "; ".join(
+            filter(None, (failure, f"a target jumped by more than {bound} rad at recovery"))
+        )
     return InjectionTrial(value=value, failure=failure, recovered=True, **steps)

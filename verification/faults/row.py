@@ -8,8 +8,18 @@ from typing import Literal
 
 import msgspec
 
-Backend = Literal["sim", "can", "both", "odrive", "moteus", "cia402", "dynamixel", "feetech", "mixed"]
-DRIVE_TYPES: tuple[Backend, ...] = ("can", "odrive", "moteus", "cia402", "dynamixel", "feetech", "mixed")
+Backend = Literal[
+    "sim", "can", "both", "odrive", "moteus", "cia402", "dynamixel", "feetech", "mixed"
+]
+DRIVE_TYPES: tuple[Backend, ...] = (
+    "can",
+    "odrive",
+    "moteus",
+    "cia402",
+    "dynamixel",
+    "feetech",
+    "mixed",
+)
 
 # Where a row is measured: in this process's environment, in network namespaces, or in a virtual machine with SocketCAN.
 Environment = Literal["here", "namespaces", "guest"]
@@ -22,9 +32,12 @@ class InjectionTrial(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=Tr
 
     value: float | None  # in the row's unit; None: the expected reaction did not happen
     failure: str = ""  # what else was wrong
-    recovered: bool | None = None  # by an operator's command; None: there was nothing to recover from
-    step_rad: float | None = None  # largest change of an applied angle target in a tick, after the recovery
-    first_rad: float | None = None  # largest distance of the first angle targets from the measured angles
+    # By an operator's command; None: there was nothing to recover from.
+    recovered: bool | None = None
+    # Largest change of an applied angle target in a tick, after the recovery.
+    step_rad: float | None = None
+    # Largest distance of the first angle targets from the measured angles.
+    first_rad: float | None = None
 
 
 class RowResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -37,9 +50,8 @@ class RowResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     load: float  # of the machine, at the beginning
     machine: str
     trials: list[InjectionTrial]
-    retried: int | None = (
-        None  # trials that were repeated, see `MeasurementRequest.retry`; None: they were not counted then
-    )
+    # Trials that were repeated, see `MeasurementRequest.retry`; None: they were not counted then.
+    retried: int | None = None
     notes: list[str] = []
     broken: str = ""  # why the measurement ended early
 

@@ -19,7 +19,9 @@ HUGE = MAX_PAYLOAD_BYTES + 1024
 
 def send_raw(session: Session, payload: bytes, encoding: str | None = None) -> None:
     """Put bytes where commands go."""
-    session._zenoh.put(keys.JOINT_COMMAND, payload, encoding=encoding or format_encoding(JointCommand))
+    session._zenoh.put(
+        keys.JOINT_COMMAND, payload, encoding=encoding or format_encoding(JointCommand)
+    )
 
 
 class CommandForger:
@@ -38,7 +40,9 @@ class CommandForger:
         observer.until(lambda: observer.clocks, "the clock", 2.0)
         tick = observer.clocks[-1].message.tick
         command, _ = self._of_controller(1)
-        return msgspec.structs.replace(command, **{"sequence": self._sequence, "tick": tick, **changes})
+        return msgspec.structs.replace(
+            command, **{"sequence": self._sequence, "tick": tick, **changes}
+        )
 
     def _of_controller(self, back: int) -> tuple[JointCommand, bytes]:
         """The controller's newest command (1), or an older one, with its bytes; what strangers sent is left out."""
@@ -97,7 +101,10 @@ class CommandForger:
         forged = self.forged()
         self.send(
             msgspec.structs.replace(
-                forged, layout=forged.layout[::-1] + "x", target=forged.target[::-1], mode=forged.mode[::-1]
+                forged,
+                layout=forged.layout[::-1] + "x",
+                target=forged.target[::-1],
+                mode=forged.mode[::-1],
             )
         )
 

@@ -32,7 +32,9 @@ from verification.fuzz.texts import flipped
 
 PER_TICK = 40
 PER_OPENING = 2000  # frames until the bus is opened again, with the stranger on it
-ROBOT = config(clock_mode="realtime", robot__sensors__contacts__rate_hz=50.0, robot__sensors__imu__rate_hz=50.0)
+ROBOT = config(
+    clock_mode="realtime", robot__sensors__contacts__rate_hz=50.0, robot__sensors__imu__rate_hz=50.0
+)
 KINDS = ("again", "bit-flipped", "other node", "other message", "length", "random", "odd id")
 
 
@@ -41,7 +43,10 @@ class FrameMaker:
 
     def __init__(self, rng: random.Random) -> None:
         self._rng = rng
-        self.heard: list[CanFrame] = [CanFrame(0x080, bytes(5)), CanFrame(frame_id(Opcode.HEARTBEAT, 1), bytes(8))]
+        self.heard: list[CanFrame] = [
+            CanFrame(0x080, bytes(5)),
+            CanFrame(frame_id(Opcode.HEARTBEAT, 1), bytes(8)),
+        ]
 
     def make(self) -> tuple[str, CanFrame]:
         """What was done, and the frame."""
@@ -86,7 +91,9 @@ class BusIntruder:
             while as_modules and not is_from_module(identifier):
                 kind, (identifier, data) = self._maker.make()
             self._words[kind] += 1
-            self.bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=identifier > 0x7FF))
+            self.bus.send(
+                can.Message(arbitration_id=identifier, data=data, is_extended_id=identifier > 0x7FF)
+            )
 
 
 def is_from_module(identifier: int) -> bool:
@@ -149,5 +156,8 @@ def _tick(run: DriverLoop, stranger: BusIntruder, words: Counter[str]) -> None:
     words.update(f"fault {fault.what}" for fault in run.faults[reported:])
     samples = run.samples[-1]
     for message in (samples.joints, *samples.by_key.values()):
-        assert MessageDecoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
+        assert (
+            MessageDecoder(type(message)).decode(encode(message), format_encoding(type(message)))
+            == message
+        )
     del run.samples[:-1]

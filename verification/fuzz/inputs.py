@@ -28,7 +28,12 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scene import SceneFile
 from snakesim_hal.network.local_registry import LocalRobot, list_local_robots
 from snakesim_hal.network.router import read_router_settings
-from snakesim_hal.network.stop_port import REQUEST_HEADER, open_stop_port, request_stop, start_stop_server
+from snakesim_hal.network.stop_port import (
+    REQUEST_HEADER,
+    open_stop_port,
+    request_stop,
+    start_stop_server,
+)
 from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import EstopRequest, Pose
 from snakesim_operator.results.last_run import read_last_run
@@ -87,14 +92,18 @@ def run(inputs: list[DecoderInput], payload_count: int, seed: int) -> dict[str, 
                 word = one.take(payload)
             except ConfigError as error:
                 word = "refused"
-                assert len(str(error)) <= LONGEST_REASON, f"{one.name}, {kind}: a long reason for {payload[:300]!r}"
+                assert len(str(error)) <= LONGEST_REASON, (
+                    f"{one.name}, {kind}: a long reason for {payload[:300]!r}"
+                )
             except Exception as error:
                 error.add_note(f"{one.name}, {kind}: {len(payload)} bytes: {payload[:300]!r}")
                 raise
             outcome.words[word] += 1
             took_s = time.monotonic() - started
             outcome.longest_s = max(outcome.longest_s, took_s)
-            assert took_s < LONGEST_S, f"{one.name}, {kind}: {took_s:.1f} s for {len(payload)} bytes: {payload[:300]!r}"
+            assert took_s < LONGEST_S, (
+                f"{one.name}, {kind}: {took_s:.1f} s for {len(payload)} bytes: {payload[:300]!r}"
+            )
     return outcomes
 
 
@@ -104,10 +113,20 @@ def all_inputs(folder: Path) -> Iterator[list[DecoderInput]]:
     record = folder / "record"
     done = snakesim("run", "triplet", "--duration", "0.3", "--out", str(record), cwd=folder)
     assert done.code == 0, done.out + done.err
-    read_again = [path for path in sorted(record.iterdir()) if path.suffix not in (".log", ".html") and path.is_file()]
+    read_again = [
+        path
+        for path in sorted(record.iterdir())
+        if path.suffix not in (".log", ".html") and path.is_file()
+    ]
     with mocap() as poses, stop_port() as stops, pytest.MonkeyPatch.context() as patched:
         patched.setenv("XDG_STATE_HOME", str(folder))  # where what outlives a run is kept
-        yield [poses, stops, *texts(), *written(folder), *(recorded(record, path) for path in read_again)]
+        yield [
+            poses,
+            stops,
+            *texts(),
+            *written(folder),
+            *(recorded(record, path) for path in read_again),
+        ]
 
 
 @contextmanager
@@ -132,7 +151,9 @@ def mocap() -> Iterator[DecoderInput]:
         def take(payload: bytes) -> str:
             word = reading(payload)
             good = reading(_pose(now_ns + 10_000_000))
-            assert good in ("a pose", "reordered", "duplicate", "no velocity yet"), f"the next good one: {good}"
+            assert good in ("a pose", "reordered", "duplicate", "no velocity yet"), (
+                f"the next good one: {good}"
+            )
             return word
 
         poses = [*map(_pose, (1, 10**7, 10**9)), _pose(10**8, reported=False)]
@@ -169,12 +190,19 @@ def stop_port() -> Iterator[DecoderInput]:
             return "a stop" if heard_now else "no stop yet"
 
         yield DecoderInput(
-            "stop port", [REQUEST_HEADER + bytes(16) + who for who in (b"", b"a person", b"x" * 64)], take, 60_000
+            "stop port",
+            [REQUEST_HEADER + bytes(16) + who for who in (b"", b"a person", b"x" * 64)],
+            take,
+            60_000,
         )
 
 
 def _pose(timestamp_ns: int, *, reported: bool = True) -> bytes:
-    plain = {"timestamp_ns": timestamp_ns, "position_w": [0.1, 0.2, 0.3], "orientation_wxyz": [1, 0, 0, 0]}
+    plain = {
+        "timestamp_ns": timestamp_ns,
+        "position_w": [0.1, 0.2, 0.3],
+        "orientation_wxyz": [1, 0, 0, 0],
+    }
     velocities = {"velocity_w": [0.0, 0.1, 0.0], "angular_velocity_w": [0.0, 0.0, 1.0]}
     return msgspec.json.encode({**plain, **(velocities if reported else {})})
 
@@ -184,7 +212,8 @@ def texts() -> list[DecoderInput]:
 
     def typed(parse: Callable[[str], object]) -> Callable[[bytes], str]:
         def take(payload: bytes) -> str:
-            parse(payload.decode(errors="surrogateescape"))  # as the interpreter hands over what is no text
+            # As the interpreter hands over what is no text.
+            parse(payload.decode(errors="surrogateescape"))
             return "taken"
 
         return take
@@ -193,13 +222,17 @@ def texts() -> list[DecoderInput]:
         DecoderInput(
             "--set",
             FLAGS,
-            typed(lambda text: scenario.load_scenario("triplet", [scenario.parse_set_option(text)])),
+            typed(
+                lambda text: scenario.load_scenario("triplet", [scenario.parse_set_option(text)])
+            ),
             LARGEST // 8,
         ),
         DecoderInput(
             "a fault",
             FAULTS,
-            typed(lambda text: (injection.parse_injection(text), twin_faults.parse_fault(text, 13))),
+            typed(
+                lambda text: (injection.parse_injection(text), twin_faults.parse_fault(text, 13))
+            ),
             LARGEST // 8,
         ),
         DecoderInput(
@@ -214,7 +247,10 @@ def written(folder: Path) -> list[DecoderInput]:
     """Files that people write, and those that the product keeps for itself."""
 
     def shipped(kind: str) -> list[bytes]:
-        return [files.resolve_file_path(name, kind).read_bytes() for name in files.list_shipped_names(kind)]
+        return [
+            files.resolve_file_path(name, kind).read_bytes()
+            for name in files.list_shipped_names(kind)
+        ]
 
     def file(name: str, read: Callable[[Path], object]) -> Callable[[bytes], str]:
         def take(payload: bytes) -> str:
@@ -256,14 +292,28 @@ def written(folder: Path) -> list[DecoderInput]:
             shipped("scenes"),
             file("s.toml", lambda p: files.decode_table(files.read_table(p), SceneFile)),
         ),
-        DecoderInput("a scenario", shipped("scenarios"), file("x.toml", lambda p: scenario.load_scenario(str(p)))),
-        DecoderInput("config.json", [config], file("x.json", lambda p: scenario.load_scenario(str(p)))),
         DecoderInput(
-            "router.json5", [files.ROUTER_CONFIG_PATH.read_bytes()], file("router.json5", read_router_settings)
+            "a scenario",
+            shipped("scenarios"),
+            file("x.toml", lambda p: scenario.load_scenario(str(p))),
+        ),
+        DecoderInput(
+            "config.json", [config], file("x.json", lambda p: scenario.load_scenario(str(p)))
+        ),
+        DecoderInput(
+            "router.json5",
+            [files.ROUTER_CONFIG_PATH.read_bytes()],
+            file("router.json5", read_router_settings),
         ),
         DecoderInput(ESTOP, [b'{"requester":"a person","tick":7}'], file(ESTOP, latch)),
-        DecoderInput(LAST_RUN, [b'{"folder":"/tmp/x","ended":"complete"}'], file(LAST_RUN, lambda _: read_last_run())),
-        DecoderInput("a live robot", [msgspec.json.encode(robot)], file("snakesim/live/4711.json", live)),
+        DecoderInput(
+            LAST_RUN,
+            [b'{"folder":"/tmp/x","ended":"complete"}'],
+            file(LAST_RUN, lambda _: read_last_run()),
+        ),
+        DecoderInput(
+            "a live robot", [msgspec.json.encode(robot)], file("snakesim/live/4711.json", live)
+        ),
     ]
 
 

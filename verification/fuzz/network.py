@@ -31,7 +31,8 @@ from verification.fuzz.writer import SentSample
 ROBOT = "planar13"
 SCENARIO = ("triplet", "--controller", "hold", "--clock-mode", "realtime", "--duration", "86400")
 LOOK_S = 0.5
-SETTLED_TICKS = 20  # after arming: until then it is the host that holds the angles, then the controller
+# After arming: until then it is the host that holds the angles, then the controller.
+SETTLED_TICKS = 20
 WARM_UP = 0.1  # of the stretch: until then, memory may grow
 GROWTH_MB = 64.0  # more than in the quiet stretch: what allocators keep of 4 MiB payloads, 25 to 45 MB, 120000 no more
 OVERRUN_SHARE = 0.01  # of the ticks, more than in the quiet stretch
@@ -131,7 +132,8 @@ class FuzzRequest:
     rate: float  # a second
     seed: int = 1
     backend: str = "sim"
-    quiet_s: float | None = None  # how long the robot is left alone first; None: as long as the sending should take
+    # How long the robot is left alone first; None: as long as the sending should take.
+    quiet_s: float | None = None
     robot_hz: float = 100.0
 
 
@@ -142,7 +144,9 @@ def fuzz(out: Path, request: FuzzRequest) -> NetworkVerdict:
     with running_and_joined(out, ROBOT, *SCENARIO, *given) as (run, session):
         watcher = RunWatcher(session, out)
         wait_until(watcher.ready, "armed and commanded")
-        until = time.monotonic() + (request.payloads / request.rate if request.quiet_s is None else request.quiet_s)
+        until = time.monotonic() + (
+            request.payloads / request.rate if request.quiet_s is None else request.quiet_s
+        )
         quiet = fuzzed = watcher.stretch(lambda: time.monotonic() < until)
         if not quiet.failure:
             with _stranger(run.endpoint, request) as stranger:
@@ -157,14 +161,18 @@ def fuzz(out: Path, request: FuzzRequest) -> NetworkVerdict:
     record = msgspec.json.decode((out / HOST_RECORD).read_bytes(), type=HostRecord)
     failure = [*(f"in a log: {line}" for line in complaints(out)), *_foreign(out, record)]
     if quiet.failure:
-        failure += [f"before anything was sent, {what}: is this machine too busy?" for what in quiet.failure]
+        failure += [
+            f"before anything was sent, {what}: is this machine too busy?" for what in quiet.failure
+        ]
     else:
         failure += [*fuzzed.failure, *_differences(quiet, fuzzed, sent, request.payloads)]
     return NetworkVerdict(quiet, fuzzed, sent, record, failure)
 
 
 @contextmanager
-def running_and_joined(out: Path, robot: str, *arguments: str) -> Iterator[tuple[RunningCommand, Session]]:
+def running_and_joined(
+    out: Path, robot: str, *arguments: str
+) -> Iterator[tuple[RunningCommand, Session]]:
     """A run, and a session on its network; what the run said when it does not come up."""
     with running_snakesim(out, *arguments) as run:
         run.wait_for("network:")
@@ -175,7 +183,9 @@ def running_and_joined(out: Path, robot: str, *arguments: str) -> Iterator[tuple
 @contextmanager
 def _stranger(endpoint: str, request: FuzzRequest) -> Iterator[subprocess.Popen[bytes]]:
     given = [endpoint, ROBOT, *map(str, (request.payloads, request.rate, request.seed))]
-    process = subprocess.Popen([sys.executable, "-m", "verification.fuzz.writer", *given], stdout=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "verification.fuzz.writer", *given], stdout=subprocess.PIPE
+    )
     try:
         yield process
     finally:
@@ -190,22 +200,30 @@ def _foreign(out: Path, record: HostRecord) -> list[str]:
     _, box = read_black_box(out / BLACK_BOX)
     modes, targets = box["mode"], box["target"]
     if (modes != JointMode.POSITION).any():
-        found.append(f"{int((modes != JointMode.POSITION).any(axis=1).sum())} ticks in another mode than position")
+        found.append(
+            f"{int((modes != JointMode.POSITION).any(axis=1).sum())} ticks in another mode than position"
+        )
     elif len(targets) and (targets != targets[-1]).any():
         moved = np.flatnonzero((targets != targets[-1]).any(axis=1))
         off = float(np.abs(targets - targets[-1]).max())
         if moved[-1] > SETTLED_TICKS:
-            found.append(f"setpoints that nobody asked for in {len(moved)} ticks, up to {off:.3g} rad away")
+            found.append(
+                f"setpoints that nobody asked for in {len(moved)} ticks, up to {off:.3g} rad away"
+            )
     return found
 
 
-def _differences(quiet: ObservedPeriod, fuzzed: ObservedPeriod, sent: SentSample, payload_count: int) -> list[str]:
+def _differences(
+    quiet: ObservedPeriod, fuzzed: ObservedPeriod, sent: SentSample, payload_count: int
+) -> list[str]:
     found: list[str] = []
     first, last = quiet.first, fuzzed.last
     if last.lifecycle != "armed":
         found.append(f"lifecycle is {last.lifecycle}: {last.reason}")
     if (last.lease_holder, last.lease_epoch) != (first.lease_holder, first.lease_epoch):
-        found.append(f"the lease went from {first.lease_holder} {first.lease_epoch} to {last.lease_holder}")
+        found.append(
+            f"the lease went from {first.lease_holder} {first.lease_epoch} to {last.lease_holder}"
+        )
     arrived = sum(sent.samples.values()) + sum(sent.queries.values())
     if arrived != payload_count:
         found.append(f"only {arrived} of {payload_count} payloads were sent")
@@ -215,13 +233,21 @@ def _differences(quiet: ObservedPeriod, fuzzed: ObservedPeriod, sent: SentSample
     for part in fuzzed.seen:
         more = fuzzed.growth_mb(part) - max(quiet.growth_mb(part), 0.0)
         if more > GROWTH_MB:
-            found.append(f"{part} grew by {more:.1f} MB more than in the quiet stretch, at most {GROWTH_MB:g} MB")
+            found.append(
+                f"{part} grew by {more:.1f} MB more than in the quiet stretch, at most {GROWTH_MB:g} MB"
+            )
     for word, share, most in (
         ("overruns", fuzzed.share("overruns") - quiet.share("overruns"), OVERRUN_SHARE),
-        ("commands taken", quiet.share("commands_accepted") - fuzzed.share("commands_accepted"), TAKEN_SHARE),
+        (
+            "commands taken",
+            quiet.share("commands_accepted") - fuzzed.share("commands_accepted"),
+            TAKEN_SHARE,
+        ),
     ):
         if share > most:
-            found.append(f"{word}: {100 * share:.2f} % of the ticks worse than quiet, at most {100 * most:g} %")
+            found.append(
+                f"{word}: {100 * share:.2f} % of the ticks worse than quiet, at most {100 * most:g} %"
+            )
     return found
 
 
@@ -231,7 +257,12 @@ def table(verdict: NetworkVerdict) -> str:
     asked, put = sum(sent.queries.values()), sum(sent.samples.values())
 
     def counts(numbers: dict[str, int]) -> str:
-        return ", ".join(f"{count} {word}" for word, count in sorted(numbers.items(), key=lambda n: -n[1])) or "none"
+        return (
+            ", ".join(
+                f"{count} {word}" for word, count in sorted(numbers.items(), key=lambda n: -n[1])
+            )
+            or "none"
+        )
 
     lines = [
         f"machine   load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores",
@@ -256,5 +287,7 @@ def table(verdict: NetworkVerdict) -> str:
             f"{part:10}{quiet.growth_mb(part):>+9.1f} MB{fuzzed.growth_mb(part):>+9.1f} MB  now "
             f"{last.resident_mb:.0f} MB, {first.threads} -> {last.threads} threads, {first.files} -> {last.files} files"
         )
-    lines += [f"VIOLATION {what}" for what in verdict.violations] or ["nothing died, nothing complained, nothing grew"]
+    lines += [f"VIOLATION {what}" for what in verdict.violations] or [
+        "nothing died, nothing complained, nothing grew"
+    ]
     return "\n".join(lines)

@@ -10,9 +10,27 @@ from msgspec import inspect
 from msgspec.msgpack import Ext
 
 from snakesim_hal.wire.codec import MAX_PAYLOAD_BYTES, encode, format_encoding
-from snakesim_hal.wire.messages import VERSIONS, JointCommand, JointState, LeaseRequest, LifecycleRequest, Message
-from snakesim_testing.hal.small_robots import LEASE_NS, make_description, make_joint_command, make_joint_state
-from snakesim_testing.hal.strategies import Place, iter_places, list_invalid_values, make_plain_example, replace_at
+from snakesim_hal.wire.messages import (
+    VERSIONS,
+    JointCommand,
+    JointState,
+    LeaseRequest,
+    LifecycleRequest,
+    Message,
+)
+from snakesim_testing.hal.small_robots import (
+    LEASE_NS,
+    make_description,
+    make_joint_command,
+    make_joint_state,
+)
+from snakesim_testing.hal.strategies import (
+    Place,
+    iter_places,
+    list_invalid_values,
+    make_plain_example,
+    replace_at,
+)
 from verification.fuzz.texts import flipped
 
 ROBOT = make_description()
@@ -23,7 +41,8 @@ REAL: dict[type[Message], list[Message]] = {
         make_joint_command(ROBOT, 0.1, lease_epoch=2, torque_limit_nm=[1.0] * 3),
     ],
     LeaseRequest: [
-        LeaseRequest(action=action, holder="control", epoch=1) for action in ("acquire", "renew", "release")
+        LeaseRequest(action=action, holder="control", epoch=1)
+        for action in ("acquire", "renew", "release")
     ],
     LifecycleRequest: [
         LifecycleRequest(action=action, robot="worm", backend="lag", config_hash=ROBOT.config_hash)
@@ -66,7 +85,10 @@ WEIRD: list[Any] = [
     datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC),
     LEASE_NS,
 ]
-HEADS = [bytes([code]) for code in (0xDC, 0xDD, 0xDE, 0xDF, 0xD9, 0xDA, 0xDB, 0xC4, 0xC5, 0xC6, 0xC7, 0xC8, 0xC9)]
+HEADS = [
+    bytes([code])
+    for code in (0xDC, 0xDD, 0xDE, 0xDF, 0xD9, 0xDA, 0xDB, 0xC4, 0xC5, 0xC6, 0xC7, 0xC8, 0xC9)
+]
 NESTS = [
     b"\x91",
     b"\x81\xa1a",
@@ -104,10 +126,18 @@ def seeds() -> list[SeedMessage]:
     found: list[SeedMessage] = []
     for message in VERSIONS:
         plain = make_plain_example(message)
-        found.append(SeedMessage(message, plain, encode(plain), list(iter_places(plain, inspect.type_info(message)))))
+        found.append(
+            SeedMessage(
+                message, plain, encode(plain), list(iter_places(plain, inspect.type_info(message)))
+            )
+        )
         for real in REAL.get(message, []):
             plain: dict[str, Any] = {name: getattr(real, name) for name in real.__struct_fields__}
-            found.append(SeedMessage(message, plain, encode(real), [((name,), inspect.AnyType()) for name in plain]))
+            found.append(
+                SeedMessage(
+                    message, plain, encode(real), [((name,), inspect.AnyType()) for name in plain]
+                )
+            )
     return found
 
 
@@ -140,26 +170,40 @@ class SampleMaker:
         encoding = format_encoding(seed.message)
         if rng.random() < 0.02:
             at = rng.randrange(len(encoding))
-            encoding = rng.choice([encoding[:at], encoding + "0", encoding[:at] + chr(rng.randrange(1, 0xD800)), ""])
+            encoding = rng.choice(
+                [encoding[:at], encoding + "0", encoding[:at] + chr(rng.randrange(1, 0xD800)), ""]
+            )
         return FuzzSample(seed.message, kind, self._kinds[kind](seed), encoding)
 
     def _spliced(self, seed: SeedMessage) -> bytes:
         one, other = seed.payload, self._rng.choice(self._seeds).payload
         at, since = self._rng.randrange(len(one)), self._rng.randrange(len(other))
-        return one[:at] + other[since : since + self._rng.randrange(60)] + one[at + self._rng.randrange(10) :]
+        return (
+            one[:at]
+            + other[since : since + self._rng.randrange(60)]
+            + one[at + self._rng.randrange(10) :]
+        )
 
     def _confused(self, seed: SeedMessage) -> bytes:
         at, info = self._rng.choice(seed.places)
         wrong = list_invalid_values(info)
-        value = self._rng.choice(wrong) if wrong and self._rng.random() < 0.5 else self._rng.choice(WEIRD)
+        value = (
+            self._rng.choice(wrong)
+            if wrong and self._rng.random() < 0.5
+            else self._rng.choice(WEIRD)
+        )
         return encode(replace_at(seed.plain, at, value))
 
     def _lost(self, seed: SeedMessage) -> bytes:
-        return encode({name: value for name, value in seed.plain.items() if self._rng.random() < 0.8})
+        return encode(
+            {name: value for name, value in seed.plain.items() if self._rng.random() < 0.8}
+        )
 
     def _huge_length(self, seed: SeedMessage) -> bytes:
         at = self._rng.randrange(len(seed.payload))
-        length = self._rng.choice((b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\x00\x10\x00\x00", b"\xff\xff", b"\xff"))
+        length = self._rng.choice(
+            (b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\x00\x10\x00\x00", b"\xff\xff", b"\xff")
+        )
         return seed.payload[:at] + self._rng.choice(HEADS) + length + seed.payload[at:]
 
     def _huge(self, seed: SeedMessage) -> bytes:

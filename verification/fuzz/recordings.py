@@ -17,7 +17,14 @@ from mcap.writer import MCAP0_MAGIC
 from snakesim_operator.recording.chunks import RECORD_HEADER, unpack_chunk
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_testing.harness.endpoint import find_free_endpoint
-from snakesim_testing.operator.damaged_recordings import RecordSpan, chunks, flipped, packed, recorded, spans
+from snakesim_testing.operator.damaged_recordings import (
+    RecordSpan,
+    chunks,
+    flipped,
+    packed,
+    recorded,
+    spans,
+)
 from verification.fuzz.forked import Forked, forked
 
 SPOILT, WHOLE, OUT = "spoilt.mcap", "whole.mcap", "made"
@@ -28,10 +35,25 @@ COMMANDS: dict[str, list[str]] = {
     "report": ["recording", "report", SPOILT],
     "compare with it": ["study", "compare", WHOLE, SPOILT],
     "compare it": ["study", "compare", SPOILT, WHOLE, "--json"],
-    **{f"export {form}": ["recording", "export", SPOILT, "--format", form, "--out", OUT] for form in FORMATS},
+    **{
+        f"export {form}": ["recording", "export", SPOILT, "--format", form, "--out", OUT]
+        for form in FORMATS
+    },
     "replay": ["replay", SPOILT, "--speed", "1000000"],
     "replay --control": ["replay", SPOILT, "--control"],
-    "video": ["recording", "video", SPOILT, "--out", "film.gif", "--width", "32", "--height", "32", "--fps", "5"],
+    "video": [
+        "recording",
+        "video",
+        SPOILT,
+        "--out",
+        "film.gif",
+        "--width",
+        "32",
+        "--height",
+        "32",
+        "--fps",
+        "5",
+    ],
     "console": ["console", SPOILT, "--port", "0"],
 }
 TRUTH = "export mcap"  # reads every message: when it says that something is lost, no other may say nothing
@@ -75,7 +97,9 @@ def lying_head(chance: random.Random, content: bytes) -> bytes:
     span = chance.choice([*spans(content), *chunks(content)])
     at, form = span.begin + 1, "<Q"
     if span.opcode == Opcode.CHUNK:
-        at, form = chance.choice(((span.begin + 1, "<Q"), *((span.begin + 9 + k, "<Q") for k in (0, 8, 16, 40))))
+        at, form = chance.choice(
+            ((span.begin + 1, "<Q"), *((span.begin + 9 + k, "<Q") for k in (0, 8, 16, 40)))
+        )
     elif chance.random() < 0.2:
         at, form = span.begin, "<B"
     size = struct.calcsize(form)
@@ -102,7 +126,11 @@ def forged(chance: random.Random, content: bytes) -> bytes:
     """A chunk that is whole, with messages that are not: other bytes, times, numbers and channels."""
     span: RecordSpan = chance.choice(chunks(content))
     data = unpack_chunk(content[span.begin + RECORD_HEADER.size : span.end])
-    places = [one.begin + RECORD_HEADER.size for one in spans(data, magic=0) if one.opcode == Opcode.MESSAGE]
+    places = [
+        one.begin + RECORD_HEADER.size
+        for one in spans(data, magic=0)
+        if one.opcode == Opcode.MESSAGE
+    ]
     for at in chance.sample(places, min(len(places), chance.choice((1, 5, 50)))):
         what = chance.randrange(4)
         if what == 0:
@@ -128,7 +156,17 @@ def untouched(_chance: random.Random, content: bytes) -> bytes:
     return content
 
 
-DAMAGES: tuple[Damage, ...] = (flips, cut, hole, swapped, lying_head, foreign, forged, noise, untouched)
+DAMAGES: tuple[Damage, ...] = (
+    flips,
+    cut,
+    hole,
+    swapped,
+    lying_head,
+    foreign,
+    forged,
+    noise,
+    untouched,
+)
 
 
 @dataclass
@@ -141,7 +179,9 @@ class RecordingsVerdict:
     peak_mb: float = 0.0
 
 
-def fuzz(folder: Path, copies: int, seed: int, command_count: int | None = None) -> RecordingsVerdict:
+def fuzz(
+    folder: Path, copies: int, seed: int, command_count: int | None = None
+) -> RecordingsVerdict:
     """So many damaged copies, each into all commands, or so many of them in turn."""
     recorded(folder / "run", 0.6, 40_000)
     content, verdict = (folder / "run" / RECORDING_FILENAME).read_bytes(), RecordingsVerdict()
@@ -151,8 +191,18 @@ def fuzz(folder: Path, copies: int, seed: int, command_count: int | None = None)
             damage, chance = DAMAGES[number % len(DAMAGES)], random.Random(seed * 100_000 + number)
             spoilt = damage(chance, content)
             first = number * (command_count or 0) % len(names)
-            chosen = names if command_count is None else [*names, *names][first : first + command_count]
-            _try(folder / f"{number}", snakesim, spoilt, content, chosen, f"{damage.__name__} {number}", verdict)
+            chosen = (
+                names if command_count is None else [*names, *names][first : first + command_count]
+            )
+            _try(
+                folder / f"{number}",
+                snakesim,
+                spoilt,
+                content,
+                chosen,
+                f"{damage.__name__} {number}",
+                verdict,
+            )
     return verdict
 
 
@@ -177,7 +227,9 @@ def _try(
         verdict.longest_cpu_s = max(verdict.longest_cpu_s, outcome.cpu_s)
         verdict.peak_mb = max(verdict.peak_mb, outcome.peak_mb)
         incomplete |= name == TRUTH and outcome.code == DAMAGED
-        wrong = outcome.code not in (0, 1, REFUSED, DAMAGED) or "Traceback" in outcome.out + outcome.err
+        wrong = (
+            outcome.code not in (0, 1, REFUSED, DAMAGED) or "Traceback" in outcome.out + outcome.err
+        )
         wrong |= incomplete and outcome.code == 0
         wrong |= outcome.code == DAMAGED and "incomplete: " not in outcome.err
         wrong |= outcome.code == REFUSED and not 0 < len(outcome.err.splitlines()) <= LINES

@@ -34,7 +34,8 @@ ANSWERS = MessageDecoder(Answer)
 class FuzzReport:
     """What became of the samples."""
 
-    outcomes: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])  # by kind of mutation
+    # By kind of mutation.
+    outcomes: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])
     answers: Counter[str] = field(default_factory=Counter[str])  # what a HAL did with what decoded
     resident_mb: list[float] = field(default_factory=list[float])  # ten times in a run
     peak_mb: float = 0.0
@@ -52,7 +53,10 @@ def taken(hal: AuthorityRig, message: Message) -> str:
     answer: Answer
     match message:
         case JointCommand():
-            return authority.process_command(message, now_ns=hal.now_ns, tick=hal.tick, age_ns=0) or "accepted"
+            return (
+                authority.process_command(message, now_ns=hal.now_ns, tick=hal.tick, age_ns=0)
+                or "accepted"
+            )
         case JointState():
             authority.observe_joints(message)
             return "observed"
@@ -79,7 +83,9 @@ def pass_tick(hal: AuthorityRig) -> None:
 def run(payload_count: int, seed: int) -> FuzzReport:
     """Raises whatever a decoder or the authority raises that it must not."""
     maker, report = SampleMaker(random.Random(seed)), FuzzReport()
-    decoders: dict[type[Message], MessageDecoder[Any]] = {message: MessageDecoder(message) for message in VERSIONS}
+    decoders: dict[type[Message], MessageDecoder[Any]] = {
+        message: MessageDecoder(message) for message in VERSIONS
+    }
     hal = make_armed_rig()
     for number in range(payload_count):
         if number % PER_ROBOT == 0:
@@ -91,7 +97,9 @@ def run(payload_count: int, seed: int) -> FuzzReport:
         except WireError as error:
             outcomes[error.reason] += 1
             report.longest_reason = max(report.longest_reason, len(str(error)))
-            assert len(str(error)) <= LONGEST_REASON, f"a reason of {len(str(error))} characters: {str(error)[:200]}"
+            assert len(str(error)) <= LONGEST_REASON, (
+                f"a reason of {len(str(error))} characters: {str(error)[:200]}"
+            )
         else:
             assert type(message) is sample.message
             outcomes["taken"] += 1

@@ -17,8 +17,12 @@ def test_fuzz_payloads_never_crash_decoders_or_their_users() -> None:
     assert sum(outcomes.total() for outcomes in report.outcomes.values()) == PAYLOADS
     refused = {reason for outcomes in report.outcomes.values() for reason in outcomes}
     assert refused == {"taken", "malformed", "unknown_message", "unknown_version"}
-    assert {"JointCommand: accepted", "LeaseRequest: yes", "LifecycleRequest: no"} <= set(report.answers)
-    assert report.outcomes["valid"]["malformed"] == 0 < report.outcomes["type-confused"]["malformed"]
+    assert {"JointCommand: accepted", "LeaseRequest: yes", "LifecycleRequest: no"} <= set(
+        report.answers
+    )
+    assert (
+        report.outcomes["valid"]["malformed"] == 0 < report.outcomes["type-confused"]["malformed"]
+    )
     assert report.growth_mb < 16
 
 
@@ -26,9 +30,22 @@ def test_fuzz_payloads_never_crash_decoders_or_their_users() -> None:
 def test_no_file_flag_or_datagram_does_more_than_be_refused(tmp_path: Path) -> None:
     with inputs.all_inputs(tmp_path) as found:
         outcomes = inputs.run(found, PAYLOADS_EACH, seed=4)
-    assert len(outcomes) >= 18 and all(outcome.words.total() == PAYLOADS_EACH for outcome in outcomes.values())
-    assert outcomes["motion capture"].words["malformed"] > 0 < outcomes["motion capture"].words["reordered"]
-    for name in ("--set", "a fault", "a robot file", "a scenario", "config.json", "a run's host.json"):
+    assert len(outcomes) >= 18 and all(
+        outcome.words.total() == PAYLOADS_EACH for outcome in outcomes.values()
+    )
+    assert (
+        outcomes["motion capture"].words["malformed"]
+        > 0
+        < outcomes["motion capture"].words["reordered"]
+    )
+    for name in (
+        "--set",
+        "a fault",
+        "a robot file",
+        "a scenario",
+        "config.json",
+        "a run's host.json",
+    ):
         assert outcomes[name].words["refused"] > 0 < outcomes[name].words["taken"], name
 
 

@@ -9,8 +9,29 @@ from collections.abc import Callable, Sequence
 
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 WORD = re.compile(rb'"[^"\n]*"')
-NUMBERS = [b"NaN", b"nan", b"inf", b"-Infinity", b"1e999", b"-1e308", b"5e-324", b"0", b"-1", b"9" * 400, b"9" * 5000]
-NUMBERS += [b"4294967296", b"9223372036854775808", b"18446744073709551616", b"1.5", b"0x7F", b"1_000", b"true", b'""']
+NUMBERS = [
+    b"NaN",
+    b"nan",
+    b"inf",
+    b"-Infinity",
+    b"1e999",
+    b"-1e308",
+    b"5e-324",
+    b"0",
+    b"-1",
+    b"9" * 400,
+    b"9" * 5000,
+]
+NUMBERS += [
+    b"4294967296",
+    b"9223372036854775808",
+    b"18446744073709551616",
+    b"1.5",
+    b"0x7F",
+    b"1_000",
+    b"true",
+    b'""',
+]
 WORDS = [
     b'""',
     b'"\\u0000"',
@@ -46,7 +67,9 @@ def flipped(rng: random.Random, payload: bytes) -> bytes:
 class TextMaker:
     """Makes one payload after the other; the same ones for the same random numbers."""
 
-    def __init__(self, rng: random.Random, seeds: Sequence[bytes], max_bytes: int = LARGEST) -> None:
+    def __init__(
+        self, rng: random.Random, seeds: Sequence[bytes], max_bytes: int = LARGEST
+    ) -> None:
         """seeds: valid ones; max_bytes: none is longer."""
         self._rng, self._seeds, self._most = rng, [seed for seed in seeds if seed], max_bytes
         self._kinds: dict[str, Callable[[bytes], bytes]] = {
@@ -59,8 +82,12 @@ class TextMaker:
             "word": lambda seed: self._replaced(seed, WORD, WORDS),
             "nested": self._nested,
             "repeated": self._repeated,
-            "line lost": lambda seed: self._lines(seed, lambda lines, at: lines[:at] + lines[at + 1 :]),
-            "line twice": lambda seed: self._lines(seed, lambda lines, at: [*lines[: at + 1], *lines[at:]]),
+            "line lost": lambda seed: self._lines(
+                seed, lambda lines, at: lines[:at] + lines[at + 1 :]
+            ),
+            "line twice": lambda seed: self._lines(
+                seed, lambda lines, at: [*lines[: at + 1], *lines[at:]]
+            ),
             "strange bytes": self._strange,
         }
 
@@ -75,7 +102,11 @@ class TextMaker:
     def _spliced(self, seed: bytes) -> bytes:
         other, at = self._rng.choice(self._seeds), self._at(seed)
         since = self._at(other)
-        return seed[:at] + other[since : since + self._rng.randrange(200)] + seed[at + self._rng.randrange(20) :]
+        return (
+            seed[:at]
+            + other[since : since + self._rng.randrange(200)]
+            + seed[at + self._rng.randrange(20) :]
+        )
 
     def _replaced(self, seed: bytes, what: re.Pattern[bytes], by: Sequence[bytes]) -> bytes:
         found = list(what.finditer(seed))
@@ -85,12 +116,16 @@ class TextMaker:
         return seed[: place.start()] + self._rng.choice(by) + seed[place.end() :]
 
     def _size(self) -> int:
-        return LARGEST if self._rng.random() < 1 / RARE else self._rng.choice((10, 1000, 3000, LARGE))
+        return (
+            LARGEST if self._rng.random() < 1 / RARE else self._rng.choice((10, 1000, 3000, LARGE))
+        )
 
     def _nested(self, seed: bytes) -> bytes:
         opening = self._rng.choice(OPENINGS)
         at = self._rng.choice((0, self._at(seed), seed.find(b":") + 1, seed.find(b"=") + 1))
-        return seed[:at] + opening * max(min(self._size(), self._most) // len(opening), 1) + seed[at:]
+        return (
+            seed[:at] + opening * max(min(self._size(), self._most) // len(opening), 1) + seed[at:]
+        )
 
     def _repeated(self, seed: bytes) -> bytes:
         at = self._at(seed)
@@ -105,6 +140,14 @@ class TextMaker:
     def _strange(self, seed: bytes) -> bytes:
         at = self._at(seed)
         strange = self._rng.choice(
-            (b"\x00", b"\xff\xfe", b"\xed\xa0\x80", b"\x1b[31m", b"\xef\xbb\xbf", b"\xc2\x85", b"\r")
+            (
+                b"\x00",
+                b"\xff\xfe",
+                b"\xed\xa0\x80",
+                b"\x1b[31m",
+                b"\xef\xbb\xbf",
+                b"\xc2\x85",
+                b"\r",
+            )
         )
         return seed[:at] + strange + seed[at:]

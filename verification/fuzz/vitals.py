@@ -6,7 +6,9 @@ from pathlib import Path
 
 import psutil
 
-COMPLAINTS = re.compile(r"Traceback|Exception|panicked|RuntimeWarning|[A-Z]\w+Error\b", re.MULTILINE)
+COMPLAINTS = re.compile(
+    r"Traceback|Exception|panicked|RuntimeWarning|[A-Z]\w+Error\b", re.MULTILINE
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,9 @@ def vitals(pid: int) -> ProcessVitals | None:
     """None when the process is gone."""
     try:
         process = psutil.Process(pid)
-        return ProcessVitals(process.memory_info().rss / 2**20, process.num_threads(), process.num_fds())
+        return ProcessVitals(
+            process.memory_info().rss / 2**20, process.num_threads(), process.num_fds()
+        )
     except psutil.Error:
         return None
 

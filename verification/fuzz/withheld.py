@@ -63,12 +63,15 @@ class EffectiveSamples:
             case EstopRequest():
                 return "an emergency stop"
             case LifecycleRequest(action="disarm" | "finish" | "reset"):
-                return f"a request to {message.action}"  # a reset, because it would cover up a fault
+                # A reset, because it would cover up a fault.
+                return f"a request to {message.action}"
             case LeaseRequest(action="acquire") if message.priority > PRIORITY:
                 return "a claim of higher priority"
             case LeaseRequest(action="release" | "renew") if message.epoch == live.epoch:
                 return f"a {message.action} of the live lease"
-            case JointCommand() if message.lease_epoch == live.epoch and message.sequence > live.sequence:
+            case JointCommand() if (
+                message.lease_epoch == live.epoch and message.sequence > live.sequence
+            ):
                 return "a command under the live lease"
             case FaultRequest() if _is_known(message):
                 return "a fault on request"

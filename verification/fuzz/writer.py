@@ -33,9 +33,19 @@ ASKED_AT_ONCE = 256  # queries without an answer yet
 QUERY_S = 20.0
 ELSEWHERE = 0.05  # of the samples go to a key that is not their message's
 SERVICES = ("control", "guidance", "navigation", "nobody")
-ODD_KEYS = ("**", "hal/*", "*/joints", "sensor/**", "hal/done/a/b", "actuator/joints/x", "alive/control", "\N{SNAKE}")
+ODD_KEYS = (
+    "**",
+    "hal/*",
+    "*/joints",
+    "sensor/**",
+    "hal/done/a/b",
+    "actuator/joints/x",
+    "alive/control",
+    "\N{SNAKE}",
+)
 REQUESTS = [row.message for row in keys.SPACE if row.kind == "query"]
-TO_HAL = (keys.LEASE, keys.LIFECYCLE, keys.ESTOP)  # who asks there gets an answer, whatever was asked
+# Who asks there gets an answer, whatever was asked.
+TO_HAL = keys.LEASE, keys.LIFECYCLE, keys.ESTOP
 STREAMS = [row.key for row in keys.SPACE if row.kind in ("stream", "latched")]
 
 
@@ -55,7 +65,9 @@ class SentSample(msgspec.Struct, kw_only=True):
 class SampleWriter:
     """Sends samples and asks queries."""
 
-    def __init__(self, session: Session, rng: random.Random, heard: list[SeedMessage], live: HeldCommand) -> None:
+    def __init__(
+        self, session: Session, rng: random.Random, heard: list[SeedMessage], live: HeldCommand
+    ) -> None:
         self._zenoh = session._zenoh  # pyright: ignore[reportPrivateUsage] - a stranger does not keep to our session
         self._rng = rng
         self._maker = SampleMaker(rng, [*seeds(), *heard])
@@ -83,7 +95,12 @@ class SampleWriter:
         while self._open and time.monotonic() < give_up:
             self._collect(0.1)
         counts = {part: dict(counter) for part, counter in self._by.items()}
-        return SentSample(seconds=took, unanswered=self._to_hal - self._answered, megabytes=self._bytes / 1e6, **counts)
+        return SentSample(
+            seconds=took,
+            unanswered=self._to_hal - self._answered,
+            megabytes=self._bytes / 1e6,
+            **counts,
+        )
 
     def _send_one(self) -> None:
         while True:
@@ -102,7 +119,12 @@ class SampleWriter:
         if self._rng.random() < 0.001:
             self._zenoh.delete(key)
             return
-        self._zenoh.put(key, sample.payload, encoding=sample.encoding, congestion_control=zenoh.CongestionControl.BLOCK)
+        self._zenoh.put(
+            key,
+            sample.payload,
+            encoding=sample.encoding,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
 
     def _ask(self, key: str, payload: bytes, encoding: str) -> None:
         while self._open >= ASKED_AT_ONCE:
@@ -117,7 +139,9 @@ class SampleWriter:
                 reported.append("an error")
                 return
             try:
-                answer = self._answer_decoder.decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+                answer = self._answer_decoder.decode(
+                    reply.ok.payload.to_bytes(), str(reply.ok.encoding)
+                )
                 reported.append("yes" if answer.ok else "no")
             except WireError as error:
                 reported.append(f"cannot be read: {error}"[:80])
@@ -125,9 +149,12 @@ class SampleWriter:
         def close() -> None:
             self._closed.put((answerable, reported))
 
-        selector = key if self._rng.random() > 0.01 else f"{key}?{'x' * self._rng.randrange(300)}=;{{}}"
+        selector = (
+            key if self._rng.random() > 0.01 else f"{key}?{'x' * self._rng.randrange(300)}=;{{}}"
+        )
         bare = self._rng.random() < 0.01
-        answerable = key in TO_HAL and len(payload) <= MAX_PAYLOAD_BYTES  # longer ones are dropped on their way
+        # Longer ones are dropped on their way.
+        answerable = key in TO_HAL and len(payload) <= MAX_PAYLOAD_BYTES
         self._to_hal += answerable
         self._zenoh.get(
             selector,
@@ -141,7 +168,9 @@ class SampleWriter:
         """Note the queries that have come to their end."""
         while self._open:
             try:
-                to_hal, reported = self._closed.get(timeout=wait_s) if wait_s else self._closed.get_nowait()
+                to_hal, reported = (
+                    self._closed.get(timeout=wait_s) if wait_s else self._closed.get_nowait()
+                )
             except Empty:
                 return
             wait_s = 0.0
@@ -181,7 +210,11 @@ def overhear(connection: ConnectionSettings) -> tuple[list[SeedMessage], HeldCom
         assert message is not None
         real: Any = MessageDecoder(message).decode(arrival.payload, arrival.encoding)
         plain: dict[str, Any] = msgspec.to_builtins(real)
-        found.append(SeedMessage(message, plain, arrival.payload, [((name,), inspect.AnyType()) for name in plain]))
+        found.append(
+            SeedMessage(
+                message, plain, arrival.payload, [((name,), inspect.AnyType()) for name in plain]
+            )
+        )
         if isinstance(real, JointCommand):
             live = HeldCommand(real.lease_epoch, real.sequence)
     assert live is not None, f"nobody commands this robot; heard only {', '.join(newest)}"
@@ -194,7 +227,9 @@ def main() -> int:
     link = ConnectionSettings(endpoint, namespace)
     heard, live = overhear(link)
     with open_session(link) as session:
-        sent = SampleWriter(session, random.Random(int(seed)), heard, live).send(int(payloads), float(rate))
+        sent = SampleWriter(session, random.Random(int(seed)), heard, live).send(
+            int(payloads), float(rate)
+        )
     sys.stdout.buffer.write(msgspec.json.encode(sent))
     return 0
 

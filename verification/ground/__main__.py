@@ -110,8 +110,12 @@ link, and their derivatives for the implicit integrator.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables, and write the page if asked to. Returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m verification.ground", description=__doc__)
-    parser.add_argument("--write", action="store_true", help="write docs/development/ground-laws.md")
-    parser.add_argument("--rounds", type=int, default=60, help="rounds of the measurement of CPU time (60)")
+    parser.add_argument(
+        "--write", action="store_true", help="write docs/development/ground-laws.md"
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=60, help="rounds of the measurement of CPU time (60)"
+    )
     options = parser.parse_args(arguments)
     parts: dict[str, list[str]] = {}
     for name, compare in (

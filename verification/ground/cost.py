@@ -68,4 +68,7 @@ def measure_medians_us(
     for _ in range(round_count):
         for key, snake in snakes.items():
             times_us[key].append(snake.measure_us())
-    return {name: {version: statistics.median(times_us[name, version]) for version in versions} for name in cases}
+    return {
+        name: {version: statistics.median(times_us[name, version]) for version in versions}
+        for name in cases
+    }

@@ -52,7 +52,10 @@ def draw_shot(scenario: str, shot: Shot) -> None:
     camera.elevation = shot.elevation_deg
     camera.distance = shot.distance_per_length * record.config.robot.length_m
     picture = film.render_picture(
-        record.position_w_m[row], record.orientation_wxyz[row], record.angle_rad[row], nodes_w.mean(axis=0)
+        record.position_w_m[row],
+        record.orientation_wxyz[row],
+        record.angle_rad[row],
+        nodes_w.mean(axis=0),
     )
     film.close()
     path = PICTURES / f"terrain-{scenario.replace('_', '-')}.png"
@@ -62,7 +65,9 @@ def draw_shot(scenario: str, shot: Shot) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Draw the pictures of the given scenarios, or of all. Returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m verification.ground.pictures", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m verification.ground.pictures", description=__doc__
+    )
     parser.add_argument("scenarios", nargs="*", choices=[[], *SHOTS], metavar="SCENARIO")
     options = parser.parse_args(arguments)
     for scenario in options.scenarios or SHOTS:

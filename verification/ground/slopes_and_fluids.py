@@ -38,7 +38,9 @@ def compare_slopes() -> list[str]:
     velocity_m_s = np.array(THROW_M_S)
     for surface in SLOPE_SURFACES:
         for name, (slope_rad, towards_rad) in SLOPES.items():
-            glider = GlidingSnake(surface, SKIN, slope={"slope_rad": slope_rad, "slope_towards_rad": towards_rad})
+            glider = GlidingSnake(
+                surface, SKIN, slope={"slope_rad": slope_rad, "slope_towards_rad": towards_rad}
+            )
             glider.throw(velocity_m_s)
             start = glider.position_w
             glider.go(SLOPE_S)
@@ -103,7 +105,9 @@ def compare_fluid_steps() -> list[str]:
     for step_s in STEPS_S:
         drift = swim_wave(wave, WATER, step_s).drift_mm_s
         reverse = swim_wave(wave.reversed, WATER, step_s).drift_mm_s
-        rows.append(f"| {1e3 * step_s:g} ms | {drift:+.2f} | {reverse:+.2f} | {drift + reverse:+.2f} |")
+        rows.append(
+            f"| {1e3 * step_s:g} ms | {drift:+.2f} | {reverse:+.2f} | {drift + reverse:+.2f} |"
+        )
     return rows
 
 

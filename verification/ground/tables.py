@@ -30,15 +30,29 @@ THROWS = {"1.0 forward, 0.6 left": (1.0, 0.6), "0.8 backward, 0.8 left": (-0.8, 
 GLIDING_S = 1.5
 DRAG_M_S = 0.2
 
-HILLS = {"ground": {"friction": FRICTION, "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0}}}
+HILLS = {
+    "ground": {
+        "friction": FRICTION,
+        "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0},
+    }
+}
 PEGS = {
     "ground": CLOTH,
-    "cylinder": [{"position_m": [0.25 * i, 0.1 * (-1) ** i], "radius_m": 0.05, "friction": 0.2} for i in range(6)],
+    "cylinder": [
+        {"position_m": [0.25 * i, 0.1 * (-1) ** i], "radius_m": 0.05, "friction": 0.2}
+        for i in range(6)
+    ],
 }
 PIPE = {
     "ground": CLOTH,
     "pipe": [
-        {"position_m": [2.0, 0.0], "length_m": 8.0, "radius_m": 0.21, "inner_radius_m": 0.2, "friction": FRICTION}
+        {
+            "position_m": [2.0, 0.0],
+            "length_m": 8.0,
+            "radius_m": 0.21,
+            "inner_radius_m": 0.2,
+            "friction": FRICTION,
+        }
     ],
 }
 POSTS = {
@@ -91,7 +105,9 @@ def compare_gliding() -> list[str]:
             moved = glider.position_w - start
             expected = glide_without_mujoco(np.array(velocity), HU, GLIDING_S)
             difference = np.linalg.norm(moved - expected) / np.linalg.norm(expected)
-            rows.append(f"| {surface} | {name} | {_in_mm(moved)} | {_in_mm(expected)} | {100 * difference:.2f} % |")
+            rows.append(
+                f"| {surface} | {name} | {_in_mm(moved)} | {_in_mm(expected)} | {100 * difference:.2f} % |"
+            )
     return rows
 
 
@@ -130,7 +146,9 @@ def compare_wheels() -> list[str]:
     for name, wave in WAVES.items():
         ours = simulate_wave(wave, CLOTH, ON_WHEELS).drift_mm_s
         middle = integrate_momentum_balance(wave, ROLLING, in_the_middle=True).drift_mm_s
-        separate = integrate_momentum_balance(wave, ROLLING, in_the_middle=True, separate_limits=True).drift_mm_s
+        separate = integrate_momentum_balance(
+            wave, ROLLING, in_the_middle=True, separate_limits=True
+        ).drift_mm_s
         of_bodies = bodies.swim(wave).drift_mm_s
         turning_wave = simulate_wave(wave, CLOTH, ON_TURNING_WHEELS).drift_mm_s
         balance = integrate_momentum_balance(wave, ROLLING, separate_limits=True).drift_mm_s

@@ -4,7 +4,13 @@ import mujoco
 import numpy as np
 
 from snakesim_testing.sim.simulator_rig import G, make_config
-from snakesim_testing.sim.waves import PERIODS, SERVO_NM_PER_RAD, SERVO_NM_S_PER_RAD, BodyTrack, JointWave
+from snakesim_testing.sim.waves import (
+    PERIODS,
+    SERVO_NM_PER_RAD,
+    SERVO_NM_S_PER_RAD,
+    BodyTrack,
+    JointWave,
+)
 
 TIRE_FRICTION = 0.6
 WHEEL_RADIUS_M = 0.03
@@ -39,7 +45,9 @@ class WheeledSnake:
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = 20.0
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=[TIRE_FRICTION, 0, 0])
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], friction=[TIRE_FRICTION, 0, 0]
+        )
         body = spec.worldbody
         armature = robot.motor.armature_kg_m2
         for i, (length_m, mass_kg) in enumerate(zip(self.lengths_m, self.masses_kg, strict=True)):
@@ -48,7 +56,9 @@ class WheeledSnake:
                 body.add_freejoint()
             else:
                 body = body.add_body(name=f"link_{i}", pos=[self.lengths_m[i - 1], 0, 0])
-                body.add_joint(name=f"joint_{i}", axis=[0, 0, 1], armature=armature, damping=SERVO_NM_S_PER_RAD)
+                body.add_joint(
+                    name=f"joint_{i}", axis=[0, 0, 1], armature=armature, damping=SERVO_NM_S_PER_RAD
+                )
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_CAPSULE,
                 size=[robot.module.radius_m, 0, 0],
@@ -64,10 +74,14 @@ class WheeledSnake:
         self._angles = [int(hinge.qposadr[0]) for hinge in hinges]
         self._velocities = [int(hinge.dofadr[0]) for hinge in hinges]
 
-    def _add_wheels(self, body: mujoco.MjsBody, link_index: int, length_m: float, mass_kg: float) -> None:
+    def _add_wheels(
+        self, body: mujoco.MjsBody, link_index: int, length_m: float, mass_kg: float
+    ) -> None:
         bearing_nm = BEARING_FRICTION * BEARING_RADIUS_M * G * mass_kg / 2
         for side, name in ((1, "left"), (-1, "right")):
-            wheel = body.add_body(name=f"{name}_{link_index}", pos=[length_m / 2, side * TRACK_M, 0])
+            wheel = body.add_body(
+                name=f"{name}_{link_index}", pos=[length_m / 2, side * TRACK_M, 0]
+            )
             wheel.add_joint(name=f"{name}_{link_index}", axis=[0, 1, 0], frictionloss=bearing_nm)
             wheel.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -92,7 +106,9 @@ class WheeledSnake:
         for k in range(steps):
             after_s = (k + 1) * STEP_S
             wanted = SERVO_NM_PER_RAD * (wave.at(after_s, count) - data.qpos[self._angles])
-            data.qfrc_applied[self._velocities] = wanted + SERVO_NM_S_PER_RAD * wave.rates_at(after_s, count)
+            data.qfrc_applied[self._velocities] = wanted + SERVO_NM_S_PER_RAD * wave.rates_at(
+                after_s, count
+            )
             mujoco.mj_step(self.model, data)
             head_w = data.xpos[head] + self.lengths_m[-1] * data.xmat[head].reshape(3, 3)[:, 0]
             center[k] = data.subtree_com[tail, :2]
@@ -129,9 +145,15 @@ class WheeledSnake:
 
     def _go(self, time_s: float) -> None:
         for _ in range(round(time_s / STEP_S)):
-            self.data.qfrc_applied[self._velocities] = -SERVO_NM_PER_RAD * self.data.qpos[self._angles]
+            self.data.qfrc_applied[self._velocities] = (
+                -SERVO_NM_PER_RAD * self.data.qpos[self._angles]
+            )
             mujoco.mj_step(self.model, self.data)
 
     def _wheel_dofs(self) -> list[int]:
         links = range(len(self.lengths_m))
-        return [int(self.model.joint(f"{name}_{i}").dofadr[0]) for i in links for name in ("left", "right")]
+        return [
+            int(self.model.joint(f"{name}_{i}").dofadr[0])
+            for i in links
+            for name in ("left", "right")
+        ]

@@ -17,7 +17,9 @@ def required(extra: str = "") -> set[str]:
         found.add(asked.name)
         for line in distribution(asked.name).requires or ():
             needed = Requirement(line)
-            if needed.marker is None or any(needed.marker.evaluate({"extra": one}) for one in asked.extras or {""}):
+            if needed.marker is None or any(
+                needed.marker.evaluate({"extra": one}) for one in asked.extras or {""}
+            ):
                 needed.marker = None
                 left.append(needed)
     return found - {"snakesim"}

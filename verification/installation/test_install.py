@@ -75,7 +75,8 @@ def dependencies(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-Installed = tuple[Path, Path, Path | None]  # the command, the folder with the packages, a folder for PYTHONPATH
+# The command, the folder with the packages, a folder for PYTHONPATH.
+Installed = tuple[Path, Path, Path | None]
 
 
 def into_a_folder(what: Path, home: Path) -> Installed:
@@ -87,7 +88,9 @@ def empty_environment(home: Path) -> tuple[Path, Path]:
     """Its Python, and the folder of its packages."""
     run(UV, "venv", "--python", sys.executable, home / "env", cwd=home)
     python = home / "env" / "bin" / "python"
-    library = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=home).strip()
+    library = run(
+        python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=home
+    ).strip()
     return python, Path(library)
 
 
@@ -100,11 +103,29 @@ def into_an_environment(what: Path, home: Path) -> Installed:
 def into_a_home(what: Path, home: Path) -> Installed:
     """As `pip install --user` does it; the Python is the one that the environment here was made of."""
     python = Path(getattr(sys, "_base_executable", sys.executable))
-    pip = [python, "-m", "pip", "install", "--user", "--no-deps", "--no-index", "--no-warn-script-location"]
-    if subprocess.run([python, "-m", "pip", "--version"], capture_output=True, check=False).returncode != 0:
+    pip = [
+        python,
+        "-m",
+        "pip",
+        "install",
+        "--user",
+        "--no-deps",
+        "--no-index",
+        "--no-warn-script-location",
+    ]
+    if (
+        subprocess.run(
+            [python, "-m", "pip", "--version"], capture_output=True, check=False
+        ).returncode
+        != 0
+    ):
         pytest.skip(f"{python} has no pip")
     run(*pip, what, cwd=home, PYTHONUSERBASE=str(home / "base"), PIP_BREAK_SYSTEM_PACKAGES="1")
-    return home / "base" / "bin" / "snakesim", next((home / "base" / "lib").glob("python*/site-packages")), None
+    return (
+        home / "base" / "bin" / "snakesim",
+        next((home / "base" / "lib").glob("python*/site-packages")),
+        None,
+    )
 
 
 NO_DEPS = ("--quiet", "--no-deps", "--no-build-isolation", "--python", sys.executable)
@@ -118,20 +139,28 @@ WAYS: dict[str, Callable[[Path, Path], Installed]] = {
 @needs_uv
 def test_a_wheel_has_what_is_no_code(wheel: Path) -> None:
     schemas = {f"snakesim_hal/schemas/{path.relative_to(SCHEMAS)}" for path in SCHEMAS.rglob("*.*")}
-    wanted = {*schemas, *(f"{package}/py.typed" for package in PACKAGES), "snakesim/environments/__init__.py"}
+    wanted = {
+        *schemas,
+        *(f"{package}/py.typed" for package in PACKAGES),
+        "snakesim/environments/__init__.py",
+    }
     assert not wanted - {*zipfile.ZipFile(wheel).namelist()}
 
 
 @needs_uv
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
-def test_a_wheel_has_all_that_it_needs(way: str, wheel: Path, dependencies: Path, tmp_path: Path) -> None:
+def test_a_wheel_has_all_that_it_needs(
+    way: str, wheel: Path, dependencies: Path, tmp_path: Path
+) -> None:
     check(WAYS[way](wheel, tmp_path), dependencies, tmp_path)
 
 
 @needs_uv
 @pytest.mark.slow
-def test_the_sources_installed_as_they_are(sources: Path, dependencies: Path, tmp_path: Path) -> None:
+def test_the_sources_installed_as_they_are(
+    sources: Path, dependencies: Path, tmp_path: Path
+) -> None:
     """`pip install .`; what builds it is lent by the environment here, too."""
     check(into_a_folder(sources, tmp_path), dependencies, tmp_path)
 
@@ -150,7 +179,16 @@ def check(installed: Installed, dependencies: Path, home: Path) -> None:
     names = {str(path.relative_to(library / "snakesim_hal" / "schemas")) for path in published}
     wanted = {str(path.relative_to(SCHEMAS)) for path in SCHEMAS.rglob("*.*")}
     assert names == wanted and all(path.is_file() for path in published)
-    flags = ("--controller", "hold", "--duration", "0.2", "--out", "run", "--endpoint", find_free_endpoint())
+    flags = (
+        "--controller",
+        "hold",
+        "--duration",
+        "0.2",
+        "--out",
+        "run",
+        "--endpoint",
+        find_free_endpoint(),
+    )
     run(command, "run", "triplet", *flags, cwd=work, **more)
     assert (work / "run" / "report.html").is_file()
 
@@ -177,7 +215,11 @@ def lent(extra: str, wheel: Path, home: Path) -> tuple[Run, Path]:
     folder = home / "lent"
     folder.mkdir()
     for name in required(extra):
-        for top in {file.parts[0] for file in distribution(name).files or () if not file.parts[0].startswith(".")}:
+        for top in {
+            file.parts[0]
+            for file in distribution(name).files or ()
+            if not file.parts[0].startswith(".")
+        }:
             here = Path(sysconfig.get_path("purelib")) / top
             if here.exists() and not (folder / top).exists():
                 (folder / top).symlink_to(here)
@@ -188,7 +230,16 @@ def fetched(extra: str, wheel: Path, home: Path) -> tuple[Run, Path]:
     """As `pip install` does it, from a package index."""
     python, library = empty_environment(home)
     what = f"{wheel}[{extra}]" if extra else wheel
-    install = (UV, "pip", "install", "--quiet", "--python", python, "--constraint", REPOSITORY / "requirements.lock")
+    install = (
+        UV,
+        "pip",
+        "install",
+        "--quiet",
+        "--python",
+        python,
+        "--constraint",
+        REPOSITORY / "requirements.lock",
+    )
     done = ended(*install, what, cwd=home, UV_OFFLINE="0")
     if done.code != 0 and ("error sending request" in done.err or "Failed to fetch" in done.err):
         pytest.skip("no package index can be reached")
@@ -206,18 +257,37 @@ def at_work(command: Path, home: Path, **more: str) -> Run:
 
 def stops_and_arms(snakesim: Run) -> None:
     """Host and controller with a backend from a file, and a person at it."""
-    ran = snakesim("run", *WORKBENCH, "--no-record", "--out", "run", "--endpoint", find_free_endpoint())
-    assert ran.code == 0 and "report:  not written" in ran.out and "snakesim[record]" in ran.out, ran
+    ran = snakesim(
+        "run", *WORKBENCH, "--no-record", "--out", "run", "--endpoint", find_free_endpoint()
+    )
+    assert ran.code == 0 and "report:  not written" in ran.out and "snakesim[record]" in ran.out, (
+        ran
+    )
     at = ("--endpoint", find_free_endpoint())
     stays = threading.Thread(
         target=snakesim,
-        args=("run", *WORKBENCH, "--clock-mode", "realtime", "--duration", "8", "--stay", "--no-record", *at),
+        args=(
+            "run",
+            *WORKBENCH,
+            "--clock-mode",
+            "realtime",
+            "--duration",
+            "8",
+            "--stay",
+            "--no-record",
+            *at,
+        ),
     )
     stays.start()
-    wait_until(lambda: "armed" in snakesim("status", *at).out.replace("disarmed", ""), "an armed robot")
+    wait_until(
+        lambda: "armed" in snakesim("status", *at).out.replace("disarmed", ""), "an armed robot"
+    )
     assert snakesim("estop", *at).code == 0
     wait_until(lambda: snakesim("robot", "reset", *at).code == 0, "a reset stop")
-    wait_until(lambda: snakesim("robot", "arm", "planar13", "Workbench", *at).code == 0, "an armed robot again")
+    wait_until(
+        lambda: snakesim("robot", "arm", "planar13", "Workbench", *at).code == 0,
+        "an armed robot again",
+    )
     stays.join()
 
 
@@ -243,18 +313,34 @@ def simulates(snakesim: Run) -> None:
     assert ran.code == 0, ran
 
 
-JOBS: dict[str, Callable[[Run], None]] = {"": stops_and_arms, "can": drives_modules, "sim": simulates}
+JOBS: dict[str, Callable[[Run], None]] = {
+    "": stops_and_arms,
+    "can": drives_modules,
+    "sim": simulates,
+}
 LARGEST_MB = {"": 110, "can": 130, "sim": 190}
 
 
 @needs_uv
 @pytest.mark.slow
 @pytest.mark.parametrize("extra", JOBS, ids=["core", "can", "sim"])
-def test_what_an_extra_is_for_works_with_that_extra_alone(extra: str, wheel: Path, tmp_path: Path) -> None:
+def test_what_an_extra_is_for_works_with_that_extra_alone(
+    extra: str, wheel: Path, tmp_path: Path
+) -> None:
     snakesim, library = fetched(extra, wheel, tmp_path)
     size_mb = sum(file.lstat().st_size for file in library.rglob("*") if file.is_file()) / 1e6
-    ours_mb = sum(f.lstat().st_size for own in library.glob("snakesim*") for f in own.rglob("*") if f.is_file()) / 1e6
-    print(f"\nsnakesim{f'[{extra}]' if extra else ''}: {size_mb:.0f} MB, of which {ours_mb:.0f} MB SnakeSIM")
+    ours_mb = (
+        sum(
+            f.lstat().st_size
+            for own in library.glob("snakesim*")
+            for f in own.rglob("*")
+            if f.is_file()
+        )
+        / 1e6
+    )
+    print(
+        f"\nsnakesim{f'[{extra}]' if extra else ''}: {size_mb:.0f} MB, of which {ours_mb:.0f} MB SnakeSIM"
+    )
     assert size_mb < LARGEST_MB[extra]
     JOBS[extra](snakesim)
 
@@ -278,10 +364,14 @@ NEEDS: tuple[tuple[str, tuple[str, ...]], ...] = (
 
 
 @needs_uv
-def test_core_installation_drives_robot_and_commands_name_missing_extras(wheel: Path, tmp_path: Path) -> None:
+def test_core_installation_drives_robot_and_commands_name_missing_extras(
+    wheel: Path, tmp_path: Path
+) -> None:
     snakesim, _ = lent("", wheel, tmp_path)
     listed = snakesim("--help")
-    assert listed.code == 0 and not listed.err and " estop " in listed.out and " drive " in listed.out
+    assert (
+        listed.code == 0 and not listed.err and " estop " in listed.out and " drive " in listed.out
+    )
     completed = snakesim("completion", "bash")
     assert completed.code == 0 and not completed.err
     stops_and_arms(snakesim)
@@ -304,7 +394,12 @@ def test_each_extra_brings_what_is_said_of_it() -> None:
     for extra, packages in PACKAGES_BY_EXTRA.items():
         needed = [one for line in asked[extra] if (one := Requirement(line)).name != "snakesim"]
         names = {one.name.lower() for one in needed}
-        names |= {name for one in needed for name in one.extras if name in imported_of}  # dask[distributed]
-        unknown = [package for package in packages if not any(package in imported_of[name] for name in names)]
+        # Dask[distributed].
+        names |= {name for one in needed for name in one.extras if name in imported_of}
+        unknown = [
+            package
+            for package in packages
+            if not any(package in imported_of[name] for name in names)
+        ]
         unsaid = [name for name in names if not imported_of[name] & {*packages}]
         assert not unknown and not unsaid, extra

@@ -33,13 +33,17 @@ IMPORT_ALL = (
 def without(rooms: Sequence[str], folder: Path) -> Path:
     """A copy of the packages without rooms and their entry points, with metadata that hides the installed ones."""
     for package in REPOSITORY.glob("snakesim*"):
-        shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__")
+        )
     for room in rooms:
         shutil.rmtree(folder / "snakesim_operator" / "features" / room)
     gone = tuple(f"snakesim_operator.features.{room}." for room in rooms)
     metadata = folder / f"snakesim-{PROJECT['version']}.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text(f"Metadata-Version: 2.4\nName: snakesim\nVersion: {PROJECT['version']}\n")
+    (metadata / "METADATA").write_text(
+        f"Metadata-Version: 2.4\nName: snakesim\nVersion: {PROJECT['version']}\n"
+    )
     lines: list[str] = []
     for group, entries in PROJECT["entry-points"].items():
         lines.append(f"[{group}]")
@@ -49,14 +53,23 @@ def without(rooms: Sequence[str], folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "rooms", [pytest.param([*COMMANDS], id="all"), *(pytest.param([n], id=n, marks=pytest.mark.slow) for n in COMMANDS)]
+    "rooms",
+    [
+        pytest.param([*COMMANDS], id="all"),
+        *(pytest.param([n], id=n, marks=pytest.mark.slow) for n in COMMANDS),
+    ],
 )
 def test_all_else_works_without(rooms: list[str], tmp_path: Path) -> None:
     library, work = without(rooms, tmp_path / "library"), tmp_path / "work"
     work.mkdir()
 
     def run(*words: str) -> CompletedRun:
-        return run_to_end([sys.executable, *words], work, {**make_environment(work), "PYTHONPATH": str(library)}, 100.0)
+        return run_to_end(
+            [sys.executable, *words],
+            work,
+            {**make_environment(work), "PYTHONPATH": str(library)},
+            100.0,
+        )
 
     imported = run("-c", IMPORT_ALL)
     assert imported.code == 0 and str(library) in imported.out, imported.out + imported.err
@@ -68,5 +81,7 @@ def test_all_else_works_without(rooms: list[str], tmp_path: Path) -> None:
     if "console" in rooms:
         beside = run("-m", "snakesim_operator", "run", "triplet", "--console")
         assert beside.code == 2 and "without the console" in beside.err, beside.err
-    ran = run("-m", "snakesim_operator", "run", "triplet", "--in-process", "--set", "duration_s=0.2")
+    ran = run(
+        "-m", "snakesim_operator", "run", "triplet", "--in-process", "--set", "duration_s=0.2"
+    )
     assert ran.code == 0, ran.out + ran.err

@@ -53,8 +53,13 @@ def held(condition: LinkCondition, trial_count: int) -> str:
     """A line of the table: how long an armed robot keeps going, how fast, and what ends it."""
     armed_s: list[float] = []
     ended: list[str] = []
-    with tempfile.TemporaryDirectory() as folder, lab(Path(folder), f"rate_hz={condition.rate_hz}") as made:
-        made.link.set_quality(loss=condition.loss, delay_s=condition.delay_s, jitter_s=condition.jitter_s)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        lab(Path(folder), f"rate_hz={condition.rate_hz}") as made,
+    ):
+        made.link.set_quality(
+            loss=condition.loss, delay_s=condition.delay_s, jitter_s=condition.jitter_s
+        )
         for _ in range(trial_count):
             try:
                 made.arm(ARM_LIMIT_S)
@@ -63,7 +68,11 @@ def held(condition: LinkCondition, trial_count: int) -> str:
                 ended.append("not armed")
                 continue
             began = time.monotonic()
-            while time.monotonic() - began < ARMED_S and (status := made.status) and status.lifecycle == "armed":
+            while (
+                time.monotonic() - began < ARMED_S
+                and (status := made.status)
+                and status.lifecycle == "armed"
+            ):
                 time.sleep(0.001)
             armed_s.append(time.monotonic() - began)
             status = made.status
@@ -77,7 +86,8 @@ def held(condition: LinkCondition, trial_count: int) -> str:
     median_s, min_s = statistics.median(armed_s), min(armed_s)
     kept = sum(seconds >= ARMED_S for seconds in armed_s)
     return (
-        f"| {condition.name} | {kept} of {trial_count} | {median_s:.1f} | {min_s:.2f} | {names} | {speed} | {latency} |"
+        f"| {condition.name} | {kept} of {trial_count} | {median_s:.1f} | {min_s:.2f} "
+        f"| {names} | {speed} | {latency} |"
     )
 
 
@@ -89,14 +99,23 @@ def moved(folder: Path) -> tuple[str, str]:
     record = RunRecord.load(folder)
     steps_m = np.hypot(*np.diff(record.position_w_m[:, :2], axis=0).T)
     steps_s = np.diff(record.time_s)
-    driven = (steps_s < 0.1) & np.isfinite(steps_m) & (np.abs(record.torque_nm[1:]).max(axis=1) > 0.05)
+    driven = (
+        (steps_s < 0.1) & np.isfinite(steps_m) & (np.abs(record.torque_nm[1:]).max(axis=1) > 0.05)
+    )
     speed = steps_m[driven].sum() / max(steps_s[driven].sum(), 1e-9)
     p50, p99 = (host.state_to_command_us[p] for p in ("p50", "p99"))
-    return f"{speed:.2f}", "-" if p50 is None or p99 is None else f"{p50 / 1000:.1f} / {p99 / 1000:.1f}"
+    return (
+        f"{speed:.2f}",
+        "-" if p50 is None or p99 is None else f"{p50 / 1000:.1f} / {p99 / 1000:.1f}",
+    )
 
 
 def event(
-    name: str, trial_count: int, break_it: Callable[[LinkLab], None], mend: Callable[[LinkLab], None], broken_s: float
+    name: str,
+    trial_count: int,
+    break_it: Callable[[LinkLab], None],
+    mend: Callable[[LinkLab], None],
+    broken_s: float,
 ) -> str:
     """A line of the other table: until the robot has stopped, and from the repair until it is armed again."""
     stopped_ms: list[float] = []
@@ -108,7 +127,9 @@ def event(
             assert made.status is not None and made.status.lifecycle == "armed", made.status
             began = time.monotonic()
             break_it(made)
-            stopped_ms.append(1000 * made.until(lambda status: status.lifecycle == "fault", "stopped"))
+            stopped_ms.append(
+                1000 * made.until(lambda status: status.lifecycle == "fault", "stopped")
+            )
             time.sleep(max(broken_s - (time.monotonic() - began), 0.0))
             mend(made)
             again_s.append(made.arm())
@@ -121,8 +142,20 @@ def events(trial_count: int) -> list[str]:
     cut, mend = (lambda made: made.link.make(cut=True)), (lambda made: made.link.make())
     return [
         event("link cut for 0.5 s", trial_count, cut, mend, 0.5),
-        event("link cut for 5 s, and the machine joins again", max(trial_count // 4, 1), cut, mend, 5.0),
-        event("router killed, and a new one started", trial_count, LinkLab.kill_router, LinkLab.start_router, 0.2),
+        event(
+            "link cut for 5 s, and the machine joins again",
+            max(trial_count // 4, 1),
+            cut,
+            mend,
+            5.0,
+        ),
+        event(
+            "router killed, and a new one started",
+            trial_count,
+            LinkLab.kill_router,
+            LinkLab.start_router,
+            0.2,
+        ),
     ]
 
 
@@ -195,7 +228,9 @@ def main() -> None:
     happened = events(wanted.trials)
     print("\n".join(happened))
     if wanted.write:
-        PAGE.write_text(head + "\n".join(lines) + "\n" + EVENTS + "\n".join(happened) + "\n", encoding="utf-8")
+        PAGE.write_text(
+            head + "\n".join(lines) + "\n" + EVENTS + "\n".join(happened) + "\n", encoding="utf-8"
+        )
 
 
 if __name__ == "__main__":

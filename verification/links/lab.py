@@ -13,7 +13,12 @@ from pathlib import Path
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option, write_config
 from snakesim_hal.network.private_channel import StarterEnd, socket_pair
 from snakesim_hal.wire.messages import LifecycleRequest, RobotStatus
-from snakesim_testing.lab.machines import NamespaceMachine, RadioLink, connect_by_cable, connect_by_radio
+from snakesim_testing.lab.machines import (
+    NamespaceMachine,
+    RadioLink,
+    connect_by_cable,
+    connect_by_radio,
+)
 from snakesim_testing.runs.command import SNAKESIM_COMMAND
 
 SCENARIO = "triplet"
@@ -31,7 +36,9 @@ class LinkLab:
         ).config
         self._saved = folder / "config.json"
         write_config(self.config, self._saved)
-        self.router_machine, self.robot, self.workstation = (NamespaceMachine(stack) for _ in range(3))
+        self.router_machine, self.robot, self.workstation = (
+            NamespaceMachine(stack) for _ in range(3)
+        )
         connect_by_cable(self.router_machine, self.robot, "robot", "10.77.1")
         self.link: RadioLink = stack.enter_context(
             connect_by_radio(self.router_machine, self.workstation, "workstation", "10.77.2")
@@ -58,7 +65,9 @@ class LinkLab:
             "tcp/0.0.0.0:7447",
             "--insecure",
         )
-        self._router = self.router_machine.start_module(*arguments, log=self.folder / "router.log", hurried=True)
+        self._router = self.router_machine.start_module(
+            *arguments, log=self.folder / "router.log", hurried=True
+        )
 
     def record(self) -> Path:
         """Start a recorder beside the controller, that reads everything; its file."""
@@ -75,9 +84,16 @@ class LinkLab:
     def _start_host(self) -> StarterEnd:
         ours, its = socket_pair()
         with its:
-            arguments = ("snakesim_hal.programs.host_program", str(self._saved), "--router", "tcp/10.77.1.1:7447")
+            arguments = (
+                "snakesim_hal.programs.host_program",
+                str(self._saved),
+                "--router",
+                "tcp/10.77.1.1:7447",
+            )
             out = ("--out", str(self.folder), "--parent-socket", str(its.fileno()))
-            self.robot.start_module(*arguments, *out, log=self.folder / "host.log", inherits=[its.fileno()])
+            self.robot.start_module(
+                *arguments, *out, log=self.folder / "host.log", inherits=[its.fileno()]
+            )
         return StarterEnd(ours)
 
     @property
@@ -86,13 +102,19 @@ class LinkLab:
         self.host.receive()
         return self.host.status
 
-    def until(self, condition: Callable[[RobotStatus], bool], what: str, limit_s: float = START_LIMIT_S) -> float:
+    def until(
+        self, condition: Callable[[RobotStatus], bool], what: str, limit_s: float = START_LIMIT_S
+    ) -> float:
         """Wait for a status. Returns how long it took, in s."""
         began = time.monotonic()
         while (status := self.status) is None or not condition(status):
             if time.monotonic() - began > limit_s:
-                logs = "\n".join(f"{log.name}: {log.read_text()[-500:]}" for log in self.folder.glob("*.log"))
-                raise AssertionError(f"not within {limit_s:g} s: {what}; {status and status.reason}\n{logs}")
+                logs = "\n".join(
+                    f"{log.name}: {log.read_text()[-500:]}" for log in self.folder.glob("*.log")
+                )
+                raise AssertionError(
+                    f"not within {limit_s:g} s: {what}; {status and status.reason}\n{logs}"
+                )
             time.sleep(0.001)
         return time.monotonic() - began
 
@@ -118,7 +140,12 @@ class LinkLab:
     def _ask(self, action: str) -> None:
         robot = self.host.description
         assert robot is not None
-        named = {"robot": robot.robot, "backend": robot.backend, "config_hash": robot.config_hash, "host": robot.host}
+        named = {
+            "robot": robot.robot,
+            "backend": robot.backend,
+            "config_hash": robot.config_hash,
+            "host": robot.host,
+        }
         self.host.send_request(LifecycleRequest(action=action, requester="links", **named))  # pyright: ignore[reportArgumentType]
 
 

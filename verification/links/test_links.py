@@ -15,7 +15,10 @@ pytestmark = [
     pytest.mark.e2e,
     pytest.mark.skipif(os.geteuid() != 0, reason="makes network namespaces: needs root"),
     pytest.mark.skipif(not shutil.which("ip"), reason="makes network namespaces: needs iproute2"),
-    pytest.mark.skipif(not Path("/dev/net/tun").exists(), reason="makes links of TAP interfaces: needs /dev/net/tun"),
+    pytest.mark.skipif(
+        not Path("/dev/net/tun").exists(),
+        reason="makes links of TAP interfaces: needs /dev/net/tun",
+    ),
 ]
 IMAGES_BYTES = 200_000
 STOP_LIMIT_S = 0.3  # 50 ms of the lease, a period, and a busy computer
@@ -63,9 +66,14 @@ def test_a_link_with_some_delay_keeps_the_robot_armed(robot: LinkLab) -> None:
 
 def test_slow_link_overloaded_by_images_stops_nothing(tmp_path: Path) -> None:
     with lab(tmp_path, "robot=planar13_camera") as made:
-        made.robot.run("sh", "-c", "tc qdisc add dev robot root tbf rate 4mbit burst 16kb latency 50ms")
+        made.robot.run(
+            "sh", "-c", "tc qdisc add dev robot root tbf rate 4mbit burst 16kb latency 50ms"
+        )
         recording = made.record()
-        made.until(lambda _: recording.is_file() and recording.stat().st_size > IMAGES_BYTES, "images are recorded")
+        made.until(
+            lambda _: recording.is_file() and recording.stat().st_size > IMAGES_BYTES,
+            "images are recorded",
+        )
 
         def stays_armed() -> bool:
             made.arm()

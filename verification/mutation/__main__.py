@@ -21,19 +21,27 @@ FORK = multiprocessing.get_context("fork")
 def main() -> int:
     """0 when every mutant was noticed or is explained."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--files", nargs="+", choices=list(trial.TRIED_BY), default=list(trial.TRIED_BY))
+    parser.add_argument(
+        "--files", nargs="+", choices=list(trial.TRIED_BY), default=list(trial.TRIED_BY)
+    )
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--time-limit", type=float, default=120.0, help="seconds that one mutant may take")
+    parser.add_argument(
+        "--time-limit", type=float, default=120.0, help="seconds that one mutant may take"
+    )
     asked = parser.parse_args()
     os.chdir(trial.ROOT)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     trial.warm_up()
     started = time.monotonic()
     sources = {file: (trial.ROOT / trial.place_of(file)).read_text() for file in asked.files}
-    unchanged = [SourceMutant(file, "module", 0, "unchanged", source) for file, source in sources.items()]
+    unchanged = [
+        SourceMutant(file, "module", 0, "unchanged", source) for file, source in sources.items()
+    ]
     for mutant, outcome in outcomes(iter(unchanged), asked.workers, asked.time_limit):
         if outcome != trial.SURVIVED:
-            print(f"mutation: the tests of {mutant.file} fail without any mutation (pytest exit {outcome})")
+            print(
+                f"mutation: the tests of {mutant.file} fail without any mutation (pytest exit {outcome})"
+            )
             return 2
     tried = killed = late = 0
     unexplained: list[SourceMutant] = []
@@ -74,7 +82,9 @@ def outcomes(
                 mutant = next(mutants, None)
                 more = mutant is not None
                 if mutant is not None:
-                    process = FORK.Process(target=trial.run, args=(mutant.file, mutant.source, folder))
+                    process = FORK.Process(
+                        target=trial.run, args=(mutant.file, mutant.source, folder)
+                    )
                     process.start()
                     running.append((mutant, process, time.monotonic() + limit_s))
             wait([process.sentinel for _, process, _ in running], timeout=1.0)
@@ -87,7 +97,10 @@ def outcomes(
                 code = process.exitcode
                 (Path(folder) / f"{process.pid}.log").unlink(missing_ok=True)
                 running.remove(entry)
-                if code not in (trial.SURVIVED, trial.KILLED, trial.BROKEN_AT_IMPORT) and code != -9:
+                if (
+                    code not in (trial.SURVIVED, trial.KILLED, trial.BROKEN_AT_IMPORT)
+                    and code != -9
+                ):
                     raise SystemExit(f"mutation: pytest ended with {code} on {mutant}")
                 yield mutant, None if code == -9 else code
 

@@ -29,7 +29,16 @@ ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
     ast.BitOr: ast.BitAnd,
 }
 TWINS = {"min": "max", "max": "min", "any": "all", "all": "any"}
-REMOVABLE = (ast.Expr, ast.Assign, ast.AugAssign, ast.AnnAssign, ast.If, ast.For, ast.Return, ast.Continue)
+REMOVABLE = (
+    ast.Expr,
+    ast.Assign,
+    ast.AugAssign,
+    ast.AnnAssign,
+    ast.If,
+    ast.For,
+    ast.Return,
+    ast.Continue,
+)
 
 Change = Callable[[], object]  # makes one change, in place
 
@@ -70,7 +79,10 @@ def mutants_of(file: str, source: str) -> Iterator[SourceMutant]:
 
 
 def _walk(
-    node: ast.AST, where: str = "module", block: list[Any] | None = None, statement: ast.AST | None = None
+    node: ast.AST,
+    where: str = "module",
+    block: list[Any] | None = None,
+    statement: ast.AST | None = None,
 ) -> Iterator[tuple[ast.AST, list[Any] | None, str, ast.AST]]:
     """Every node that is code: with the block that it is a statement of, the function and the statement around it."""
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
@@ -82,10 +94,16 @@ def _walk(
         if name in ("annotation", "returns"):
             continue
         for child in list(value) if isinstance(value, list) else [value]:
-            if isinstance(child, ast.Return) and isinstance(node, ast.FunctionDef) and _shown(child) == "return None":
+            if (
+                isinstance(child, ast.Return)
+                and isinstance(node, ast.FunctionDef)
+                and _shown(child) == "return None"
+            ):
                 continue  # at the end of a function, which does so anyway
             if isinstance(child, ast.AST) and not _is_no_code(child):
-                yield from _walk(child, where, value if isinstance(child, ast.stmt) else None, statement)
+                yield from _walk(
+                    child, where, value if isinstance(child, ast.stmt) else None, statement
+                )
 
 
 def _is_no_code(node: ast.AST) -> bool:
@@ -103,7 +121,9 @@ def _shown(node: ast.AST) -> str:
 
 
 def _removable(node: ast.AST) -> bool:
-    return isinstance(node, REMOVABLE) and not (isinstance(node, ast.AnnAssign) and node.value is None)
+    return isinstance(node, REMOVABLE) and not (
+        isinstance(node, ast.AnnAssign) and node.value is None
+    )
 
 
 def _changes(node: ast.AST, block: list[Any] | None) -> list[Change]:
@@ -133,7 +153,9 @@ def _changes(node: ast.AST, block: list[Any] | None) -> list[Change]:
         case _:
             pass
     if block is not None and _removable(node):
-        found.append(_put(block, next(i for i, inner in enumerate(block) if inner is node), ast.Pass()))
+        found.append(
+            _put(block, next(i for i, inner in enumerate(block) if inner is node), ast.Pass())
+        )
     return found
 
 
@@ -150,7 +172,9 @@ def _other_constants(value: object) -> list[object]:
             return [not value]
         case int() | float():
             return [value + 1, value - 1]
-        case str() if value.isidentifier():  # a word that the program goes by, not a text for people
+        case str() if (
+            value.isidentifier()
+        ):  # a word that the program goes by, not a text for people
             return [value + "_"]
         case _:
             return []

@@ -14,11 +14,26 @@ ROOT = Path(__file__).resolve().parents[2]
 TESTS = Path("tests/unit/hal")
 # The tests of a file first, quick ones before thorough ones: most mutants die in the first second.
 TRIED_BY = {
-    "limiter.py": ("test_limiter.py", "test_gate_limits.py", "test_authority.py", "test_authority_machine.py"),
+    "limiter.py": (
+        "test_limiter.py",
+        "test_gate_limits.py",
+        "test_authority.py",
+        "test_authority_machine.py",
+    ),
     "limit_names.py": ("test_limiter.py", "test_gate_limits.py", "test_authority_machine.py"),
-    "joint_limits.py": ("test_limiter.py", "test_gate_limits.py", "test_authority.py", "test_authority_machine.py"),
+    "joint_limits.py": (
+        "test_limiter.py",
+        "test_gate_limits.py",
+        "test_authority.py",
+        "test_authority_machine.py",
+    ),
     "lease.py": ("test_lease.py", "test_authority.py", "test_authority_machine.py"),
-    "lifecycle.py": ("test_lifecycle.py", "test_arm_session.py", "test_authority.py", "test_authority_machine.py"),
+    "lifecycle.py": (
+        "test_lifecycle.py",
+        "test_arm_session.py",
+        "test_authority.py",
+        "test_authority_machine.py",
+    ),
     "authority.py": ("test_authority.py", "test_isolation.py", "test_authority_machine.py"),
     "fault_log.py": ("test_fault_log.py", "test_authority.py", "test_authority_machine.py"),
     "isolation.py": ("test_isolation.py", "test_authority_machine.py"),
@@ -62,11 +77,19 @@ class InPlaceOf(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 def warm_up() -> None:
     """Import what every trial needs and no mutant touches, so that the forks have it already."""
     os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-    for name in ("hypothesis", "hypothesis.stateful", "numpy", "pytest_timeout", "snakesim_hal.model.scenario"):
+    for name in (
+        "hypothesis",
+        "hypothesis.stateful",
+        "numpy",
+        "pytest_timeout",
+        "snakesim_hal.model.scenario",
+    ):
         importlib.import_module(name)
     early = [file for file in TRIED_BY if module_of(file) in sys.modules]
     if early:
-        raise SystemExit(f"mutation: {early} are imported before any mutant; import less in warm_up()")
+        raise SystemExit(
+            f"mutation: {early} are imported before any mutant; import less in warm_up()"
+        )
 
 
 def run(file: str, source: str, folder: str) -> None:
@@ -78,6 +101,8 @@ def run(file: str, source: str, folder: str) -> None:
     os.dup2(log, 2)
     sys.meta_path.insert(0, InPlaceOf(file, source))
     tests = [str(next(TESTS.rglob(name))) for name in TRIED_BY[file]]
-    code = pytest.main(["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "pytest_timeout", *tests])
+    code = pytest.main(
+        ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "pytest_timeout", *tests]
+    )
     sys.stdout.flush()
     os._exit(code)

@@ -65,21 +65,28 @@ class SoakResult:
 class SoakOperator:
     """Lets one thing go wrong after the other, and gets the robot going again."""
 
-    def __init__(self, watch: JudgingObserver, health: ProcessHealth, soak: SoakResult, log: Any) -> None:
+    def __init__(
+        self, watch: JudgingObserver, health: ProcessHealth, soak: SoakResult, log: Any
+    ) -> None:
         self._watch, self._health, self._soak, self._log = watch, health, soak, log
         self._started = time.monotonic()
 
     def go(self, dice: EventDrawer, seconds: float) -> None:
         """Until the time is over, or too much is wrong."""
         for event in dice.events():
-            if time.monotonic() - self._started > seconds or len(self._soak.violations) >= MAX_VIOLATIONS:
+            if (
+                time.monotonic() - self._started > seconds
+                or len(self._soak.violations) >= MAX_VIOLATIONS
+            ):
                 return
             self._spend(event.pause_s)
             answer = self._ask(keys.fault_key(event.part), event.request)
             if not answer.ok:
                 if answer.refusal in ("cannot", "unknown_fault", "not_permitted"):
                     dice.rule_out(event)
-                    self._soak.impossible[f"{event.request.kind}:{event.request.target}: {answer.reason}"] += 1
+                    self._soak.impossible[
+                        f"{event.request.kind}:{event.request.target}: {answer.reason}"
+                    ] += 1
                 else:
                     self._violated(event, [f"the injector says no: {answer.reason}"])
                 continue
@@ -118,10 +125,16 @@ class SoakOperator:
             watch.start_over()
         seen = [heard.message for heard in watch.statuses if heard.at_ns >= began_ns]
         latched = next((status for status in seen if status.lifecycle == "fault"), None)
-        line.detected = latched is not None or restarted or any(status.lifecycle == "disarmed" for status in seen)
+        line.detected = (
+            latched is not None
+            or restarted
+            or any(status.lifecycle == "disarmed" for status in seen)
+        )
         if latched is not None:
             line.causes = [fault.cause for fault in latched.faults]
-            words = " ".join((latched.reason, *line.causes, *(f"{fault.joint}" for fault in latched.faults)))
+            words = " ".join(
+                (latched.reason, *line.causes, *(f"{fault.joint}" for fault in latched.faults))
+            )
             if not any(name in words for name in event.names):
                 line.violations.append(f"no cause names one of {', '.join(event.names)}: {words}")
         if event.follows == "stop" and not line.detected:
@@ -129,7 +142,9 @@ class SoakOperator:
         self._recover()
         watch.blind = set()
         line.became = watch.in_words()
-        line.recovered_s = round((time.monotonic_ns() - began_ns) * 1e-9 - event.lasts_s - SETTLE_S, 3)
+        line.recovered_s = round(
+            (time.monotonic_ns() - began_ns) * 1e-9 - event.lasts_s - SETTLE_S, 3
+        )
 
     def _recover(self) -> None:
         """As a person would: reset, wait until it is ready, arm, and see it move."""
@@ -150,7 +165,9 @@ class SoakOperator:
                 last = self._ask(keys.LIFECYCLE, LifecycleRequest(action="reset")).reason
             elif status.ready_to_arm:
                 hash_ = watch.description().config_hash
-                arm = LifecycleRequest(action="arm", robot=status.robot, backend=status.backend, config_hash=hash_)
+                arm = LifecycleRequest(
+                    action="arm", robot=status.robot, backend=status.backend, config_hash=hash_
+                )
                 last = self._ask(keys.LIFECYCLE, arm).reason
 
     def _fresh(self) -> bool:
@@ -203,7 +220,10 @@ def soak(out: Path, minutes: float, seed: int, backend: str) -> SoakResult:
     found = SoakResult(seed)
     log_path, began = out.with_suffix(".jsonl"), time.monotonic()
     with (
-        running_and_joined(out, ROBOT, *RUN, "--backend", backend, "--seed", str(seed)) as (run, session),
+        running_and_joined(out, ROBOT, *RUN, "--backend", backend, "--seed", str(seed)) as (
+            run,
+            session,
+        ),
         log_path.open("wb") as log,
     ):
         watch, health = JudgingObserver(session), ProcessHealth(out)
@@ -220,9 +240,13 @@ def soak(out: Path, minutes: float, seed: int, backend: str) -> SoakResult:
     try:
         wait_until(lambda: not find_processes_of_run(out), "all processes gone", 10.0)
     except AssertionError:
-        found.violations += [f"left behind: {pid} {line[:200]!r}" for pid, line in find_processes_of_run(out)]
+        found.violations += [
+            f"left behind: {pid} {line[:200]!r}" for pid, line in find_processes_of_run(out)
+        ]
     found.violations += [
-        f"in a log: {line}" for line in complaints(out) if any(word in line for word in ONLY_BEHIND_THE_ROBOT)
+        f"in a log: {line}"
+        for line in complaints(out)
+        if any(word in line for word in ONLY_BEHIND_THE_ROBOT)
     ]
     found.took_s = time.monotonic() - began
     return found
@@ -247,9 +271,13 @@ def summary(found: SoakResult) -> str:
         f"p50 {statistics.median(back) if back else 0:.1f} s, slowest {max(back, default=0):.1f} s"
     )
     lines += [f"cannot be had here: {what}" for what in sorted(found.impossible)]
-    lines += [f"could not be read: {what}, {count} times" for what, count in sorted(found.heard.items())]
+    lines += [
+        f"could not be read: {what}, {count} times" for what, count in sorted(found.heard.items())
+    ]
     lines += found.health
-    lines += [f"VIOLATION {what}" for what in found.violations] or ["nothing unexplained, nothing grew, nothing left"]
+    lines += [f"VIOLATION {what}" for what in found.violations] or [
+        "nothing unexplained, nothing grew, nothing left"
+    ]
     return "\n".join(lines)
 
 
@@ -259,7 +287,11 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--backend", default="sim", help="sim or can")
-    parser.add_argument("--out", type=Path, help="folder of the run, the events beside it (default: a temporary one)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="folder of the run, the events beside it (default: a temporary one)",
+    )
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="snakesim-soak-") as temporary:
         out = (asked.out or Path(temporary) / "run").resolve()

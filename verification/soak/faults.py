@@ -6,7 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesim_hal.model.fault_kinds import FAULT_KINDS, FaultInjection, TargetType, validate_and_complete_injection
+from snakesim_hal.model.fault_kinds import (
+    FAULT_KINDS,
+    FaultInjection,
+    TargetType,
+    validate_and_complete_injection,
+)
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import FaultRequest
 
@@ -14,7 +19,15 @@ Follows = Literal["stop", "restart", "perhaps"]
 
 SORTS: tuple[TargetType, ...] = ("process", "process", "key", "key", "joint", "bus", "simulator")
 SERVICES = ("guidance", "navigation", "control")
-SPOILT_KEYS = (keys.JOINT_COMMAND, keys.CLOCK, keys.JOINTS, keys.POSE, keys.CONTACTS, keys.WORLD, keys.TRAJECTORY)
+SPOILT_KEYS = (
+    keys.JOINT_COMMAND,
+    keys.CLOCK,
+    keys.JOINTS,
+    keys.POSE,
+    keys.CONTACTS,
+    keys.WORLD,
+    keys.TRAJECTORY,
+)
 DISTURBED_KEYS = (*SPOILT_KEYS, keys.IMU, keys.APPLIED, keys.STATUS, keys.CONTROL_STATE)
 # The wall clock belongs to the machine, and to everybody on it: stepping it is a row of the fault table, not of a soak.
 TARGETS: Mapping[TargetType, tuple[str, ...]] = {
@@ -53,7 +66,9 @@ class SoakEvent:
     @property
     def end_request(self) -> FaultRequest | None:
         """How a person ends it; None when it ends by itself, or has no end."""
-        about = FAULT_KINDS[FaultInjection(self.request.kind, self.request.target).target_type][self.request.kind]
+        about = FAULT_KINDS[FaultInjection(self.request.kind, self.request.target).target_type][
+            self.request.kind
+        ]
         if about.is_instantaneous or self.request.for_s is not None:
             return None
         return FaultRequest(kind=self.request.kind, target=self.request.target, end=True)
@@ -91,20 +106,39 @@ class EventDrawer:
             kind = dice.choice(list(FAULT_KINDS[sort]))
             target = dice.choice(self._targets[sort])
             amount = (
-                dice.choice(AMOUNTS[kind]) if kind in AMOUNTS and FAULT_KINDS[sort][kind].amount is not None else None
+                dice.choice(AMOUNTS[kind])
+                if kind in AMOUNTS and FAULT_KINDS[sort][kind].amount is not None
+                else None
             )
-            lasts_s, pause_s, by_itself = dice.choice(LASTS_S), dice.uniform(0.5, 3.0), dice.random() < 0.5
-            if (sort, kind) in self._impossible or (kind == "corrupt" and target not in SPOILT_KEYS):
+            lasts_s, pause_s, by_itself = (
+                dice.choice(LASTS_S),
+                dice.uniform(0.5, 3.0),
+                dice.random() < 0.5,
+            )
+            if (sort, kind) in self._impossible or (
+                kind == "corrupt" and target not in SPOILT_KEYS
+            ):
                 continue
-            injection = validate_and_complete_injection(FaultInjection(kind, target, 0.0, lasts_s, amount))
+            injection = validate_and_complete_injection(
+                FaultInjection(kind, target, 0.0, lasts_s, amount)
+            )
             once = injection.kind_info.is_instantaneous
             by_itself |= (kind, target) == ("freeze", "host")  # nobody can ask for its end
             request = FaultRequest(
-                kind=kind, target=target, amount=amount, for_s=lasts_s if by_itself and not once else None
+                kind=kind,
+                target=target,
+                amount=amount,
+                for_s=lasts_s if by_itself and not once else None,
             )
             follows, names = _follows(injection)
             return SoakEvent(
-                number, pause_s, request, injection.executing_part, 0.0 if once else lasts_s, follows, names
+                number,
+                pause_s,
+                request,
+                injection.executing_part,
+                0.0 if once else lasts_s,
+                follows,
+                names,
             )
 
 
@@ -113,7 +147,11 @@ def _follows(injection: FaultInjection) -> tuple[Follows, tuple[str, ...]]:
     kind, target, lasts_s = injection.kind, injection.target, injection.end_s
     match injection.target_type:
         case "process" if target == "host":
-            return ("restart" if kind in ("kill", "stop") else "perhaps"), ("host", "control", "lease")
+            return ("restart" if kind in ("kill", "stop") else "perhaps"), (
+                "host",
+                "control",
+                "lease",
+            )
         case "process" if target == "control":
             sure = kind in ("kill", "stop") or lasts_s >= LONG_FREEZE_S
             return ("stop" if sure else "perhaps"), ("control",)

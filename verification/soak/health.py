@@ -51,7 +51,9 @@ class ProcessHealth:
         self._extra_since = {pid: self._extra_since.get(pid, now) for pid in extra}
         for pid, since in self._extra_since.items():
             if now - since > ORPHANED_S:
-                self.violations.append(f"process {pid} is there as {extra[pid]} for {now - since:.0f} s")
+                self.violations.append(
+                    f"process {pid} is there as {extra[pid]} for {now - since:.0f} s"
+                )
                 self._extra_since[pid] = now
 
     def judge(self) -> list[str]:
@@ -64,7 +66,9 @@ class ProcessHealth:
             lasted_s = rows[-1].at_s - rows[0].at_s
             grown_mb = rows[-1].vitals.resident_mb - rows[0].vitals.resident_mb
             if grown_mb > GROWTH_MB:
-                found.append(f"{name} (process {pid}) grew by {grown_mb:.1f} MB in {lasted_s:.0f} s")
+                found.append(
+                    f"{name} (process {pid}) grew by {grown_mb:.1f} MB in {lasted_s:.0f} s"
+                )
             if lasted_s > LONG_ENOUGH_S and grown_mb > GROWTH_MB / 4:
                 at_min = [(row.at_s - rows[0].at_s) / 60 for row in rows]
                 slope = np.polyfit(at_min, [row.vitals.resident_mb for row in rows], 1)[0]

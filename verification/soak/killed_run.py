@@ -24,17 +24,21 @@ from snakesim_operator.results.summary import RunSummary
 from snakesim_testing.harness.command import running_snakesim
 from snakesim_testing.harness.processes import find_processes_with, find_run_processes
 
-Moment = Literal["starting", "arm_session", "armed", "stopping", "resetting", "interrupted", "ending"]
+Moment = Literal[
+    "starting", "arm_session", "armed", "stopping", "resetting", "interrupted", "ending"
+]
 MOMENTS: tuple[Moment, ...] = get_args(Moment)
 SUPERVISOR = "supervisor"
 ROBOT = "planar13"
-RATE_HZ = 50  # the longest lease there is: this is about processes that end, not about a busy machine
+# The longest lease there is: this is about processes that end, not about a busy machine.
+RATE_HZ = 50
 MOMENT_LIMIT_S = 60.0
 PATIENCE_S = 15.0  # for a run to end by itself; then it is interrupted
 STAYS_S = 1.5  # how long a run that stays is left alone
 END_LIMIT_S = 20.0
 GONE_LIMIT_S = 10.0
-BORN_LIMIT_S = 3.0  # until a process that is to be hit at the start is there: then it is hit at once
+# Until a process that is to be hit at the start is there: then it is hit at once.
+BORN_LIMIT_S = 3.0
 LOOK_S = 0.003
 MARK = "SNAKESIM_KILLS"  # in the environment of everything that descends from a trial
 
@@ -46,7 +50,8 @@ class ProcessKill:
     victim: str
     number: signal.Signals
     after_s: float
-    thaw_s: float | None = None  # of a SIGSTOP: so long until SIGCONT; None: until the run is to end
+    # Of a SIGSTOP: so long until SIGCONT; None: until the run is to end.
+    thaw_s: float | None = None
 
     def __str__(self) -> str:
         thaw = "" if self.thaw_s is None else f" for {self.thaw_s:.2f} s"
@@ -126,7 +131,9 @@ class KilledRun:
 
     def go(self) -> KillOutcome:
         """Carry it out, wait for the end, and gather what is left."""
-        with running_snakesim(self._out, *self._trial.arguments(), extra_env={MARK: self._mark}) as run:
+        with running_snakesim(
+            self._out, *self._trial.arguments(), extra_env={MARK: self._mark}
+        ) as run:
             self._process, self._endpoint = run.process, run.endpoint
             try:
                 with contextlib.ExitStack() as stack:
@@ -206,7 +213,12 @@ class KilledRun:
         for hit in self._trial.hits:
             events.append((hit.after_s, lambda hit=hit: self._signal(hit.victim, hit.number)))
             if hit.thaw_s is not None:
-                events.append((hit.after_s + hit.thaw_s, lambda hit=hit: self._signal(hit.victim, signal.SIGCONT)))
+                events.append(
+                    (
+                        hit.after_s + hit.thaw_s,
+                        lambda hit=hit: self._signal(hit.victim, signal.SIGCONT),
+                    )
+                )
         for after_s, event in sorted(events, key=lambda pair: pair[0]):
             while time.monotonic() < began + after_s and self._process.poll() is None:
                 self._look()
@@ -215,14 +227,21 @@ class KilledRun:
 
     def _signal(self, name: str, number: signal.Signals) -> None:
         born_by = time.monotonic() + (BORN_LIMIT_S if self._trial.moment == "starting" else 0.0)
-        while (pid := self._pid(name)) is None and time.monotonic() < born_by and self._process.poll() is None:
+        while (
+            (pid := self._pid(name)) is None
+            and time.monotonic() < born_by
+            and self._process.poll() is None
+        ):
             time.sleep(LOOK_S)
         if pid is None or self._process.poll() is not None:
             return
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, number)
             self._outcome.hits += number is not signal.SIGCONT
-            self._outcome.interrupted |= name == SUPERVISOR and number in (signal.SIGINT, signal.SIGTERM)
+            self._outcome.interrupted |= name == SUPERVISOR and number in (
+                signal.SIGINT,
+                signal.SIGTERM,
+            )
 
     def _pid(self, name: str) -> int | None:
         return self._process.pid if name == SUPERVISOR else find_run_processes(self._out).get(name)
@@ -242,16 +261,22 @@ class KilledRun:
         with contextlib.suppress(NotConnectedError):
             if self._trial.by_datagram:
                 host, _, port = self._endpoint.removeprefix("tcp/").rpartition(":")
-                self._outcome.stop_answered = request_stop(host, int(port), "kills", 3.0) is not None
+                self._outcome.stop_answered = (
+                    request_stop(host, int(port), "kills", 3.0) is not None
+                )
             elif self._session is not None:
-                answer = self._session.send_request(keys.ESTOP, EstopRequest(requester="kills"), 3.0)
+                answer = self._session.send_request(
+                    keys.ESTOP, EstopRequest(requester="kills"), 3.0
+                )
                 self._outcome.stop_answered = answer.ok
 
     def _ask_to_reset(self) -> None:
         if self._session is not None:
             with contextlib.suppress(NotConnectedError):
                 request = LifecycleRequest(action="reset", requester="kills")
-                self._outcome.reset_answered = self._session.send_request(keys.LIFECYCLE, request, 3.0).ok
+                self._outcome.reset_answered = self._session.send_request(
+                    keys.LIFECYCLE, request, 3.0
+                ).ok
 
     # --- after it ---------------------------------------------------------------------------------------------
 
@@ -265,11 +290,15 @@ class KilledRun:
     def _sweep(self) -> None:
         """Everything that descends from this trial must be gone by itself; what is not is told, and killed."""
         if self._process.poll() is None:
-            self._outcome.left_behind.append(f"the run itself, {END_LIMIT_S:g} s after an interrupt")
+            self._outcome.left_behind.append(
+                f"the run itself, {END_LIMIT_S:g} s after an interrupt"
+            )
             self._process.kill()
             self._process.wait()
         deadline = time.monotonic() + GONE_LIMIT_S
-        while (left := find_processes_with("environ", f"{MARK}={self._mark}\0")) and time.monotonic() < deadline:
+        while (
+            left := find_processes_with("environ", f"{MARK}={self._mark}\0")
+        ) and time.monotonic() < deadline:
             time.sleep(0.02)
         for pid, line in left:
             self._outcome.left_behind.append(f"{pid} {line[:200]}".replace("\0", " "))
@@ -282,7 +311,11 @@ class KilledRun:
         for log in sorted(self._out.glob("*.log")):
             outcome.logs[log.stem] = log.read_text(encoding="utf-8", errors="replace")
         with contextlib.suppress(FileNotFoundError):
-            outcome.record = msgspec.json.decode((self._out / HOST_RECORD).read_bytes(), type=HostRecord)
+            outcome.record = msgspec.json.decode(
+                (self._out / HOST_RECORD).read_bytes(), type=HostRecord
+            )
         with contextlib.suppress(FileNotFoundError):
-            outcome.summary = msgspec.json.decode((self._out / SUMMARY_FILENAME).read_bytes(), type=RunSummary)
+            outcome.summary = msgspec.json.decode(
+                (self._out / SUMMARY_FILENAME).read_bytes(), type=RunSummary
+            )
         outcome.stop_kept = any(self._folder.glob("snakesim/robots/*/estop.json"))

@@ -17,9 +17,24 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from verification.soak.killed_run import MOMENTS, RATE_HZ, SUPERVISOR, KilledRun, KillOutcome, KillTrial, ProcessKill
+from verification.soak.killed_run import (
+    MOMENTS,
+    RATE_HZ,
+    SUPERVISOR,
+    KilledRun,
+    KillOutcome,
+    KillTrial,
+    ProcessKill,
+)
 
-SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGSTOP, signal.SIGSTOP, signal.SIGTERM, signal.SIGINT)
+SIGNALS = (
+    signal.SIGKILL,
+    signal.SIGKILL,
+    signal.SIGSTOP,
+    signal.SIGSTOP,
+    signal.SIGTERM,
+    signal.SIGINT,
+)
 VICTIMS = (SUPERVISOR, "host", "host", "guidance", "navigation", "control")
 WITHIN_S = {  # of the moment, the hits come
     "starting": 2.0,
@@ -44,7 +59,14 @@ def draw(seed: int, *, backend: str | None = None) -> Iterator[KillTrial]:
         for _ in range(dice.choice((1, 1, 1, 2, 3))):
             what = dice.choice(SIGNALS)
             thaw_s = dice.choice((0.02, 0.2, 1.0, 3.0, None)) if what is signal.SIGSTOP else None
-            hits.append(ProcessKill(dice.choice(victims), what, round(dice.uniform(0.0, WITHIN_S[moment]), 3), thaw_s))
+            hits.append(
+                ProcessKill(
+                    dice.choice(victims),
+                    what,
+                    round(dice.uniform(0.0, WITHIN_S[moment]), 3),
+                    thaw_s,
+                )
+            )
         yield KillTrial(
             number=number,
             backend=backend or ("sim", "can")[number // len(MOMENTS) % 2],
@@ -82,8 +104,15 @@ def judge(outcome: KillOutcome) -> list[str]:
 
 def _before_our_code(trial: KillTrial, name: str, text: str) -> bool:
     """Whether Ctrl-C came while Python itself was starting: no line of ours had been read."""
-    interrupted = any(hit.victim == SUPERVISOR and hit.number is signal.SIGINT for hit in trial.hits)
-    return interrupted and name == "the run" and "KeyboardInterrupt" in text and "snakesim_" not in text
+    interrupted = any(
+        hit.victim == SUPERVISOR and hit.number is signal.SIGINT for hit in trial.hits
+    )
+    return (
+        interrupted
+        and name == "the run"
+        and "KeyboardInterrupt" in text
+        and "snakesim_" not in text
+    )
 
 
 def _lies(outcome: KillOutcome) -> list[str]:
@@ -91,10 +120,15 @@ def _lies(outcome: KillOutcome) -> list[str]:
     code, trial = outcome.code, outcome.trial
     asked = round(trial.asked_s * RATE_HZ)
     if code == 0:
-        record, ended = outcome.record, outcome.summary.ended if outcome.summary is not None else None
+        record, ended = (
+            outcome.record,
+            outcome.summary.ended if outcome.summary is not None else None,
+        )
         counted = None if record is None else record.armed_ticks
         if counted is None or counted < asked or ended != "complete":
-            return [f"exit code 0 with {counted} of {asked} ticks armed by the host's record, ended {ended!r}"]
+            return [
+                f"exit code 0 with {counted} of {asked} ticks armed by the host's record, ended {ended!r}"
+            ]
         if outcome.reached and trial.moment == "ending" and outcome.armed_ticks < 0.8 * asked:
             return [f"exit code 0, and {outcome.armed_ticks} of {asked} ticks were seen armed"]
         return ["exit code 0 with the emergency stop latched"] if outcome.stop_kept else []
@@ -102,7 +136,11 @@ def _lies(outcome: KillOutcome) -> list[str]:
         return [] if outcome.interrupted else ["exit code 130, and nobody has interrupted it"]
     if code == 1:
         words = ("fault:", "snakesim:", "left no record")
-        return [] if any(word in outcome.printed for word in words) else ["exit code 1, and no word of a fault"]
+        return (
+            []
+            if any(word in outcome.printed for word in words)
+            else ["exit code 1, and no word of a fault"]
+        )
     by = {hit.number for hit in trial.hits if hit.victim == SUPERVISOR}
     by |= {signal.SIGINT} if outcome.interrupted else set()
     return [] if code is not None and -code in by else [f"exit code {code}"]
@@ -124,10 +162,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--backend", choices=["sim", "can"], help="one of them alone (default: in turns)")
+    parser.add_argument(
+        "--backend", choices=["sim", "can"], help="one of them alone (default: in turns)"
+    )
     parser.add_argument("--only", type=int, help="the trial of this number alone")
     parser.add_argument("--workers", type=int, default=2, help="how many at the same time")
-    parser.add_argument("--out", type=Path, help="where the folders of the runs stay (default: nowhere)")
+    parser.add_argument(
+        "--out", type=Path, help="where the folders of the runs stay (default: nowhere)"
+    )
     asked = parser.parse_args()
     drawn = itertools.islice(draw(asked.seed, backend=asked.backend), asked.trials)
     trials = [trial for trial in drawn if asked.only in (None, trial.number)]
@@ -137,7 +179,9 @@ def main() -> int:
         ThreadPoolExecutor(asked.workers) as side_by_side,
     ):
         folder = (asked.out or Path(temporary)).resolve()
-        made = side_by_side.map(lambda trial: carry_out(trial, folder / f"{trial.number:04}"), trials)
+        made = side_by_side.map(
+            lambda trial: carry_out(trial, folder / f"{trial.number:04}"), trials
+        )
         for outcome, found in made:
             hits += outcome.hits
             codes[f"{outcome.trial.moment}: exit code {outcome.code}"] += 1
@@ -149,7 +193,9 @@ def main() -> int:
         print(f"{count:>5} {what}")
     for what, count in wrong.most_common():
         print(f"{count:>5} WRONG {what}")
-    print(f"{len(trials)} trials of seed {asked.seed}, {hits} signals, {(time.monotonic() - began) / 60:.1f} minutes")
+    print(
+        f"{len(trials)} trials of seed {asked.seed}, {hits} signals, {(time.monotonic() - began) / 60:.1f} minutes"
+    )
     return 1 if wrong else 0
 
 

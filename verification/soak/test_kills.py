@@ -16,7 +16,10 @@ TRIALS = list(islice(draw(11), 2 * len(MOMENTS)))
 @pytest.mark.e2e
 @pytest.mark.parametrize(
     "trial",
-    [pytest.param(trial, marks=[pytest.mark.slow] if i not in (0, 3) else []) for i, trial in enumerate(TRIALS[3:10])],
+    [
+        pytest.param(trial, marks=[pytest.mark.slow] if i not in (0, 3) else [])
+        for i, trial in enumerate(TRIALS[3:10])
+    ],
     ids=str,
 )
 def test_what_a_killed_run_leaves(tmp_path: Path, trial: KillTrial) -> None:
@@ -26,7 +29,9 @@ def test_what_a_killed_run_leaves(tmp_path: Path, trial: KillTrial) -> None:
 
 def test_kills_of_one_seed_are_same_on_both_backends() -> None:
     assert list(islice(draw(11), 14)) == TRIALS
-    assert {(trial.moment, trial.backend) for trial in TRIALS} == {(m, b) for m in MOMENTS for b in ("sim", "can")}
+    assert {(trial.moment, trial.backend) for trial in TRIALS} == {
+        (m, b) for m in MOMENTS for b in ("sim", "can")
+    }
 
 
 @pytest.mark.parametrize(
@@ -36,17 +41,25 @@ def test_kills_of_one_seed_are_same_on_both_backends() -> None:
         ({"code": 130}, "nobody has interrupted"),
         ({"code": 1, "printed": "all is well"}, "no word of a fault"),
         ({"code": -11, "printed": "x"}, "exit code -11"),
-        ({"code": 1, "printed": "fault: x\nTraceback (most recent call last):\nValueError: y"}, "ValueError: y"),
+        (
+            {"code": 1, "printed": "fault: x\nTraceback (most recent call last):\nValueError: y"},
+            "ValueError: y",
+        ),
         ({"code": 1, "printed": "fault: x", "logs": {"host": "thread panicked"}}, "host: panicked"),
         ({"code": 1, "printed": "fault: x", "left_behind": ["12 python"]}, "left behind: 12"),
         ({"code": 1, "printed": "fault: x", "stop_answered": True}, "not on the disk"),
-        ({"code": 1, "printed": "fault: x", "reset_answered": True, "stop_kept": True}, "still on the disk"),
+        (
+            {"code": 1, "printed": "fault: x", "reset_answered": True, "stop_kept": True},
+            "still on the disk",
+        ),
         ({"code": 1, "printed": "fault: x", "stop_answered": True, "stop_kept": True}, None),
         ({"code": 130, "printed": "x", "interrupted": True}, None),
     ],
 )
 def test_the_judge_sees_what_is_wrong(outcome: dict[str, object], word: str | None) -> None:
-    trial = replace(TRIALS[0], asked_s=8.0, moment="armed", hits=(ProcessKill("host", signal.SIGKILL, 0.1),))
+    trial = replace(
+        TRIALS[0], asked_s=8.0, moment="armed", hits=(ProcessKill("host", signal.SIGKILL, 0.1),)
+    )
     wrong = judge(KillOutcome(trial, **outcome))  # pyright: ignore[reportArgumentType]
     assert any(word in what for what in wrong) if word else wrong == []
     assert SUPERVISOR not in str(trial)

@@ -8,7 +8,13 @@ from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.session import Session
 from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import AppliedCommand, Clock, JointMode, RobotDescription, RobotStatus
+from snakesim_hal.wire.messages import (
+    AppliedCommand,
+    Clock,
+    JointMode,
+    RobotDescription,
+    RobotStatus,
+)
 from verification.faults.observer import Observer
 
 ROUNDING_RAD = 1e-6
@@ -23,7 +29,8 @@ class JudgingObserver(Observer):
         self.violations: list[str] = []
         self.counts: Counter[str] = Counter()
         self.sequences = 0  # applied commands of a controller
-        self.blind: set[str] = set()  # keys that are corrupted on purpose: what comes there proves nothing
+        # Keys that are corrupted on purpose: what comes there proves nothing.
+        self.blind: set[str] = set()
         self._robot: RobotDescription | None = None
         self._before: AppliedCommand | None = None
         self._pending: list[AppliedCommand] = []
@@ -71,7 +78,9 @@ class JudgingObserver(Observer):
         for fault in status.faults:
             if not fault.cause or not fault.what:
                 self._violated(f"a fault without a cause: {fault}")
-        if status.lifecycle == "fault" and not any(fault.cause in status.reason for fault in status.faults):
+        if status.lifecycle == "fault" and not any(
+            fault.cause in status.reason for fault in status.faults
+        ):
             self._violated(f"in fault because {status.reason!r}, which none of its faults says")
         if status.ready_to_arm and (status.lifecycle != "disarmed" or status.waiting_for):
             self._violated(f"ready to arm in {status.lifecycle}, waiting for {status.waiting_for}")
@@ -86,23 +95,32 @@ class JudgingObserver(Observer):
             self._robot = self.description()
         robot, measured = self._robot, self.joints.get(now.tick)
         follows = before is not None and before.tick == now.tick - 1
-        for i, (joint, mode, target) in enumerate(zip(robot.joints, now.mode, now.target, strict=True)):
+        for i, (joint, mode, target) in enumerate(
+            zip(robot.joints, now.mode, now.target, strict=True)
+        ):
             if mode is not JointMode.POSITION:
                 continue
             edge = math.nan if measured is None else abs(target - measured.angle_rad[i])
             in_range = joint.angle_min_rad < target < joint.angle_max_rad
             if now.sequence is not None and in_range and edge > robot.max_step_rad + ROUNDING_RAD:
                 most = f"at most {robot.max_step_rad:g}"
-                self._violated(f"tick {now.tick}: {joint.name} is sent {edge:.3f} rad away from where it is, {most}")
+                self._violated(
+                    f"tick {now.tick}: {joint.name} is sent {edge:.3f} rad away from where it is, {most}"
+                )
             if not follows or before is None or before.mode[i] is not JointMode.POSITION:
                 continue
-            step, most = abs(target - before.target[i]), joint.speed_limit_rad_s * robot.period_ns * 1e-9
+            step, most = (
+                abs(target - before.target[i]),
+                joint.speed_limit_rad_s * robot.period_ns * 1e-9,
+            )
             if step <= most + ROUNDING_RAD:
                 continue
             if math.isnan(edge) or abs(edge - robot.max_step_rad) <= ROUNDING_RAD:
                 self.counts["steps that the measured angle forced"] += 1
             elif before.sequence is not None or now.sequence is not None:
-                self._violated(f"tick {now.tick}: the target of {joint.name} jumps {step:.3f} rad, at most {most:.3f}")
+                self._violated(
+                    f"tick {now.tick}: the target of {joint.name} jumps {step:.3f} rad, at most {most:.3f}"
+                )
 
     def _violated(self, what: str) -> None:
         if what not in self.violations:

@@ -150,7 +150,9 @@ class RaisedHead(_WaveGait[RaisedHeadParameters]):
     def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
         reference_rad = self.make_straight_angles_rad()
         # Positive pitch bends the head down. With one pitch joint only, nothing keeps the head level.
-        lift_joint = self._pitch_joints[0] if len(self._pitch_joints) == 1 else self._pitch_joints[-2]
+        lift_joint = (
+            self._pitch_joints[0] if len(self._pitch_joints) == 1 else self._pitch_joints[-2]
+        )
         if len(self._pitch_joints) > 1:
             reference_rad[self._pitch_joints[-1]] = self.parameters.lift_rad
         reference_rad[lift_joint] = -self.parameters.lift_rad

@@ -114,7 +114,9 @@ class _BackboneGait(Gait[GaitParametersT]):
                 "are allowed: reduce this parameter, or make the waves longer",
                 code="python/invalid-argument",
             )
-        shapes_rad = np.array([self._keyframe_waves.compute_joint_angles_rad(phase) for phase in CHECKED_PHASES_RAD])
+        shapes_rad = np.array(
+            [self._keyframe_waves.compute_joint_angles_rad(phase) for phase in CHECKED_PHASES_RAD]
+        )
         # The limits of all joints are checked, whatever axis the curve has.
         BodyCurve(self.robot, "yaw").check_limits(shapes_rad, parameter_label)
 
@@ -130,7 +132,9 @@ class BackboneSidewinding(_BackboneGait[BackboneSidewindingParameters]):
         for axis in cls._required_axes:
             curve = BodyCurve(robot, axis)
             curve.check_wavelength(
-                parameters.wavelength, f"control.wavelength of {parameters.wavelength:g}", "increase it"
+                parameters.wavelength,
+                f"control.wavelength of {parameters.wavelength:g}",
+                "increase it",
             )
         cls(robot, parameters).fit_and_validate(f"control.half_width of {parameters.half_width:g}")
 
@@ -149,7 +153,9 @@ class BackboneRolling(_BackboneGait[BackboneRollingParameters]):
         cls(robot, parameters).fit_and_validate(f"control.bend_rad of {parameters.bend_rad:g} rad")
 
     def compute_backbone(self, phase_rad: float) -> BackboneCurve:
-        return compute_arc(self._point_fractions, self._length_m, self.parameters.bend_rad, phase_rad)
+        return compute_arc(
+            self._point_fractions, self._length_m, self.parameters.bend_rad, phase_rad
+        )
 
 
 def compute_node_fractions(robot: RobotDescription) -> Floats:
@@ -159,7 +165,10 @@ def compute_node_fractions(robot: RobotDescription) -> Floats:
 
 
 def compute_helix(
-    point_fractions: Floats, length_m: float, parameters: BackboneSidewindingParameters, phase_rad: float
+    point_fractions: Floats,
+    length_m: float,
+    parameters: BackboneSidewindingParameters,
+    phase_rad: float,
 ) -> BackboneCurve:
     """Return the helix of sidewinding, from the tail to the head.
 
@@ -180,11 +189,15 @@ def compute_helix(
     segment_lengths = np.linalg.norm(np.diff(dense_points, axis=0), axis=1)
     arc_lengths = np.concatenate(([0.0], np.cumsum(segment_lengths)))
     start_arc_length = 0.5 * (arc_lengths[-1] - 1.0)
-    points = sample_by_arc_length(dense_points, (start_arc_length + point_fractions) / arc_lengths[-1])
+    points = sample_by_arc_length(
+        dense_points, (start_arc_length + point_fractions) / arc_lengths[-1]
+    )
     return BackboneCurve(length_m * points, np.array([0.0, 0.0, 1.0]))
 
 
-def compute_arc(point_fractions: Floats, length_m: float, bend_rad: float, phase_rad: float) -> BackboneCurve:
+def compute_arc(
+    point_fractions: Floats, length_m: float, bend_rad: float, phase_rad: float
+) -> BackboneCurve:
     """Return the arc of rolling, from the tail to the head, and the roll of its middle.
 
     Args:
@@ -197,7 +210,12 @@ def compute_arc(point_fractions: Floats, length_m: float, bend_rad: float, phase
     radius_m = length_m / arc_rad
     angles_rad = arc_rad * (point_fractions - 0.5)
     points = np.stack(
-        [radius_m * np.sin(angles_rad), radius_m * (1.0 - np.cos(angles_rad)), np.zeros_like(angles_rad)], axis=1
+        [
+            radius_m * np.sin(angles_rad),
+            radius_m * (1.0 - np.cos(angles_rad)),
+            np.zeros_like(angles_rad),
+        ],
+        axis=1,
     )
     roll_rad = math.copysign(phase_rad, bend_rad)
     roll_normal = np.array([0.0, -math.sin(roll_rad), math.cos(roll_rad)])
@@ -221,7 +239,12 @@ def _find_axis_wavelength(arc_wavelength: float, width: float, height: float) ->
     for _ in range(40):
         middle_wavelength = 0.5 * (min_wavelength + max_wavelength)
         wave_points = np.stack(
-            [middle_wavelength * angles_rad / math.tau, width * np.sin(angles_rad), height * np.cos(angles_rad)], axis=1
+            [
+                middle_wavelength * angles_rad / math.tau,
+                width * np.sin(angles_rad),
+                height * np.cos(angles_rad),
+            ],
+            axis=1,
         )
         if np.linalg.norm(np.diff(wave_points, axis=0), axis=1).sum() > arc_wavelength:
             max_wavelength = middle_wavelength

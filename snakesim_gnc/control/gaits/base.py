@@ -9,7 +9,13 @@ import numpy as np
 from snakesim_gnc.control.bumpless import BumplessFollower
 from snakesim_gnc.control.gaits.body_curve import DIRECTIONS
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, is_motion_requested
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    Observation,
+    Telemetry,
+    is_motion_requested,
+)
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.wire.messages import Axis, RobotDescription
 from snakesim_hal.wire.quantities import above
@@ -62,9 +68,13 @@ class Gait(Controller[GaitParametersT]):
         reference_rad = self.compute_reference_rad(observation, self._phase_rad)
         may_have_jumped = self._is_holding and self._blends_after_hold
         self._is_holding = False
-        setpoints = self._bumpless_follower.make_setpoints(observation, reference_rad, may_have_jumped=may_have_jumped)
+        setpoints = self._bumpless_follower.make_setpoints(
+            observation, reference_rad, may_have_jumped=may_have_jumped
+        )
         telemetry = Telemetry(
-            reason=self._no_travel_reason, reference_rad=reference_rad.tolist(), custom=self.list_custom_telemetry()
+            reason=self._no_travel_reason,
+            reference_rad=reference_rad.tolist(),
+            custom=self.list_custom_telemetry(),
         )
         return ControllerCommand(setpoints, telemetry)
 

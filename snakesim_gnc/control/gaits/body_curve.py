@@ -17,9 +17,11 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import Axis, RobotDescription
 
-DIRECTIONS: dict[Axis, str] = {"pitch": "up and down", "yaw": "left and right"}  # of a joint, by its axis
+# Of a joint, by its axis.
+DIRECTIONS: dict[Axis, str] = {"pitch": "up and down", "yaw": "left and right"}
 MIN_JOINTS_PER_WAVE = 3.0  # with fewer, the body is far from the curve
-CHECKED_PHASES_RAD = np.linspace(0.0, math.tau, 32, endpoint=False)  # rad, at which angle limits are checked
+# Rad, at which angle limits are checked.
+CHECKED_PHASES_RAD = np.linspace(0.0, math.tau, 32, endpoint=False)
 
 
 class BodyCurve:
@@ -32,7 +34,8 @@ class BodyCurve:
             robot: Description of the robot.
             axis: Axis of the joints that bend: yaw in the ground plane, pitch in the vertical plane.
         """
-        ends_m = np.cumsum([link.length_m for link in robot.links])  # of the links, from the tail end
+        # Of the links, from the tail end.
+        ends_m = np.cumsum([link.length_m for link in robot.links])
         self.joint_indices = [i for i, joint in enumerate(robot.joints) if joint.axis == axis]
         self.length_m = float(ends_m[-1])
         self._robot = robot

@@ -94,7 +94,9 @@ class ChainFit:
             self._position, self._rotation, self.angles_rad, self._axes, self._lengths_m.tolist()
         )
 
-    def _do_gauss_newton_step(self, backbone: BackboneCurve, first_joint_index: int, end_joint: int) -> None:
+    def _do_gauss_newton_step(
+        self, backbone: BackboneCurve, first_joint_index: int, end_joint: int
+    ) -> None:
         """Do one Gauss-Newton step of a group of joints, and of the base if the group begins at the tail.
 
         Args:
@@ -103,18 +105,27 @@ class ChainFit:
             end_joint: Index after the last joint of the group.
         """
         origins, rotations = self._compute_link_frames()
-        points = np.vstack([origins, origins[-1] + self._lengths_m[-1] * rotations[-1][:, 0]])[: end_joint + 2]
+        points = np.vstack([origins, origins[-1] + self._lengths_m[-1] * rotations[-1][:, 0]])[
+            : end_joint + 2
+        ]
         includes_base = first_joint_index == 0
         pivots = origins[first_joint_index + 1 : end_joint + 1]  # (k, 3) of the joints
         columns = [0 if axis == "pitch" else 1 for axis in self._axes[first_joint_index:end_joint]]
         axes = np.array(
-            [rotations[first_joint_index + 1 + k][:, 2 if column else 1] for k, column in enumerate(columns)]
+            [
+                rotations[first_joint_index + 1 + k][:, 2 if column else 1]
+                for k, column in enumerate(columns)
+            ]
         )  # (k, 3) of rotation, unit
 
         # Derivatives of the nodes and of the middle link's y axis by rotations about points.
         angles = self.angles_rad[first_joint_index:end_joint]
-        point_derivatives = np.cross(axes[:, None, :], points[None, :, :] - pivots[:, None, :])  # (k, n, 3)
-        is_behind_joint = np.arange(len(points))[None, :] <= np.arange(first_joint_index + 1, end_joint + 1)[:, None]
+        # (k, n, 3).
+        point_derivatives = np.cross(axes[:, None, :], points[None, :, :] - pivots[:, None, :])
+        is_behind_joint = (
+            np.arange(len(points))[None, :]
+            <= np.arange(first_joint_index + 1, end_joint + 1)[:, None]
+        )
         point_derivatives[is_behind_joint] = 0.0
         middle_y_derivatives = np.cross(axes, rotations[self._middle_link][:, 1])  # (k, 3)
         middle_y_derivatives[np.arange(first_joint_index, end_joint) >= self._middle_link] = 0.0
@@ -124,9 +135,15 @@ class ChainFit:
             base_rotation_derivatives = np.cross(
                 np.eye(3)[:, None, :], points[None, :, :] - self._position
             )  # (3, n, 3)
-            base_translation_derivatives = np.broadcast_to(np.eye(3)[:, None, :], (3, len(points), 3))
+            base_translation_derivatives = np.broadcast_to(
+                np.eye(3)[:, None, :], (3, len(points), 3)
+            )
             rows[0] = np.hstack(
-                [rows[0], base_rotation_derivatives.reshape(3, -1).T, base_translation_derivatives.reshape(3, -1).T]
+                [
+                    rows[0],
+                    base_rotation_derivatives.reshape(3, -1).T,
+                    base_translation_derivatives.reshape(3, -1).T,
+                ]
             )
         unknown_count = rows[0].shape[1]
 
@@ -141,19 +158,32 @@ class ChainFit:
                     weight_m * np.cross(np.eye(3), middle_y) @ backbone.roll_normal
                 )
             rows.append(roll_row[None, :])
-            residuals.append(np.array([weight_m * rotations[self._middle_link][:, 1] @ backbone.roll_normal]))
+            residuals.append(
+                np.array([weight_m * rotations[self._middle_link][:, 1] @ backbone.roll_normal])
+            )
 
         # The angles.
         weight_m = ANGLE_WEIGHT * self._mean_link_length_m
-        rows.append(np.hstack([weight_m * np.eye(len(angles)), np.zeros((len(angles), unknown_count - len(angles)))]))
+        rows.append(
+            np.hstack(
+                [
+                    weight_m * np.eye(len(angles)),
+                    np.zeros((len(angles), unknown_count - len(angles))),
+                ]
+            )
+        )
         residuals.append(weight_m * angles)
 
         jacobian = np.vstack(rows)
-        normal_matrix = jacobian.T @ jacobian + DAMPING * self._mean_link_length_m**2 * np.eye(unknown_count)
+        normal_matrix = jacobian.T @ jacobian + DAMPING * self._mean_link_length_m**2 * np.eye(
+            unknown_count
+        )
         solution_step = -np.linalg.solve(normal_matrix, jacobian.T @ np.concatenate(residuals))
         self.angles_rad[first_joint_index:end_joint] += solution_step[: len(angles)]
         if includes_base:
-            base_rotation_step: Floats = np.array(solution_step[len(angles) : len(angles) + 3], dtype=np.float64)
+            base_rotation_step: Floats = np.array(
+                solution_step[len(angles) : len(angles) + 3], dtype=np.float64
+            )
             self._rotation = _make_rotation(base_rotation_step) @ self._rotation
             self._position = self._position + solution_step[len(angles) + 3 :]
 
@@ -206,7 +236,9 @@ class KeyframeWaves:
     def compute_joint_angles_rad(self, phase_rad: float) -> Floats:
         """Evaluate the Fourier series of all joints at a phase, (n_joints,) in rad. The fit must be complete."""
         order_phases_rad: Floats = self._orders * phase_rad
-        angles_rad: Floats = np.cos(order_phases_rad) @ self._cosines + np.sin(order_phases_rad) @ self._sines
+        angles_rad: Floats = (
+            np.cos(order_phases_rad) @ self._cosines + np.sin(order_phases_rad) @ self._sines
+        )
         return angles_rad
 
     def _fit_keyframes(self) -> Iterator[None]:
@@ -217,7 +249,9 @@ class KeyframeWaves:
             backbone = self._compute_backbone(2.0 * np.pi * keyframe_index / phase_count)
             yield from chain.fit_next(backbone) if keyframe_index else chain.fit_first(backbone)
             self.keyframes_rad[keyframe_index] = chain.angles_rad
-            distances_m = np.linalg.norm(chain.compute_node_positions() - backbone.node_positions, axis=1)
+            distances_m = np.linalg.norm(
+                chain.compute_node_positions() - backbone.node_positions, axis=1
+            )
             self.max_deviation_m = max(self.max_deviation_m, float(distances_m.max()))
 
     def _compute_fourier_series(self) -> None:
@@ -243,7 +277,11 @@ def sample_by_arc_length(points: Floats, fractions: Sequence[float] | Floats) ->
     segment_lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     arc_lengths = np.concatenate(([0.0], np.cumsum(segment_lengths)))
     return np.stack(
-        [np.interp(np.asarray(fractions) * arc_lengths[-1], arc_lengths, points[:, k]) for k in range(3)], axis=1
+        [
+            np.interp(np.asarray(fractions) * arc_lengths[-1], arc_lengths, points[:, k])
+            for k in range(3)
+        ],
+        axis=1,
     )
 
 

@@ -66,9 +66,15 @@ class Concertina(Gait[ConcertinaParameters]):
     def check(cls, robot: RobotDescription, parameters: ConcertinaParameters) -> None:
         """Check that the joints can form the folds. Raises ConfigError."""
         curve = BodyCurve(robot, "yaw")
-        curve.check_wavelength(0.5 / parameters.folds, f"control.folds of {parameters.folds}", "reduce it")
-        shapes_rad = np.array([_compute_angles_rad(curve, parameters, phase) for phase in CHECKED_PHASES_RAD])
-        curve.check_limits(shapes_rad, f"control.winding_angle_rad of {parameters.winding_angle_rad:g} rad")
+        curve.check_wavelength(
+            0.5 / parameters.folds, f"control.folds of {parameters.folds}", "reduce it"
+        )
+        shapes_rad = np.array(
+            [_compute_angles_rad(curve, parameters, phase) for phase in CHECKED_PHASES_RAD]
+        )
+        curve.check_limits(
+            shapes_rad, f"control.winding_angle_rad of {parameters.winding_angle_rad:g} rad"
+        )
 
     def __init__(self, robot: RobotDescription, parameters: ConcertinaParameters) -> None:
         super().__init__(robot, parameters)
@@ -78,8 +84,12 @@ class Concertina(Gait[ConcertinaParameters]):
         return _compute_angles_rad(self._curve, self.parameters, phase_rad)
 
 
-def _compute_angles_rad(curve: BodyCurve, parameters: ConcertinaParameters, phase_rad: float) -> Floats:
+def _compute_angles_rad(
+    curve: BodyCurve, parameters: ConcertinaParameters, phase_rad: float
+) -> Floats:
     front, rear = compute_fold_fractions(phase_rad)
     fold_fractions = np.where(curve.head_distance_fractions < 0.5, front, rear)
     waves = np.sin(math.tau * parameters.folds * 2.0 * curve.head_distance_fractions)
-    return curve.compute_joint_angles_rad(parameters.winding_angle_rad * np.sqrt(fold_fractions) * waves)
+    return curve.compute_joint_angles_rad(
+        parameters.winding_angle_rad * np.sqrt(fold_fractions) * waves
+    )

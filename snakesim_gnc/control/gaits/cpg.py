@@ -34,7 +34,12 @@ import numpy as np
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds, get_travel_sign
 from snakesim_gnc.control.gaits.body_curve import BodyCurve
-from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead, MaxBend, SteeringGain
+from snakesim_gnc.control.gaits.heading_control import (
+    HeadingControl,
+    LookAhead,
+    MaxBend,
+    SteeringGain,
+)
 from snakesim_gnc.control.gaits.serpenoid import Wavelength, WindingAngle, check_serpenoid
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
@@ -101,7 +106,11 @@ class OscillatorChains:
         self._a = amplitude_rate
 
     def integrate(
-        self, elapsed_s: float, intrinsic_frequency_rad_s: float, amplitude_limit_rad: Floats, feedback_rad_s: Floats
+        self,
+        elapsed_s: float,
+        intrinsic_frequency_rad_s: float,
+        amplitude_limit_rad: Floats,
+        feedback_rad_s: Floats,
     ) -> None:
         """Integrate the equations of the oscillators over a time, in Euler steps of at most MAX_STEP_S.
 
@@ -114,7 +123,9 @@ class OscillatorChains:
         step_count = math.ceil(elapsed_s / MAX_STEP_S)
         for _ in range(step_count):
             step_s = elapsed_s / step_count
-            r_acceleration = self._a * (0.25 * self._a * (amplitude_limit_rad - self.r_rad) - self._r_velocity_rad_s)
+            r_acceleration = self._a * (
+                0.25 * self._a * (amplitude_limit_rad - self.r_rad) - self._r_velocity_rad_s
+            )
             self.theta_rad = self.theta_rad + step_s * (
                 intrinsic_frequency_rad_s + self._compute_coupling_rad_s() + feedback_rad_s
             )
@@ -133,9 +144,8 @@ class OscillatorChains:
         """
         theta = self.theta_rad
         r = self.r_rad
-        ahead_terms = np.sin(
-            np.diff(theta, axis=1) - self._bias_step_rad
-        )  # of the joint ahead, as seen from each joint
+        # Of the joint ahead, as seen from each joint.
+        ahead_terms = np.sin(np.diff(theta, axis=1) - self._bias_step_rad)
         across_terms = np.sin(theta[::-1] - theta - math.pi)
         coupling_terms = r[::-1] * across_terms
         coupling_terms[:, :-1] += r[:, 1:] * ahead_terms
@@ -174,16 +184,25 @@ class Cpg(Gait[CpgParameters]):
         piece_distance = from_head[:-1] - from_head[1:]  # (n_yaw,) l of every joint
         joint_from_head = 0.5 * (from_head[:-1] + from_head[1:])
         wave_number = math.tau / parameters.wavelength
-        self._amplitude_rad = 2.0 * parameters.winding_angle_rad * np.sin(0.5 * wave_number * piece_distance)
+        self._amplitude_rad = (
+            2.0 * parameters.winding_angle_rad * np.sin(0.5 * wave_number * piece_distance)
+        )
         self._bend_fraction = piece_distance  # of the bend of the whole body, in each joint
         phase_bias_rad = 0.5 * math.pi - wave_number * joint_from_head
-        self._oscillators = OscillatorChains(phase_bias_rad, parameters.coupling, parameters.amplitude_rate)
+        self._oscillators = OscillatorChains(
+            phase_bias_rad, parameters.coupling, parameters.amplitude_rate
+        )
 
     def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        intrinsic_frequency_rad_s = get_travel_sign(observation) * math.tau / self.parameters.period_s
+        intrinsic_frequency_rad_s = (
+            get_travel_sign(observation) * math.tau / self.parameters.period_s
+        )
         bend_rad = self._bend_fraction * self._heading_control.compute_bend_rad(observation)
-        bend_rad = np.clip(bend_rad, -self._amplitude_rad, self._amplitude_rad)  # no oscillator below zero
-        amplitude_limit_rad = 0.5 * np.stack([self._amplitude_rad + bend_rad, self._amplitude_rad - bend_rad])
+        # No oscillator below zero.
+        bend_rad = np.clip(bend_rad, -self._amplitude_rad, self._amplitude_rad)
+        amplitude_limit_rad = 0.5 * np.stack(
+            [self._amplitude_rad + bend_rad, self._amplitude_rad - bend_rad]
+        )
         feedback_rad_s = self._compute_feedback_rad_s(observation.world)
         self._oscillators.integrate(
             observation.period_s, intrinsic_frequency_rad_s, amplitude_limit_rad, feedback_rad_s
@@ -217,6 +236,10 @@ class Cpg(Gait[CpgParameters]):
             forces_n[contact.link] += tangent_x * force_y - tangent_y * force_x
         at_joints_n = (forces_n[:-1] + forces_n[1:])[self._curve.joint_indices]
         signed_n = np.stack([at_joints_n, -at_joints_n])
-        feedback = self.parameters.force_gain * signed_n * np.cos(theta_rad - self.parameters.force_phase_rad)
+        feedback = (
+            self.parameters.force_gain
+            * signed_n
+            * np.cos(theta_rad - self.parameters.force_phase_rad)
+        )
         max_rad_s = MAX_FEEDBACK_RATIO * math.tau / self.parameters.period_s
         return np.clip(feedback, -max_rad_s, max_rad_s)

@@ -43,7 +43,13 @@ class HeadingControl:
     """Computes the bend of one robot."""
 
     def __init__(
-        self, robot: RobotDescription, *, k_theta: float, look_ahead: float, max_bend_rad: float, time_constant_s: float
+        self,
+        robot: RobotDescription,
+        *,
+        k_theta: float,
+        look_ahead: float,
+        max_bend_rad: float,
+        time_constant_s: float,
     ) -> None:
         """Create a heading control without a path, whose bend is zero.
 
@@ -89,7 +95,8 @@ class HeadingControl:
             self._route = Route(trajectory.path_w)
             self._path_id = trajectory.path_id
 
-        body_points_w = self._body.compute_body_points_w(world, observation.joints.angle_rad)  # (2, n_points)
+        # (2, n_points).
+        body_points_w = self._body.compute_body_points_w(world, observation.joints.angle_rad)
         link_vectors_w = np.diff(body_points_w, axis=1)
         headings_rad = np.arctan2(link_vectors_w[1], link_vectors_w[0])
         resultant = np.exp(1j * headings_rad).mean()

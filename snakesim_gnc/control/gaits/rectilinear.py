@@ -57,8 +57,12 @@ class Rectilinear(Gait[RectilinearParameters]):
     def check(cls, robot: RobotDescription, parameters: RectilinearParameters) -> None:
         """Check that the joints can form the wave. Raises ConfigError."""
         curve = BodyCurve(robot, "pitch")
-        curve.check_wavelength(parameters.wavelength, f"control.wavelength of {parameters.wavelength:g}", "increase it")
-        shapes_rad = np.array([_compute_slope_angles_rad(curve, parameters, phase) for phase in CHECKED_PHASES_RAD])
+        curve.check_wavelength(
+            parameters.wavelength, f"control.wavelength of {parameters.wavelength:g}", "increase it"
+        )
+        shapes_rad = np.array(
+            [_compute_slope_angles_rad(curve, parameters, phase) for phase in CHECKED_PHASES_RAD]
+        )
         curve.check_limits(shapes_rad, f"control.slope_rad of {parameters.slope_rad:g} rad")
 
     def __init__(self, robot: RobotDescription, parameters: RectilinearParameters) -> None:
@@ -70,10 +74,14 @@ class Rectilinear(Gait[RectilinearParameters]):
         )
 
     def compute_reference_rad(self, observation: Observation, phase_rad: float) -> Floats:
-        return self._stance_rad + _compute_slope_angles_rad(self._pitch_curve, self.parameters, phase_rad)
+        return self._stance_rad + _compute_slope_angles_rad(
+            self._pitch_curve, self.parameters, phase_rad
+        )
 
 
-def _compute_slope_angles_rad(curve: BodyCurve, parameters: RectilinearParameters, phase_rad: float) -> Floats:
+def _compute_slope_angles_rad(
+    curve: BodyCurve, parameters: RectilinearParameters, phase_rad: float
+) -> Floats:
     slopes_rad = parameters.slope_rad * np.cos(
         phase_rad + math.tau * curve.head_distance_fractions / parameters.wavelength
     )

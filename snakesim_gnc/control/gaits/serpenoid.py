@@ -18,7 +18,12 @@ import numpy as np
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds
 from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
-from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead, MaxBend, SteeringGain
+from snakesim_gnc.control.gaits.heading_control import (
+    HeadingControl,
+    LookAhead,
+    MaxBend,
+    SteeringGain,
+)
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import RobotDescription
@@ -85,11 +90,15 @@ def check_serpenoid(robot: RobotDescription, winding_angle_rad: float, wavelengt
     curve.check_wavelength(wavelength, f"control.wavelength of {wavelength:g}", "increase it")
     shapes_rad = [
         curve.compute_joint_angles_rad(
-            compute_serpenoid_headings(curve.head_distance_fractions, phase_rad, winding_angle_rad, wavelength)
+            compute_serpenoid_headings(
+                curve.head_distance_fractions, phase_rad, winding_angle_rad, wavelength
+            )
         )
         for phase_rad in CHECKED_PHASES_RAD
     ]
-    curve.check_limits(np.array(shapes_rad), f"control.winding_angle_rad of {winding_angle_rad:g} rad")
+    curve.check_limits(
+        np.array(shapes_rad), f"control.winding_angle_rad of {winding_angle_rad:g} rad"
+    )
 
 
 class Serpenoid(Gait[SerpenoidParameters]):
@@ -122,7 +131,9 @@ class Serpenoid(Gait[SerpenoidParameters]):
             self.parameters.wavelength,
         )
         bend_rad = self._heading_control.compute_bend_rad(observation)
-        return self._curve.compute_joint_angles_rad(headings_rad + self._curve.make_bend_headings_rad(bend_rad))
+        return self._curve.compute_joint_angles_rad(
+            headings_rad + self._curve.make_bend_headings_rad(bend_rad)
+        )
 
     def list_custom_telemetry(self) -> dict[str, float]:
         return {"heading_error_rad": self._heading_control.error_rad}

@@ -21,8 +21,17 @@ import numpy as np
 
 from snakesim_gnc.control.gaits.base import Gait, GaitParameters, Seconds
 from snakesim_gnc.control.gaits.body_curve import CHECKED_PHASES_RAD, BodyCurve
-from snakesim_gnc.control.gaits.heading_control import HeadingControl, LookAhead, MaxBend, SteeringGain
-from snakesim_gnc.control.gaits.serpenoid import Wavelength, WindingAngle, compute_serpenoid_headings
+from snakesim_gnc.control.gaits.heading_control import (
+    HeadingControl,
+    LookAhead,
+    MaxBend,
+    SteeringGain,
+)
+from snakesim_gnc.control.gaits.serpenoid import (
+    Wavelength,
+    WindingAngle,
+    compute_serpenoid_headings,
+)
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
 from snakesim_hal.wire.messages import RobotDescription
@@ -72,8 +81,15 @@ class SinusLifting(Gait[SinusLiftingParameters]):
         yaw_curve.check_wavelength(parameters.wavelength, parameter_label, "increase it")
         pitch_curve.check_wavelength(0.5 * parameters.wavelength, parameter_label, "increase it")
         if yaw_curve.joint_indices and pitch_curve.joint_indices:
-            shapes_rad = np.array([_compute_angles_rad(curves, parameters, phase, 0.0) for phase in CHECKED_PHASES_RAD])
-            yaw_curve.check_limits(shapes_rad, f"control.winding_angle_rad of {parameters.winding_angle_rad:g} rad")
+            shapes_rad = np.array(
+                [
+                    _compute_angles_rad(curves, parameters, phase, 0.0)
+                    for phase in CHECKED_PHASES_RAD
+                ]
+            )
+            yaw_curve.check_limits(
+                shapes_rad, f"control.winding_angle_rad of {parameters.winding_angle_rad:g} rad"
+            )
 
     def __init__(self, robot: RobotDescription, parameters: SinusLiftingParameters) -> None:
         super().__init__(robot, parameters)
@@ -92,13 +108,21 @@ class SinusLifting(Gait[SinusLiftingParameters]):
 
 
 def _compute_angles_rad(
-    curves: tuple[BodyCurve, BodyCurve], parameters: SinusLiftingParameters, phase_rad: float, bend_rad: float
+    curves: tuple[BodyCurve, BodyCurve],
+    parameters: SinusLiftingParameters,
+    phase_rad: float,
+    bend_rad: float,
 ) -> Floats:
     yaw_curve, pitch_curve = curves
     headings_rad = compute_serpenoid_headings(
-        yaw_curve.head_distance_fractions, phase_rad, parameters.winding_angle_rad, parameters.wavelength
+        yaw_curve.head_distance_fractions,
+        phase_rad,
+        parameters.winding_angle_rad,
+        parameters.wavelength,
     )
     u = phase_rad - math.tau * pitch_curve.head_distance_fractions / parameters.wavelength
     slopes_rad = parameters.lift_slope_rad * np.sin(2.0 * u)
-    yaw_rad = yaw_curve.compute_joint_angles_rad(headings_rad + yaw_curve.make_bend_headings_rad(bend_rad))
+    yaw_rad = yaw_curve.compute_joint_angles_rad(
+        headings_rad + yaw_curve.make_bend_headings_rad(bend_rad)
+    )
     return yaw_rad + pitch_curve.compute_joint_angles_rad(slopes_rad)

@@ -13,6 +13,16 @@ It shares localization on the path and bumpless mode changes with other controll
 
 from snakesim_gnc.control.obstacle_triplet.controller import ObstacleTriplet
 from snakesim_gnc.control.obstacle_triplet.parameters import TripletParameters
-from snakesim_gnc.control.obstacle_triplet.statics import TripletSolution, compute_bending_torque_nm, solve_triplet
+from snakesim_gnc.control.obstacle_triplet.statics import (
+    TripletSolution,
+    compute_bending_torque_nm,
+    solve_triplet,
+)
 
-__all__ = ["ObstacleTriplet", "TripletParameters", "TripletSolution", "compute_bending_torque_nm", "solve_triplet"]
+__all__ = [
+    "ObstacleTriplet",
+    "TripletParameters",
+    "TripletSolution",
+    "compute_bending_torque_nm",
+    "solve_triplet",
+]

@@ -35,7 +35,8 @@ class PlannedContact:
     normal_w: Planar  # from the obstacle into the body, across the path
     tangent_w: Planar  # along the path
     side: int  # +1: the obstacle is on the right of the path, and pushes to the left
-    clearance_m: float  # from the obstacle to a body that lies on the path; negative when it would overlap
+    # From the obstacle to a body that lies on the path; negative when it would overlap.
+    clearance_m: float
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,9 @@ def plan_contact(
         distance_m = math.hypot(*direction_from_obstacle_w) - obstacle.radius_m
     heading_rad = route.compute_heading_rad(nearest_s_m)
     tangent = (math.cos(heading_rad), math.sin(heading_rad))
-    is_pushed_left = tangent[0] * direction_from_obstacle_w[1] - tangent[1] * direction_from_obstacle_w[0] >= 0
+    is_pushed_left = (
+        tangent[0] * direction_from_obstacle_w[1] - tangent[1] * direction_from_obstacle_w[0] >= 0
+    )
     side = 1 if is_pushed_left else -1
     return PlannedContact(
         obstacle=obstacle.name,
@@ -120,7 +123,11 @@ def _find_nearest_point_to_box(
         distance_m = float(distances_m[best_index])
         low_s_m = nearest_s_m - step_m
         high_s_m = nearest_s_m + step_m
-    return nearest_s_m, (float(direction_from_obstacle_w[0]), float(direction_from_obstacle_w[1])), distance_m
+    return (
+        nearest_s_m,
+        (float(direction_from_obstacle_w[0]), float(direction_from_obstacle_w[1])),
+        distance_m,
+    )
 
 
 def find_push_points(
@@ -164,13 +171,23 @@ def find_push_points(
         fraction = (contact.path_s_m - points_path_s_m[segment]) / (
             points_path_s_m[segment + 1] - points_path_s_m[segment]
         )
-        body_s_m = body_points_s_m[segment] + fraction * (body_points_s_m[segment + 1] - body_points_s_m[segment])
+        body_s_m = body_points_s_m[segment] + fraction * (
+            body_points_s_m[segment + 1] - body_points_s_m[segment]
+        )
         if not end_m < body_s_m < length_m - end_m:
             continue
         # Offset of the measured body from the planned contact, and its gap to the obstacle along the normal.
-        offset_x_m = x_m[segment] + fraction * (x_m[segment + 1] - x_m[segment]) - contact.point_w[0]
-        offset_y_m = y_m[segment] + fraction * (y_m[segment + 1] - y_m[segment]) - contact.point_w[1]
-        measured_gap_m = contact.clearance_m + offset_x_m * contact.normal_w[0] + offset_y_m * contact.normal_w[1]
+        offset_x_m = (
+            x_m[segment] + fraction * (x_m[segment + 1] - x_m[segment]) - contact.point_w[0]
+        )
+        offset_y_m = (
+            y_m[segment] + fraction * (y_m[segment + 1] - y_m[segment]) - contact.point_w[1]
+        )
+        measured_gap_m = (
+            contact.clearance_m
+            + offset_x_m * contact.normal_w[0]
+            + offset_y_m * contact.normal_w[1]
+        )
         max_gap_m = give_up_gap_m if contact.obstacle in retained_obstacles else gap_m
         # A large negative gap does not count either: the body is on the other side of the obstacle.
         if abs(measured_gap_m) <= max_gap_m:

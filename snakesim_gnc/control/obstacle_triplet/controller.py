@@ -26,7 +26,12 @@ import numpy as np
 from snakesim_gnc.control.bumpless import BumplessTransfer
 from snakesim_gnc.control.climb import PlatformClimb
 from snakesim_gnc.control.contact_forces import MeasuredContacts
-from snakesim_gnc.control.obstacle_triplet.contacts import PlannedContact, PushPoint, find_push_points, plan_contact
+from snakesim_gnc.control.obstacle_triplet.contacts import (
+    PlannedContact,
+    PushPoint,
+    find_push_points,
+    plan_contact,
+)
 from snakesim_gnc.control.obstacle_triplet.parameters import TripletParameters
 from snakesim_gnc.control.obstacle_triplet.selection import (
     ObstacleNames,
@@ -35,16 +40,26 @@ from snakesim_gnc.control.obstacle_triplet.selection import (
     choose_triplet,
 )
 from snakesim_gnc.control.obstacle_triplet.stall import StallDetector, StallReason, explain_stall
-from snakesim_gnc.control.obstacle_triplet.telemetry import compute_bending_torques_nm, make_contact_messages
+from snakesim_gnc.control.obstacle_triplet.telemetry import (
+    compute_bending_torques_nm,
+    make_contact_messages,
+)
 from snakesim_gnc.control.progress import BodyLocation, PathProgress
 from snakesim_gnc.geometry.body_on_path import PathBodyPose
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    Observation,
+    Telemetry,
+    make_position_setpoints,
+)
 from snakesim_hal.wire.messages import JointMode, KnownObstacle, RobotDescription
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
-PLAN_WINDOW_M = 1.0  # the path may pass an obstacle that is near the body so far beyond the body's ends
+# The path may pass an obstacle that is near the body so far beyond the body's ends.
+PLAN_WINDOW_M = 1.0
 MIN_TORQUE_PER_N = 1e-12  # N·m/N; avoids a division by zero
 MAX_REASON_LENGTH = 400  # characters
 
@@ -91,10 +106,13 @@ class ObstacleTriplet(Controller[TripletParameters]):
         self._bumpless_transfer = BumplessTransfer(robot)
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
         self._body_pose: PathBodyPose | None = None  # the pose on the path that these joints follow
-        self._reference_rad = np.empty(0)  # (n_joints,) rad, angles of that pose; empty before the first tick
-        self._filtered_loads_nm = np.zeros(len(robot.joints))  # filtered load that their targets compensate
+        # (n_joints,) rad, angles of that pose; empty before the first tick.
+        self._reference_rad = np.empty(0)
+        # Filtered load that their targets compensate.
+        self._filtered_loads_nm = np.zeros(len(robot.joints))
         # Push-points and triplets.
-        self._planned_contacts: dict[str, tuple[KnownObstacle, PlannedContact]] = {}  # by the obstacle's name
+        # By the obstacle's name.
+        self._planned_contacts: dict[str, tuple[KnownObstacle, PlannedContact]] = {}
         self._push_points: list[PushPoint] = []
         self._triplet_finder = TripletFinder(
             condition_max=parameters.condition_max,
@@ -108,13 +126,16 @@ class ObstacleTriplet(Controller[TripletParameters]):
         self._force_n = 0.0
         # Supervision.
         self._stall_detector = StallDetector(
-            stall_m=parameters.stall_m, stall_s=parameters.stall_s, propulsion_n=parameters.propulsion_n
+            stall_m=parameters.stall_m,
+            stall_s=parameters.stall_s,
+            propulsion_n=parameters.propulsion_n,
         )
-        self._stall: tuple[StallReason, float] | None = (
-            None  # last stall, and the arc length of the tail where it occurred
-        )
-        self._banned_triplets: dict[ObstacleNames, float] = {}  # triplet -> arc length at which it was stationary
-        self._excluded_joint: tuple[int, float] | None = None  # joint among those that bend, time until which
+        # Last stall, and the arc length of the tail where it occurred.
+        self._stall: tuple[StallReason, float] | None = None
+        # Triplet -> arc length at which it was stationary.
+        self._banned_triplets: dict[ObstacleNames, float] = {}
+        # Joint among those that bend, time until which.
+        self._excluded_joint: tuple[int, float] | None = None
         self._position_mode_until_s = 0.0
 
     def update(self, observation: Observation) -> ControllerCommand:
@@ -142,7 +163,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
             self._update_push_points(location, body_pose)
             self._update_choice(observation, location, body_pose)
         self._release_swung_out_joint(observation, body_pose)
-        reference_rad = self._reference_rad + self._compute_load_compensation_rad(observation, body_pose)
+        reference_rad = self._reference_rad + self._compute_load_compensation_rad(
+            observation, body_pose
+        )
         self._switch_propulsion_joint(observation, location, reference_rad, last_choice)
         return self._make_command(observation, location, body_pose, reference_rad)
 
@@ -167,7 +190,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
         has_changed_triplet = False
         if choice is not None:
             joint = self._body.yaw_joints[choice.joint]
-            has_changed_triplet = last_choice is not None and choice.triplet.names != last_choice.triplet.names
+            has_changed_triplet = (
+                last_choice is not None and choice.triplet.names != last_choice.triplet.names
+            )
         self._bumpless_transfer.switch_torque_joint(
             joint, observation.joints, reference_rad, restart_ramp=has_changed_triplet
         )
@@ -177,7 +202,11 @@ class ObstacleTriplet(Controller[TripletParameters]):
         )
 
     def _make_command(
-        self, observation: Observation, location: BodyLocation, body_pose: PathBodyPose, reference_rad: Floats
+        self,
+        observation: Observation,
+        location: BodyLocation,
+        body_pose: PathBodyPose,
+        reference_rad: Floats,
     ) -> ControllerCommand:
         """Set all joints to position mode at their reference, and the propulsion joint, if there is one, to its torque.
 
@@ -190,7 +219,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
         Returns:
             The setpoints, with telemetry. Without a chosen triplet, no joint propels.
         """
-        targets: list[float] = self._bumpless_transfer.compute_position_targets_rad(reference_rad).tolist()
+        targets: list[float] = self._bumpless_transfer.compute_position_targets_rad(
+            reference_rad
+        ).tolist()
         modes = [JointMode.POSITION] * len(targets)
         setpoints = RequestedSetpoints(modes, targets, self._body.torque_limit_nm)
         choice = self._choice
@@ -203,11 +234,15 @@ class ObstacleTriplet(Controller[TripletParameters]):
         modes[demand.joint] = JointMode.TORQUE
         targets[demand.joint] = demand.torque_nm
         self._watch_stall(observation, location, choice, demand)
-        return ControllerCommand(setpoints, self._make_push_telemetry(location, body_pose, choice, demand))
+        return ControllerCommand(
+            setpoints, self._make_push_telemetry(location, body_pose, choice, demand)
+        )
 
     # --- control law ---------------------------------------------------------------------------------------------
 
-    def _update_reference_pose(self, observation: Observation, location: BodyLocation) -> PathBodyPose:
+    def _update_reference_pose(
+        self, observation: Observation, location: BodyLocation
+    ) -> PathBodyPose:
         """Update the pose on the path that the joints in position mode follow, without a jump of their targets.
 
         Its arc length follows the measured one with slack, no faster than `overspeed_ratio` times the mission's speed,
@@ -230,8 +265,12 @@ class ObstacleTriplet(Controller[TripletParameters]):
             max_speed_m_s = max(location.trajectory.speed_m_s, 0.0) * parameters.overspeed_ratio
             max_s = last_s + max_speed_m_s * observation.period_s
             followed_s = min(max(last_s, s - parameters.slack_m), s + parameters.slack_m, max_s)
-            body_pose = location.body_on_path.compute_pose_at(max(followed_s, s - parameters.brake_m))
-        pitch_rad = self._platform_climb.compute_pitch_angles_rad(location.trajectory.rises, body_pose.tail_s_m)
+            body_pose = location.body_on_path.compute_pose_at(
+                max(followed_s, s - parameters.brake_m)
+            )
+        pitch_rad = self._platform_climb.compute_pitch_angles_rad(
+            location.trajectory.rises, body_pose.tail_s_m
+        )
         reference_rad = self._body.expand_joint_angles(body_pose) + pitch_rad
         if not len(self._reference_rad):
             self._bumpless_transfer.start_in_position_mode(observation.joints, reference_rad)
@@ -241,7 +280,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
         self._reference_rad = reference_rad
         return body_pose
 
-    def _compute_load_compensation_rad(self, observation: Observation, body_pose: PathBodyPose) -> Floats:
+    def _compute_load_compensation_rad(
+        self, observation: Observation, body_pose: PathBodyPose
+    ) -> Floats:
         """Update the filtered loads, and return by how much targets lead the path's angles: load / stiffness.
 
         The load of a joint is `load_ratio` times its torque for the planned contact forces. A servo gives way under a
@@ -259,7 +300,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
             return np.zeros(len(self._filtered_loads_nm))
         loads_nm = np.zeros(len(self._filtered_loads_nm))
         if self._choice is not None and self._force_n > 0.0:
-            loads_nm = load_ratio * compute_bending_torques_nm(self._body, body_pose, self._choice, self._force_n)
+            loads_nm = load_ratio * compute_bending_torques_nm(
+                self._body, body_pose, self._choice, self._force_n
+            )
         decay = np.exp(-observation.period_s / self.parameters.load_filter_s)
         self._filtered_loads_nm = decay * self._filtered_loads_nm + (1.0 - decay) * loads_nm
         return self._filtered_loads_nm / self._stiffness
@@ -297,13 +340,19 @@ class ObstacleTriplet(Controller[TripletParameters]):
         unlimited_force_n = desired_force_n * min(max(fade, 0.0), 1.0)
         max_change_n = parameters.propulsion_rate_n_s * observation.period_s
         unlimited_force_n = min(
-            max(unlimited_force_n, self._unlimited_force_n - max_change_n), self._unlimited_force_n + max_change_n
+            max(unlimited_force_n, self._unlimited_force_n - max_change_n),
+            self._unlimited_force_n + max_change_n,
         )
         self._unlimited_force_n = unlimited_force_n
 
         force_n = min(unlimited_force_n, limit_nm / max(abs(torque_per_n), MIN_TORQUE_PER_N))
-        torque_nm = force_n * torque_per_n - parameters.damping_nm_s_per_rad * observation.joints.velocity_rad_s[joint]
-        torque_nm = min(max(self._bumpless_transfer.compute_torque_target_nm(torque_nm), -limit_nm), limit_nm)
+        torque_nm = (
+            force_n * torque_per_n
+            - parameters.damping_nm_s_per_rad * observation.joints.velocity_rad_s[joint]
+        )
+        torque_nm = min(
+            max(self._bumpless_transfer.compute_torque_target_nm(torque_nm), -limit_nm), limit_nm
+        )
         return PropulsionDemand(
             joint=joint,
             desired_force_n=desired_force_n,
@@ -327,7 +376,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
         if location.may_have_jumped:
             self._planned_contacts.clear()
         self._update_planned_contacts(location)
-        retained = [contact.obstacle for contact in location.world.contacts if contact.obstacle is not None]
+        retained = [
+            contact.obstacle for contact in location.world.contacts if contact.obstacle is not None
+        ]
         if self._choice is not None:
             retained += self._choice.triplet.names
         self._push_points = find_push_points(
@@ -362,7 +413,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
             window_m=half_length_m + PLAN_WINDOW_M,
         )
 
-    def _update_choice(self, observation: Observation, location: BodyLocation, body_pose: PathBodyPose) -> None:
+    def _update_choice(
+        self, observation: Observation, location: BodyLocation, body_pose: PathBodyPose
+    ) -> None:
         """Choose the triplet that propels, with its joint, from the current push-points; `_choice` is None without one.
 
         No triplet is chosen if no motion is desired, or for some time after a stall. A triplet at which the body was
@@ -378,7 +431,11 @@ class ObstacleTriplet(Controller[TripletParameters]):
         if self._excluded_joint is not None:
             excluded_joint, _ = self._excluded_joint
         choices, self._refusal_reasons = self._triplet_finder.find_propulsion_choices(
-            self._push_points, body_pose.body_points_w, self._body.body_points_s_m, self._choice, excluded_joint
+            self._push_points,
+            body_pose.body_points_w,
+            self._body.body_points_s_m,
+            self._choice,
+            excluded_joint,
         )
         if location.trajectory.speed_m_s <= 0 or observation.time_s < self._position_mode_until_s:
             self._choice = None
@@ -388,7 +445,10 @@ class ObstacleTriplet(Controller[TripletParameters]):
             current_triplet = self._choice.triplet
         switch_fraction = self.parameters.switch_fraction
         choice = choose_triplet(
-            choices, current_triplet, switch_fraction=switch_fraction, banned_triplets=self._banned_triplets
+            choices,
+            current_triplet,
+            switch_fraction=switch_fraction,
+            banned_triplets=self._banned_triplets,
         )
         if choice is None:  # a banned triplet is better than none
             choice = choose_triplet(choices, current_triplet, switch_fraction=switch_fraction)
@@ -398,7 +458,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
         """Forget a stall and bans that lie `blend_m` of travel back, and an excluded joint whose time is over."""
         blend_m = self.parameters.blend_m
         self._banned_triplets = {
-            names: s_m for names, s_m in self._banned_triplets.items() if abs(tail_s_m - s_m) < blend_m
+            names: s_m
+            for names, s_m in self._banned_triplets.items()
+            if abs(tail_s_m - s_m) < blend_m
         }
         if self._stall is not None and abs(tail_s_m - self._stall[1]) > blend_m:
             self._stall = None
@@ -414,7 +476,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
         joint = self._choice.joint
         guard_s = self.parameters.guard_s
         robot_joint = self._body.yaw_joints[joint]
-        swing_out_rad = observation.joints.angle_rad[robot_joint] - float(body_pose.angles_rad[joint])
+        swing_out_rad = observation.joints.angle_rad[robot_joint] - float(
+            body_pose.angles_rad[joint]
+        )
         if abs(swing_out_rad) > self.parameters.angle_guard_rad:
             self._excluded_joint = (joint, observation.time_s + guard_s)
             name = self._body.joint_names[robot_joint]
@@ -424,7 +488,11 @@ class ObstacleTriplet(Controller[TripletParameters]):
             self._choice = None
 
     def _watch_stall(
-        self, observation: Observation, location: BodyLocation, choice: PropulsionChoice, demand: PropulsionDemand
+        self,
+        observation: Observation,
+        location: BodyLocation,
+        choice: PropulsionChoice,
+        demand: PropulsionDemand,
     ) -> None:
         """Detect a standstill while pushing, and release a triplet that is strained but does not move the body.
 
@@ -436,7 +504,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
             choice: The triplet that propels.
             demand: Force and torque of the propulsion joint, and which limit applied.
         """
-        if not self._stall_detector.has_stalled(observation.time_s, location.tail_s_m, demand.desired_force_n):
+        if not self._stall_detector.has_stalled(
+            observation.time_s, location.tail_s_m, demand.desired_force_n
+        ):
             return
         self._stall_detector.reset()
         joint_name = self._body.joint_names[demand.joint]
@@ -513,7 +583,11 @@ class ObstacleTriplet(Controller[TripletParameters]):
         return self._stall is not None and self._stall[0].is_jammed
 
     def _make_push_telemetry(
-        self, location: BodyLocation, body_pose: PathBodyPose, choice: PropulsionChoice, demand: PropulsionDemand
+        self,
+        location: BodyLocation,
+        body_pose: PathBodyPose,
+        choice: PropulsionChoice,
+        demand: PropulsionDemand,
     ) -> Telemetry:
         """Return the telemetry of a tick in which a triplet propels: its joint, its contacts and its forces.
 
@@ -541,7 +615,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
             push_points=make_contact_messages(self._body, location.world, choice, forces_n),
             desired_force_n=forces_n,
             propulsion_torque_nm=demand.torque_nm,
-            bending_torque_nm=compute_bending_torques_nm(self._body, body_pose, choice, demand.force_n).tolist(),
+            bending_torque_nm=compute_bending_torques_nm(
+                self._body, body_pose, choice, demand.force_n
+            ).tolist(),
             reference_rad=self._reference_rad.tolist(),
             condition=choice.triplet.unit_forces.condition,
             torque_headroom_nm=self._body.torque_limit_nm[demand.joint] - full_torque_nm,

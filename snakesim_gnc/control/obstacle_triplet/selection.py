@@ -46,7 +46,9 @@ class ContactTriplet:
         points_w = np.array([contact.point_w for contact in self.contacts])
         normals_w = np.array([contact.normal_w for contact in self.contacts])
         tether_w = -np.array(self.contacts[0].tangent_w)
-        return compute_wrenches(points_w, add_tether_force(self.unit_forces.forces, normals_w, tether_w))
+        return compute_wrenches(
+            points_w, add_tether_force(self.unit_forces.forces, normals_w, tether_w)
+        )
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,9 @@ class PropulsionChoice:
     torque_per_n: float  # N·m/N, on the part of the body ahead of that joint
 
 
-def solve_triplets(contact_triples: Sequence[ContactTriple], *, condition_max: float) -> list[ContactTriplet]:
+def solve_triplets(
+    contact_triples: Sequence[ContactTriple], *, condition_max: float
+) -> list[ContactTriplet]:
     """Solve the contact forces for 1 N of propulsion of several triplets at once.
 
     Args:
@@ -72,8 +76,12 @@ def solve_triplets(contact_triples: Sequence[ContactTriple], *, condition_max: f
     if not contact_triples:
         return []
     all_unit_forces = solve_unit_forces(
-        np.array([[contact.point_w for contact in contact_triple] for contact_triple in contact_triples]),
-        np.array([[contact.normal_w for contact in contact_triple] for contact_triple in contact_triples]),
+        np.array(
+            [[contact.point_w for contact in contact_triple] for contact_triple in contact_triples]
+        ),
+        np.array(
+            [[contact.normal_w for contact in contact_triple] for contact_triple in contact_triples]
+        ),
         np.array([contact_triple[0].tangent_w for contact_triple in contact_triples]),
         condition_max=condition_max,
     )
@@ -86,9 +94,15 @@ def solve_triplets(contact_triples: Sequence[ContactTriple], *, condition_max: f
 def _make_triplet(contact_triple: ContactTriple, unit_forces: UnitForces) -> ContactTriplet:
     _, middle, front = contact_triple
     force_3_per_n = float(unit_forces.forces[2])
-    max_torque = compute_torque_per_newton(force_3_per_n, front.point_w, front.normal_w, middle.point_w)
+    max_torque = compute_torque_per_newton(
+        force_3_per_n, front.point_w, front.normal_w, middle.point_w
+    )
     return ContactTriplet(
-        _get_obstacle_names(contact_triple), contact_triple, unit_forces, force_3_per_n, abs(max_torque)
+        _get_obstacle_names(contact_triple),
+        contact_triple,
+        unit_forces,
+        force_3_per_n,
+        abs(max_torque),
     )
 
 
@@ -110,7 +124,11 @@ def find_alternating_triples(sides: Sequence[int]) -> list[tuple[int, int, int]]
 
 
 def find_propulsion_joint(
-    body_points_s_m: Sequence[float], o_2_s_m: float, o_3_s_m: float, current_joint_index: int | None, hold_on_m: float
+    body_points_s_m: Sequence[float],
+    o_2_s_m: float,
+    o_3_s_m: float,
+    current_joint_index: int | None,
+    hold_on_m: float,
 ) -> int | None:
     """Find the joint that propels a triplet of push-points o_1, o_2, o_3 (tail to head).
 
@@ -173,7 +191,10 @@ def choose_triplet(
         return None
     min_torque = min(choice.triplet.torque_per_n for choice in allowed_choices)
     for choice in allowed_choices:
-        if choice.triplet is current_triplet and min_torque >= switch_fraction * choice.triplet.torque_per_n:
+        if (
+            choice.triplet is current_triplet
+            and min_torque >= switch_fraction * choice.triplet.torque_per_n
+        ):
             return choice
     current_obstacles: frozenset[str] = frozenset()
     if current_triplet is not None:
@@ -181,9 +202,17 @@ def choose_triplet(
 
     def compute_rank(choice: PropulsionChoice) -> tuple[int, float, float]:
         shared_count = len(current_obstacles.intersection(choice.triplet.names))
-        return shared_count, -round(choice.triplet.torque_per_n, TORQUE_DECIMALS), -choice.body_s_m[1]
+        return (
+            shared_count,
+            -round(choice.triplet.torque_per_n, TORQUE_DECIMALS),
+            -choice.body_s_m[1],
+        )
 
-    candidates = [choice for choice in allowed_choices if switch_fraction * choice.triplet.torque_per_n <= min_torque]
+    candidates = [
+        choice
+        for choice in allowed_choices
+        if switch_fraction * choice.triplet.torque_per_n <= min_torque
+    ]
     return max(candidates, key=compute_rank)
 
 
@@ -275,20 +304,28 @@ class TripletFinder:
         if triplet.unit_forces.reason:
             return triplet.unit_forces.reason
         _, o_2_s_m, o_3_s_m = contacts_s_m
-        joint = find_propulsion_joint(body_points_s_m, o_2_s_m, o_3_s_m, current_joint_index, self._hold_on_m)
+        joint = find_propulsion_joint(
+            body_points_s_m, o_2_s_m, o_3_s_m, current_joint_index, self._hold_on_m
+        )
         if joint is None:
             return "no joint between o_2 and o_3"
         if joint == excluded_joint_index:
             return "its propulsion joint has left its reference too far"
         joint_w = (float(body_points_w[0, joint + 1]), float(body_points_w[1, joint + 1]))
         o_3 = triplet.contacts[2]
-        authority_problem = find_authority_problem(o_3.point_w, o_3.normal_w, joint_w, self._authority_min)
+        authority_problem = find_authority_problem(
+            o_3.point_w, o_3.normal_w, joint_w, self._authority_min
+        )
         if authority_problem:
             return authority_problem
-        torque_per_n = compute_torque_per_newton(triplet.force_3_per_n, o_3.point_w, o_3.normal_w, joint_w)
+        torque_per_n = compute_torque_per_newton(
+            triplet.force_3_per_n, o_3.point_w, o_3.normal_w, joint_w
+        )
         return PropulsionChoice(triplet, contacts_s_m, joint, torque_per_n)
 
-    def _solve_triplets_cached(self, contact_triples: Sequence[ContactTriple]) -> list[ContactTriplet]:
+    def _solve_triplets_cached(
+        self, contact_triples: Sequence[ContactTriple]
+    ) -> list[ContactTriplet]:
         """Return the triplets of these contacts in order. Solve only those that are new, and forget all others."""
         solved_triplets: dict[ObstacleNames, ContactTriplet] = {}
         for contact_triple in contact_triples:
@@ -303,4 +340,7 @@ class TripletFinder:
         for triplet in solve_triplets(new_triples, condition_max=self._condition_max):
             solved_triplets[triplet.names] = triplet
         self._solved_triplets = solved_triplets
-        return [solved_triplets[_get_obstacle_names(contact_triple)] for contact_triple in contact_triples]
+        return [
+            solved_triplets[_get_obstacle_names(contact_triple)]
+            for contact_triple in contact_triples
+        ]

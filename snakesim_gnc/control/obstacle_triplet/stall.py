@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from snakesim_gnc.control.contact_forces import NetContactForce, explain_standstill
 
-MIN_PUSH_RATIO = 0.5  # of `propulsion_n`; with less as a mean over the window, the body does not really push
+# Of `propulsion_n`; with less as a mean over the window, the body does not really push.
+MIN_PUSH_RATIO = 0.5
 TIME_TOLERANCE_S = 1e-9  # rounding of sums of ticks
 
 
@@ -33,7 +34,8 @@ class StallDetector:
         self._min_progress_m = stall_m
         self._window_s = stall_s
         self._min_mean_force_n = MIN_PUSH_RATIO * propulsion_n
-        self._recent_samples: deque[tuple[float, float, float]] = deque()  # time in s, arc length in m, force in N
+        # Time in s, arc length in m, force in N.
+        self._recent_samples: deque[tuple[float, float, float]] = deque()
         self._force_sum_n = 0.0  # over the window
 
     def reset(self) -> None:
@@ -61,9 +63,9 @@ class StallDetector:
         first_s, first_s_m, _ = samples[0]
         if time_s - first_s < self._window_s - TIME_TOLERANCE_S:
             return False
-        return abs(tail_s_m - first_s_m) < self._min_progress_m and self._force_sum_n > self._min_mean_force_n * len(
-            samples
-        )
+        return abs(
+            tail_s_m - first_s_m
+        ) < self._min_progress_m and self._force_sum_n > self._min_mean_force_n * len(samples)
 
 
 def explain_stall(
@@ -97,7 +99,9 @@ def explain_stall(
     """
     may_touch_obstacles = net_force is None or net_force.max_contact_n != 0.0
     is_joint_strained = (
-        saturated_joint is not None or swung_out_joint is not None or desired_force_n > drag_ratio * weight_n
+        saturated_joint is not None
+        or swung_out_joint is not None
+        or desired_force_n > drag_ratio * weight_n
     )
     are_contacts_strained = net_force is not None and net_force.max_contact_n > jam_force_n
     jammed, reason = explain_standstill(force_n, net_force, push_points)

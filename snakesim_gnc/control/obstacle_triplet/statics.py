@@ -33,7 +33,8 @@ class UnitForces:
     """Forces of three contacts for each newton of propulsion."""
 
     forces: Floats  # (3,) N/N, tail to head; NaN where the balance has no unique solution
-    condition: float  # of the balance, with lengths in units of the triplet's span; infinite when singular
+    # Of the balance, with lengths in units of the triplet's span; infinite when singular.
+    condition: float
     reason: str  # why these contacts cannot propel; empty when they can
 
 
@@ -41,7 +42,8 @@ class UnitForces:
 class TripletSolution:
     """Forces of three contacts and torque of one joint for a propulsion force."""
 
-    forces_n: Floats  # (3,) tail to head, along the normals; NaN where the balance has no unique solution
+    # (3,) tail to head, along the normals; NaN where the balance has no unique solution.
+    forces_n: Floats
     torque_nm: float  # internal torque on the part of the body ahead of the joint, left turn positive; NaN like forces
     condition: float
     is_feasible: bool
@@ -84,9 +86,13 @@ def solve_triplet(
     _check_unit_vectors("tangent_1_w", tangent[None])
     if not (math.isfinite(propulsion_n) and propulsion_n > 0):
         raise ValueError(f"propulsion_n = {propulsion_n} N must be a finite force above 0")
-    (unit,) = solve_unit_forces(points[None], normals[None], tangent[None], condition_max=condition_max)
+    (unit,) = solve_unit_forces(
+        points[None], normals[None], tangent[None], condition_max=condition_max
+    )
     forces_n = propulsion_n * unit.forces
-    torque_nm = propulsion_n * compute_torque_per_newton(unit.forces[2], points[2], normals[2], joint)
+    torque_nm = propulsion_n * compute_torque_per_newton(
+        unit.forces[2], points[2], normals[2], joint
+    )
     reason = unit.reason or find_authority_problem(points[2], normals[2], joint, authority_min)
     return TripletSolution(
         forces_n=forces_n,
@@ -98,7 +104,11 @@ def solve_triplet(
 
 
 def solve_unit_forces(
-    points_w: Floats, normals_w: Floats, tangents_1_w: Floats, *, condition_max: float = CONDITION_MAX
+    points_w: Floats,
+    normals_w: Floats,
+    tangents_1_w: Floats,
+    *,
+    condition_max: float = CONDITION_MAX,
 ) -> list[UnitForces]:
     """Compute the contact forces for 1 N of propulsion of m triplets at once. Arguments are not checked.
 
@@ -132,16 +142,24 @@ def solve_unit_forces(
     conditions = np.where(has_span, np.linalg.cond(a), np.inf)
     is_well_conditioned = conditions <= condition_max
     forces = np.full((len(span_m), 3), np.nan)  # lambda
-    forces[is_well_conditioned] = np.linalg.solve(a[is_well_conditioned], b[is_well_conditioned, :, None])[..., 0]
+    forces[is_well_conditioned] = np.linalg.solve(
+        a[is_well_conditioned], b[is_well_conditioned, :, None]
+    )[..., 0]
 
     results: list[UnitForces] = []
-    for forces_of_triplet, condition, length_m in zip(forces, conditions.tolist(), span_m.tolist(), strict=True):
-        reason = _find_propulsion_problem(length_m, condition, condition_max, forces_of_triplet.tolist())
+    for forces_of_triplet, condition, length_m in zip(
+        forces, conditions.tolist(), span_m.tolist(), strict=True
+    ):
+        reason = _find_propulsion_problem(
+            length_m, condition, condition_max, forces_of_triplet.tolist()
+        )
         results.append(UnitForces(forces_of_triplet, condition, reason))
     return results
 
 
-def _find_propulsion_problem(span_m: float, condition: float, condition_max: float, forces: list[float]) -> str:
+def _find_propulsion_problem(
+    span_m: float, condition: float, condition_max: float, forces: list[float]
+) -> str:
     """Return why three contacts cannot propel the body; an empty text if they can.
 
     Args:
@@ -155,13 +173,17 @@ def _find_propulsion_problem(span_m: float, condition: float, condition_max: flo
     if not condition <= condition_max:  # also true for NaN
         condition_text = f"the three normals (nearly) meet in a point or are parallel (condition {condition:.3g})"
         return f"ill-conditioned: {condition_text}"
-    pulling = [f"lambda_{i + 1} = {force:.3g} N/N" for i, force in enumerate(forces) if force <= 0.0]
+    pulling = [
+        f"lambda_{i + 1} = {force:.3g} N/N" for i, force in enumerate(forces) if force <= 0.0
+    ]
     if pulling:
         return f"a contact would have to pull: {', '.join(pulling)}"
     return ""
 
 
-def compute_torque_per_newton(unit_force_3: float, point_3_w: Planar, normal_3_w: Planar, joint_w: Planar) -> float:
+def compute_torque_per_newton(
+    unit_force_3: float, point_3_w: Planar, normal_3_w: Planar, joint_w: Planar
+) -> float:
     """Return the torque on the part ahead of a joint between o_2 and o_3, in N·m per newton of propulsion.
 
     It is -lambda_3 (r x n_3), where r reaches from the joint to o_3.
@@ -180,7 +202,9 @@ def compute_torque_per_newton(unit_force_3: float, point_3_w: Planar, normal_3_w
     return float(-unit_force_3 * r_cross_n)
 
 
-def find_authority_problem(point_3_w: Planar, normal_3_w: Planar, joint_w: Planar, authority_min: float) -> str:
+def find_authority_problem(
+    point_3_w: Planar, normal_3_w: Planar, joint_w: Planar, authority_min: float
+) -> str:
     """Return why a torque of the joint does not press on the contact at o_3; an empty text if it does.
 
     With r from the joint to o_3, the joint has authority if |r x n_3| >= authority_min |r|.
@@ -202,7 +226,11 @@ def find_authority_problem(point_3_w: Planar, normal_3_w: Planar, joint_w: Plana
 
 
 def compute_bending_torque_nm(
-    joints_w: ArrayLike, joints_s_m: ArrayLike, points_w: ArrayLike, points_s_m: ArrayLike, forces_w: ArrayLike
+    joints_w: ArrayLike,
+    joints_s_m: ArrayLike,
+    points_w: ArrayLike,
+    points_s_m: ArrayLike,
+    forces_w: ArrayLike,
 ) -> Floats:
     """Compute the internal torque at every joint that balances the forces ahead of it; equation (12).
 
@@ -220,10 +248,14 @@ def compute_bending_torque_nm(
         (n,) torques in N·m.
     """
     wrenches = compute_wrenches(np.asarray(points_w), np.asarray(forces_w))
-    return compute_joint_torques(np.asarray(joints_w), np.asarray(joints_s_m), np.asarray(points_s_m), wrenches)
+    return compute_joint_torques(
+        np.asarray(joints_w), np.asarray(joints_s_m), np.asarray(points_s_m), wrenches
+    )
 
 
-def compute_joint_torques(joints_w: Floats, joints_s_m: Floats, points_s_m: Floats, wrenches: Floats) -> Floats:
+def compute_joint_torques(
+    joints_w: Floats, joints_s_m: Floats, points_s_m: Floats, wrenches: Floats
+) -> Floats:
     """Compute the internal torque at every joint that balances the wrenches ahead of the joint.
 
     With the sums F and M over all wrenches ahead of a joint at p, M about the origin: torque = p x F - M.

@@ -28,7 +28,10 @@ def compute_bending_torques_nm(
     """
     contacts_s_m = np.array(choice.body_s_m)
     unit_torques_nm = compute_joint_torques(
-        body.compute_joint_positions_w(body_pose), body.joint_s_m, contacts_s_m, choice.triplet.unit_wrenches
+        body.compute_joint_positions_w(body_pose),
+        body.joint_s_m,
+        contacts_s_m,
+        choice.triplet.unit_wrenches,
     )  # for 1 N of propulsion
     return force_n * unit_torques_nm
 
@@ -49,7 +52,9 @@ def make_contact_messages(
     """
     height_m = world.base_position_w[2]
     messages: list[WorldContact] = []
-    for contact, body_s_m, force_n in zip(choice.triplet.contacts, choice.body_s_m, forces_n, strict=True):
+    for contact, body_s_m, force_n in zip(
+        choice.triplet.contacts, choice.body_s_m, forces_n, strict=True
+    ):
         x, y = contact.point_w
         normal_x, normal_y = contact.normal_w
         tangent_x, tangent_y = contact.tangent_w

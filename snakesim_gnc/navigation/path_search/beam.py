@@ -30,12 +30,19 @@ import numpy as np
 
 from snakesim_gnc.geometry.planar import compute_wrenches, sample_back_from_end
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
-from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_obstacle_contacts
+from snakesim_gnc.navigation.path_search.body_contacts import (
+    compute_node_margins_n,
+    find_obstacle_contacts,
+)
 from snakesim_gnc.navigation.path_search.native_growth import NativeExpander
 from snakesim_gnc.navigation.path_search.native_library import is_native_available
 from snakesim_gnc.navigation.path_search.path_growth import PathExpander
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, make_start_nodes
-from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_arcs_per_body
+from snakesim_gnc.navigation.path_search.search_parameters import (
+    STEP_M,
+    SearchParameters,
+    count_arcs_per_body,
+)
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
 from snakesim_gnc.navigation.path_search.specified_growth import NumpyExpander
 from snakesim_hal.base.arrays import Floats
@@ -44,9 +51,8 @@ from snakesim_hal.base.arrays import Floats
 TAIL_OFFSETS_M = (-0.03, 0.0, 0.03)  # to the left
 TAIL_TURNS_RAD = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])
 
-PathSearchSteps = Generator[
-    int, None, SearchedPath | None
-]  # yields the nodes of each step; returns None without a path
+# Yields the nodes of each step; returns None without a path.
+PathSearchSteps = Generator[int, None, SearchedPath | None]
 
 
 class BeamSearch:
@@ -73,7 +79,9 @@ class BeamSearch:
             expander_class = NativeExpander if is_native_available() else NumpyExpander
         self._expander_class = expander_class
 
-    def search_ahead(self, body_w: Floats, travel_direction_rad: float, arc_count: int) -> PathSearchSteps:
+    def search_ahead(
+        self, body_w: Floats, travel_direction_rad: float, arc_count: int
+    ) -> PathSearchSteps:
         """Search the best path ahead of the head.
 
         Args:
@@ -93,7 +101,9 @@ class BeamSearch:
         task = SearchTask(
             origin_w=origin_w,
             travel_direction_rad=travel_direction_rad,
-            travel_direction_w=np.array([np.cos(travel_direction_rad), np.sin(travel_direction_rad)]),
+            travel_direction_w=np.array(
+                [np.cos(travel_direction_rad), np.sin(travel_direction_rad)]
+            ),
             # Integral of the wrench of the unit tangent over each arc of the body.
             initial_drag_m=STEP_M * compute_wrenches(midpoints_w - origin_w, tangents),
         )
@@ -127,7 +137,9 @@ class BeamSearch:
         task = SearchTask(
             origin_w=body_w[-1],
             travel_direction_rad=travel_direction_rad,
-            travel_direction_w=np.array([np.cos(travel_direction_rad), np.sin(travel_direction_rad)]),
+            travel_direction_w=np.array(
+                [np.cos(travel_direction_rad), np.sin(travel_direction_rad)]
+            ),
             initial_drag_m=np.zeros((self._arcs_per_body, 3)),
             initial_body_w=initial_body_w,
             max_sideways_m=max_sideways_m,
@@ -174,12 +186,18 @@ class BeamSearch:
         ahead = body_w[-1:] - body_w[-2:-1]
         node = make_start_nodes(body_w[-1:], np.arctan2(ahead[:, 1], ahead[:, 0]))
         node.drag_m = task.initial_drag_m.sum(axis=0)[None]
-        contacts = find_obstacle_contacts(self._obstacles, middles_w, tangents, self._parameters, task)
+        contacts = find_obstacle_contacts(
+            self._obstacles, middles_w, tangents, self._parameters, task
+        )
         for arc in np.flatnonzero(contacts.is_usable):
             s_m = -STEP_M * (self._arcs_per_body - int(arc) - 0.5)
             row = slice(arc, arc + 1)
             node.add_contacts(
-                contacts.is_usable[row], contacts.obstacle[row], contacts.gap_m[row], contacts.wrench[row], s_m
+                contacts.is_usable[row],
+                contacts.obstacle[row],
+                contacts.gap_m[row],
+                contacts.wrench[row],
+                s_m,
             )
         node.propulsion_margin_n = compute_node_margins_n(node, self._parameters)
         return node
@@ -203,5 +221,7 @@ def _make_start_nodes_at_tail(initial_body_w: Floats) -> NodeLayer:
     heading_rad = float(np.arctan2(ahead[1], ahead[0]))
     left = np.array([-np.sin(heading_rad), np.cos(heading_rad)])
     turn_count = len(TAIL_TURNS_RAD)
-    points_w = np.concatenate([np.tile(tail_w + offset_m * left, (turn_count, 1)) for offset_m in TAIL_OFFSETS_M])
+    points_w = np.concatenate(
+        [np.tile(tail_w + offset_m * left, (turn_count, 1)) for offset_m in TAIL_OFFSETS_M]
+    )
     return make_start_nodes(points_w, np.tile(heading_rad + TAIL_TURNS_RAD, len(TAIL_OFFSETS_M)))

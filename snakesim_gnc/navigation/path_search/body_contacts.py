@@ -13,7 +13,11 @@ from snakesim_gnc.geometry.planar import compute_wrenches
 from snakesim_gnc.navigation.obstacle_grid import NO_OBSTACLE, ObstacleGrid
 from snakesim_gnc.navigation.path_search.margin import compute_margins_n
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer
-from snakesim_gnc.navigation.path_search.search_parameters import MAX_FRONTAL, MIN_PUSH, SearchParameters
+from snakesim_gnc.navigation.path_search.search_parameters import (
+    MAX_FRONTAL,
+    MIN_PUSH,
+    SearchParameters,
+)
 from snakesim_gnc.navigation.path_search.search_task import SearchTask
 from snakesim_hal.base.arrays import Floats
 
@@ -33,7 +37,11 @@ class ObstacleContacts:
 
 
 def find_obstacle_contacts(
-    obstacles: ObstacleGrid, points_w: Floats, tangents: Floats, parameters: SearchParameters, task: SearchTask
+    obstacles: ObstacleGrid,
+    points_w: Floats,
+    tangents: Floats,
+    parameters: SearchParameters,
+    task: SearchTask,
 ) -> ObstacleContacts:
     """Find the obstacles that bodies touch at points on their axes, and the force that these contacts give.
 
@@ -58,7 +66,8 @@ def find_obstacle_contacts(
     is_at_side = np.abs(_dot(normals, tangents)) < MAX_FRONTAL
     is_contact = has_obstacle & is_close & is_at_side
     propulsion = _dot(normals, task.travel_direction_w)
-    contact_points_m = points_w - normals * parameters.radius_m - task.origin_w  # on the skin, from the origin
+    # On the skin, from the origin.
+    contact_points_m = points_w - normals * parameters.radius_m - task.origin_w
     unit_force = normals - parameters.assumed_obstacle_friction * tangents
     return ObstacleContacts(
         propulsion=np.where(is_contact, propulsion, 0.0),
@@ -78,7 +87,8 @@ def compute_node_margins_n(nodes: NodeLayer, parameters: SearchParameters) -> Fl
     last_s_m = nodes.path_length_m - parameters.unused_head_m
     is_usable = (nodes.contact_arc_length_m >= first_s_m) & (nodes.contact_arc_length_m <= last_s_m)
     usable_wrenches = np.where(is_usable[..., None], nodes.contact_wrench, 0.0)
-    drag_per_newton = nodes.drag_m / parameters.body_length_m  # wrench of a drag of 1 N, spread over the whole body
+    # Wrench of a drag of 1 N, spread over the whole body.
+    drag_per_newton = nodes.drag_m / parameters.body_length_m
     return compute_margins_n(usable_wrenches, drag_per_newton)
 
 

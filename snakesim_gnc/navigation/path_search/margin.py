@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 
 MAX_CONTACT_FORCE_N = 80.0  # lambda_max
-MIN_DETERMINANT = 1e-4  # of three unit wrenches with scaled moments; smaller ones cannot balance every load
-WRENCH_SCALE = (1.0, 1.0, 2.0)  # moments count over half a meter, so that they are of the order of the forces
+# Of three unit wrenches with scaled moments; smaller ones cannot balance every load.
+MIN_DETERMINANT = 1e-4
+# Moments count over half a meter, so that they are of the order of the forces.
+WRENCH_SCALE = 1.0, 1.0, 2.0
 MIN_FORCE_PER_N = 1e-9  # avoids a division by zero
 
 
@@ -75,7 +77,11 @@ def _compute_margins_with_all_contacts_n(contacts: Floats, drag: Floats) -> Floa
     is_regular = np.abs(volume) > MIN_DETERMINANT
     inverse_volume = 1.0 / np.where(is_regular, volume, 1.0)
     forces = np.stack(
-        [_dot(d, b_cross_c) * inverse_volume, -_dot(c, d_cross_a) * inverse_volume, _dot(b, d_cross_a) * inverse_volume]
+        [
+            _dot(d, b_cross_c) * inverse_volume,
+            -_dot(c, d_cross_a) * inverse_volume,
+            _dot(b, d_cross_a) * inverse_volume,
+        ]
     )
     can_push = is_regular & (forces.min(axis=0) >= 0.0)
     max_force = np.maximum(forces.max(axis=0), MIN_FORCE_PER_N)
@@ -91,7 +97,9 @@ def _list_contact_triples(count: int) -> tuple[NDArray[np.intp], ...]:
 
 def _cross(a: Floats, b: Floats) -> Floats:
     """Return a x b of vectors whose components are the first axis."""
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
 
 
 def _dot(a: Floats, b: Floats) -> Floats:

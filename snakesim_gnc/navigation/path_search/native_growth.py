@@ -27,7 +27,11 @@ from snakesim_gnc.navigation.path_search.native_library import (
 from snakesim_gnc.navigation.path_search.path_growth import PathExpander
 from snakesim_gnc.navigation.path_search.search_arcs import ArcTable
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer
-from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, SearchParameters, count_arcs_per_body
+from snakesim_gnc.navigation.path_search.search_parameters import (
+    STEP_M,
+    SearchParameters,
+    count_arcs_per_body,
+)
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
 
 Array = NDArray[Any]
@@ -42,7 +46,12 @@ class NativeExpander(PathExpander):
     """
 
     def __init__(
-        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, step_count: int
+        self,
+        obstacles: ObstacleGrid,
+        parameters: SearchParameters,
+        task: SearchTask,
+        start: NodeLayer,
+        step_count: int,
     ) -> None:
         """Copy a search into the structures of the C library, which then expands it layer by layer.
 
@@ -58,7 +67,9 @@ class NativeExpander(PathExpander):
         """
         library = load_library()
         if library is None:
-            raise PlannerLibraryError(f"there is no C library of the planner: {explain_missing_library()}")
+            raise PlannerLibraryError(
+                f"there is no C library of the planner: {explain_missing_library()}"
+            )
         self._expand_in_c = library.expand
         self._max_nodes_per_layer = max(parameters.kept_nodes, len(start.x_m))
         self._max_layers = step_count + 1
@@ -79,7 +90,9 @@ class NativeExpander(PathExpander):
     def expand_layer(self) -> bool:
         added_count = self._expand_in_c(ctypes.byref(self._native_search))
         if added_count == LAYER_LIMIT_REACHED:
-            raise PlannerLibraryError(f"the paths have {self._max_layers - 1} arcs already, as many as were asked for")
+            raise PlannerLibraryError(
+                f"the paths have {self._max_layers - 1} arcs already, as many as were asked for"
+            )
         return added_count > 0
 
     def trace_cheapest(self) -> SearchedPath | None:
@@ -87,7 +100,9 @@ class NativeExpander(PathExpander):
         layers = self._native_search.layers
         if layers.layer_count == 1:
             return None
-        newest = self._alternating_nodes[(layers.layer_count - 1) % 2]["cost_m"][: layers.node_count]
+        newest = self._alternating_nodes[(layers.layer_count - 1) % 2]["cost_m"][
+            : layers.node_count
+        ]
         row = int(np.argmin(newest))
         cost_m = float(newest[row])
         points: list[tuple[float, float]] = []
@@ -104,15 +119,33 @@ class NativeExpander(PathExpander):
         curvatures_per_m = arcs.curvatures_per_m
         shape = (len(curvatures_per_m),)
         table.count = len(curvatures_per_m)
-        table.curvature_per_m = self._memory.get_array_address("the curvatures", curvatures_per_m, shape)
-        table.turn_rad = self._memory.get_array_address("the turns", curvatures_per_m * STEP_M, shape)
-        table.half_turn_rad = self._memory.get_array_address("the half turns", 0.5 * curvatures_per_m * STEP_M, shape)
-        table.end_ahead_m = self._memory.get_array_address("the ends of the arcs", arcs.end_m[0], shape)
-        table.end_left_m = self._memory.get_array_address("the ends of the arcs", arcs.end_m[1], shape)
-        table.middle_ahead_m = self._memory.get_array_address("the middles of the arcs", arcs.middle_m[0], shape)
-        table.middle_left_m = self._memory.get_array_address("the middles of the arcs", arcs.middle_m[1], shape)
-        table.needed_inside_m = self._memory.get_array_address("the needed distances", arcs.needed_inside_m, shape)
-        table.surely_clear_m = self._memory.get_array_address("the clear distances", arcs.surely_clear_m, shape)
+        table.curvature_per_m = self._memory.get_array_address(
+            "the curvatures", curvatures_per_m, shape
+        )
+        table.turn_rad = self._memory.get_array_address(
+            "the turns", curvatures_per_m * STEP_M, shape
+        )
+        table.half_turn_rad = self._memory.get_array_address(
+            "the half turns", 0.5 * curvatures_per_m * STEP_M, shape
+        )
+        table.end_ahead_m = self._memory.get_array_address(
+            "the ends of the arcs", arcs.end_m[0], shape
+        )
+        table.end_left_m = self._memory.get_array_address(
+            "the ends of the arcs", arcs.end_m[1], shape
+        )
+        table.middle_ahead_m = self._memory.get_array_address(
+            "the middles of the arcs", arcs.middle_m[0], shape
+        )
+        table.middle_left_m = self._memory.get_array_address(
+            "the middles of the arcs", arcs.middle_m[1], shape
+        )
+        table.needed_inside_m = self._memory.get_array_address(
+            "the needed distances", arcs.needed_inside_m, shape
+        )
+        table.surely_clear_m = self._memory.get_array_address(
+            "the clear distances", arcs.surely_clear_m, shape
+        )
         table.needed_m = arcs.needed_m
         table.surely_blocked_m = arcs.surely_blocked_m
 
@@ -180,11 +213,15 @@ class NativeExpander(PathExpander):
         native.is_relaid = task.initial_body_w is not None
         if task.initial_body_w is not None:
             native.lying_count = len(task.initial_body_w)
-            native.lying_m = self._memory.get_array_address("the lying body", task.initial_body_w, (body_arcs + 1, 2))
+            native.lying_m = self._memory.get_array_address(
+                "the lying body", task.initial_body_w, (body_arcs + 1, 2)
+            )
         native.max_sideways_m = task.max_sideways_m
         if task.failed_w is not None:
             native.failed_count = len(task.failed_w)
-            native.failed_m = self._memory.get_array_address("the failed paths", task.failed_w, (len(task.failed_w), 2))
+            native.failed_m = self._memory.get_array_address(
+                "the failed paths", task.failed_w, (len(task.failed_w), 2)
+            )
 
     def _fill_layers(self, start: NodeLayer) -> None:
         """Allocate the layers of the search for C, and copy the nodes of the first layer into them.
@@ -231,14 +268,19 @@ class NativeExpander(PathExpander):
         )
         layers.x_m = self._memory.get_array_address("the history of x", self._x_m, history_shape)
         layers.y_m = self._memory.get_array_address("the history of y", self._y_m, history_shape)
-        layers.margin_n = self._memory.get_array_address("the history of margins", self._margin_n, history_shape)
-        layers.arc_drag_m = self._memory.get_array_address("the history of drag", arc_drag_m, (*history_shape, 3))
+        layers.margin_n = self._memory.get_array_address(
+            "the history of margins", self._margin_n, history_shape
+        )
+        layers.arc_drag_m = self._memory.get_array_address(
+            "the history of drag", arc_drag_m, (*history_shape, 3)
+        )
 
     def _allocate_scratch_memory(self, layout: NativeLayout, curvature_count: int) -> None:
         """Allocate the memory that C needs while it expands a layer: arcs, sort keys and a hash table of cells."""
         scratch = self._native_search.scratch
         max_arcs = self._max_nodes_per_layer * curvature_count
-        entry_room = 1 << (max_arcs * 5 // 4).bit_length()  # a power of two; the table is at most 80 % full
+        # A power of two; the table is at most 80 % full.
+        entry_room = 1 << (max_arcs * 5 // 4).bit_length()
         scratch.entry_room = entry_room
         scratch.stamp = 0
         scratch.arcs = self._memory.allocate(max_arcs * layout.arc)
@@ -246,7 +288,9 @@ class NativeExpander(PathExpander):
         scratch.spare_keys = self._memory.allocate(max_arcs * layout.sort_key)
         scratch.candidates = self._memory.allocate(max_arcs * layout.candidate)
         scratch.entries = self._memory.allocate(entry_room * layout.cell_entry)
-        scratch.tail_nodes = self._memory.allocate(self._max_nodes_per_layer * INTEGER_DTYPE.itemsize)
+        scratch.tail_nodes = self._memory.allocate(
+            self._max_nodes_per_layer * INTEGER_DTYPE.itemsize
+        )
         scratch.near_failed_m = self._memory.allocate(
             max(self._native_search.task.failed_count, 1) * 2 * FLOAT_DTYPE.itemsize
         )

@@ -20,7 +20,12 @@ Array = NDArray[Any]
 INTEGER_DTYPE = np.dtype(np.int64)
 FLOAT_DTYPE = np.dtype(np.float64)
 CONTACT_DTYPE = np.dtype(
-    [("obstacle", INTEGER_DTYPE), ("s_m", FLOAT_DTYPE), ("gap_m", FLOAT_DTYPE), ("wrench", FLOAT_DTYPE, 3)]
+    [
+        ("obstacle", INTEGER_DTYPE),
+        ("s_m", FLOAT_DTYPE),
+        ("gap_m", FLOAT_DTYPE),
+        ("wrench", FLOAT_DTYPE, 3),
+    ]
 )
 NODE_DTYPE = np.dtype(
     [
@@ -99,7 +104,9 @@ class NativeGrid(ctypes.Structure):
     _fields_ = [
         *_make_double_fields("low_x_m", "low_y_m", "cell_m", "cell_error_m", "max_distance_m"),
         *_make_integer_fields("columns", "rows"),
-        *_make_pointer_fields("nearest", "distance_m", "center_m", "direction", "half_size_m", "rounding_m"),
+        *_make_pointer_fields(
+            "nearest", "distance_m", "center_m", "direction", "half_size_m", "rounding_m"
+        ),
     ]
 
 
@@ -119,15 +126,27 @@ class NativeParameters(ctypes.Structure):
     """The robot and the costs."""
 
     _fields_ = [
-        *_make_double_fields("step_m", "body_length_m", "radius_m", "contact_distance_m", "max_frontal", "min_push"),
-        *_make_double_fields("obstacle_friction", "unused_tail_m", "unused_head_m", "wanted_margin_n"),
+        *_make_double_fields(
+            "step_m", "body_length_m", "radius_m", "contact_distance_m", "max_frontal", "min_push"
+        ),
+        *_make_double_fields(
+            "obstacle_friction", "unused_tail_m", "unused_head_m", "wanted_margin_n"
+        ),
         *_make_double_fields("max_heading_error_rad", "near_m"),
         *_make_double_fields(
-            "push_reward", "push_reward_of_body", "brake_cost", "progress_reward", "curvature_change_cost_m2"
+            "push_reward",
+            "push_reward_of_body",
+            "brake_cost",
+            "progress_reward",
+            "curvature_change_cost_m2",
         ),
-        *_make_double_fields("weak_margin_cost_m", "weak_margin_cost_near_m", "failed_path_cost_m", "sideways_cost_m"),
+        *_make_double_fields(
+            "weak_margin_cost_m", "weak_margin_cost_near_m", "failed_path_cost_m", "sideways_cost_m"
+        ),
         *_make_double_fields("failed_path_m"),
-        *_make_double_fields("max_contact_force_n", "min_determinant", "moment_scale", "min_force_per_n"),
+        *_make_double_fields(
+            "max_contact_force_n", "min_determinant", "moment_scale", "min_force_per_n"
+        ),
         *_make_double_fields("cell_m", "cell_rad", "wide_cell_m", "wide_cell_rad"),
         *_make_integer_fields("max_candidates", "kept_nodes", "kept_per_wide_cell", "body_arcs"),
     ]
@@ -164,7 +183,9 @@ class NativeScratch(ctypes.Structure):
     _fields_ = [
         *_make_integer_fields("entry_room"),
         ("stamp", ctypes.c_int32),
-        *_make_pointer_fields("arcs", "keys", "spare_keys", "candidates", "entries", "tail_nodes", "near_failed_m"),
+        *_make_pointer_fields(
+            "arcs", "keys", "spare_keys", "candidates", "entries", "tail_nodes", "near_failed_m"
+        ),
     ]
 
 
@@ -184,7 +205,9 @@ class NativeSearch(ctypes.Structure):
 class NativeLayout(ctypes.Structure):
     """The sizes of the structures in bytes."""
 
-    _fields_ = _make_integer_fields("search", "node", "contact", "arc", "sort_key", "candidate", "cell_entry")
+    _fields_ = _make_integer_fields(
+        "search", "node", "contact", "arc", "sort_key", "candidate", "cell_entry"
+    )
 
 
 @dataclass(frozen=True)
@@ -224,7 +247,11 @@ def load_library() -> PlannerLibrary | None:
     expand.argtypes = [ctypes.POINTER(NativeSearch)]
     mark_obstacle = library.snakesim_planner_mark_obstacle
     mark_obstacle.restype = None
-    mark_obstacle.argtypes = [ctypes.POINTER(NativeGrid), ctypes.POINTER(NativeWindow), ctypes.c_int64]
+    mark_obstacle.argtypes = [
+        ctypes.POINTER(NativeGrid),
+        ctypes.POINTER(NativeWindow),
+        ctypes.c_int64,
+    ]
     return PlannerLibrary(expand, mark_obstacle, layout)
 
 

@@ -13,7 +13,12 @@ class PathExpander(ABC):
 
     @abstractmethod
     def __init__(
-        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, step_count: int
+        self,
+        obstacles: ObstacleGrid,
+        parameters: SearchParameters,
+        task: SearchTask,
+        start: NodeLayer,
+        step_count: int,
     ) -> None:
         """Start with the start nodes as the first layer.
 

@@ -56,7 +56,10 @@ class ArcTable:
         self.end_m = np.stack([chord_m * np.cos(half_turn_rad), chord_m * np.sin(half_turn_rad)])
         middle_chord_m = 0.5 * STEP_M * np.sinc(0.5 * half_turn_rad / np.pi)
         self.middle_m = np.stack(
-            [middle_chord_m * np.cos(0.5 * half_turn_rad), middle_chord_m * np.sin(0.5 * half_turn_rad)]
+            [
+                middle_chord_m * np.cos(0.5 * half_turn_rad),
+                middle_chord_m * np.sin(0.5 * half_turn_rad),
+            ]
         )
 
     def make_arcs(self, parents: NodeLayer) -> SearchArcs:
@@ -75,7 +78,9 @@ class ArcTable:
             heading_rad=heading_rad,
         )
 
-    def find_clear_poses(self, obstacles: ObstacleGrid, x_m: Floats, y_m: Floats, heading_rad: Floats) -> Bools:
+    def find_clear_poses(
+        self, obstacles: ObstacleGrid, x_m: Floats, y_m: Floats, heading_rad: Floats
+    ) -> Bools:
         """Find the poses on the arcs at which the body clears all obstacles.
 
         Most poses are decided by the approximate distance. The exact distance and its normal are computed only for the
@@ -96,7 +101,9 @@ class ArcTable:
         nearest = obstacles.find_nearest(x_m[undecided], y_m[undecided])
         heading = heading_rad[undecided]
         curvature_index = undecided[1]
-        normal_to_left = np.cos(heading) * nearest.normal_w[:, 1] - np.sin(heading) * nearest.normal_w[:, 0]
+        normal_to_left = (
+            np.cos(heading) * nearest.normal_w[:, 1] - np.sin(heading) * nearest.normal_w[:, 0]
+        )
         is_inner_side = normal_to_left * np.sign(self.curvatures_per_m[curvature_index]) < 0
         needed_m = np.where(is_inner_side, self.needed_inside_m[curvature_index], self.needed_m)
         is_clear[undecided] = nearest.distance_m >= needed_m

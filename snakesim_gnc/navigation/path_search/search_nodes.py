@@ -32,7 +32,8 @@ class NodeLayer:
     contact_obstacle_index: Ints  # (n, C) index; NO_OBSTACLE in an empty slot
     contact_arc_length_m: Floats  # (n, C) arc length of the contact along the path
     contact_gap_m: Floats  # (n, C) between skin and obstacle
-    contact_wrench: Floats  # (n, C, 3) of a unit push: fx, fy, moment about the search's origin in m
+    # (n, C, 3) of a unit push: fx, fy, moment about the search's origin in m.
+    contact_wrench: Floats
     # What resists the body.
     drag_m: Floats  # (n, 3) integral of the tangent's wrench over the whole body: m, m, m²
     arc_drag_m: Floats  # (n, 3) the part of that integral over the arc that led here
@@ -43,12 +44,19 @@ class NodeLayer:
     def select_rows(self, rows: Ints) -> "NodeLayer":
         """Return a layer with copies of some of the nodes."""
         arrays = {
-            field.name: getattr(self, field.name)[rows] for field in fields(self) if field.name != "path_length_m"
+            field.name: getattr(self, field.name)[rows]
+            for field in fields(self)
+            if field.name != "path_length_m"
         }
         return NodeLayer(**arrays, path_length_m=self.path_length_m)
 
     def add_contacts(
-        self, touches: Bools, obstacle_index: Ints, gap_m: Floats, wrench: Floats, arc_length_m: float
+        self,
+        touches: Bools,
+        obstacle_index: Ints,
+        gap_m: Floats,
+        wrench: Floats,
+        arc_length_m: float,
     ) -> None:
         """Store a contact in each node of the search tree whose path touches an obstacle at an arc length.
 

@@ -47,7 +47,8 @@ class SearchParameters:
     progress_reward: float = 1.2
     # Costs of a path on which the whole body is laid again.
     push_reward_of_body: float = 4.0  # instead of `push_reward`, up to where the head will lie
-    weak_margin_cost_near: float = 15.0  # instead of `weak_margin_cost`, over the first `near_m` ahead of the head
+    # Instead of `weak_margin_cost`, over the first `near_m` ahead of the head.
+    weak_margin_cost_near: float = 15.0
     near_m: float = 0.3
     failed_path_cost: float = 1.0
     sideways_cost: float = 0.5

@@ -26,7 +26,8 @@ class SearchTask:
     origin_w: Floats  # (2,) the head of the measured body; moments are about it
     travel_direction_rad: float
     travel_direction_w: Floats  # (2,) unit vector
-    initial_drag_m: Floats  # (a, 3) drag of each arc of the body that the start node has, tail to head
+    # (a, 3) drag of each arc of the body that the start node has, tail to head.
+    initial_drag_m: Floats
     # For a search of the whole body.
     initial_body_w: Floats | None = None  # (a + 1, 2) where the body lies, tail to head
     max_sideways_m: float = np.inf  # how far the path may be from where the body lies

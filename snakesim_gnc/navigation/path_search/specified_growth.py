@@ -12,10 +12,17 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.geometry.planar import compute_wrenches
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
-from snakesim_gnc.navigation.path_search.body_contacts import compute_node_margins_n, find_obstacle_contacts
+from snakesim_gnc.navigation.path_search.body_contacts import (
+    compute_node_margins_n,
+    find_obstacle_contacts,
+)
 from snakesim_gnc.navigation.path_search.path_growth import PathExpander
 from snakesim_gnc.navigation.path_search.search_arcs import ArcTable, SearchArcs
-from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, compute_cell_numbers, count_earlier_in_cell
+from snakesim_gnc.navigation.path_search.search_nodes import (
+    NodeLayer,
+    compute_cell_numbers,
+    count_earlier_in_cell,
+)
 from snakesim_gnc.navigation.path_search.search_parameters import (
     CANDIDATES_PER_KEPT_NODE,
     CELL_M,
@@ -39,7 +46,12 @@ class NumpyExpander(PathExpander):
     """Grows paths with NumPy, in the words of the cost's equation in `beam`."""
 
     def __init__(
-        self, obstacles: ObstacleGrid, parameters: SearchParameters, task: SearchTask, start: NodeLayer, step_count: int
+        self,
+        obstacles: ObstacleGrid,
+        parameters: SearchParameters,
+        task: SearchTask,
+        start: NodeLayer,
+        step_count: int,
     ) -> None:
         del step_count  # memory is allocated layer by layer
         self._obstacles = obstacles
@@ -83,7 +95,9 @@ class NumpyExpander(PathExpander):
             row = int(layer.parent[row])
         return SearchedPath(np.array(points[::-1]), np.array(margins[::-1]), cost_m)
 
-    def _compute_distance_from_initial_body_m(self, arcs: SearchArcs, parent_s_m: float) -> Floats | None:
+    def _compute_distance_from_initial_body_m(
+        self, arcs: SearchArcs, parent_s_m: float
+    ) -> Floats | None:
         """Compute the distances of the ends of the arcs from where the body lies at the same arc length.
 
         Args:
@@ -100,7 +114,9 @@ class NumpyExpander(PathExpander):
         arc_end_index = round(parent_s_m / STEP_M) + 1
         if arc_end_index >= len(initial_body_w):
             return None
-        return np.hypot(arcs.x_m - initial_body_w[arc_end_index, 0], arcs.y_m - initial_body_w[arc_end_index, 1])
+        return np.hypot(
+            arcs.x_m - initial_body_w[arc_end_index, 0], arcs.y_m - initial_body_w[arc_end_index, 1]
+        )
 
     def _find_allowed_arcs(self, arcs: SearchArcs, sideways_m: Floats | None) -> Bools:
         """Find the arcs on which the body clears all obstacles and heads roughly towards the goal.
@@ -115,7 +131,9 @@ class NumpyExpander(PathExpander):
         is_allowed = self._arc_table.find_clear_poses(
             self._obstacles, arcs.middle_x_m, arcs.middle_y_m, arcs.middle_heading_rad
         )
-        is_allowed &= self._arc_table.find_clear_poses(self._obstacles, arcs.x_m, arcs.y_m, arcs.heading_rad)
+        is_allowed &= self._arc_table.find_clear_poses(
+            self._obstacles, arcs.x_m, arcs.y_m, arcs.heading_rad
+        )
         from_goal_rad = arcs.heading_rad - self._task.travel_direction_rad
         heading_error_rad = np.abs(np.remainder(from_goal_rad + np.pi, 2 * np.pi) - np.pi)
         is_allowed &= heading_error_rad < MAX_HEADING_ERROR_RAD
@@ -123,7 +141,9 @@ class NumpyExpander(PathExpander):
             is_allowed &= sideways_m < self._task.max_sideways_m
         return is_allowed
 
-    def _compute_path_costs_m(self, parents: NodeLayer, arcs: SearchArcs, sideways_m: Floats | None) -> Floats:
+    def _compute_path_costs_m(
+        self, parents: NodeLayer, arcs: SearchArcs, sideways_m: Floats | None
+    ) -> Floats:
         """Return the cost of the paths to the ends of the arcs, without the terms of the last contacts.
 
         It is the cost of the parent, plus length and change of curvature, minus progress towards the goal. A search of
@@ -139,7 +159,9 @@ class NumpyExpander(PathExpander):
         """
         parameters = self._parameters
         task = self._task
-        curvature_change = np.abs(self._arc_table.curvatures_per_m - parents.curvature_per_m[:, None])
+        curvature_change = np.abs(
+            self._arc_table.curvatures_per_m - parents.curvature_per_m[:, None]
+        )
         step_x = arcs.x_m - parents.x_m[:, None]
         step_y = arcs.y_m - parents.y_m[:, None]
         progress_m = step_x * task.travel_direction_w[0] + step_y * task.travel_direction_w[1]
@@ -181,9 +203,13 @@ class NumpyExpander(PathExpander):
         )
         _, first_of_cell = np.unique(cells, return_index=True)
         first_of_cell = np.sort(first_of_cell)
-        return cheapest_first[first_of_cell[: CANDIDATES_PER_KEPT_NODE * self._parameters.kept_nodes]]
+        return cheapest_first[
+            first_of_cell[: CANDIDATES_PER_KEPT_NODE * self._parameters.kept_nodes]
+        ]
 
-    def _make_nodes(self, parents: NodeLayer, arcs: SearchArcs, cost_m: Floats, arc_indices: Ints) -> NodeLayer:
+    def _make_nodes(
+        self, parents: NodeLayer, arcs: SearchArcs, cost_m: Floats, arc_indices: Ints
+    ) -> NodeLayer:
         """Make nodes at the ends of the selected arcs, with the contacts and the drag of their parents.
 
         Args:
@@ -215,13 +241,18 @@ class NumpyExpander(PathExpander):
             arcs: All arcs from the parents of these nodes.
             arc_indices: (n,) index of each node's arc among the flattened arcs.
         """
-        middles_w = np.stack([arcs.middle_x_m.ravel()[arc_indices], arcs.middle_y_m.ravel()[arc_indices]], axis=-1)
+        middles_w = np.stack(
+            [arcs.middle_x_m.ravel()[arc_indices], arcs.middle_y_m.ravel()[arc_indices]], axis=-1
+        )
         headings_rad = arcs.middle_heading_rad.ravel()[arc_indices]
         tangents = np.stack([np.cos(headings_rad), np.sin(headings_rad)], axis=-1)
 
-        starts_at_tail = self._task.initial_body_w is not None  # only a search of the whole body has an initial body
+        # Only a search of the whole body has an initial body.
+        starts_at_tail = self._task.initial_body_w is not None
         # All nodes of a layer have the same arc length; half an arc allows for rounding of its sum.
-        is_incomplete = starts_at_tail and nodes.path_length_m < self._parameters.body_length_m - 0.5 * STEP_M
+        is_incomplete = (
+            starts_at_tail and nodes.path_length_m < self._parameters.body_length_m - 0.5 * STEP_M
+        )
         self._add_contacts(nodes, middles_w, tangents, is_incomplete=is_incomplete)
         self._add_drag(nodes, middles_w, tangents)
         # The margin depends on the contacts and the drag, which are complete now.
@@ -229,7 +260,9 @@ class NumpyExpander(PathExpander):
         if not is_incomplete:
             self._add_margin_cost(nodes)
 
-    def _add_contacts(self, nodes: NodeLayer, middles_w: Floats, tangents: Floats, *, is_incomplete: bool) -> None:
+    def _add_contacts(
+        self, nodes: NodeLayer, middles_w: Floats, tangents: Floats, *, is_incomplete: bool
+    ) -> None:
         """Store the contacts of the newest arcs, and add their cost: negative if they propel, positive if they brake.
 
         Args:
@@ -239,9 +272,13 @@ class NumpyExpander(PathExpander):
             is_incomplete: Whether the path is still shorter than the body.
         """
         parameters = self._parameters
-        contacts = find_obstacle_contacts(self._obstacles, middles_w, tangents, parameters, self._task)
+        contacts = find_obstacle_contacts(
+            self._obstacles, middles_w, tangents, parameters, self._task
+        )
         middle_s_m = nodes.path_length_m - 0.5 * STEP_M
-        nodes.add_contacts(contacts.is_usable, contacts.obstacle, contacts.gap_m, contacts.wrench, middle_s_m)
+        nodes.add_contacts(
+            contacts.is_usable, contacts.obstacle, contacts.gap_m, contacts.wrench, middle_s_m
+        )
         push_reward = parameters.push_reward_of_body if is_incomplete else parameters.push_reward
         propulsion = contacts.propulsion
         reward_cost = -push_reward * propulsion
@@ -263,10 +300,16 @@ class NumpyExpander(PathExpander):
         """Add the cost of propulsion margins below the wanted one; it is higher just ahead of the measured head."""
         parameters = self._parameters
         starts_at_tail = self._task.initial_body_w is not None
-        is_just_ahead = starts_at_tail and nodes.path_length_m < parameters.body_length_m + parameters.near_m
-        weak_margin_cost = parameters.weak_margin_cost_near if is_just_ahead else parameters.weak_margin_cost
+        is_just_ahead = (
+            starts_at_tail and nodes.path_length_m < parameters.body_length_m + parameters.near_m
+        )
+        weak_margin_cost = (
+            parameters.weak_margin_cost_near if is_just_ahead else parameters.weak_margin_cost
+        )
         # 0 with the wanted margin, 1 without any.
-        missing_fraction = np.clip(1.0 - nodes.propulsion_margin_n / parameters.wanted_margin_n, 0.0, 1.0)
+        missing_fraction = np.clip(
+            1.0 - nodes.propulsion_margin_n / parameters.wanted_margin_n, 0.0, 1.0
+        )
         nodes.cost_m += STEP_M * weak_margin_cost * missing_fraction
 
     def _get_drag_at_tail_m(self, parent_rows: Ints) -> Floats:

@@ -20,7 +20,12 @@ from snakesim_hal.model.files import (
     resolve_file_path,
 )
 from snakesim_hal.model.fitting import compute_scaled_scene_values
-from snakesim_hal.model.scenario.run_config import POLICY, POLICY_CONTROLLER, RunConfig, get_section_name
+from snakesim_hal.model.scenario.run_config import (
+    POLICY,
+    POLICY_CONTROLLER,
+    RunConfig,
+    get_section_name,
+)
 from snakesim_hal.model.scenario.start_pose import validate_start_pose
 from snakesim_hal.model.textfiles import parse_toml
 
@@ -38,7 +43,9 @@ class LoadedScenario:
     def list_effective_values(self) -> list[tuple[str, Any, str]]:
         """Return every effective value as (dotted key, value, file or flag or `default`)."""
         effective = msgspec.to_builtins(self.config)
-        return [(key, value, self.table.find_origin(key)) for key, value in iterate_leaves(effective)]
+        return [
+            (key, value, self.table.find_origin(key)) for key, value in iterate_leaves(effective)
+        ]
 
 
 @dataclass(frozen=True)
@@ -121,7 +128,9 @@ def compose_config_table(scenario: str, overrides: Sequence[KeyOverride] = ()) -
 
     # A controller or backend is chosen before the keys that refer to the chosen one.
     value_overrides = [override for override in overrides if override not in file_choices]
-    for override in sorted(value_overrides, key=lambda override: override.key.startswith(CHOSEN_PREFIXES)):
+    for override in sorted(
+        value_overrides, key=lambda override: override.key.startswith(CHOSEN_PREFIXES)
+    ):
         _apply_override(table, override)
 
     scene = table.values.get("scene")
@@ -138,7 +147,9 @@ def _replace_name_by_file(table: ConfigTable, part: str, kind: str, base_dir: Pa
     included = read_table_with_base(name, kind, base_dir)
     table.set_value(part, included.values, included.source)
     # With `extends`, the values of one part come from two files.
-    table.origin_by_key |= {f"{part}.{key}": origin for key, origin in included.origin_by_key.items()}
+    table.origin_by_key |= {
+        f"{part}.{key}": origin for key, origin in included.origin_by_key.items()
+    }
 
 
 def _apply_override(table: ConfigTable, override: KeyOverride) -> None:
@@ -181,4 +192,6 @@ def _split_policy_controller(table: ConfigTable, controller: Any, origin: str) -
     """Replace the controller `policy:MODEL` by the controller `policy` and its parameter `model`."""
     if isinstance(controller, str) and controller.startswith(POLICY):
         table.set_value("controller", POLICY_CONTROLLER, origin)
-        table.set_value(f"controllers.{POLICY_CONTROLLER}.model", controller.removeprefix(POLICY), origin)
+        table.set_value(
+            f"controllers.{POLICY_CONTROLLER}.model", controller.removeprefix(POLICY), origin
+        )

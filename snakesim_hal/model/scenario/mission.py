@@ -86,4 +86,6 @@ class Mission(FileStruct, frozen=True, kw_only=True):
         if self.map_error_m > 0 and self.map == "perceived":
             raise ValueError('`map_error_m` is of a survey; with map = "perceived" there is none')
         if self.until_goal and self.goal is None:
-            raise ValueError("`until_goal`: this mission has no goal to reach; give it one in [mission.goal]")
+            raise ValueError(
+                "`until_goal`: this mission has no goal to reach; give it one in [mission.goal]"
+            )

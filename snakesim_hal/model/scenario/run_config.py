@@ -186,7 +186,9 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
     @property
     def in_host_services(self) -> list[str]:
         """Return the names of the services that run in the process of the HAL host."""
-        return [name for name, service in self.internal_services.items() if service.process == "host"]
+        return [
+            name for name, service in self.internal_services.items() if service.process == "host"
+        ]
 
     @property
     def has_internal_control(self) -> bool:
@@ -212,7 +214,9 @@ class RunConfig(FileStruct, frozen=True, kw_only=True):
         if self.mission.localization == "dead_reckoning":
             return True
         robot_publishes_pose = any(sensor.key == keys.POSE for sensor in robot.sensors)
-        has_pose_sensor = robot_publishes_pose or self.robot.sensors.pose is not None or SENSOR in self.services
+        has_pose_sensor = (
+            robot_publishes_pose or self.robot.sensors.pose is not None or SENSOR in self.services
+        )
         return not has_pose_sensor
 
     @property
@@ -253,7 +257,9 @@ def read_config(path: Path) -> RunConfig:
     return decode_table(read_table(path), RunConfig)
 
 
-def describe_run_robot(config: RunConfig, backend: str = "", *, emulated: bool = False) -> RobotDescription:
+def describe_run_robot(
+    config: RunConfig, backend: str = "", *, emulated: bool = False
+) -> RobotDescription:
     """Return the description that the HAL publishes of the configured robot.
 
     Args:

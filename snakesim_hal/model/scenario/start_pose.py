@@ -8,9 +8,17 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.kinematics import (
+    compute_link_frames,
+    quaternion_from_yaw,
+    rotation_from_quaternion,
+)
 from snakesim_hal.model.outlines import CapsuleOutline
-from snakesim_hal.model.placement import PlacedObstacle, place_scene_obstacles, validate_start_clearance
+from snakesim_hal.model.placement import (
+    PlacedObstacle,
+    place_scene_obstacles,
+    validate_start_clearance,
+)
 from snakesim_hal.model.route import compute_yaw_segments_m, expand_yaw_angles, place_chain_on_route
 from snakesim_hal.model.scenario.run_config import RunConfig
 from snakesim_hal.model.scene import make_route
@@ -76,7 +84,9 @@ def compute_start_pose(config: RunConfig) -> StartPose:
         return StartPose(start.position_m, start.yaw_rad, straight_rad)
     segments_m = compute_yaw_segments_m(robot.axes, robot.link_lengths_m)
     chain = place_chain_on_route(route, start.tail_s_m, segments_m)
-    return StartPose(chain.tail_w, chain.heading_rad, expand_yaw_angles(robot.axes, chain.angles_rad))
+    return StartPose(
+        chain.tail_w, chain.heading_rad, expand_yaw_angles(robot.axes, chain.angles_rad)
+    )
 
 
 def make_start_capsules(config: RunConfig) -> list[CapsuleOutline]:
@@ -86,14 +96,21 @@ def make_start_capsules(config: RunConfig) -> list[CapsuleOutline]:
     radius_m = robot.module.radius_m
     base_w = (*pose.position_w, radius_m)
     base_rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
-    origins, rotations = compute_link_frames(base_w, base_rotation, pose.angles_rad, robot.axes, robot.link_lengths_m)
+    origins, rotations = compute_link_frames(
+        base_w, base_rotation, pose.angles_rad, robot.axes, robot.link_lengths_m
+    )
     capsules: list[CapsuleOutline] = []
     for i, length_m in enumerate(robot.link_lengths_m):
         front_w = origins[i] + length_m * rotations[i][:, 0]
         rear_x, rear_y, _ = origins[i].tolist()
         front_x, front_y, _ = front_w.tolist()
         capsules.append(
-            CapsuleOutline(name=f"link_{i}", rear_m=(rear_x, rear_y), front_m=(front_x, front_y), radius_m=radius_m)
+            CapsuleOutline(
+                name=f"link_{i}",
+                rear_m=(rear_x, rear_y),
+                front_m=(front_x, front_y),
+                radius_m=radius_m,
+            )
         )
     return capsules
 

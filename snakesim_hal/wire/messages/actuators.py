@@ -12,8 +12,13 @@ from snakesim_hal.wire.quantities import about
 class JointCommand(Message, frozen=True, kw_only=True):
     """`actuator/joints`: setpoints for every joint from the lease holder. The checks are in protocol.md."""
 
-    tick: Annotated[q.Tick, about("of the joint state that the command answers: its age is the command's age")]
-    sequence: Annotated[q.Count, about("greater than that of any command accepted under this lease; gaps are allowed")]
+    tick: Annotated[
+        q.Tick, about("of the joint state that the command answers: its age is the command's age")
+    ]
+    sequence: Annotated[
+        q.Count,
+        about("greater than that of any command accepted under this lease; gaps are allowed"),
+    ]
     lease_epoch: Annotated[q.Count, about("`Answer.epoch` of the lease")]
     layout: Annotated[q.Name, about("`RobotDescription.layout`")]
     valid_for_ns: Annotated[
@@ -23,11 +28,14 @@ class JointCommand(Message, frozen=True, kw_only=True):
     mode: Modes
     target: q.Targets
     torque_limit_nm: Annotated[
-        q.TorqueLimits | None, about("limit of each motor, if lower than the robot's own; null: the robot's own")
+        q.TorqueLimits | None,
+        about("limit of each motor, if lower than the robot's own; null: the robot's own"),
     ] = None
     arm_session: Annotated[
         q.Count,
-        about("`Clock.arm_session`; 0: before any arming. An armed robot rejects any number but its own, including 0"),
+        about(
+            "`Clock.arm_session`; 0: before any arming. An armed robot rejects any number but its own, including 0"
+        ),
     ] = 0
 
 

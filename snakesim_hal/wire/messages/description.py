@@ -6,7 +6,14 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.wire import quantities as q
-from snakesim_hal.wire.messages.base import ABOUT_HOST, Axis, JointMode, Measurement, Message, StopMode
+from snakesim_hal.wire.messages.base import (
+    ABOUT_HOST,
+    Axis,
+    JointMode,
+    Measurement,
+    Message,
+    StopMode,
+)
 from snakesim_hal.wire.quantities import about
 
 MAX_CONFIG = 500_000  # characters
@@ -16,7 +23,9 @@ class JointDescription(Message, frozen=True, kw_only=True):
     """One joint: its name, its position in every vector, and its limits."""
 
     name: q.Name
-    axis: Annotated[Axis, about("of its rear link about which the joint turns: yaw about z, pitch about y")]
+    axis: Annotated[
+        Axis, about("of its rear link about which the joint turns: yaw about z, pitch about y")
+    ]
     angle_min_rad: q.Angle
     angle_max_rad: q.Angle
     speed_limit_rad_s: q.AngularVelocity
@@ -31,7 +40,9 @@ class JointDescription(Message, frozen=True, kw_only=True):
         q.from_zero(1e3, "kg·m²"),
         about("inertia that `torque_nm` turns besides the links; 0: measured beyond the rotor"),
     ] = 0.0
-    derate_from_c: Annotated[q.Temperature, about("of the winding: above it torque is derated")] = 80.0
+    derate_from_c: Annotated[q.Temperature, about("of the winding: above it torque is derated")] = (
+        80.0
+    )
     stop_at_c: Annotated[q.Temperature, about("of the winding: at it the robot is stopped")] = 105.0
     min_voltage_v: Annotated[q.Voltage, about("below it the robot is stopped")] = 18.0
     modes: Annotated[
@@ -42,13 +53,22 @@ class JointDescription(Message, frozen=True, kw_only=True):
     measures: Annotated[
         list[Measurement],
         Meta(max_length=8),
-        about("beside angle and velocity; a torque that is not measured is 0, heat and voltage then stop nothing"),
+        about(
+            "beside angle and velocity; a torque that is not measured is 0, heat and voltage then stop nothing"
+        ),
     ] = msgspec.field(default_factory=lambda: list(get_args(Measurement)))
     watchdog: Annotated[
-        bool, about("its drive stops by itself without setpoints; false: it holds its last angle if the host dies")
+        bool,
+        about(
+            "its drive stops by itself without setpoints; false: it holds its last angle if the host dies"
+        ),
     ] = True
-    serial: Annotated[str, Meta(max_length=64), about("serial number that its drive reports; empty: none")] = ""
-    firmware: Annotated[str, Meta(max_length=64), about("firmware version that its drive reports; empty: none")] = ""
+    serial: Annotated[
+        str, Meta(max_length=64), about("serial number that its drive reports; empty: none")
+    ] = ""
+    firmware: Annotated[
+        str, Meta(max_length=64), about("firmware version that its drive reports; empty: none")
+    ] = ""
 
     def supports_mode(self, mode: JointMode) -> bool:
         """Return whether the joint may be commanded in a mode. It can always be passive."""
@@ -67,7 +87,9 @@ class LinkDescription(Message, frozen=True, kw_only=True):
 class SensorDescription(Message, frozen=True, kw_only=True):
     """A sensor and its rate; for IMUs the rate of each link, which need not be sampled together."""
 
-    key: Annotated[q.Name, about("where it is published, such as sensor/pose; only listed keys are published")]
+    key: Annotated[
+        q.Name, about("where it is published, such as sensor/pose; only listed keys are published")
+    ]
     rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
     delay_s: Annotated[float, Meta(ge=0, le=10)]
 
@@ -77,36 +99,60 @@ class RobotDescription(Message, frozen=True, kw_only=True):
 
     robot: q.Name
     backend: Annotated[q.Name, about("name of the backend: sim, can, ...")]
-    layout: Annotated[q.Name, about("hash of the joints' names, order and axes; every command carries it")]
+    layout: Annotated[
+        q.Name, about("hash of the joints' names, order and axes; every command carries it")
+    ]
     config_hash: Annotated[q.Name, about("of the whole configuration; a request to arm carries it")]
     period_ns: Annotated[q.Nanoseconds, about("from tick to tick")]
-    lease_ns: Annotated[q.Nanoseconds, about("a lease term: how long one accepted command keeps the robot armed")]
-    max_step_rad: Annotated[float, Meta(gt=0, le=10), about("a position target further from the measured is limited")]
-    stop_mode: Annotated[StopMode, about("in fault: passive, brake (damp), or decelerate and then hold")]
+    lease_ns: Annotated[
+        q.Nanoseconds, about("a lease term: how long one accepted command keeps the robot armed")
+    ]
+    max_step_rad: Annotated[
+        float, Meta(gt=0, le=10), about("a position target further from the measured is limited")
+    ]
+    stop_mode: Annotated[
+        StopMode, about("in fault: passive, brake (damp), or decelerate and then hold")
+    ]
     max_isolated_joints: Annotated[
-        int, Meta(ge=0, le=q.MAX_JOINTS), about("how many may fail while armed before the robot stops")
+        int,
+        Meta(ge=0, le=q.MAX_JOINTS),
+        about("how many may fail while armed before the robot stops"),
     ] = 0
     emulated: Annotated[
-        bool, about("nothing real moves: a simulator, or emulated modules; fault injection is allowed")
+        bool,
+        about("nothing real moves: a simulator, or emulated modules; fault injection is allowed"),
     ] = False
     simulated_time: Annotated[
-        bool, about("a simulator: its time can stand, pass by single ticks, faster or slower, and start over")
+        bool,
+        about(
+            "a simulator: its time can stand, pass by single ticks, faster or slower, and start over"
+        ),
     ] = False
     hardware: Annotated[
-        str, Meta(max_length=200), about("hardware that it drives, such as `can0+can1`; empty: none")
+        str,
+        Meta(max_length=200),
+        about("hardware that it drives, such as `can0+can1`; empty: none"),
     ] = ""
     host: Annotated[q.Name | None, ABOUT_HOST] = None
-    proof: Annotated[str, Meta(max_length=64), about("for the run that started the host; of no use to others")] = ""
+    proof: Annotated[
+        str, Meta(max_length=64), about("for the run that started the host; of no use to others")
+    ] = ""
     arithmetic: Annotated[
         dict[q.Name, q.Name],
         Meta(max_length=8),
-        about("hashes of what the host's BLAS, NumPy and C library compute: where they are equal, digests can be"),
+        about(
+            "hashes of what the host's BLAS, NumPy and C library compute: where they are equal, digests can be"
+        ),
     ] = {}
     laws: Annotated[
         Literal["c", "python"] | None,
-        about("in which language a simulator computes ground and friction, with equal results; null: no simulator"),
+        about(
+            "in which language a simulator computes ground and friction, with equal results; null: no simulator"
+        ),
     ] = None
-    joints: Annotated[list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS), about("tail to head")]
+    joints: Annotated[
+        list[JointDescription], Meta(min_length=1, max_length=q.MAX_JOINTS), about("tail to head")
+    ]
     links: Annotated[
         list[LinkDescription],
         Meta(min_length=2, max_length=q.MAX_JOINTS + 1),
@@ -116,7 +162,9 @@ class RobotDescription(Message, frozen=True, kw_only=True):
     custom: Annotated[
         dict[q.Name, Annotated[str, Meta(max_length=q.MAX_CUSTOM_SCHEMA)]],
         Meta(max_length=q.MAX_CUSTOM_SENSORS),
-        about("key -> JSON Schema of its message, of each sensor with a custom message, from any process"),
+        about(
+            "key -> JSON Schema of its message, of each sensor with a custom message, from any process"
+        ),
     ] = {}
 
 
@@ -124,4 +172,6 @@ class RunConfiguration(Message, frozen=True, kw_only=True):
     """`hal/config`, latched: the effective configuration of the run, which explains a recording."""
 
     config_hash: Annotated[q.Name, about("as in the description")]
-    content: Annotated[str, Meta(max_length=MAX_CONFIG), about("JSON, as `schemas/files/run.json` describes it")]
+    content: Annotated[
+        str, Meta(max_length=MAX_CONFIG), about("JSON, as `schemas/files/run.json` describes it")
+    ]

@@ -20,10 +20,15 @@ class KnownObstacle(Message, frozen=True, kw_only=True):
     half_size_m: Annotated[q.Vector, about("of a box")] = (0.0, 0.0, 0.0)
     height_m: q.Length = 0.0
     confidence: Annotated[q.Fraction, about("1: measured (less: estimated)")] = 1.0
-    position_sd_m: Annotated[q.Distance, about("standard deviation of `position_w`, horizontally (0: exact)")] = 0.0
-    size_sd_m: Annotated[q.Distance, about("standard deviation of `radius_m` or `half_size_m` (0: exact)")] = 0.0
+    position_sd_m: Annotated[
+        q.Distance, about("standard deviation of `position_w`, horizontally (0: exact)")
+    ] = 0.0
+    size_sd_m: Annotated[
+        q.Distance, about("standard deviation of `radius_m` or `half_size_m` (0: exact)")
+    ] = 0.0
     last_seen_ns: Annotated[
-        q.Stamp | None, about("stamp of the newest measurement of it (null: from a map, not from a sensor)")
+        q.Stamp | None,
+        about("stamp of the newest measurement of it (null: from a map, not from a sensor)"),
     ] = None
     touched: Annotated[bool, about("the body has touched it")] = False
 
@@ -49,8 +54,12 @@ class WorldModel(Message, frozen=True, kw_only=True):
     base_position_w: Annotated[q.Vector, about("of the tail end")]
     base_orientation_wxyz: Annotated[q.Quaternion, about("of the tail link")]
     base_confidence: Annotated[q.Fraction, about("of the base's pose")]
-    contacts: Annotated[list[WorldContact], Meta(max_length=q.MAX_CONTACTS), about("of the body with obstacles")]
-    obstacles: Annotated[list[KnownObstacle], Meta(max_length=4096), about("in the neighborhood of the body")]
+    contacts: Annotated[
+        list[WorldContact], Meta(max_length=q.MAX_CONTACTS), about("of the body with obstacles")
+    ]
+    obstacles: Annotated[
+        list[KnownObstacle], Meta(max_length=4096), about("in the neighborhood of the body")
+    ]
     pose_timestamp_ns: Annotated[q.Stamp | None, about("of the pose in it (null: unknown)")] = None
     contacts_timestamp_ns: Annotated[
         q.Stamp | None, about("of the contacts in it (null: no sample yet, and no estimate)")
@@ -67,15 +76,20 @@ class WorldModel(Message, frozen=True, kw_only=True):
         q.Angle | None, about("standard deviation of the base's heading (null: not estimated)")
     ] = None
     depth_timestamp_ns: Annotated[
-        q.Stamp | None, about("of the newest image or ranges in `obstacles` (null: none, or a map that is known)")
+        q.Stamp | None,
+        about("of the newest image or ranges in `obstacles` (null: none, or a map that is known)"),
     ] = None
     pose_from: Annotated[
         Literal["sensor", "dead_reckoning"] | None,
-        about("present source of the base's pose, measured at `pose_timestamp_ns` or `timestamp_ns` (null: unknown)"),
+        about(
+            "present source of the base's pose, measured at `pose_timestamp_ns` or `timestamp_ns` (null: unknown)"
+        ),
     ] = None
     contacts_from: Annotated[
         Literal["sensor", "joint_torques"] | None,
-        about("what `contacts` are of: measured, or estimated, at `contacts_timestamp_ns` (null: none)"),
+        about(
+            "what `contacts` are of: measured, or estimated, at `contacts_timestamp_ns` (null: none)"
+        ),
     ] = None
 
 
@@ -91,24 +105,38 @@ class Trajectory(Message, frozen=True, kw_only=True):
     """`navigation/trajectory`: path, speed, and the push-points expected along it."""
 
     tick: Annotated[q.Tick, about("of the clock that navigation acted on")]
-    timestamp_ns: Annotated[q.Stamp | None, about("of the world model that it was planned from (null: without one)")]
+    timestamp_ns: Annotated[
+        q.Stamp | None, about("of the world model that it was planned from (null: without one)")
+    ]
     path_id: Annotated[q.Count, about("changes when `path_w` does")]
-    path_w: Annotated[list[tuple[q.Length, q.Length]], Meta(min_length=2, max_length=20000), about("x and y")]
+    path_w: Annotated[
+        list[tuple[q.Length, q.Length]], Meta(min_length=2, max_length=20000), about("x and y")
+    ]
     speed_m_s: Annotated[q.Velocity, about("along the path (0: stop)")]
     push_points: Annotated[
-        list[q.Name], Meta(max_length=512), about("obstacles within reach of the path, in the order along it")
+        list[q.Name],
+        Meta(max_length=512),
+        about("obstacles within reach of the path, in the order along it"),
     ]
     finished: Annotated[bool, about("the end of the path is reached")]
-    reason: Annotated[q.Reason, about("why the speed is not that of the mission (empty: it is)")] = ""
-    searching: Annotated[
-        q.Reason, about("why another path is being searched, while this one is followed (empty: none is)")
+    reason: Annotated[
+        q.Reason, about("why the speed is not that of the mission (empty: it is)")
     ] = ""
-    searched_nodes: Annotated[q.Count, about("nodes that this search expanded since the last message")] = 0
+    searching: Annotated[
+        q.Reason,
+        about("why another path is being searched, while this one is followed (empty: none is)"),
+    ] = ""
+    searched_nodes: Annotated[
+        q.Count, about("nodes that this search expanded since the last message")
+    ] = 0
     assumed_obstacle_friction: Annotated[
-        float, q.from_zero(2, "1 (Coulomb coefficient)"), about("of the obstacles, as the path is planned with it")
+        float,
+        q.from_zero(2, "1 (Coulomb coefficient)"),
+        about("of the obstacles, as the path is planned with it"),
     ] = 0.0
     goal_w: Annotated[
-        tuple[q.Length, q.Length] | None, about("x and y to which the mission leads the head (null: along the path)")
+        tuple[q.Length, q.Length] | None,
+        about("x and y to which the mission leads the head (null: along the path)"),
     ] = None
     rises: Annotated[
         list[PathRise],
@@ -126,13 +154,26 @@ class ControlState(Message, frozen=True, kw_only=True):
     tick: Annotated[q.Tick, about("of the clock that control acted on")]
     timestamp_ns: q.Stamp
     controller: q.Name
-    state: Annotated[LocomotionState, about("PowerOff: the HAL is silent; Idle: not armed, or the speed is to be 0")]
+    state: Annotated[
+        LocomotionState,
+        about("PowerOff: the HAL is silent; Idle: not armed, or the speed is to be 0"),
+    ]
     reason: q.Reason
-    path_s_m: Annotated[q.Length | None, about("arc length of the tail along the path (null: unknown)")] = None
-    propulsion_joint: Annotated[q.Name | None, about("the joint that pushes (null: none does)")] = None
-    propulsion_n: Annotated[q.Force | None, about("commanded force along the path (null: none)")] = None
-    push_points: Annotated[list[WorldContact], Meta(max_length=64), about("obstacles that the body pushes off")] = []
-    desired_force_n: Annotated[list[q.Force], Meta(max_length=64), about("expected at each of `push_points`")] = []
+    path_s_m: Annotated[
+        q.Length | None, about("arc length of the tail along the path (null: unknown)")
+    ] = None
+    propulsion_joint: Annotated[q.Name | None, about("the joint that pushes (null: none does)")] = (
+        None
+    )
+    propulsion_n: Annotated[
+        q.Force | None, about("commanded force along the path (null: none)")
+    ] = None
+    push_points: Annotated[
+        list[WorldContact], Meta(max_length=64), about("obstacles that the body pushes off")
+    ] = []
+    desired_force_n: Annotated[
+        list[q.Force], Meta(max_length=64), about("expected at each of `push_points`")
+    ] = []
     measured_force_n: Annotated[
         list[q.Force | None],
         Meta(max_length=64),
@@ -141,19 +182,32 @@ class ControlState(Message, frozen=True, kw_only=True):
             "sensor of contacts"
         ),
     ] = []
-    propulsion_torque_nm: Annotated[q.Torque | None, about("of `propulsion_joint` (null: none pushes)")] = None
-    bending_torque_nm: Annotated[q.Torques, about("of every joint, for the desired forces; or empty")] = []
+    propulsion_torque_nm: Annotated[
+        q.Torque | None, about("of `propulsion_joint` (null: none pushes)")
+    ] = None
+    bending_torque_nm: Annotated[
+        q.Torques, about("of every joint, for the desired forces; or empty")
+    ] = []
     reference_rad: Annotated[q.Angles, about("of every joint, from the path; or empty")] = []
-    condition: Annotated[q.Scalar | None, about("condition number of the equations (null: none were solved)")] = None
-    torque_headroom_nm: Annotated[q.Torque | None, about("left below its limit at full push (null: none pushes)")] = (
-        None
-    )
+    condition: Annotated[
+        q.Scalar | None, about("condition number of the equations (null: none were solved)")
+    ] = None
+    torque_headroom_nm: Annotated[
+        q.Torque | None, about("left below its limit at full push (null: none pushes)")
+    ] = None
     saturated: Annotated[bool, about("the push is at its torque limit")] = False
     jammed: Annotated[bool, about("the body is stuck although a joint pushes")] = False
-    custom: Annotated[dict[q.Name, q.Scalar], Meta(max_length=32), about("numbers that the controller defines")] = {}
-    failed: Annotated[bool, about("the last message of a controller that cannot continue; `reason` is why")] = False
+    custom: Annotated[
+        dict[q.Name, q.Scalar], Meta(max_length=32), about("numbers that the controller defines")
+    ] = {}
+    failed: Annotated[
+        bool, about("the last message of a controller that cannot continue; `reason` is why")
+    ] = False
     too_slow: Annotated[
-        q.Reason, about("in real time: what shows that the controller misses its deadlines (empty: nothing does)")
+        q.Reason,
+        about(
+            "in real time: what shows that the controller misses its deadlines (empty: nothing does)"
+        ),
     ] = ""
 
 
@@ -175,11 +229,17 @@ class ControlParameters(Message, frozen=True, kw_only=True):
     tick: Annotated[q.Tick, about("since when")]
     timestamp_ns: q.Stamp
     controller: q.Name
-    parameters: Annotated[str, Meta(max_length=q.MAX_PARAMETERS_JSON), about("all of them, as a JSON object")]
-    schema: Annotated[str, Meta(max_length=q.MAX_SCHEMA), about("JSON Schema of `parameters`, with bounds and units")]
-    requester: Annotated[q.Name | None, about("name of the requester of them (null: the configuration of the run)")] = (
-        None
-    )
+    parameters: Annotated[
+        str, Meta(max_length=q.MAX_PARAMETERS_JSON), about("all of them, as a JSON object")
+    ]
+    schema: Annotated[
+        str,
+        Meta(max_length=q.MAX_SCHEMA),
+        about("JSON Schema of `parameters`, with bounds and units"),
+    ]
+    requester: Annotated[
+        q.Name | None, about("name of the requester of them (null: the configuration of the run)")
+    ] = None
     changes: Annotated[q.Count, about("how often they have been changed since control started")] = 0
 
 
@@ -194,9 +254,10 @@ class LocomotionIntent(Message, frozen=True, kw_only=True):
     requester: q.Name
     speed_m_s: Annotated[q.Velocity | None, about("null: that of the mission")] = None
     go: Annotated[bool, about("false: stop")] = True
-    valid_for_ns: Annotated[q.Nanoseconds, about("valid for this long from `timestamp_ns`, at most 5 s")] = (
-        1_000_000_000
-    )
+    valid_for_ns: Annotated[
+        q.Nanoseconds, about("valid for this long from `timestamp_ns`, at most 5 s")
+    ] = 1_000_000_000
     heading_w_rad: Annotated[
-        q.Angle | None, about("direction of travel in the world, from its x axis (null: the mission's own goal)")
+        q.Angle | None,
+        about("direction of travel in the world, from its x axis (null: the mission's own goal)"),
     ] = None

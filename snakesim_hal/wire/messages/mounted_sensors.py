@@ -46,8 +46,12 @@ class DepthImage(CameraImage, frozen=True, kw_only=True):
     right and v downwards from the middle of the top left one, is (1, -(u - cx_px) / fx_px, -(v - cy_px) / fy_px).
     """
 
-    range_min_m: Annotated[q.Distance, about("along the optical axis; what is nearer is 0 in `depth`")]
-    range_max_m: Annotated[q.Distance, about("along the optical axis; what is further is 0 in `depth`")]
+    range_min_m: Annotated[
+        q.Distance, about("along the optical axis; what is nearer is 0 in `depth`")
+    ]
+    range_max_m: Annotated[
+        q.Distance, about("along the optical axis; what is further is 0 in `depth`")
+    ]
     scale_m: Annotated[float, Meta(gt=0, le=1), about("meters per count of `depth`")]
     depth: Annotated[
         bytes,
@@ -69,7 +73,9 @@ class ColorImage(CameraImage, frozen=True, kw_only=True):
     """`sensor/color/<name>`: what a camera sees, in color. Frame and pixels are as in DepthImage."""
 
     rgb: Annotated[
-        bytes, Meta(max_length=3 * q.MAX_PIXELS), about("red, green and blue of each pixel, row by row from the top")
+        bytes,
+        Meta(max_length=3 * q.MAX_PIXELS),
+        about("red, green and blue of each pixel, row by row from the top"),
     ]
 
 
@@ -98,7 +104,9 @@ class RangeScan(MountedSample, frozen=True, kw_only=True):
 def _describe_beyond_range(min_m: float, max_m: float, distances_m: list[float]) -> str:
     """Describe distances that are beyond the range of their sensor; empty if all are within it."""
     slack_m = RANGE_SLACK_FRACTION * max_m
-    if min_m < max_m and all(min_m - slack_m <= distance_m <= max_m + slack_m for distance_m in distances_m):
+    if min_m < max_m and all(
+        min_m - slack_m <= distance_m <= max_m + slack_m for distance_m in distances_m
+    ):
         return ""
     measured = "nothing"
     if distances_m:
@@ -117,9 +125,13 @@ class ImagePreview(Message, frozen=True, kw_only=True):
     timestamp_ns: Annotated[q.Stamp, about("of the image that it was made from")]
     width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row of this copy")]
     height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows of this copy")]
-    format: Annotated[Literal["jpeg", "png"], about("of `data`: jpeg in color, png of 16 bits for depth")]
+    format: Annotated[
+        Literal["jpeg", "png"], about("of `data`: jpeg in color, png of 16 bits for depth")
+    ]
     scale_m: Annotated[
         Annotated[float, Meta(gt=0, le=1)] | None,
-        about("meters per count of depth, which is 0 for nothing within range; null: it is in color"),
+        about(
+            "meters per count of depth, which is 0 for nothing within range; null: it is in color"
+        ),
     ] = None
     data: Annotated[bytes, Meta(max_length=q.MAX_PREVIEW_BYTES), about("the file")]

@@ -17,8 +17,12 @@ class LeaseRequest(Message, frozen=True, kw_only=True):
         Literal["acquire", "renew", "release"],
         about("renew works only while disarmed: an armed robot needs commands"),
     ]
-    holder: Annotated[q.Name, about("name of the requester; a service of the run uses its own name")]
-    epoch: Annotated[q.Count, about("of the lease that is renewed or released; acquire needs none")] = 0
+    holder: Annotated[
+        q.Name, about("name of the requester; a service of the run uses its own name")
+    ]
+    epoch: Annotated[
+        q.Count, about("of the lease that is renewed or released; acquire needs none")
+    ] = 0
     priority: Annotated[
         int,
         Meta(ge=0, le=255),
@@ -33,21 +37,31 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
         Literal["arm", "disarm", "reset", "finish"],
         about("reset leads from fault or estop to disarmed; finish disarms, and ends the run"),
     ]
-    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
-    host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
-    robot: Annotated[q.Name | None, about("`RobotDescription.robot`; arm needs it, others may leave it null")] = None
-    backend: Annotated[q.Name | None, about("`RobotDescription.backend`; arm needs it, others may leave it null")] = (
-        None
+    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")] = (
+        "an unnamed client"
     )
+    host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
+    robot: Annotated[
+        q.Name | None, about("`RobotDescription.robot`; arm needs it, others may leave it null")
+    ] = None
+    backend: Annotated[
+        q.Name | None, about("`RobotDescription.backend`; arm needs it, others may leave it null")
+    ] = None
     config_hash: Annotated[
-        q.Name | None, about("`RobotDescription.config_hash`; arm needs it, others may leave it null")
+        q.Name | None,
+        about("`RobotDescription.config_hash`; arm needs it, others may leave it null"),
     ] = None
     unchecked: Annotated[
-        bool, about("arm also if `RobotStatus.unchecked` gives a reason why the joints do not count as checked")
+        bool,
+        about(
+            "arm also if `RobotStatus.unchecked` gives a reason why the joints do not count as checked"
+        ),
     ] = False
 
 
-def make_arm_request(robot: RobotDescription, requester: str, *, unchecked: bool = False) -> LifecycleRequest:
+def make_arm_request(
+    robot: RobotDescription, requester: str, *, unchecked: bool = False
+) -> LifecycleRequest:
     """Make a request to arm exactly the robot, backend, configuration and host process that are described.
 
     Args:
@@ -77,9 +91,13 @@ class SimulatorRequest(Message, frozen=True, kw_only=True):
 
     action: Annotated[
         Literal["pause", "resume", "step", "speed", "reset"],
-        about("step: some ticks, then paused; reset: another host, at the start and disarmed, takes the place of this"),
+        about(
+            "step: some ticks, then paused; reset: another host, at the start and disarmed, takes the place of this"
+        ),
     ]
-    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")] = "an unnamed client"
+    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")] = (
+        "an unnamed client"
+    )
     host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
     ticks: Annotated[int, Meta(ge=1, le=1_000_000), about("of a step")] = 1
     speed: Annotated[q.Speed, about("robot time per wall time, in real time; 1: as the wall")] = 1.0
@@ -91,9 +109,12 @@ class FaultRequest(Message, frozen=True, kw_only=True):
     kind: Annotated[q.Name, about("kind of fault: `snakesim fault list` prints all")]
     target: Annotated[q.Name, about("a process, key, joint or bus, such as joint_3")]
     for_s: Annotated[
-        Annotated[float, Meta(gt=0, le=86400)] | None, about("seconds of robot time; null: until it is ended")
+        Annotated[float, Meta(gt=0, le=86400)] | None,
+        about("seconds of robot time; null: until it is ended"),
     ] = None
-    amount: Annotated[q.Scalar | None, about("amount, in the unit of the kind; null: the default of this kind")] = None
+    amount: Annotated[
+        q.Scalar | None, about("amount, in the unit of the kind; null: the default of this kind")
+    ] = None
     end: Annotated[bool, about("true: end it")] = False
 
 
@@ -101,8 +122,12 @@ class Answer(Message, frozen=True, kw_only=True):
     """Reply to every query: whether it was done, and if not, why, as a text and as one stable word."""
 
     ok: Annotated[bool, about("whether it was done")]
-    reason: Annotated[q.Reason, about("a text: why not, or if it was done why the robot is in its state")]
-    refusal: Annotated[q.Name | None, about("why not, as one word: see protocol.md; null: it was done")] = None
+    reason: Annotated[
+        q.Reason, about("a text: why not, or if it was done why the robot is in its state")
+    ]
+    refusal: Annotated[
+        q.Name | None, about("why not, as one word: see protocol.md; null: it was done")
+    ] = None
     epoch: Annotated[q.Count, about("of the lease, or of the last one when it is free")] = 0
     lifecycle: Annotated[LifecycleState, ABOUT_LIFECYCLE] = "disarmed"
     host: Annotated[q.Name | None, ABOUT_HOST] = None

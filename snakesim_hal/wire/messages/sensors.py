@@ -14,11 +14,15 @@ class JointState(Message, frozen=True, kw_only=True):
 
     tick: q.Tick
     timestamp_ns: q.Stamp
-    angle_rad: Annotated[q.Angles, about("positive: yaw to the left, pitch downwards, seen towards the head")]
+    angle_rad: Annotated[
+        q.Angles, about("positive: yaw to the left, pitch downwards, seen towards the head")
+    ]
     velocity_rad_s: Annotated[q.AngularVelocities, about(ONE_PER_JOINT)]
     torque_nm: Annotated[
         q.Torques,
-        about("of the motor, positive towards positive angles (0 of a joint that does not measure it)"),
+        about(
+            "of the motor, positive towards positive angles (0 of a joint that does not measure it)"
+        ),
     ]
     valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
     age_ns: Annotated[q.Ages, about("how long before `timestamp_ns` each joint was measured")]
@@ -38,7 +42,9 @@ class Contact(Message, frozen=True, kw_only=True):
     """One contact of a link with an obstacle (not the ground); all vectors in the link's frame."""
 
     link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
-    obstacle: Annotated[q.Name | None, about("touched obstacle; null: the sensor does not identify it")]
+    obstacle: Annotated[
+        q.Name | None, about("touched obstacle; null: the sensor does not identify it")
+    ]
     position_l: q.Vector
     normal_l: Annotated[q.UnitVector, about("from the obstacle into the body")]
     tangent_1_l: Annotated[q.UnitVector, about("across the normal, towards the head")]
@@ -55,7 +61,9 @@ class Contacts(Message, frozen=True, kw_only=True):
     contacts: Annotated[list[Contact], Meta(max_length=q.MAX_CONTACTS)]
     measured_force_n: Annotated[
         q.Force | None,
-        about("largest force of one obstacle on one link, as a mean over the last 50 ms; null: not measured"),
+        about(
+            "largest force of one obstacle on one link, as a mean over the last 50 ms; null: not measured"
+        ),
     ] = None
 
 
@@ -64,10 +72,18 @@ class Imu(Message, frozen=True, kw_only=True):
 
     tick: q.Tick
     timestamp_ns: q.Stamp
-    link: Annotated[list[q.LinkIndex], Meta(max_length=q.MAX_JOINTS + 1), about("their numbers, from 0 at the tail")]
-    angular_velocity_rad_s: Annotated[list[q.AngularVelocityVector], Meta(max_length=q.MAX_JOINTS + 1)]
+    link: Annotated[
+        list[q.LinkIndex],
+        Meta(max_length=q.MAX_JOINTS + 1),
+        about("their numbers, from 0 at the tail"),
+    ]
+    angular_velocity_rad_s: Annotated[
+        list[q.AngularVelocityVector], Meta(max_length=q.MAX_JOINTS + 1)
+    ]
     acceleration_m_s2: Annotated[
-        list[q.AccelerationVector], Meta(max_length=q.MAX_JOINTS + 1), about("specific force: at rest 1 g upwards")
+        list[q.AccelerationVector],
+        Meta(max_length=q.MAX_JOINTS + 1),
+        about("specific force: at rest 1 g upwards"),
     ]
 
 
@@ -90,6 +106,8 @@ class Power(Message, frozen=True, kw_only=True):
     voltage_v: Annotated[list[q.Voltage], Meta(max_length=q.MAX_JOINTS)]
     current_a: Annotated[list[q.Current], Meta(max_length=q.MAX_JOINTS)]
     motor_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the winding")]
-    board_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the electronics")]
+    board_c: Annotated[
+        list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the electronics")
+    ]
     leak: Annotated[q.Flags, about("true: water inside")]
     valid: Annotated[q.Flags, about("false: the state of this module is unknown")]

@@ -29,7 +29,10 @@ class Clock(Message, frozen=True, kw_only=True):
     clock_mode: Annotated[ClockMode, ABOUT_CLOCK_MODE]
     lifecycle: Annotated[LifecycleState, ABOUT_LIFECYCLE]
     arm_session: Annotated[
-        q.Count, about("how often the robot has been armed since its host started; a new number: reset the controller")
+        q.Count,
+        about(
+            "how often the robot has been armed since its host started; a new number: reset the controller"
+        ),
     ]
     lease_epoch: Annotated[q.Count, about("of the live lease (0: there is none)")]
     newest: Annotated[
@@ -38,7 +41,10 @@ class Clock(Message, frozen=True, kw_only=True):
         about("sensor key or service -> tick of its newest sample that is valid now"),
     ]
     paused: Annotated[
-        bool, about("true: not a new tick; the last clock is repeated as a sign of life while robot time is paused")
+        bool,
+        about(
+            "true: not a new tick; the last clock is repeated as a sign of life while robot time is paused"
+        ),
     ] = False
 
 
@@ -46,12 +52,16 @@ class Fault(Message, frozen=True, kw_only=True):
     """One fault, and its location."""
 
     tick: q.Tick
-    what: Annotated[q.Name, about("a short word to count by: lease_expired, service_lost, diverged, ...")]
+    what: Annotated[
+        q.Name, about("a short word to count by: lease_expired, service_lost, diverged, ...")
+    ]
     cause: Annotated[q.Reason, about("in words, for the operator")]
     joint: Annotated[q.Name | None, about("null: it is not about one joint")] = None
     reach: Annotated[
         Reach,
-        about("joint: no other is affected, and the robot may continue if its file allows it (none: it stops nothing)"),
+        about(
+            "joint: no other is affected, and the robot may continue if its file allows it (none: it stops nothing)"
+        ),
     ] = "robot"
 
 
@@ -62,8 +72,12 @@ class TimingStatistics(Message, frozen=True, kw_only=True):
     median_us: q.Microseconds
     p99_us: Annotated[q.Microseconds, about("99 % took no longer")]
     max_us: q.Microseconds
-    low_us: Annotated[q.Microseconds, about("where the first bin begins; it counts all that is below, too")]
-    bin_decades: Annotated[float, q.from_zero(8.0, "1"), about("width of a bin: log10 of its end over its begin")]
+    low_us: Annotated[
+        q.Microseconds, about("where the first bin begins; it counts all that is below, too")
+    ]
+    bin_decades: Annotated[
+        float, q.from_zero(8.0, "1"), about("width of a bin: log10 of its end over its begin")
+    ]
     bins: Annotated[list[q.Count], Meta(max_length=64)]
 
 
@@ -85,35 +99,63 @@ class RobotStatus(Message, frozen=True, kw_only=True):
     clock_mode: Annotated[ClockMode, ABOUT_CLOCK_MODE]
     rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
     lifecycle: Annotated[LifecycleState, ABOUT_LIFECYCLE]
-    reason: Annotated[q.Reason, about("why it is in this state, and while disarmed what prevents arming")]
+    reason: Annotated[
+        q.Reason, about("why it is in this state, and while disarmed what prevents arming")
+    ]
     lease_holder: Annotated[q.Name | None, about("null: the lease is free")]
     lease_epoch: Annotated[q.Count, about("of the lease, or of the last one when it is free")]
     commands_accepted: Annotated[q.Count, about("commands that the limiter accepted while armed")]
-    commands_standby: Annotated[q.Count, about("valid commands while disarmed: received, not enacted")]
-    commands_rejected: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many, by reason")]
-    commands_limited: Annotated[dict[q.Name, q.Count], Meta(max_length=64), about("how many targets, by limit")]
-    faults: Annotated[list[Fault], Meta(max_length=64), about("since the last reset; not all of them stop the robot")]
-    alive: Annotated[list[q.Name], Meta(max_length=64), about("services of the run with a liveliness token")]
-    waiting_for: Annotated[list[q.Name], Meta(max_length=64), about("services that arming waits for")]
+    commands_standby: Annotated[
+        q.Count, about("valid commands while disarmed: received, not enacted")
+    ]
+    commands_rejected: Annotated[
+        dict[q.Name, q.Count], Meta(max_length=64), about("how many, by reason")
+    ]
+    commands_limited: Annotated[
+        dict[q.Name, q.Count], Meta(max_length=64), about("how many targets, by limit")
+    ]
+    faults: Annotated[
+        list[Fault],
+        Meta(max_length=64),
+        about("since the last reset; not all of them stop the robot"),
+    ]
+    alive: Annotated[
+        list[q.Name], Meta(max_length=64), about("services of the run with a liveliness token")
+    ]
+    waiting_for: Annotated[
+        list[q.Name], Meta(max_length=64), about("services that arming waits for")
+    ]
     overruns: Annotated[q.Count, about("ticks that were late, while armed in real time")]
-    ready_to_arm: Annotated[bool, about("whether a request to arm that names the right robot would be granted now")]
-    injected: Annotated[list[q.Reason], Meta(max_length=64), about("injected faults that are active now")] = []
+    ready_to_arm: Annotated[
+        bool, about("whether a request to arm that names the right robot would be granted now")
+    ]
+    injected: Annotated[
+        list[q.Reason], Meta(max_length=64), about("injected faults that are active now")
+    ] = []
     realtime_warnings: Annotated[
         list[q.Reason], Meta(max_length=16), about("real-time measures that the system refused")
     ] = []
     derated: Annotated[
-        dict[q.Name, q.Fraction], Meta(max_length=q.MAX_JOINTS), about("joint -> share of its torque left by derating")
+        dict[q.Name, q.Fraction],
+        Meta(max_length=q.MAX_JOINTS),
+        about("joint -> share of its torque left by derating"),
     ] = {}
     isolated: Annotated[
-        list[q.Name], Meta(max_length=q.MAX_JOINTS), about("joints that failed, and are passive until a reset")
+        list[q.Name],
+        Meta(max_length=q.MAX_JOINTS),
+        about("joints that failed, and are passive until a reset"),
     ] = []
     host: Annotated[q.Name | None, ABOUT_HOST] = None
     faults_left_out: Annotated[q.Count, about("of `faults`, between the first and the newest")] = 0
-    paused_by: Annotated[q.Name | None, about("client that paused the simulator (null: it is not paused)")] = None
+    paused_by: Annotated[
+        q.Name | None, about("client that paused the simulator (null: it is not paused)")
+    ] = None
     speed: Annotated[q.Speed, about("requested speed in real time: robot time per wall time")] = 1.0
     real_time_factor: Annotated[
         Annotated[float, q.from_zero(1e6, "1")] | None,
-        about("robot time per wall time over the last second (null: not measured, such as in a pause)"),
+        about(
+            "robot time per wall time over the last second (null: not measured, such as in a pause)"
+        ),
     ] = None
     tick_times: Annotated[
         dict[q.Name, TimingStatistics],
@@ -130,7 +172,10 @@ class RobotStatus(Message, frozen=True, kw_only=True):
         ),
     ] = ""
     held_up: Annotated[
-        q.Reason, about("which answer to which tick lockstep has been waiting for, if longer than half a second")
+        q.Reason,
+        about(
+            "which answer to which tick lockstep has been waiting for, if longer than half a second"
+        ),
     ] = ""
 
 
@@ -152,7 +197,9 @@ class ProcessInfo(Message, frozen=True, kw_only=True):
     settings: Annotated[
         dict[q.Name, q.Name],
         Meta(max_length=q.MAX_SHARED_SETTINGS),
-        about("settings that host and services must share: values, and hashes of long ones (empty: it uses none)"),
+        about(
+            "settings that host and services must share: values, and hashes of long ones (empty: it uses none)"
+        ),
     ] = {}
     messages: Annotated[
         dict[q.Name, Annotated[q.Count, about("version of that message")]],
@@ -160,5 +207,7 @@ class ProcessInfo(Message, frozen=True, kw_only=True):
         about("messages that it knows (empty: unknown)"),
     ] = {}
     waits_for: Annotated[
-        list[q.Name], Meta(max_length=16), about("keys whose first message it waits for; it publishes nothing before")
+        list[q.Name],
+        Meta(max_length=16),
+        about("keys whose first message it waits for; it publishes nothing before"),
     ] = []

@@ -36,12 +36,16 @@ def _add_robot_file_argument(parser: argparse.ArgumentParser) -> None:
 
 def _add_calibrate_arguments(parser: argparse.ArgumentParser) -> None:
     _add_robot_file_argument(parser)
-    parser.add_argument("joints", nargs="*", metavar="JOINT", help="such as joint_3 (default: all joints)")
+    parser.add_argument(
+        "joints", nargs="*", metavar="JOINT", help="such as joint_3 (default: all joints)"
+    )
 
 
 def _add_calibrate_zero_arguments(parser: argparse.ArgumentParser) -> None:
     _add_robot_file_argument(parser)
-    parser.add_argument("--now", action="store_true", help="do not wait for Enter: it lies straight")
+    parser.add_argument(
+        "--now", action="store_true", help="do not wait for Enter: it lies straight"
+    )
 
 
 def _add_calibrate_gear_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,19 +61,33 @@ def _add_calibrate_gear_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_shape_draw_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", metavar="FILE", help="robot file, or name of a shipped one")
-    add_output_argument(parser, f"a .pdf for a printer, or an .svg for a plotter (default: {DEFAULT_DRAWING})")
-    parser.add_argument("--sheet-size", choices=PAPER_NAMES, default="a4", help="size of the sheets (default: a4)")
+    add_output_argument(
+        parser, f"a .pdf for a printer, or an .svg for a plotter (default: {DEFAULT_DRAWING})"
+    )
+    parser.add_argument(
+        "--sheet-size", choices=PAPER_NAMES, default="a4", help="size of the sheets (default: a4)"
+    )
 
 
 def _add_jog_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help=ROBOT_FILE_HELP.partition(";")[0])
     parser.add_argument("joint", metavar="JOINT", help="such as joint_3")
     parser.add_argument(
-        "--joint-speed", type=float, default=0.1, metavar="RAD/S", help="at most 0.5 rad/s (default: 0.1)"
+        "--joint-speed",
+        type=float,
+        default=0.1,
+        metavar="RAD/S",
+        help="at most 0.5 rad/s (default: 0.1)",
     )
-    parser.add_argument("--travel", type=float, default=0.2, metavar="RAD", help="to either side (default: 0.2 rad)")
     parser.add_argument(
-        "--torque", type=float, default=0.3, metavar="FRACTION", help="of the joint's limit (default: 0.3)"
+        "--travel", type=float, default=0.2, metavar="RAD", help="to either side (default: 0.2 rad)"
+    )
+    parser.add_argument(
+        "--torque",
+        type=float,
+        default=0.3,
+        metavar="FRACTION",
+        help="of the joint's limit (default: 0.3)",
     )
     add_network_arguments(parser)
 
@@ -90,7 +108,11 @@ def _add_check_arguments(parser: argparse.ArgumentParser) -> None:
         help="you measured the gears that it cannot judge with `robot calibrate gear`, they are right, and have no "
         "backlash",
     )
-    parser.add_argument("--straight", action="store_true", help="the robot lay straight at its start: judge all zeros")
+    parser.add_argument(
+        "--straight",
+        action="store_true",
+        help="the robot lay straight at its start: judge all zeros",
+    )
     parser.add_argument(
         "--allow-backlash",
         type=make_number_parser(0.0, 0.5, "rad"),
@@ -103,7 +125,10 @@ def _add_check_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_identify_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "run", type=Path, metavar="RUN", help="folder of the run, in which the robot was suspended by its tail"
+        "run",
+        type=Path,
+        metavar="RUN",
+        help="folder of the run, in which the robot was suspended by its tail",
     )
     add_write_option(parser, "the values are written into it")
     add_output_argument(parser, "the page, an HTML file (default: identified.html in the run)")
@@ -113,7 +138,9 @@ def _add_identify_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_calibrate_zero(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.by_hand import calibrate_zeros
 
-    return calibrate_zeros(arguments.file, select_robots(arguments), wait_for_enter=not arguments.now)
+    return calibrate_zeros(
+        arguments.file, select_robots(arguments), wait_for_enter=not arguments.now
+    )
 
 
 def _run_shape_draw(arguments: argparse.Namespace) -> int:
@@ -155,7 +182,9 @@ def _run_calibrate_limits(arguments: argparse.Namespace) -> int:
 def _run_calibrate_gear(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.by_hand import check_gears
 
-    return check_gears(arguments.file, select_robots(arguments), arguments.joints, arguments.degrees)
+    return check_gears(
+        arguments.file, select_robots(arguments), arguments.joints, arguments.degrees
+    )
 
 
 def _run_check(arguments: argparse.Namespace) -> int:
@@ -173,7 +202,9 @@ def _run_check(arguments: argparse.Namespace) -> int:
 def _run_identify(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.commissioning.identify import identify_and_report
 
-    return identify_and_report(arguments.run, arguments.write, arguments.out, as_json=arguments.json)
+    return identify_and_report(
+        arguments.run, arguments.write, arguments.out, as_json=arguments.json
+    )
 
 
 COMMANDS: Commands = (
@@ -193,7 +224,10 @@ COMMANDS: Commands = (
         help="Find joints that count the wrong way round or have another's id, while you turn them by hand.",
         add=_add_calibrate_arguments,
         run=_run_calibrate_direction,
-        examples=("robot calibrate direction snake.toml", "robot calibrate direction snake.toml joint_3 joint_4"),
+        examples=(
+            "robot calibrate direction snake.toml",
+            "robot calibrate direction snake.toml joint_3 joint_4",
+        ),
     ),
     Command(
         name="robot calibrate limits",
@@ -207,7 +241,10 @@ COMMANDS: Commands = (
         help="Find whether gear ratios match the robot file, while you turn joints by hand by a known angle.",
         add=_add_calibrate_gear_arguments,
         run=_run_calibrate_gear,
-        examples=("robot calibrate gear snake.toml", "robot calibrate gear snake.toml joint_3 --degrees 90"),
+        examples=(
+            "robot calibrate gear snake.toml",
+            "robot calibrate gear snake.toml joint_3 --degrees 90",
+        ),
     ),
     CommandGroup(
         name="robot shape",
@@ -229,7 +266,10 @@ COMMANDS: Commands = (
         run=_run_shape_check,
         details="Exit code 0: all were confirmed, and recorded in the robot file. 1: one is wrong or unknown. 2: wrong "
         "input.",
-        examples=("robot shape check snake.toml", "robot shape check snake.toml --namespace snake_2"),
+        examples=(
+            "robot shape check snake.toml",
+            "robot shape check snake.toml --namespace snake_2",
+        ),
     ),
     Command(
         name="robot jog",
@@ -237,7 +277,10 @@ COMMANDS: Commands = (
         add=_add_jog_arguments,
         run=_run_jog,
         details="The motors of the other joints stay off. It arms the robot, checked or not.",
-        examples=("robot jog snake.toml joint_3", "robot jog snake.toml joint_3 --joint-speed 0.05 --travel 0.1"),
+        examples=(
+            "robot jog snake.toml joint_3",
+            "robot jog snake.toml joint_3 --joint-speed 0.05 --travel 0.1",
+        ),
     ),
     Command(
         name="robot check",
@@ -246,7 +289,10 @@ COMMANDS: Commands = (
         run=_run_check,
         details="Exit code 0: sign, order, zero and gear of every joint were confirmed. 1: one is wrong or unknown. "
         "2: wrong input.",
-        examples=("robot check runs/check --straight", "robot check runs/check --straight --write snake.toml"),
+        examples=(
+            "robot check runs/check --straight",
+            "robot check runs/check --straight --write snake.toml",
+        ),
     ),
     Command(
         name="robot identify",
@@ -255,6 +301,9 @@ COMMANDS: Commands = (
         run=_run_identify,
         details="Exit code 0: every joint was identified. 1: one was not, or does not move as it should. 2: wrong "
         "input.",
-        examples=("robot identify runs/identify", "robot identify runs/identify --write snake.toml"),
+        examples=(
+            "robot identify runs/identify",
+            "robot identify runs/identify --write snake.toml",
+        ),
     ),
 )

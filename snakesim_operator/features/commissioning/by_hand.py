@@ -43,12 +43,11 @@ ZERO_SAMPLING_S = 1.0  # samples for a zero are taken for that long
 MAX_SILENCE_S = 1.0  # without joint angles
 HOST_TIMEOUT_S = 3.0  # for configuration and status of a running host
 REDRAW_PERIOD_S = 0.2
-POSITIVE_DIRECTION_BY_AXIS = {
-    "yaw": "to the left",
-    "pitch": "downwards",
-}  # of what is ahead of the joint, seen towards the head
+# Of what is ahead of the joint, seen towards the head.
+POSITIVE_DIRECTION_BY_AXIS = {"yaw": "to the left", "pitch": "downwards"}
 HOST_TIMEOUT_MESSAGE = (
-    f"the robot's host did not publish its configuration within {HOST_TIMEOUT_S:g} s; see `snakesim status`"
+    "the "
+    f"robot's host did not publish its configuration within {HOST_TIMEOUT_S:g} s; see `snakesim status`"
 )
 
 
@@ -71,7 +70,9 @@ def load_running_joints(session: Session, path: Path) -> Sequence[Joint]:
         raise RefusedError(HOST_TIMEOUT_MESSAGE, code="network/no-answer")
     running = msgspec.json.decode(configuration.content, type=RunConfig).robot.joint_table
     joints = read_joints_with_drive_modes(path, running)
-    if [_get_drive_identity(joint) for joint in running] != [_get_drive_identity(joint) for joint in joints]:
+    if [_get_drive_identity(joint) for joint in running] != [
+        _get_drive_identity(joint) for joint in joints
+    ]:
         raise ConfigError(
             f"{path}: its joints are not those that the host was started with, so measured angles would be "
             f"computed wrongly; restart the host with this file",
@@ -124,7 +125,11 @@ class HandMovedRobot:
         while not is_last_pass:
             is_last_pass = should_stop()  # samples that arrived before that are still read
             self._raise_if_armed()
-            states = [state for state in self._joint_state_reader.drain() if state.has_joint_count(len(self.joints))]
+            states = [
+                state
+                for state in self._joint_state_reader.drain()
+                if state.has_joint_count(len(self.joints))
+            ]
             if states:
                 last_arrival_s = time.monotonic()
             elif time.monotonic() - last_arrival_s > MAX_SILENCE_S:
@@ -150,7 +155,9 @@ class HandMovedRobot:
                 )
 
     def _raise_if_angles_unknown(self, state: JointState) -> None:
-        unknown = [joint.name for joint, valid in zip(self.joints, state.valid, strict=True) if not valid]
+        unknown = [
+            joint.name for joint, valid in zip(self.joints, state.valid, strict=True) if not valid
+        ]
         if unknown:
             raise RefusedError(
                 f"{', '.join(unknown)}: the angle is not known; see `snakesim status`",
@@ -159,7 +166,9 @@ class HandMovedRobot:
 
 
 @contextmanager
-def _connect_to_disarmed_robot(path: Path, selection: RobotSelection, command: str) -> Iterator[HandMovedRobot]:
+def _connect_to_disarmed_robot(
+    path: Path, selection: RobotSelection, command: str
+) -> Iterator[HandMovedRobot]:
     """Connect to the selected robot for the duration of a `with` block.
 
     Args:
@@ -192,7 +201,9 @@ def calibrate_zeros(path: Path, selection: RobotSelection, *, wait_for_enter: bo
     """
     with _connect_to_disarmed_robot(path, selection, "robot calibrate zero") as robot:
         if wait_for_enter:
-            print_line("Lay the robot straight on a flat floor, take your hands off it, then press Enter.")
+            print_line(
+                "Lay the robot straight on a flat floor, take your hands off it, then press Enter."
+            )
             for _ in robot.read_angles_rad(is_enter_pressed):
                 pass  # reading continues until Enter is pressed; these samples are not needed
         start_s = time.monotonic()
@@ -206,12 +217,18 @@ def calibrate_zeros(path: Path, selection: RobotSelection, *, wait_for_enter: bo
             ) from None
     values_by_joint: dict[str, dict[str, Any]] = {}
     for joint, zero_offset_rad in zip(robot.joints, zero_offsets_rad, strict=True):
-        print_line(f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_offset_rad:+8.4f}")
+        print_line(
+            f"{joint.name:<10} zero_rad {joint.drive.zero_rad:+8.4f} -> {zero_offset_rad:+8.4f}"
+        )
         values_by_joint[joint.name] = {"zero_rad": zero_offset_rad}
         if joint.limits.cable_turns is not None:
             # Time at which the cable was unwound; the host accepts it for an hour.
-            values_by_joint[joint.name]["cable_unwound"] = datetime.now(UTC).isoformat(timespec="seconds")
-            print_line(f"{joint.name:<10} its cable counts as unwound here: restart the host within an hour")
+            values_by_joint[joint.name]["cable_unwound"] = datetime.now(UTC).isoformat(
+                timespec="seconds"
+            )
+            print_line(
+                f"{joint.name:<10} its cable counts as unwound here: restart the host within an hour"
+            )
     _write_joint_values(path, values_by_joint, "straight pose")
     return 0
 
@@ -239,11 +256,15 @@ def calibrate_directions(path: Path, selection: RobotSelection, names: Sequence[
     with _connect_to_disarmed_robot(path, selection, "robot calibrate direction") as robot:
         for joint in select_joints(robot.joints, names, path):
             direction = POSITIVE_DIRECTION_BY_AXIS[joint.axis]
-            instruction = f"turn what is ahead of it {direction}, 10 degrees or more, and hold it still"
+            instruction = (
+                f"turn what is ahead of it {direction}, 10 degrees or more, and hold it still"
+            )
             turn = _wait_for_hand_turn(robot, joint, instruction)
             if turn is None:
                 unknown_joints.append(joint.name)
-            elif turn.angle_rad > 0:  # the person turned it in the positive direction, so the sign in the file is right
+            elif (
+                turn.angle_rad > 0
+            ):  # the person turned it in the positive direction, so the sign in the file is right
                 print_line(f"  {turn.angle_rad:+.2f} rad: matches the file")
             else:
                 print_line(f"  {turn.angle_rad:+.2f} rad: mounted the other way round")
@@ -275,7 +296,9 @@ def check_gears(path: Path, selection: RobotSelection, names: Sequence[str], deg
     with _connect_to_disarmed_robot(path, selection, "robot calibrate gear") as robot:
         for joint in select_joints(robot.joints, names, path):
             direction = POSITIVE_DIRECTION_BY_AXIS[joint.axis]
-            instruction = f"turn what is ahead of it {direction} by {degrees:g} degrees, and hold it still"
+            instruction = (
+                f"turn what is ahead of it {direction} by {degrees:g} degrees, and hold it still"
+            )
             turn = _wait_for_hand_turn(robot, joint, instruction)
             if turn is None:
                 unknown_joints.append(joint.name)
@@ -287,11 +310,17 @@ def check_gears(path: Path, selection: RobotSelection, names: Sequence[str], deg
                 print_line(f"{result}: matches the file")
             else:
                 gear_ratio = joint.drive.gear * ratio
-                print_line(f"{result}: gear = {gear_ratio:.3g} or so; write that of its data sheet into the file")
+                print_line(
+                    f"{result}: gear = {gear_ratio:.3g} or so; write that of its data sheet into the file"
+                )
                 wrong_joints.append(joint.name)
     if wrong_joints:
-        print_line(f"wrong: {', '.join(wrong_joints)}; correct the gear in {path}, and restart the host with it")
-    unknown_exit_code = _report_unknown_joints(unknown_joints, f"snakesim robot calibrate gear {path}")
+        print_line(
+            f"wrong: {', '.join(wrong_joints)}; correct the gear in {path}, and restart the host with it"
+        )
+    unknown_exit_code = _report_unknown_joints(
+        unknown_joints, f"snakesim robot calibrate gear {path}"
+    )
     return 1 if wrong_joints else unknown_exit_code
 
 
@@ -389,13 +418,18 @@ def _record_travel(robot: HandMovedRobot) -> TravelRange | None:
         travel.add_sample(angles_rad)
         if sys.stdout.isatty() and time.monotonic() >= next_drawing_s:
             next_drawing_s = time.monotonic() + REDRAW_PERIOD_S
-            drawn_line_count = overwrite_lines(_format_travel(robot.joints, travel, angles_rad), drawn_line_count)
+            drawn_line_count = overwrite_lines(
+                _format_travel(robot.joints, travel, angles_rad), drawn_line_count
+            )
     return travel
 
 
 def _format_travel(joints: Sequence[Joint], travel: TravelRange, now_rad: Floats) -> list[str]:
     rows = zip(joints, travel.lower_rad, now_rad, travel.upper_rad, strict=True)
-    return [f"{joint.name:<10} {lower:+7.3f}  now {now:+7.3f}  {upper:+7.3f} rad" for joint, lower, now, upper in rows]
+    return [
+        f"{joint.name:<10} {lower:+7.3f}  now {now:+7.3f}  {upper:+7.3f} rad"
+        for joint, lower, now, upper in rows
+    ]
 
 
 def select_joints(joints: Sequence[Joint], names: Sequence[str], path: Path) -> Sequence[Joint]:
@@ -417,7 +451,9 @@ def is_enter_pressed() -> bool:
     if not select.select([sys.stdin], [], [], 0.0)[0]:
         return False
     if not sys.stdin.readline():
-        raise RefusedError("the terminal is gone; nothing was written", code="commissioning/not-possible")
+        raise RefusedError(
+            "the terminal is gone; nothing was written", code="commissioning/not-possible"
+        )
     return True
 
 

@@ -15,9 +15,11 @@ from snakesim_hal.model.joints import Joint
 
 STILLNESS_TOLERANCE_RAD = 0.01  # a joint that is not touched moves less, noise included
 MIN_TURN_RAD = 0.15  # about 9 degrees; a smaller turn may be a shake of the hand
-MAX_REST_MOTION_RAD = 0.02  # a robot that rests, or that a hand holds still, moves less within `REST_S`: 0.04 rad/s
+# A robot that rests, or that a hand holds still, moves less within `REST_S`: 0.04 rad/s.
+MAX_REST_MOTION_RAD = 0.02
 REST_S = 0.5
-MAX_NEIGHBOR_FRACTION = 0.5  # of a turn; if another joint turns further, the turn is not of one joint alone
+# Of a turn; if another joint turns further, the turn is not of one joint alone.
+MAX_NEIGHBOR_FRACTION = 0.5
 LIMIT_MARGIN_RAD = 0.02  # between the end that a hand found and the limit that is written
 MIN_TRAVEL_RAD = 0.2
 
@@ -42,7 +44,9 @@ def compute_zero_offsets_rad(joints: Sequence[Joint], angles_rad: Floats) -> lis
     peak_to_peak_rad = np.ptp(angles_rad, axis=0)
     joint_index = int(np.argmax(peak_to_peak_rad))  # the joint that moved most
     if peak_to_peak_rad[joint_index] > STILLNESS_TOLERANCE_RAD:
-        raise RobotMovedError(f"{joints[joint_index].name} moved by {peak_to_peak_rad[joint_index]:.3f} rad")
+        raise RobotMovedError(
+            f"{joints[joint_index].name} moved by {peak_to_peak_rad[joint_index]:.3f} rad"
+        )
     return DriveMounting(joints).to_drive_angle_rad(np.median(angles_rad, axis=0)).tolist()
 
 
@@ -62,7 +66,9 @@ def find_hand_turn(before_rad: Floats, after_rad: Floats) -> HandTurn | None:
     if abs(turned_rad[joint_index]) < MIN_TURN_RAD:
         return None
     others_rad = np.delete(np.abs(turned_rad), joint_index)
-    is_single_joint = bool((others_rad < MAX_NEIGHBOR_FRACTION * abs(turned_rad[joint_index])).all())
+    is_single_joint = bool(
+        (others_rad < MAX_NEIGHBOR_FRACTION * abs(turned_rad[joint_index])).all()
+    )
     return HandTurn(joint_index, float(turned_rad[joint_index]), is_single_joint)
 
 

@@ -53,7 +53,9 @@ class CheckStatement:
         return properties
 
 
-def report_joint_check(run: Path, robot_file: Path | None, statement: CheckStatement, *, as_json: bool = False) -> int:
+def report_joint_check(
+    run: Path, robot_file: Path | None, statement: CheckStatement, *, as_json: bool = False
+) -> int:
     """Judge the joints in a run of the joint check, print the verdicts, and mark the robot file as checked.
 
     Args:
@@ -80,12 +82,16 @@ def report_joint_check(run: Path, robot_file: Path | None, statement: CheckState
         record.config, record.description, compute_tick_numbers(record), columns, read_imus(record)
     )
     verdicts = judge_joints(
-        measurements, was_laid_straight=statement.straight, allowed_backlash_rad=statement.allowed_backlash_rad
+        measurements,
+        was_laid_straight=statement.straight,
+        allowed_backlash_rad=statement.allowed_backlash_rad,
     )
     verdicts = [verdict.confirm_by_hand(statement.by_hand) for verdict in verdicts]
     if robot_file is not None:
         # What drawn shapes confirmed needs no IMU. It counts as long as neither file nor drives have changed.
-        by_shape = read_shape_properties(robot_file, record.config.robot.joint_table, record.description)
+        by_shape = read_shape_properties(
+            robot_file, record.config.robot.joint_table, record.description
+        )
         verdicts = [verdict.confirm_by_shape(by_shape) for verdict in verdicts]
     if as_json:
         print_json({"joints": verdicts})
@@ -131,7 +137,9 @@ def _format_counts(verdicts: Sequence[JointVerdict]) -> str:
     right = sum(verdict.all_confirmed for verdict in verdicts)
     wrong = sum(bool(verdict.list_properties("wrong")) for verdict in verdicts)
     unknown = len(verdicts) - right - wrong
-    by_hand = sum(any(finding.by_hand for finding in verdict.findings.values()) for verdict in verdicts)
+    by_hand = sum(
+        any(finding.by_hand for finding in verdict.findings.values()) for verdict in verdicts
+    )
     counts = [f"{right} of {len(verdicts)} joints match the robot file"]
     if wrong:
         counts.append(f"{wrong} wrong")
@@ -139,7 +147,9 @@ def _format_counts(verdicts: Sequence[JointVerdict]) -> str:
         counts.append(f"{unknown} unknown")
     if by_hand:
         counts.append(f"{by_hand} with properties that you confirmed by hand")
-    by_shape = sum(any(finding.by_shape for finding in verdict.findings.values()) for verdict in verdicts)
+    by_shape = sum(
+        any(finding.by_shape for finding in verdict.findings.values()) for verdict in verdicts
+    )
     if by_shape:
         counts.append(f"{by_shape} with properties that drawn shapes confirmed")
     return "; ".join(counts)
@@ -147,15 +157,20 @@ def _format_counts(verdicts: Sequence[JointVerdict]) -> str:
 
 def _format_unknown_properties(verdicts: Sequence[JointVerdict]) -> list[str]:
     """Return a line for each reason why properties are unknown, with the joints that it concerns."""
-    properties_by_reason: dict[str, dict[str, list[JointProperty]]] = {}  # reason -> joint -> properties
+    # Reason -> joint -> properties.
+    properties_by_reason: dict[str, dict[str, list[JointProperty]]] = {}
     for verdict in verdicts:
         for name in verdict.list_properties("unknown"):
             properties_by_joint = properties_by_reason.setdefault(verdict.findings[name].reason, {})
             properties_by_joint.setdefault(verdict.joint, []).append(name)
     lines: list[str] = []
     for reason, joints in properties_by_reason.items():
-        properties = [name for name in PROPERTIES if any(name in names for names in joints.values())]
-        lines.append(f"unknown: {', '.join(properties)} of {_join_joint_names(list(joints), verdicts)}: {reason}")
+        properties = [
+            name for name in PROPERTIES if any(name in names for names in joints.values())
+        ]
+        lines.append(
+            f"unknown: {', '.join(properties)} of {_join_joint_names(list(joints), verdicts)}: {reason}"
+        )
     return lines
 
 
@@ -187,7 +202,9 @@ def _write_check_record(
             f"{record.path}: its drives were emulated, so the check is not valid for a real robot; not written",
             code="commissioning/not-possible",
         )
-    if compute_mounting_digest(read_joints_with_drive_modes(path, joints)) != compute_mounting_digest(joints):
+    if compute_mounting_digest(
+        read_joints_with_drive_modes(path, joints)
+    ) != compute_mounting_digest(joints):
         raise ConfigError(
             f"{path}: the mounting of the joints differs from that in {record.path}; check the robot again",
             code="commissioning/not-possible",
@@ -211,10 +228,14 @@ def _write_check_record(
 
 def _list_properties_confirmed_by_shape(verdicts: Sequence[JointVerdict]) -> list[JointProperty]:
     """Return the properties that drawn shapes confirmed, of any joint: they have confirmed them of every joint."""
-    return [name for name in PROPERTIES if any(verdict.findings[name].by_shape for verdict in verdicts)]
+    return [
+        name for name in PROPERTIES if any(verdict.findings[name].by_shape for verdict in verdicts)
+    ]
 
 
-def _group_joints_confirmed_by_hand(verdicts: Sequence[JointVerdict]) -> dict[JointProperty, list[str]]:
+def _group_joints_confirmed_by_hand(
+    verdicts: Sequence[JointVerdict],
+) -> dict[JointProperty, list[str]]:
     """Return the joints whose property a person confirmed, for each property with such joints."""
     joints_by_property: dict[JointProperty, list[str]] = {}
     for name in PROPERTIES:

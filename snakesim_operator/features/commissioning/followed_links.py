@@ -13,10 +13,14 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.commissioning.measured import PITCH, YAW
-from snakesim_operator.features.commissioning.suspended_load import UNIT_VECTOR_BY_AXIS, make_rotations_about
+from snakesim_operator.features.commissioning.suspended_load import (
+    UNIT_VECTOR_BY_AXIS,
+    make_rotations_about,
+)
 
 MIN_SAMPLES = 20  # of a gyro
-MAX_DISAGREEMENT = 0.06  # of the link's rate, rms; intact joints show 0.02 of it, 10 mrad of backlash 0.12
+# Of the link's rate, rms; intact joints show 0.02 of it, 10 mrad of backlash 0.12.
+MAX_DISAGREEMENT = 0.06
 MIN_DISAGREEMENT_RAD_S = 0.03  # less may be noise of gyros and of encoders
 MAX_RATIO_ERROR = 0.12  # of an intact joint, whose ratio is 1
 
@@ -42,7 +46,11 @@ class LinkMismatch:
 
 
 def find_link_mismatch(
-    robot: RobotFile, period_s: float, angle_rad: Floats, velocity_rad_s: Floats, link_rate_rad_s: Floats
+    robot: RobotFile,
+    period_s: float,
+    angle_rad: Floats,
+    velocity_rad_s: Floats,
+    link_rate_rad_s: Floats,
 ) -> LinkMismatch | None:
     """Return the first joint from the tail whose link does not turn as its encoder measures.
 
@@ -64,8 +72,10 @@ def find_link_mismatch(
     for joint, axis_name in enumerate(robot.axes):
         axis = np.array(UNIT_VECTOR_BY_AXIS[axis_name])
         component = YAW if axis_name == "yaw" else PITCH
-        rotation = make_rotations_about(axis, angle_rad[:, joint])  # from the link ahead to the link behind the joint
-        link_behind_rad_s = np.einsum("nji,nj->ni", rotation, omega_rad_s)  # in the frame of the link ahead
+        # From the link ahead to the link behind the joint.
+        rotation = make_rotations_about(axis, angle_rad[:, joint])
+        # In the frame of the link ahead.
+        link_behind_rad_s = np.einsum("nji,nj->ni", rotation, omega_rad_s)
         omega_rad_s = link_behind_rad_s + velocity_rad_s[:, joint, None] * axis
         mismatch = _find_gyro_mismatch(
             joint,

@@ -13,13 +13,27 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.features.commissioning.followed_links import find_link_mismatch
 from snakesim_operator.features.commissioning.least_squares import IntervalEstimate
-from snakesim_operator.features.commissioning.servo_response import ServoResponse, estimate_bandwidth_hz, fit_servo
-from snakesim_operator.features.commissioning.smoothing import smooth, smooth_derivative, smooth_second_derivative
+from snakesim_operator.features.commissioning.servo_response import (
+    ServoResponse,
+    estimate_bandwidth_hz,
+    fit_servo,
+)
+from snakesim_operator.features.commissioning.smoothing import (
+    smooth,
+    smooth_derivative,
+    smooth_second_derivative,
+)
 from snakesim_operator.features.commissioning.suspended_load import compute_link_loads_nm
-from snakesim_operator.features.commissioning.torque_balance import JointRecord, TorqueBalance, fit_torque_balance
+from snakesim_operator.features.commissioning.torque_balance import (
+    JointRecord,
+    TorqueBalance,
+    fit_torque_balance,
+)
 
-MAX_RELATIVE_WIDTH = 0.3  # half of an interval, of its value; a torque constant that is less certain is unknown
-MIN_EXPLAINED = 0.8  # fraction of the torque; below, the robot was not suspended as it is supposed to be
+# Half of an interval, of its value; a torque constant that is less certain is unknown.
+MAX_RELATIVE_WIDTH = 0.3
+# Fraction of the torque; below, the robot was not suspended as it is supposed to be.
+MIN_EXPLAINED = 0.8
 TOO_LIGHT = "what it carries is too light to tell"
 BALANCE_LABELS = {  # fields of a robot file that come from the torque balance -> their names
     "friction_nm": "dry friction",
@@ -34,7 +48,8 @@ class JointIdentification:
     """What was identified of one joint."""
 
     joint: str
-    fields: Mapping[str, IntervalEstimate]  # fields of the robot file; those that could not be identified are missing
+    # Fields of the robot file; those that could not be identified are missing.
+    fields: Mapping[str, IntervalEstimate]
     unknown: Sequence[str]  # why fields are missing
     bandwidth_hz: float | None = None
     balance: TorqueBalance | None = None
@@ -89,7 +104,9 @@ def identify_joints(
             target_rad=columns["target"][:, joint_index],
             torque_limit_nm=joint.limits.torque_nm,
         )
-        result = _try_identify_joint(joint, record, loads[:, joint_index], loads_by_angle[:, joint_index])
+        result = _try_identify_joint(
+            joint, record, loads[:, joint_index], loads_by_angle[:, joint_index]
+        )
         results.append(result)
         if _has_model_misfit(result, joint.drive):
             failing_joints[joint_index] = result.joint
@@ -102,11 +119,14 @@ def identify_joints(
             failing_joints[mismatch.joint_index] = result.joint
             results[mismatch.joint_index] = result.without_values(mismatch.reason)
     return [
-        _withhold_if_neighbor_fails(result, joint_index, failing_joints) for joint_index, result in enumerate(results)
+        _withhold_if_neighbor_fails(result, joint_index, failing_joints)
+        for joint_index, result in enumerate(results)
     ]
 
 
-def _compute_link_loads(robot: RobotFile, period_s: float, columns: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+def _compute_link_loads(
+    robot: RobotFile, period_s: float, columns: Mapping[str, Floats]
+) -> tuple[Floats, Floats]:
     """Return the torque that the links need: with the measured velocities, and with those derived from the angles.
 
     Both are (ticks - 2 HALF_WINDOW_TICKS, joints).
@@ -118,7 +138,10 @@ def _compute_link_loads(robot: RobotFile, period_s: float, columns: Mapping[str,
         robot, smooth_angle_rad, smooth(velocity_rad_s), smooth_derivative(velocity_rad_s, period_s)
     )
     by_angle = compute_link_loads_nm(
-        robot, smooth_angle_rad, smooth_derivative(angle_rad, period_s), smooth_second_derivative(angle_rad, period_s)
+        robot,
+        smooth_angle_rad,
+        smooth_derivative(angle_rad, period_s),
+        smooth_second_derivative(angle_rad, period_s),
     )
     return by_velocity, by_angle
 
@@ -128,9 +151,13 @@ def _try_identify_joint(
 ) -> JointIdentification:
     """Identify one joint; if that is not possible, return a result without values that holds the reason."""
     if "torque" not in joint.drive.measures:
-        return JointIdentification(joint.name, {}, ["everything: it does not measure torque"], complete=False)
+        return JointIdentification(
+            joint.name, {}, ["everything: it does not measure torque"], complete=False
+        )
     try:
-        return _identify_joint(joint.name, record, load_nm, load_by_angle_nm, joint.motor.torque_constant_nm_per_a)
+        return _identify_joint(
+            joint.name, record, load_nm, load_by_angle_nm, joint.motor.torque_constant_nm_per_a
+        )
     except ValueError as error:
         return JointIdentification(joint.name, {}, [f"everything: {error}"], complete=False)
 
@@ -146,15 +173,23 @@ def _withhold_if_neighbor_fails(
     if joint_index in failing_joints:
         return result
     neighbors = [
-        failing_joints[neighbor] for neighbor in (joint_index - 1, joint_index + 1) if neighbor in failing_joints
+        failing_joints[neighbor]
+        for neighbor in (joint_index - 1, joint_index + 1)
+        if neighbor in failing_joints
     ]
     if not neighbors:
         return result
-    return result.without_values(f"{' and '.join(neighbors)} beside it fails; correct that first, and identify again")
+    return result.without_values(
+        f"{' and '.join(neighbors)} beside it fails; correct that first, and identify again"
+    )
 
 
 def _identify_joint(
-    name: str, record: JointRecord, load_nm: Floats, load_by_angle_nm: Floats, torque_constant_nm_per_a: float | None
+    name: str,
+    record: JointRecord,
+    load_nm: Floats,
+    load_by_angle_nm: Floats,
+    torque_constant_nm_per_a: float | None,
 ) -> JointIdentification:
     """Fit the servo response and the torque balance of one joint, and drop the values that are too uncertain.
 
@@ -170,14 +205,21 @@ def _identify_joint(
         ValueError: The joint moved too little.
     """
     unknown: list[str] = []
-    unknown_by_misfit: list[str] = []  # values that are unknown because the torque does not fit the motion
+    # Values that are unknown because the torque does not fit the motion.
+    unknown_by_misfit: list[str] = []
     complete = True
     servo = fit_servo(record)
     balance = fit_torque_balance(
-        record, servo.between_nm, load_nm, load_by_angle_nm, fit_scale=torque_constant_nm_per_a is not None
+        record,
+        servo.between_nm,
+        load_nm,
+        load_by_angle_nm,
+        fit_scale=torque_constant_nm_per_a is not None,
     )
     if torque_constant_nm_per_a is None:
-        unknown.append("torque constant: the file has none, so its torque is taken as it is measured")
+        unknown.append(
+            "torque constant: the file has none, so its torque is taken as it is measured"
+        )
     elif not balance.torque_scale.half_width < MAX_RELATIVE_WIDTH * balance.torque_scale.value:
         if balance.misfit > 0:
             unknown_by_misfit.append("torque constant")
@@ -185,7 +227,9 @@ def _identify_joint(
             unknown.append(f"torque constant: {TOO_LIGHT}; its torque is taken as it is measured")
         complete = False
         torque_constant_nm_per_a = None
-        balance = fit_torque_balance(record, servo.between_nm, load_nm, load_by_angle_nm, fit_scale=False)
+        balance = fit_torque_balance(
+            record, servo.between_nm, load_nm, load_by_angle_nm, fit_scale=False
+        )
     fields = _collect_robot_file_fields(balance, servo, torque_constant_nm_per_a)
     for field, label in BALANCE_LABELS.items():
         value = fields[field]

@@ -49,7 +49,10 @@ def _draw_torques(result: JointIdentification, period_s: float) -> list[PlotlyDi
     tick_count = min(len(result.servo.torque_nm) - 2 * HALF_WINDOW_TICKS, len(measured_nm))
     time_s = (np.arange(tick_count, dtype=np.float64) + HALF_WINDOW_TICKS) * np.float64(period_s)
     servo_nm = result.servo.torque_nm[HALF_WINDOW_TICKS : HALF_WINDOW_TICKS + tick_count]
-    torque_by_model = {"links and friction": balance_nm[:tick_count], "target, servo and lag": servo_nm}
+    torque_by_model = {
+        "links and friction": balance_nm[:tick_count],
+        "target, servo and lag": servo_nm,
+    }
     figures: list[PlotlyDict] = []
     for model, model_nm in torque_by_model.items():
         curves = [

@@ -18,7 +18,11 @@ from snakesim_operator.features.commissioning.identification import (
 )
 from snakesim_operator.features.commissioning.identified_page import render_identification_page
 from snakesim_operator.features.commissioning.least_squares import IntervalEstimate
-from snakesim_operator.features.commissioning.measured import arrange_imus_by_tick, compute_tick_numbers, read_imus
+from snakesim_operator.features.commissioning.measured import (
+    arrange_imus_by_tick,
+    compute_tick_numbers,
+    read_imus,
+)
 from snakesim_operator.results.run_log import RunRecord
 
 PAGE_FILENAME = "identified.html"
@@ -36,7 +40,9 @@ LABEL_AND_UNIT_BY_FIELD = {  # fields of the robot file -> name and unit
 }
 
 
-def identify_and_report(run: Path, robot_file: Path | None, output_path: Path | None, *, as_json: bool = False) -> int:
+def identify_and_report(
+    run: Path, robot_file: Path | None, output_path: Path | None, *, as_json: bool = False
+) -> int:
     """Identify the joints from a run, print the values, and write them to an HTML page and into the robot file.
 
     Args:
@@ -59,7 +65,9 @@ def identify_and_report(run: Path, robot_file: Path | None, output_path: Path | 
     record = RunRecord.load(run)
     usable_ticks = _find_usable_ticks(record)
     columns: dict[str, Any] = {name: getattr(record, name)[usable_ticks] for name in SIGNAL_NAMES}
-    link_rates, _ = arrange_imus_by_tick(read_imus(record), compute_tick_numbers(record), len(record.description.links))
+    link_rates, _ = arrange_imus_by_tick(
+        read_imus(record), compute_tick_numbers(record), len(record.description.links)
+    )
     results = identify_joints(record.config, columns, link_rates[usable_ticks])
     run_folder = run if run.is_dir() else run.parent
     page_path = output_path or run_folder / PAGE_FILENAME
@@ -114,7 +122,9 @@ def _print_joints(results: Sequence[JointIdentification], *, judges_links: bool)
     for result in results:
         _print_joint(result)
     if not judges_links:
-        print_line("not judged: whether the links follow their encoders; backlash shows only where links have IMUs")
+        print_line(
+            "not judged: whether the links follow their encoders; backlash shows only where links have IMUs"
+        )
 
 
 def _print_joint(result: JointIdentification) -> None:
@@ -126,11 +136,15 @@ def _print_joint(result: JointIdentification) -> None:
         name, unit = LABEL_AND_UNIT_BY_FIELD[field]
         print_line(f"  {name:<17} {_format_interval(estimate)} {unit}")
     if result.bandwidth_hz is not None:
-        print_line(f"  {'servo bandwidth':<17} {result.bandwidth_hz:.3g} Hz, of this joint with what it carries")
+        print_line(
+            f"  {'servo bandwidth':<17} {result.bandwidth_hz:.3g} Hz, of this joint with what it carries"
+        )
     for reason in result.unknown:
         print_line(f"  unknown: {reason}")
     if result.explained is not None and result.explained < MIN_EXPLAINED:
-        print_line("  it does not move as a robot that hangs by its tail: look at clamp, masses, lengths and backlash")
+        print_line(
+            "  it does not move as a robot that hangs by its tail: look at clamp, masses, lengths and backlash"
+        )
 
 
 def _format_interval(estimate: IntervalEstimate) -> str:
@@ -139,7 +153,9 @@ def _format_interval(estimate: IntervalEstimate) -> str:
     return f"{estimate.value:.4g}, {low:.4g} to {high:.4g}"
 
 
-def _write_robot_file(path: Path, record: RunRecord, results: Sequence[JointIdentification]) -> None:
+def _write_robot_file(
+    path: Path, record: RunRecord, results: Sequence[JointIdentification]
+) -> None:
     """Write the values of the joints that do not fail into a robot file, and print what was written."""
     from snakesim_operator.features.commissioning.robot_edit import write_joint_fields
 
@@ -147,7 +163,9 @@ def _write_robot_file(path: Path, record: RunRecord, results: Sequence[JointIden
     for result in results:
         if result.fields and not result.fails:
             # An estimate of a small friction or latency may be below zero, which no robot file may hold.
-            values[result.joint] = {field: max(estimate.value, 0.0) for field, estimate in result.fields.items()}
+            values[result.joint] = {
+                field: max(estimate.value, 0.0) for field, estimate in result.fields.items()
+            }
     unchanged = [result.joint for result in results if result.joint not in values]
     if not values:
         print_line(f"{path}: nothing was written: the values of no joint are sure")

@@ -15,7 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError, RefusedError
-from snakesim_hal.base.process import SERVICE_PRIORITY, call_on_stop_signals, get_user_name, set_realtime_priority
+from snakesim_hal.base.process import (
+    SERVICE_PRIORITY,
+    call_on_stop_signals,
+    get_user_name,
+    set_realtime_priority,
+)
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.commanding import CommandingClient
 from snakesim_hal.network.session import ConnectionSettings, Session, open_session
@@ -37,7 +42,8 @@ from snakesim_operator.robot_commands.command import request_while_commanding
 from snakesim_operator.robot_commands.teleop.keyboard import KeyReader
 
 KEY_HOLD_S = 0.15  # a key repeats 20 to 30 times a second
-MAX_LEAD_RAD = 0.1  # of the target before the measured angle; a blocked joint must not jump once it is free
+# Of the target before the measured angle; a blocked joint must not jump once it is free.
+MAX_LEAD_RAD = 0.1
 READY_TIMEOUT_S = 10.0
 DIRECTION_BY_KEY = {"up": 1, "right": 1, "+": 1, "down": -1, "left": -1, "-": -1}
 STALE_KEY = ""  # stands for a key that may have waited in a stalled terminal: it stops the joint
@@ -63,7 +69,8 @@ class JogRequest:
 def _check_bound(option: str, value: float, maximum: float, unit: str) -> None:
     if not 0 < value <= maximum:
         raise ConfigError(
-            f"{option} {value:g}: give more than 0, and at most {maximum:g} {unit}", code="command/invalid-option"
+            f"{option} {value:g}: give more than 0, and at most {maximum:g} {unit}",
+            code="command/invalid-option",
         )
 
 
@@ -99,7 +106,9 @@ class JogTarget:
         if not self._direction:
             return self.target_rad
         target_rad = self.target_rad + self._direction * self._speed_rad_s * period_s
-        target_rad = float(np.clip(target_rad, measured_rad - MAX_LEAD_RAD, measured_rad + MAX_LEAD_RAD))
+        target_rad = float(
+            np.clip(target_rad, measured_rad - MAX_LEAD_RAD, measured_rad + MAX_LEAD_RAD)
+        )
         self.target_rad = float(np.clip(target_rad, self.lower_rad, self.upper_rad))
         return self.target_rad
 
@@ -128,7 +137,8 @@ def jog_joint(path: Path, selection: RobotSelection, request: JogRequest) -> int
         status = session.wait_for_latched(keys.STATUS, RobotStatus, CONNECT_TIMEOUT_S)
         if robot is None or status is None:
             raise RefusedError(
-                "the robot's host did not publish its description; see `snakesim status`", code="network/no-answer"
+                "the robot's host did not publish its description; see `snakesim status`",
+                code="network/no-answer",
             )
         if status.lifecycle != "disarmed":
             raise RefusedError(
@@ -136,7 +146,9 @@ def jog_joint(path: Path, selection: RobotSelection, request: JogRequest) -> int
                 code="robot/not-disarmed",
             )
         with keyboard:
-            _JogSession(session, connection, robot, status, request, joints.index(joint)).run(keyboard)
+            _JogSession(session, connection, robot, status, request, joints.index(joint)).run(
+                keyboard
+            )
     return 0
 
 
@@ -190,7 +202,9 @@ class _JogSession:
             self._follow_keys(keyboard)
         finally:
             if self._run_cycle().lifecycle == "armed":
-                disarm = LifecycleRequest(action="disarm", requester=requester, host=self._robot.host)
+                disarm = LifecycleRequest(
+                    action="disarm", requester=requester, host=self._robot.host
+                )
                 self._send_request(disarm, "disarmed")
 
     def _follow_keys(self, keyboard: KeyReader) -> None:
@@ -218,7 +232,9 @@ class _JogSession:
             clock = self._run_cycle()
             if clock.lifecycle != "armed":
                 self._update_status()
-                raise RefusedError(f"the robot is {clock.lifecycle}: {self._status.reason}", code="robot/not-armed")
+                raise RefusedError(
+                    f"the robot is {clock.lifecycle}: {self._status.reason}", code="robot/not-armed"
+                )
             if was_moving and not target.is_moving:
                 print_line(f"{joint.name}: {self._read_angle_rad():+.3f} rad")
             was_moving = target.is_moving

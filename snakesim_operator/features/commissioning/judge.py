@@ -33,9 +33,12 @@ from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH
 
 MATCHES_FILE = "matches the robot file"
 MIN_MOVED_RAD = 0.012  # a fifth of the default motion to one side
-MIN_FOLLOWED_FRACTION = 0.3  # of its target's range and time; other joints move one without current at times
-MAX_RATIO_ERROR = 0.12  # between the fraction of the motion that the links made and the expected one
-MIN_TORQUE_NM = 0.1  # mean along the motion; a light link's inertia may be a tenth of it against the motion
+# Of its target's range and time; other joints move one without current at times.
+MIN_FOLLOWED_FRACTION = 0.3
+# Between the fraction of the motion that the links made and the expected one.
+MAX_RATIO_ERROR = 0.12
+# Mean along the motion; a light link's inertia may be a tenth of it against the motion.
+MIN_TORQUE_NM = 0.1
 MAX_STRAIGHT_ERROR_RAD = 0.08  # a robot that was laid straight by hand is straight within that
 MAX_GRAVITY_ERROR_RAD = 0.05  # accuracy of an angle from the direction of gravity
 MIN_GRAVITY_M_S2 = 5.0  # across the axis of a joint; with less, gravity does not give its angle
@@ -47,21 +50,28 @@ class PropertyFinding:
     """Whether one property of a joint matches the robot file."""
 
     state: PropertyState
-    reason: str = ""  # what is wrong and what to write, or why it is unknown and how it could be confirmed
+    # What is wrong and what to write, or why it is unknown and how it could be confirmed.
+    reason: str = ""
     by_hand: bool = False  # confirmed by a person
     by_shape: bool = False  # confirmed by drawn shapes
 
 
 CONFIRMED = PropertyFinding("confirmed")
 NO_MOTION = "it did not move; correct its drive, and run the check again"
-NO_END = "its motion did not come: the run ended before; run the check again with a longer --duration"
+NO_END = (
+    "its motion did not come: the run ended before; run the check again with a longer --duration"
+)
 NO_LINK_TURNS = "no link turns with it; correct its gear, and run the check again"
 NO_LINK = (
     "the links on both sides need an IMU or motion capture, at 30 Hz or more; or check the robot with "
     "`snakesim robot shape check`; or "
 )
-CONFIRM_DIRECTION_BY_HAND = NO_LINK + "turn it with `snakesim robot calibrate direction`, then add --by-hand"
-CONFIRM_GEAR_BY_HAND = NO_LINK + "measure it with `snakesim robot calibrate gear`, then add --gear-by-hand"
+CONFIRM_DIRECTION_BY_HAND = (
+    NO_LINK + "turn it with `snakesim robot calibrate direction`, then add --by-hand"
+)
+CONFIRM_GEAR_BY_HAND = (
+    NO_LINK + "measure it with `snakesim robot calibrate gear`, then add --gear-by-hand"
+)
 NO_REST = "the robot did not rest before the first motion; run the check again"
 NOT_STRAIGHT = "lay the robot straight, run the check again, and add --straight"
 
@@ -108,7 +118,9 @@ class JointVerdict:
         """Return a copy in which drawn shapes have confirmed those of the properties that were unknown."""
         return self._confirm_unknown(properties, PropertyFinding("confirmed", by_shape=True))
 
-    def _confirm_unknown(self, properties: Iterable[JointProperty], finding: PropertyFinding) -> "JointVerdict":
+    def _confirm_unknown(
+        self, properties: Iterable[JointProperty], finding: PropertyFinding
+    ) -> "JointVerdict":
         findings = dict(self.findings)
         for name in properties:
             if findings[name].state == "unknown":
@@ -117,7 +129,10 @@ class JointVerdict:
 
 
 def judge_joints(
-    run: CheckMeasurements, *, was_laid_straight: bool = False, allowed_backlash_rad: float = ALLOWED_BACKLASH_RAD
+    run: CheckMeasurements,
+    *,
+    was_laid_straight: bool = False,
+    allowed_backlash_rad: float = ALLOWED_BACKLASH_RAD,
 ) -> list[JointVerdict]:
     """Judge every joint, tail to head.
 
@@ -126,7 +141,9 @@ def judge_joints(
         was_laid_straight: Whether the robot lay straight at the start, so that all angles should have been zero.
         allowed_backlash_rad: Motion that may be lost in a gear when its load reverses.
     """
-    evaluator = _JointEvaluator(run, was_laid_straight=was_laid_straight, allowed_backlash_rad=allowed_backlash_rad)
+    evaluator = _JointEvaluator(
+        run, was_laid_straight=was_laid_straight, allowed_backlash_rad=allowed_backlash_rad
+    )
     return [evaluator.check_joint(joint) for joint in range(len(run.joint_names))]
 
 
@@ -134,7 +151,11 @@ class _JointEvaluator:
     """Judges the joints of one run, with what all of their motions tell together."""
 
     def __init__(
-        self, measurements: CheckMeasurements, *, was_laid_straight: bool, allowed_backlash_rad: float
+        self,
+        measurements: CheckMeasurements,
+        *,
+        was_laid_straight: bool,
+        allowed_backlash_rad: float,
     ) -> None:
         """Measure the motion of the links for each joint, and find modules whose ids are swapped.
 
@@ -148,15 +169,19 @@ class _JointEvaluator:
         self._allowed_backlash_rad = allowed_backlash_rad
         # A joint that brakes while it drives moves all the same, so its links can be judged.
         self._motion_fractions: list[LinkMotionFractions | None] = [
-            measure_link_motion_fractions(measurements, joint) if _has_followed_target(measurements, joint) else None
+            measure_link_motion_fractions(measurements, joint)
+            if _has_followed_target(measurements, joint)
+            else None
             for joint in range(len(measurements.joint_names))
         ]
         self._module_order: ModuleOrder = find_module_order(self._motion_fractions)
         link_order = [0, *(self._module_order + 1)]
-        self._reordered_measurements = replace(  # every IMU on the link on which its module really is
-            measurements,
-            link_rate_rad_s=measurements.link_rate_rad_s[:, link_order],
-            link_force_m_s2=measurements.link_force_m_s2[:, link_order],
+        self._reordered_measurements = (
+            replace(  # every IMU on the link on which its module really is
+                measurements,
+                link_rate_rad_s=measurements.link_rate_rad_s[:, link_order],
+                link_force_m_s2=measurements.link_force_m_s2[:, link_order],
+            )
         )
 
     def check_joint(self, joint_index: int) -> JointVerdict:
@@ -191,9 +216,13 @@ class _JointEvaluator:
         motion = self._motion_fractions[joint_index]
         if motion is None or self._module_order[joint_index] != joint_index:
             return float("nan")
-        return float(motion.reorder_modules(self._module_order).compute_joint_motions()[joint_index])
+        return float(
+            motion.reorder_modules(self._module_order).compute_joint_motions()[joint_index]
+        )
 
-    def _judge_mounting(self, joint_index: int, motion_ratio: float) -> dict[JointProperty, PropertyFinding]:
+    def _judge_mounting(
+        self, joint_index: int, motion_ratio: float
+    ) -> dict[JointProperty, PropertyFinding]:
         """Judge how the module of a joint is mounted: its order, sign, gear and zero.
 
         Args:
@@ -202,7 +231,9 @@ class _JointEvaluator:
         """
         if self._module_order[joint_index] != joint_index:
             return self._make_swapped_findings(joint_index)
-        zero = _judge_zero(self._reordered_measurements, joint_index, was_laid_straight=self._was_laid_straight)
+        zero = _judge_zero(
+            self._reordered_measurements, joint_index, was_laid_straight=self._was_laid_straight
+        )
         if self._motion_fractions[joint_index] is None:
             was_commanded = self._measurements.is_moved_by_target(joint_index).any()
             unknown = PropertyFinding("unknown", NO_MOTION if was_commanded else NO_END)
@@ -210,7 +241,9 @@ class _JointEvaluator:
         drive = self._measurements.drives[joint_index]
         candidates = [
             self._measurements.joint_names[other]
-            for other in find_swap_candidates(self._motion_fractions, self._module_order, joint_index)
+            for other in find_swap_candidates(
+                self._motion_fractions, self._module_order, joint_index
+            )
         ]
         lost_motion = measure_lost_motion(self._reordered_measurements, joint_index)
         return {
@@ -225,10 +258,13 @@ class _JointEvaluator:
         names = self._measurements.joint_names
         other = names[int(self._module_order[joint_index])]
         unknown = PropertyFinding(
-            "unknown", f"judged once the ids of {names[joint_index]} and {other} are right; run the check again then"
+            "unknown",
+            f"judged once the ids of {names[joint_index]} and {other} are right; run the check again then",
         )
         return {
-            "order": PropertyFinding("wrong", f"moves the link of {other}: their ids or cables are swapped"),
+            "order": PropertyFinding(
+                "wrong", f"moves the link of {other}: their ids or cables are swapped"
+            ),
             "sign": unknown,
             "gear": unknown,
             "zero": unknown,
@@ -249,23 +285,31 @@ def _has_followed_target(measurements: CheckMeasurements, joint_index: int) -> b
     return moved_far_enough and moved_long_enough
 
 
-def _compute_mean_driving_torque_nm(measurements: CheckMeasurements, joint_index: int) -> float | None:
+def _compute_mean_driving_torque_nm(
+    measurements: CheckMeasurements, joint_index: int
+) -> float | None:
     """Return the mean of a joint's torque, positive where it drives; None if it is not measured."""
     velocity = measurements.velocity_rad_s[:, joint_index]
     is_moving = measurements.is_moved_by_target(joint_index) & (np.abs(velocity) > MIN_RATE_RAD_S)
     if "torque" not in measurements.drives[joint_index].measures or not is_moving.any():
         return None
-    return float(np.mean(measurements.torque_nm[is_moving, joint_index] * np.sign(velocity[is_moving])))
+    return float(
+        np.mean(measurements.torque_nm[is_moving, joint_index] * np.sign(velocity[is_moving]))
+    )
 
 
-def _judge_drive(measurements: CheckMeasurements, joint_index: int, torque_nm: float | None) -> PropertyFinding:
+def _judge_drive(
+    measurements: CheckMeasurements, joint_index: int, torque_nm: float | None
+) -> PropertyFinding:
     """Judge whether a joint's drive moves it. `torque_nm` is the mean along the motion; None if it is not measured."""
     if not measurements.is_moved_by_target(joint_index).any():
         return PropertyFinding("unknown", NO_END)
     if not _has_followed_target(measurements, joint_index):
         return PropertyFinding("wrong", "did not move: motor, brake, power, or a link that is held")
     if torque_nm is not None and torque_nm < -MIN_TORQUE_NM:
-        return PropertyFinding("wrong", "its torque has the wrong sign: it measures a brake while it drives")
+        return PropertyFinding(
+            "wrong", "its torque has the wrong sign: it measures a brake while it drives"
+        )
     return CONFIRMED
 
 
@@ -275,7 +319,8 @@ def _judge_order(motion_ratio: float, candidates: Sequence[str]) -> PropertyFind
         return PropertyFinding("unknown", NO_LINK_TURNS)
     if candidates:
         return PropertyFinding(
-            "unknown", f"its module may be exchanged with that of {', '.join(candidates)}: {CONFIRM_DIRECTION_BY_HAND}"
+            "unknown",
+            f"its module may be exchanged with that of {', '.join(candidates)}: {CONFIRM_DIRECTION_BY_HAND}",
         )
     return CONFIRMED
 
@@ -292,7 +337,10 @@ def _judge_sign(motion_ratio: float, drive: JointDrive) -> PropertyFinding:
 
 
 def _judge_gear(
-    motion_ratio: float, lost_motion: LostMotion | None, drive: JointDrive, allowed_backlash_rad: float
+    motion_ratio: float,
+    lost_motion: LostMotion | None,
+    drive: JointDrive,
+    allowed_backlash_rad: float,
 ) -> PropertyFinding:
     """Judge whether a joint's links turn as far as its encoder measures.
 
@@ -306,11 +354,17 @@ def _judge_gear(
         return PropertyFinding("unknown", CONFIRM_GEAR_BY_HAND)
     ratio = abs(motion_ratio)
     if ratio < MAX_RATIO_ERROR:
-        return PropertyFinding("wrong", "its drive turns and no link does: coupling, a gear that slips, or backlash")
+        return PropertyFinding(
+            "wrong", "its drive turns and no link does: coupling, a gear that slips, or backlash"
+        )
     reasons: list[str] = []
-    if lost_motion is not None and lost_motion.lost_rad > max(allowed_backlash_rad, lost_motion.noise_rad):
+    if lost_motion is not None and lost_motion.lost_rad > max(
+        allowed_backlash_rad, lost_motion.noise_rad
+    ):
         ratio = abs(lost_motion.ratio)  # not reduced by the backlash
-        backlash = f"{lost_motion.lost_rad:.3f} rad ({np.rad2deg(lost_motion.lost_rad):.1f} degrees)"
+        backlash = (
+            f"{lost_motion.lost_rad:.3f} rad ({np.rad2deg(lost_motion.lost_rad):.1f} degrees)"
+        )
         reasons.append(
             f"backlash of {backlash}: its drive turns that much further than its link when the load reverses, "
             f"{allowed_backlash_rad:g} rad are allowed; repair the gear, or allow more with --allow-backlash"
@@ -319,13 +373,17 @@ def _judge_gear(
         other_cause = ""
         if lost_motion is None:
             other_cause = ", or backlash, as it moved to one side only or its gyros are noisy"
-        reasons.append(f"turns {ratio:.2f} as far as its drive measures: gear = {drive.gear / ratio:.3g}{other_cause}")
+        reasons.append(
+            f"turns {ratio:.2f} as far as its drive measures: gear = {drive.gear / ratio:.3g}{other_cause}"
+        )
     if reasons:
         return PropertyFinding("wrong", "; ".join(reasons))
     return CONFIRMED
 
 
-def _judge_zero(measurements: CheckMeasurements, joint_index: int, *, was_laid_straight: bool) -> PropertyFinding:
+def _judge_zero(
+    measurements: CheckMeasurements, joint_index: int, *, was_laid_straight: bool
+) -> PropertyFinding:
     """Judge whether the zero of a joint's angle in the robot file is right.
 
     If accelerometers measure the joint's angle by gravity, the encoder is compared with it. Otherwise it is compared
@@ -345,7 +403,9 @@ def _judge_zero(measurements: CheckMeasurements, joint_index: int, *, was_laid_s
     if measurements.axes[joint_index] == "pitch":
         angle_by_gravity_rad = _measure_angle_by_gravity_rad(measurements, joint_index, at_rest)
     if angle_by_gravity_rad is not None:
-        error_rad = float(np.mean(measurements.angle_rad[at_rest, joint_index])) - angle_by_gravity_rad
+        error_rad = (
+            float(np.mean(measurements.angle_rad[at_rest, joint_index])) - angle_by_gravity_rad
+        )
         allowed_rad = MAX_GRAVITY_ERROR_RAD
     elif not was_laid_straight:
         return PropertyFinding("unknown", NOT_STRAIGHT)
@@ -358,10 +418,14 @@ def _judge_zero(measurements: CheckMeasurements, joint_index: int, *, was_laid_s
         return CONFIRMED
     drive = measurements.drives[joint_index]
     zero_rad = drive.zero_rad + drive.sign * drive.gear * error_rad
-    return PropertyFinding("wrong", f"its zero is off by {error_rad:+.3f} rad: zero_rad = {zero_rad:.3f}")
+    return PropertyFinding(
+        "wrong", f"its zero is off by {error_rad:+.3f} rad: zero_rad = {zero_rad:.3f}"
+    )
 
 
-def _measure_angle_by_gravity_rad(measurements: CheckMeasurements, joint_index: int, at_rest: Mask) -> float | None:
+def _measure_angle_by_gravity_rad(
+    measurements: CheckMeasurements, joint_index: int, at_rest: Mask
+) -> float | None:
     """Return a pitch joint's angle from the direction of gravity in both of its links; None if that is not known."""
     tilts_rad: list[float] = []
     for link in (joint_index, joint_index + 1):

@@ -44,7 +44,9 @@ class IntervalEstimate:
 
     def multiply_by(self, other: "IntervalEstimate") -> "IntervalEstimate":
         """Return the product with an independent estimate; its interval is right to first order."""
-        half_width = ((self.half_width * other.value) ** 2 + (self.value * other.half_width) ** 2) ** 0.5
+        half_width = (
+            (self.half_width * other.value) ** 2 + (self.value * other.half_width) ** 2
+        ) ** 0.5
         return IntervalEstimate(self.value * other.value, half_width)
 
     def widen_by(self, uncertainty: float) -> "IntervalEstimate":
@@ -60,13 +62,16 @@ class LeastSquaresFit:
     covariance: Floats  # (k, k)
     degrees_of_freedom: int
     residuals: Floats  # (rows,)
-    bias: Floats | None = None  # (k,), by which each interval is wider to either side; None: no bias
+    # (k,), by which each interval is wider to either side; None: no bias.
+    bias: Floats | None = None
 
     @property
     def half_widths(self) -> Floats:
         """The half widths of the 95 % intervals, (k,)."""
         by_scatter: Floats = (
-            INTERVAL_FACTOR * compute_student_t_95(self.degrees_of_freedom) * np.sqrt(np.diag(self.covariance))
+            INTERVAL_FACTOR
+            * compute_student_t_95(self.degrees_of_freedom)
+            * np.sqrt(np.diag(self.covariance))
         )
         if self.bias is None:
             return by_scatter
@@ -121,7 +126,9 @@ def solve_with_instruments(
     block_count = len(block_ids)
     value_count = regressors.shape[1]
     if block_count < MIN_BLOCKS_PER_VALUE * value_count:
-        raise ValueError("too little motion is left to judge; let it run longer, with larger motion")
+        raise ValueError(
+            "too little motion is left to judge; let it run longer, with larger motion"
+        )
     normal_matrix = instruments.T @ regressors
     if _compute_condition_number(normal_matrix, instruments, regressors) > MAX_CONDITION:
         raise ValueError("its motion does not tell the values apart; was it moved at all?")
@@ -140,7 +147,9 @@ def solve_with_instruments(
     return LeastSquaresFit(values, covariance, block_count - value_count, residuals)
 
 
-def _compute_condition_number(normal_matrix: Floats, instruments: Floats, regressors: Floats) -> float:
+def _compute_condition_number(
+    normal_matrix: Floats, instruments: Floats, regressors: Floats
+) -> float:
     """Return the condition number of the normal equations with all columns scaled to length 1."""
     instrument_lengths = np.linalg.norm(instruments, axis=0) + 1e-300
     regressor_lengths = np.linalg.norm(regressors, axis=0) + 1e-300

@@ -54,7 +54,9 @@ class LinkMotionFractions:
         return float(np.nansum(elsewhere**2) + np.nansum(motion_across**2))
 
 
-def measure_link_motion_fractions(measurements: CheckMeasurements, joint_index: int) -> LinkMotionFractions:
+def measure_link_motion_fractions(
+    measurements: CheckMeasurements, joint_index: int
+) -> LinkMotionFractions:
     """Measure the motion of all links and encoders while one joint moved, as fractions of that joint's motion."""
     is_commanded = measurements.is_moved_by_target(joint_index)
     speed_rad_s = measurements.velocity_rad_s[:, joint_index]
@@ -65,14 +67,22 @@ def measure_link_motion_fractions(measurements: CheckMeasurements, joint_index: 
     along_axes = [measurements.find_axis_component(k) for k in range(len(measurements.axes))]
     across_axes = [YAW + PITCH - component for component in along_axes]
     return LinkMotionFractions(
-        links=_compute_link_fractions(measurements, joint_index, is_commanded, is_moving, along_axes),
-        across=_compute_link_fractions(measurements, joint_index, is_commanded, is_moving, across_axes),
+        links=_compute_link_fractions(
+            measurements, joint_index, is_commanded, is_moving, along_axes
+        ),
+        across=_compute_link_fractions(
+            measurements, joint_index, is_commanded, is_moving, across_axes
+        ),
         encoders=encoder_fractions,
     )
 
 
 def _compute_link_fractions(
-    measurements: CheckMeasurements, joint_index: int, is_commanded: Mask, is_moving: Mask, components: Sequence[int]
+    measurements: CheckMeasurements,
+    joint_index: int,
+    is_commanded: Mask,
+    is_moving: Mask,
+    components: Sequence[int],
 ) -> Floats:
     """Return the motion of every link while one joint moved, as a fraction of that joint's motion by its encoder.
 
@@ -93,9 +103,13 @@ def _compute_link_fractions(
     fractions_by_component: dict[int, list[float]] = {}  # one fraction for each link
     for component in set(components):
         link_rates_rad_s = measurements.link_rate_rad_s[:, :, component].T
-        fractions_by_component[component] = [_fit_fraction(rate, speed_rad_s, is_moving) for rate in link_rates_rad_s]
+        fractions_by_component[component] = [
+            _fit_fraction(rate, speed_rad_s, is_moving) for rate in link_rates_rad_s
+        ]
     fractions = np.array([fractions_by_component[component] for component in components]).T
-    if np.isnan(fractions[0]).all():  # link 0 has no IMU; motion capture may have measured its angle
+    if np.isnan(
+        fractions[0]
+    ).all():  # link 0 has no IMU; motion capture may have measured its angle
         angle_rad = _remove_mean(measurements.angle_rad[:, joint_index], is_commanded)
         for k, component in enumerate(components):
             base_rad = _remove_mean(measurements.base_rotation_rad[:, component], is_commanded)
@@ -112,7 +126,9 @@ def _fit_fraction(signal: Floats, reference: Floats, mask: Mask) -> float:
     is_known = mask & ~np.isnan(signal)
     if is_known.sum() < MIN_SAMPLES:
         return float("nan")
-    return float(signal[is_known] @ reference[is_known] / (reference[is_known] @ reference[is_known]))
+    return float(
+        signal[is_known] @ reference[is_known] / (reference[is_known] @ reference[is_known])
+    )
 
 
 def find_module_order(motion_fractions: Sequence[LinkMotionFractions | None]) -> ModuleOrder:
@@ -129,9 +145,13 @@ def find_module_order(motion_fractions: Sequence[LinkMotionFractions | None]) ->
         For each joint, the index of the joint whose module is in its place.
     """
     order = np.arange(len(motion_fractions))
-    pairs = [(j, k) for j in range(len(motion_fractions)) for k in range(j + 1, len(motion_fractions))]
+    pairs = [
+        (j, k) for j in range(len(motion_fractions)) for k in range(j + 1, len(motion_fractions))
+    ]
     while pairs:
-        misfits = [_compute_total_misfit(motion_fractions, _swap_modules(order, *pair)) for pair in pairs]
+        misfits = [
+            _compute_total_misfit(motion_fractions, _swap_modules(order, *pair)) for pair in pairs
+        ]
         best_pair = pairs[int(np.argmin(misfits))]
         swapped_order = _swap_modules(order, *best_pair)
         pair_fractions = [motion_fractions[joint] for joint in best_pair]
@@ -187,8 +207,14 @@ def _find_joint_of_module(order: ModuleOrder, module: int) -> int:
     return int(np.flatnonzero(order == module)[0])
 
 
-def _compute_total_misfit(motion_fractions: Sequence[LinkMotionFractions | None], order: ModuleOrder) -> float:
-    return sum(motion.reorder_modules(order).compute_misfit() for motion in motion_fractions if motion is not None)
+def _compute_total_misfit(
+    motion_fractions: Sequence[LinkMotionFractions | None], order: ModuleOrder
+) -> float:
+    return sum(
+        motion.reorder_modules(order).compute_misfit()
+        for motion in motion_fractions
+        if motion is not None
+    )
 
 
 def _swap_modules(order: ModuleOrder, j: int, k: int) -> ModuleOrder:

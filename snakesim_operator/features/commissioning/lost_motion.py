@@ -16,11 +16,14 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_operator.features.commissioning.link_shares import MIN_SAMPLES
 from snakesim_operator.features.commissioning.measured import CheckMeasurements
 
-SLOPE_HALF_WINDOW_S = 0.04  # rates are slopes over that time to either side, so that noisy angles give no noisy rates
+# Rates are slopes over that time to either side, so that noisy angles give no noisy rates.
+SLOPE_HALF_WINDOW_S = 0.04
 MOTION_MARGIN_S = 0.1  # before and after a joint's motion
 FAST_FRACTION = 0.3  # of the highest rate; slower samples tell no ratio
-MAX_DISAGREEMENT_FRACTION = 0.06  # of the highest rate; a sample that is nearer to a ratio agrees with it
-MIN_ASSUMED_RATIO = 0.5  # a link behind a slower gear has slower rates, so the agreement scales with the ratio
+# Of the highest rate; a sample that is nearer to a ratio agrees with it.
+MAX_DISAGREEMENT_FRACTION = 0.06
+# A link behind a slower gear has slower rates, so the agreement scales with the ratio.
+MIN_ASSUMED_RATIO = 0.5
 MAX_RATIO = 4.0
 MIN_RATIO = 0.12  # of a link that turns at all
 RATIO_STEP = 0.01
@@ -35,7 +38,8 @@ class LostMotion:
     """The motion that was lost between a joint's drive and its link."""
 
     lost_rad: float  # by which the drive turned further than the link, from end to end
-    noise_rad: float  # that much would be measured without any backlash, by the noise of gyros and encoder
+    # That much would be measured without any backlash, by the noise of gyros and encoder.
+    noise_rad: float
     ratio: float  # of the link's rate to the drive's, while the teeth touch
 
 
@@ -99,8 +103,11 @@ def _find_ratio(drive_rate: Floats, link_rate: Floats) -> float | None:
     is_fast = np.abs(drive_rate) > FAST_FRACTION * max_rate
     magnitudes = np.arange(MIN_RATIO, MAX_RATIO, RATIO_STEP)
     candidates = np.concatenate((magnitudes, -magnitudes))
-    distances = np.abs(link_rate[is_fast, None] - candidates * drive_rate[is_fast, None])  # (samples, candidates)
-    max_distances = MAX_DISAGREEMENT_FRACTION * max_rate * np.maximum(np.abs(candidates), MIN_ASSUMED_RATIO)
+    # (samples, candidates).
+    distances = np.abs(link_rate[is_fast, None] - candidates * drive_rate[is_fast, None])
+    max_distances = (
+        MAX_DISAGREEMENT_FRACTION * max_rate * np.maximum(np.abs(candidates), MIN_ASSUMED_RATIO)
+    )
     agreeing_fractions = np.mean(distances < max_distances, axis=0)
     best_index = int(np.argmax(agreeing_fractions))
     if agreeing_fractions[best_index] < MIN_AGREEING_FRACTION:
@@ -108,7 +115,9 @@ def _find_ratio(drive_rate: Floats, link_rate: Floats) -> float | None:
     return float(candidates[best_index])
 
 
-def _refine_ratio(ratio: float, drive_rate: Floats, link_rate: Floats, acceleration: Floats) -> tuple[float, float]:
+def _refine_ratio(
+    ratio: float, drive_rate: Floats, link_rate: Floats, acceleration: Floats
+) -> tuple[float, float]:
     """Return the ratio by least squares over the samples that agree with it, and the link's delay in seconds.
 
     link rate = ratio * (drive rate - delay * acceleration)
@@ -116,14 +125,18 @@ def _refine_ratio(ratio: float, drive_rate: Floats, link_rate: Floats, accelerat
     max_rate = float(np.max(np.abs(drive_rate)))
     distances = np.abs(link_rate - ratio * drive_rate)
     # The first ratio is one of a grid, so more samples are accepted than for the grid.
-    agrees = distances < 1.5 * MAX_DISAGREEMENT_FRACTION * max_rate * max(abs(ratio), MIN_ASSUMED_RATIO)
+    agrees = distances < 1.5 * MAX_DISAGREEMENT_FRACTION * max_rate * max(
+        abs(ratio), MIN_ASSUMED_RATIO
+    )
     regressors = np.column_stack((drive_rate[agrees], acceleration[agrees]))
     coefficients = np.linalg.lstsq(regressors, link_rate[agrees], rcond=None)[0]
     delay_s = float(np.clip(-coefficients[1] / coefficients[0], -MAX_DELAY_S, MAX_DELAY_S))
     return float(coefficients[0]), delay_s
 
 
-def _integrate_link_angle(measurements: CheckMeasurements, joint_index: int) -> tuple[Floats, float] | None:
+def _integrate_link_angle(
+    measurements: CheckMeasurements, joint_index: int
+) -> tuple[Floats, float] | None:
     """Return a joint's angle by the gyros of its two links, and the drift of that angle by the gyros' noise.
 
     For the joint at the tail, motion capture may replace a missing gyro on the tail link.
@@ -154,7 +167,9 @@ def _integrate_link_angle(measurements: CheckMeasurements, joint_index: int) -> 
     return None
 
 
-def _read_gyro(measurements: CheckMeasurements, link_index: int, component: int) -> tuple[Floats, float] | None:
+def _read_gyro(
+    measurements: CheckMeasurements, link_index: int, component: int
+) -> tuple[Floats, float] | None:
     """Return a link's rate at every tick, (n,), without its bias, and its drift after a second; None without a gyro."""
     rate = measurements.link_rate_rad_s[:, link_index, component]
     known = np.flatnonzero(~np.isnan(rate))

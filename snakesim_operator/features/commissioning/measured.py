@@ -18,7 +18,8 @@ from snakesim_operator.results.run_log import RunRecord
 
 SIGNAL_NAMES = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientation_wxyz")
 MIN_TARGET_MOTION_RAD = 1e-6  # a target that is further from its rest moves its joint
-CLAMPED_FRACTION = 0.9  # of the largest step from the measured angle; beyond, the command limiter set the target
+# Of the largest step from the measured angle; beyond, the command limiter set the target.
+CLAMPED_FRACTION = 0.9
 PITCH = 1  # y, component of a vector in a link's frame
 YAW = 2  # z
 Mask = NDArray[np.bool_]
@@ -37,8 +38,10 @@ class CheckMeasurements:
     torque_nm: Floats  # (n, joints)
     target_rad: Floats  # (n, joints)
     link_rate_rad_s: Floats  # (n, links, 3), in the link's frame; NaN where no IMU reported
-    link_force_m_s2: Floats  # (n, links, 3): specific force, in the link's frame; at rest 1 g upwards
-    base_rotation_rad: Floats  # (n, 3): integral of link 0's rate, in its frame; NaN without motion capture
+    # (n, links, 3): specific force, in the link's frame; at rest 1 g upwards.
+    link_force_m_s2: Floats
+    # (n, 3): integral of link 0's rate, in its frame; NaN without motion capture.
+    base_rotation_rad: Floats
 
     def is_moved_by_target(self, joint_index: int) -> Mask:
         """Return the ticks in which the joint's target is away from its rest, (n,)."""
@@ -80,7 +83,9 @@ def compute_tick_numbers(record: RunRecord) -> list[int]:
     return np.round(record.time_s * record.config.rate_hz).astype(int).tolist()
 
 
-def arrange_imus_by_tick(imus: Iterable[Imu], ticks: Sequence[int], link_count: int) -> tuple[Floats, Floats]:
+def arrange_imus_by_tick(
+    imus: Iterable[Imu], ticks: Sequence[int], link_count: int
+) -> tuple[Floats, Floats]:
     """Return angular rates and specific forces of the links, both (n, links, 3); NaN where no IMU reported."""
     row_by_tick = {tick: row for row, tick in enumerate(ticks)}
     rates_rad_s = np.full((len(ticks), link_count, 3), np.nan)
@@ -94,7 +99,11 @@ def arrange_imus_by_tick(imus: Iterable[Imu], ticks: Sequence[int], link_count: 
 
 
 def collect_measurements(
-    config: RunConfig, robot: RobotDescription, ticks: Sequence[int], columns: Mapping[str, Floats], imus: Iterable[Imu]
+    config: RunConfig,
+    robot: RobotDescription,
+    ticks: Sequence[int],
+    columns: Mapping[str, Floats],
+    imus: Iterable[Imu],
 ) -> CheckMeasurements:
     """Collect what joints, IMUs and motion capture measured in a run of the joint check, one row for each tick.
 
@@ -116,8 +125,12 @@ def collect_measurements(
         delay_ticks = round(pose_sensor.delay_s * config.rate_hz)
     # Move each pose to the tick at which it was true. The last ticks have none.
     orientations_wxyz = np.full_like(columns["orientation_wxyz"], np.nan)
-    orientations_wxyz[: len(orientations_wxyz) - delay_ticks] = columns["orientation_wxyz"][delay_ticks:]
-    target_rad = remove_clamped_targets(columns["target"], columns["angle_rad"], config.robot.safety.max_step_rad)
+    orientations_wxyz[: len(orientations_wxyz) - delay_ticks] = columns["orientation_wxyz"][
+        delay_ticks:
+    ]
+    target_rad = remove_clamped_targets(
+        columns["target"], columns["angle_rad"], config.robot.safety.max_step_rad
+    )
     return CheckMeasurements(
         period_s=config.period_ns * 1e-9,
         joint_names=[joint.name for joint in robot.joints],
@@ -152,7 +165,9 @@ def _integrate_base_rate(orientation_wxyz: Floats) -> Floats:
     to the next is small, so its vector is the antisymmetric part of its matrix.
     """
     integral_rad = np.full((len(orientation_wxyz), 3), np.nan)
-    is_known = np.isfinite(orientation_wxyz).all(axis=1) & (np.abs(orientation_wxyz).sum(axis=1) > 0)
+    is_known = np.isfinite(orientation_wxyz).all(axis=1) & (
+        np.abs(orientation_wxyz).sum(axis=1) > 0
+    )
     known_rows = np.flatnonzero(is_known)
     if not len(known_rows):
         return integral_rad

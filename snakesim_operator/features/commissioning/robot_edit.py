@@ -46,8 +46,12 @@ def read_joints_with_drive_modes(path: Path, running: Sequence[Joint]) -> list[J
     joints = decode_table(read_table_with_base(str(path), "robots"), RobotFile).joint_table
     for i, (in_file, on_host) in enumerate(zip(joints, running, strict=False)):
         modes = [mode for mode in in_file.drive.modes if mode in on_host.drive.modes]
-        measures = [quantity for quantity in in_file.drive.measures if quantity in on_host.drive.measures]
-        drive = msgspec.structs.replace(in_file.drive, modes=modes or in_file.drive.modes, measures=measures)
+        measures = [
+            quantity for quantity in in_file.drive.measures if quantity in on_host.drive.measures
+        ]
+        drive = msgspec.structs.replace(
+            in_file.drive, modes=modes or in_file.drive.modes, measures=measures
+        )
         joints[i] = dataclasses.replace(in_file, drive=drive)
     return joints
 
@@ -101,7 +105,9 @@ def write_check_record(path: Path, checked: StartCheckRecord) -> None:
     """Write the section `[checked]` of a robot file. If this raises ConfigError, the file is as it was."""
     document = tomlkit.parse(read_text(path))
     section = tomlkit.table()
-    section.comment("written by `snakesim robot check`; it counts until the joints above or their drives change")
+    section.comment(
+        "written by `snakesim robot check`; it counts until the joints above or their drives change"
+    )
     for name, value in msgspec.to_builtins(checked).items():
         if value:
             section[name] = value
@@ -133,5 +139,7 @@ def _get_or_add_section(parent: Any, name: str, *, super_table: bool) -> Any:
         parent[name] = tomlkit.table(is_super_table=super_table)
     section = parent[name]
     if not isinstance(section, Table):
-        raise ConfigError(f"`{name}` is written within one line: write it as a section, [joints.{name}]")
+        raise ConfigError(
+            f"`{name}` is written within one line: write it as a section, [joints.{name}]"
+        )
     return section

@@ -20,13 +20,17 @@ from snakesim_operator.features.commissioning.least_squares import (
     solve_with_instruments,
 )
 from snakesim_operator.features.commissioning.smoothing import filter_columns
-from snakesim_operator.features.commissioning.torque_balance import JointRecord, number_jackknife_blocks
+from snakesim_operator.features.commissioning.torque_balance import (
+    JointRecord,
+    number_jackknife_blocks,
+)
 
 SPECTRUM_SEGMENT_S = 4.0  # length of the pieces whose spectra are averaged
 MIN_EXCITATION = 1e-4  # of the strongest power; with less power, a frequency is not evaluated
 DRIVE_LOOP_S = 0.001  # period of a drive's own control loop
 STEPS_PER_TICK = 10  # of the servo model
-ENCODER_SMOOTHING_S = 0.2  # time scale beyond which angles come from the encoder, below it from the velocities
+# Time scale beyond which angles come from the encoder, below it from the velocities.
+ENCODER_SMOOTHING_S = 0.2
 Gains = NDArray[np.floating[Any]]  # stiffness, damping, offset
 
 
@@ -56,7 +60,9 @@ def fit_servo(record: JointRecord) -> ServoResponse:
     latency_s, response_time_s = model.search_delays()
     regressors = model.compute_regressors(latency_s, response_time_s)
     gains = np.linalg.lstsq(regressors, model.torque_nm, rcond=None)[0]
-    latency_derivative, response_time_derivative = model.compute_delay_derivatives(latency_s, response_time_s, gains)
+    latency_derivative, response_time_derivative = model.compute_delay_derivatives(
+        latency_s, response_time_s, gains
+    )
     jacobian = np.column_stack((regressors, latency_derivative, response_time_derivative))
     residuals = model.torque_nm - regressors @ gains
     step = solve_with_instruments(jacobian, residuals, jacobian, model.blocks)
@@ -67,7 +73,9 @@ def fit_servo(record: JointRecord) -> ServoResponse:
 def _make_servo_response(model: "_ServoModel", fit: LeastSquaresFit) -> ServoResponse:
     """Return the fitted servo, and the torque that it would have had in this motion."""
     stiffness, damping, offset, latency, response_time = fit.estimates
-    fine_inputs = model.compute_lagged_inputs(max(latency.value, 0.0), max(response_time.value, 0.0))
+    fine_inputs = model.compute_lagged_inputs(
+        max(latency.value, 0.0), max(response_time.value, 0.0)
+    )
     fine_torque_nm = fine_inputs @ fit.values[:2]
     return ServoResponse(
         stiffness_nm_per_rad=stiffness,
@@ -96,7 +104,9 @@ class _ServoModel:
     def compute_regressors(self, latency_s: float, response_time_s: float) -> Floats:
         """Return what stiffness, damping and offset are multiplied with, (rows, 3)."""
         sampled = _sample_at_ticks(self.compute_lagged_inputs(latency_s, response_time_s))
-        return np.column_stack((sampled[self.FIRST_TICK :][self._is_used], np.ones(len(self.torque_nm))))
+        return np.column_stack(
+            (sampled[self.FIRST_TICK :][self._is_used], np.ones(len(self.torque_nm)))
+        )
 
     def compute_lagged_inputs(self, latency_s: float, response_time_s: float) -> Floats:
         """Compute the inputs of the servo, target minus angle and minus velocity, behind delay and first-order lag.
@@ -122,15 +132,17 @@ class _ServoModel:
         held_target_rad = np.repeat(record.target_rad, STEPS_PER_TICK)
         delayed_indices = np.clip(np.arange(len(step_times_s)) - int(whole_steps), 0, None)
         earlier_indices = np.clip(delayed_indices - 1, 0, None)
-        target_rad = (1 - fraction_of_step) * held_target_rad[delayed_indices] + fraction_of_step * held_target_rad[
-            earlier_indices
-        ]
+        target_rad = (1 - fraction_of_step) * held_target_rad[
+            delayed_indices
+        ] + fraction_of_step * held_target_rad[earlier_indices]
         inputs = np.column_stack((target_rad - angle_rad, -velocity_rad_s))
         # A first-order lag is the convolution with an exponential, which is cut off after 12 time constants.
         decay = np.exp(-step_s / max(response_time_s, 1e-6))
         kernel_step_count = min(int(np.ceil(12 * response_time_s / step_s)) + 1, len(step_times_s))
         kernel = (1 - decay) * decay ** np.arange(kernel_step_count)
-        return np.column_stack([np.convolve(column, kernel)[: len(step_times_s)] for column in inputs.T])
+        return np.column_stack(
+            [np.convolve(column, kernel)[: len(step_times_s)] for column in inputs.T]
+        )
 
     def compute_squared_error(self, latency_s: float, response_time_s: float) -> float:
         """Return the sum of squared residuals with the best gains."""
@@ -157,7 +169,8 @@ class _ServoModel:
         step_s = period_s / 2
         while step_s > period_s / 200:
             neighbor_error, neighbor = min(
-                (self.compute_squared_error(*pair), pair) for pair in self._list_neighbors(best_delays, step_s)
+                (self.compute_squared_error(*pair), pair)
+                for pair in self._list_neighbors(best_delays, step_s)
             )
             if neighbor_error < min_error:
                 min_error = neighbor_error
@@ -166,7 +179,9 @@ class _ServoModel:
                 step_s /= 2
         return best_delays
 
-    def _list_neighbors(self, delays: tuple[float, float], step_s: float) -> list[tuple[float, float]]:
+    def _list_neighbors(
+        self, delays: tuple[float, float], step_s: float
+    ) -> list[tuple[float, float]]:
         """Return the eight pairs of delays that are one step away, without those that are too short."""
         latency_s, response_time_s = delays
         pairs: list[tuple[float, float]] = []
@@ -237,7 +252,9 @@ def _fuse_angles(record: JointRecord) -> Floats:
     integral_rad = np.concatenate(([0.0], np.cumsum(steps_rad)))
     half_window = max(round(ENCODER_SMOOTHING_S / record.period_s), 1)
     window = np.hanning(2 * half_window + 1)
-    drift_rad: Floats = np.pad(record.angle_rad - integral_rad, half_window, mode="reflect", reflect_type="odd")
+    drift_rad: Floats = np.pad(
+        record.angle_rad - integral_rad, half_window, mode="reflect", reflect_type="odd"
+    )
     return integral_rad + filter_columns(drift_rad, window / window.sum())
 
 

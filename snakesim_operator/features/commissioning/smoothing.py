@@ -52,7 +52,9 @@ def compute_motion_direction(velocity_rad_s: Floats) -> Floats:
     return np.clip(2 * velocity / change_in_tick, -1.0, 1.0)
 
 
-def is_slow(velocity_rad_s: Floats, threshold_rad_s: float, max_fraction: float) -> NDArray[np.bool_]:
+def is_slow(
+    velocity_rad_s: Floats, threshold_rad_s: float, max_fraction: float
+) -> NDArray[np.bool_]:
     """Return where at least `max_fraction` of the smoothing window is slow, (ticks - 2 HALF_WINDOW_TICKS,)."""
     is_slow_tick = (np.abs(average_with_neighbors(velocity_rad_s)) < threshold_rad_s).astype(float)
     return smooth(is_slow_tick) >= max_fraction

@@ -25,7 +25,8 @@ class _LinkMotion:
 
     omega: Floats  # angular velocity, rad/s
     alpha: Floats  # angular acceleration, rad/s^2
-    acceleration: Floats  # of the link's rear joint, m/s^2; weight counts as an acceleration upwards
+    # Of the link's rear joint, m/s^2; weight counts as an acceleration upwards.
+    acceleration: Floats
 
 
 def list_links(robot: RobotFile) -> Sequence[Link]:
@@ -85,9 +86,8 @@ def _propagate_link_motions(
     motions: list[_LinkMotion] = []
     for joint, axis_name in enumerate(robot.axes):
         axis = np.array(UNIT_VECTOR_BY_AXIS[axis_name])
-        to_front = np.array(
-            [links[joint].length_m, 0.0, 0.0]
-        )  # from the rear to the front of the link behind the joint
+        # From the rear to the front of the link behind the joint.
+        to_front = np.array([links[joint].length_m, 0.0, 0.0])
         acceleration_m_s2 = (
             acceleration_m_s2
             + np.cross(alpha_rad_s2, to_front)
@@ -97,14 +97,21 @@ def _propagate_link_motions(
         alpha_rad_s2 = _rotate_into_link_ahead(rotations[joint], alpha_rad_s2)
         acceleration_m_s2 = _rotate_into_link_ahead(rotations[joint], acceleration_m_s2)
         joint_rate = velocity_rad_s[:, joint, None] * axis
-        alpha_rad_s2 = alpha_rad_s2 + np.cross(omega_rad_s, joint_rate) + acceleration_rad_s2[:, joint, None] * axis
+        alpha_rad_s2 = (
+            alpha_rad_s2
+            + np.cross(omega_rad_s, joint_rate)
+            + acceleration_rad_s2[:, joint, None] * axis
+        )
         omega_rad_s = omega_rad_s + joint_rate
         motions.append(_LinkMotion(omega_rad_s, alpha_rad_s2, acceleration_m_s2))
     return motions
 
 
 def _compute_joint_torques_nm(
-    robot: RobotFile, links: Sequence[Link], rotations: Sequence[Floats], motions: Sequence[_LinkMotion]
+    robot: RobotFile,
+    links: Sequence[Link],
+    rotations: Sequence[Floats],
+    motions: Sequence[_LinkMotion],
 ) -> Floats:
     """Compute the torque through every joint, from the head to the tail (backward Newton-Euler recursion).
 
@@ -135,9 +142,18 @@ def _compute_joint_torques_nm(
         xx, yy, zz, xy, xz, yz = link.inertia(robot.module.radius_m)
         inertia_kg_m2 = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         centripetal = np.cross(motion.omega, np.cross(motion.omega, center))
-        inertial_force_n = link.mass_kg * (motion.acceleration + np.cross(motion.alpha, center) + centripetal)
-        inertial_moment_nm = motion.alpha @ inertia_kg_m2 + np.cross(motion.omega, motion.omega @ inertia_kg_m2)
-        moment_nm = inertial_moment_nm + np.cross(center, inertial_force_n) + moment_nm + np.cross(to_front, force_n)
+        inertial_force_n = link.mass_kg * (
+            motion.acceleration + np.cross(motion.alpha, center) + centripetal
+        )
+        inertial_moment_nm = motion.alpha @ inertia_kg_m2 + np.cross(
+            motion.omega, motion.omega @ inertia_kg_m2
+        )
+        moment_nm = (
+            inertial_moment_nm
+            + np.cross(center, inertial_force_n)
+            + moment_nm
+            + np.cross(to_front, force_n)
+        )
         force_n = inertial_force_n + force_n
         torque_nm[:, joint] = moment_nm @ np.array(UNIT_VECTOR_BY_AXIS[robot.axes[joint]])
         force_n = _rotate_into_link_behind(rotations[joint], force_n)

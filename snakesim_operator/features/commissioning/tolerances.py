@@ -1,3 +1,4 @@
 """What a joint check tolerates. Imports nothing: the command line reads it before it knows what will run."""
 
-ALLOWED_BACKLASH_RAD = 0.01  # 0.6 degrees; an intact gear and the noise of its gyros show half of it
+# 0.6 degrees; an intact gear and the noise of its gyros show half of it.
+ALLOWED_BACKLASH_RAD = 0.01

@@ -72,7 +72,12 @@ class TorqueBalance:
 
 
 def fit_torque_balance(
-    record: JointRecord, between_nm: Floats, load_nm: Floats, load_by_angle_nm: Floats, *, fit_scale: bool
+    record: JointRecord,
+    between_nm: Floats,
+    load_nm: Floats,
+    load_by_angle_nm: Floats,
+    *,
+    fit_scale: bool,
 ) -> TorqueBalance:
     """Fit friction, rotor inertia and torque scale of a joint; the equation is in the module's docstring.
 
@@ -92,30 +97,44 @@ def fit_torque_balance(
     is_slow_tick = is_slow(record.velocity_rad_s, SLOW_RAD_S, MAX_SLOW_FRACTION)
     is_used = ~is_slow_tick & record.is_below_torque_limit()[HALF_WINDOW_TICKS:-HALF_WINDOW_TICKS]
     fitted_torque_nm = torque_nm[is_used]
-    if not fit_scale:  # the load is the last column; with a known scale it is subtracted from the torque
+    if (
+        not fit_scale
+    ):  # the load is the last column; with a known scale it is subtracted from the torque
         regressors = regressors[:, :-1]
         instruments = instruments[:, :-1]
         fitted_torque_nm = fitted_torque_nm - load_nm[is_used]
     fit = solve_with_instruments(
-        regressors[is_used], fitted_torque_nm, instruments[is_used], number_jackknife_blocks(is_used, period_s)
+        regressors[is_used],
+        fitted_torque_nm,
+        instruments[is_used],
+        number_jackknife_blocks(is_used, period_s),
     )
     explained = 1 - float(np.var(fit.residuals) / np.var(torque_nm[is_used]))
     misfit = max(1 - explained - MODEL_MISFIT**2, 0.0) ** 0.5
     fit = fit.with_bias(
-        ABSORBED_MISFIT * misfit * float(np.std(torque_nm[is_used])) / compute_independent_rms(regressors[is_used])
+        ABSORBED_MISFIT
+        * misfit
+        * float(np.std(torque_nm[is_used]))
+        / compute_independent_rms(regressors[is_used])
     )
     scale = IntervalEstimate(1.0, 0.0)
     if fit_scale:
         load_coefficient = fit.values[-1]  # measured torque divided by real torque
-        scale = IntervalEstimate(float(1 / load_coefficient), float(fit.half_widths[-1] / load_coefficient**2))
+        scale = IntervalEstimate(
+            float(1 / load_coefficient), float(fit.half_widths[-1] / load_coefficient**2)
+        )
         fit = fit.divide_by_value(len(fit.values) - 1)
     dry_nm, viscous_nm_s_per_rad, armature_kg_m2, *_ = fit.estimates
     measured_and_fitted = np.column_stack((torque_nm, np.full(len(torque_nm), np.nan)))
     measured_and_fitted[is_used, 1] = torque_nm[is_used] - fit.residuals
-    return TorqueBalance(dry_nm, viscous_nm_s_per_rad, armature_kg_m2, scale, explained, misfit, measured_and_fitted)
+    return TorqueBalance(
+        dry_nm, viscous_nm_s_per_rad, armature_kg_m2, scale, explained, misfit, measured_and_fitted
+    )
 
 
-def _make_regression_columns(record: JointRecord, load_nm: Floats, load_by_angle_nm: Floats) -> tuple[Floats, Floats]:
+def _make_regression_columns(
+    record: JointRecord, load_nm: Floats, load_by_angle_nm: Floats
+) -> tuple[Floats, Floats]:
     """Return regressors and instruments of the torque balance of a joint.
 
     Columns: dry friction, viscous friction, rotor inertia, offset, latency of the torque, load. The instruments of

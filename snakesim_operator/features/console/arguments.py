@@ -41,7 +41,10 @@ def _run_console(arguments: argparse.Namespace) -> int:
 
     if arguments.run is not None:
         if arguments.commission is not None:
-            raise ConfigError("--commission is for a running robot; leave RUN out", code="command/conflicting-options")
+            raise ConfigError(
+                "--commission is for a running robot; leave RUN out",
+                code="command/conflicting-options",
+            )
         return show_recorded_run(arguments.run, arguments.at, arguments.port)
     return show_live_robot(select_robots(arguments), arguments.port, arguments.commission)
 

@@ -17,7 +17,11 @@ from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import read_config
 from snakesim_hal.network.local_registry import list_local_robots
 from snakesim_hal.network.session import ConnectionSettings
-from snakesim_hal.programs.arguments import add_network_arguments, add_parent_argument, add_scenario_arguments
+from snakesim_hal.programs.arguments import (
+    add_network_arguments,
+    add_parent_argument,
+    add_scenario_arguments,
+)
 from snakesim_hal.programs.service_program import read_process_options
 from snakesim_operator.base import extras
 from snakesim_operator.base.console_port import ConsolePorts, open_console_ports
@@ -28,7 +32,9 @@ from snakesim_operator.run.console_front import start_console_front
 MAX_OPEN_FILES = 4096  # far more than connections of browsers may use
 
 
-def show_live_robot(selection: RobotSelection, port: int | None, robot_file: Path | None = None) -> int:
+def show_live_robot(
+    selection: RobotSelection, port: int | None, robot_file: Path | None = None
+) -> int:
     """Show a running robot in the browser, on pages that can also control it, until Ctrl-C.
 
     Args:
@@ -47,13 +53,16 @@ def show_live_robot(selection: RobotSelection, port: int | None, robot_file: Pat
     if robot_file is not None:
         extras.require_extra("lab", "commissioning")
         robot_text = read_table_with_base(str(robot_file), "robots")
-        decode_table(robot_text, RobotFile)  # an invalid file is an error now, rather than when a page writes it
+        # An invalid file is an error now, rather than when a page writes it.
+        decode_table(robot_text, RobotFile)
     from snakesim_operator.features.console.display_loop import run_live_display
 
     link = find_single_robot(selection, "console")
     stop_event = _make_stop_event()
     with _run_front_server(port, link, stop_event) as ports:
-        run_live_display(link, _find_surroundings(link), ports.pages, stop_event, robot_file=robot_file)
+        run_live_display(
+            link, _find_surroundings(link), ports.pages, stop_event, robot_file=robot_file
+        )
     return 0
 
 
@@ -98,7 +107,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_scenario_arguments(parser)
     add_network_arguments(parser, "")
     add_parent_argument(parser)
-    parser.add_argument("--listening", type=int, required=True, help=argparse.SUPPRESS)  # inherited descriptor
+    # Inherited descriptor.
+    parser.add_argument("--listening", type=int, required=True, help=argparse.SUPPRESS)
     options = read_process_options(parser.parse_args(argv))
     _prepare_process()
     from snakesim_operator.features.console.display_loop import run_live_display
@@ -107,7 +117,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     listening_socket = socket.socket(fileno=options.arguments.listening)
     expected = make_expected_snapshot(options.config)
-    run_live_display(options.link, TrueSurroundings(options.config), listening_socket, _make_stop_event(), expected)
+    run_live_display(
+        options.link,
+        TrueSurroundings(options.config),
+        listening_socket,
+        _make_stop_event(),
+        expected,
+    )
     return 0
 
 
@@ -163,7 +179,10 @@ def _find_surroundings(connection: ConnectionSettings):
     from snakesim_operator.features.console.scene.drawing import TrueSurroundings
 
     for robot in list_local_robots():
-        is_same_robot = (robot.endpoint, robot.namespace) == (connection.endpoint, connection.namespace)
+        is_same_robot = (robot.endpoint, robot.namespace) == (
+            connection.endpoint,
+            connection.namespace,
+        )
         if is_same_robot and robot.config is not None:
             try:
                 return TrueSurroundings(read_config(Path(robot.config)))

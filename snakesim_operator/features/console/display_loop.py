@@ -63,7 +63,9 @@ def run_live_display(
     signals_page = SignalsPage(signals, SECOND_STOP)
     signals_page.now_s = signals.now_s
 
-    with serve_pages(listening_socket, report, signals_page.answer_request, has_stop=True) as server:
+    with serve_pages(
+        listening_socket, report, signals_page.answer_request, has_stop=True
+    ) as server:
         page = ConsolePage(server, surroundings, operations, log, robot_file=robot_file)
         page.show_snapshot(expected)
         link_with_images = replace(connection, max_bytes=MAX_IMAGE_BYTES)
@@ -112,8 +114,12 @@ def run_recording_display(
         log.write(f"of {run.history.image_decimation} camera images one is kept")
     run_exit_code = report_missing_data(folder, run.record.missing)
     signals_page = SignalsPage(PlaybackSignals(run))
-    with serve_pages(listening_socket, print_line, signals_page.answer_request, has_stop=False) as server:
-        page = ConsolePage(server, TrueSurroundings(run.record.config), None, log, recorded=folder.name)
+    with serve_pages(
+        listening_socket, print_line, signals_page.answer_request, has_stop=False
+    ) as server:
+        page = ConsolePage(
+            server, TrueSurroundings(run.record.config), None, log, recorded=folder.name
+        )
         player = RecordingPlayer(server, run.span_s, start_s)
         signals_page.now_s = lambda: player.elapsed_s
         signals_page.jump_to = player.jump_to

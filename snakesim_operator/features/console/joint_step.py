@@ -53,7 +53,9 @@ class JointStep:
             raise
         finally:
             os.close(command_terminal)
-        self._reader_thread = threading.Thread(target=self._read_output, name="joint step", daemon=True)
+        self._reader_thread = threading.Thread(
+            target=self._read_output, name="joint step", daemon=True
+        )
         self._reader_thread.start()
 
     @property
@@ -94,7 +96,8 @@ class JointStep:
             self._add_line("done" if exit_code == 0 else f"ended ({exit_code})")
             with self._lock:
                 os.close(self._terminal_fd)
-                self._terminal_fd = -1  # a key that is sent now fails, rather than going to another file
+                # A key that is sent now fails, rather than going to another file.
+                self._terminal_fd = -1
 
     def _add_line(self, line: str) -> None:
         with self._lock:
@@ -111,7 +114,10 @@ def _disable_echo(terminal: int) -> None:
 def _start_command(command_words: Sequence[str], terminal: int) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         make_python_command(
-            "-m", "snakesim_operator", *format_command_name(command_words[0]).split(), *command_words[1:]
+            "-m",
+            "snakesim_operator",
+            *format_command_name(command_words[0]).split(),
+            *command_words[1:],
         ),
         env=make_child_environment(),
         stdin=terminal,

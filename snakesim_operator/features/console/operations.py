@@ -14,7 +14,12 @@ from snakesim_hal.base.errors import NotConnectedError, RefusedError, SnakesimEr
 from snakesim_hal.network.session import ConnectionSettings, Session
 from snakesim_hal.network.streams import Publisher
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import LocomotionIntent, Message, ParametersRequest, RobotDescription
+from snakesim_hal.wire.messages import (
+    LocomotionIntent,
+    Message,
+    ParametersRequest,
+    RobotDescription,
+)
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.robot_commands.command import (
     ANSWER_TIMEOUT_S,
@@ -65,7 +70,9 @@ class RobotOperations:
 
     def __init__(self, connection: ConnectionSettings, log: PageLog) -> None:
         self.link = connection
-        self._selection = RobotSelection(connection.endpoint, connection.namespace, connection.session)
+        self._selection = RobotSelection(
+            connection.endpoint, connection.namespace, connection.session
+        )
         self._log = log
         self.stop = PreparedStop(self._selection, connection, self._log_stop)
         # Known once the console is connected.
@@ -87,21 +94,29 @@ class RobotOperations:
         if unchecked:
             title += ", unchecked"
         return self._run_command(
-            title, lambda print_: arm_robot(robot.robot, robot.backend, self._selection, print_, unchecked=unchecked)
+            title,
+            lambda print_: arm_robot(
+                robot.robot, robot.backend, self._selection, print_, unchecked=unchecked
+            ),
         )
 
     def disarm(self, requester: str) -> str:
         """Make the joints passive."""
-        return self._run_command(f"{requester}: disarm", lambda print_: disarm_robot(self._selection, print_))
+        return self._run_command(
+            f"{requester}: disarm", lambda print_: disarm_robot(self._selection, print_)
+        )
 
     def reset_fault(self, requester: str) -> str:
         """Reset a fault or an emergency stop."""
-        return self._run_command(f"{requester}: reset", lambda print_: reset_robot(self._selection, print_))
+        return self._run_command(
+            f"{requester}: reset", lambda print_: reset_robot(self._selection, print_)
+        )
 
     def control_simulator(self, requester: str, order: SimulatorOrder) -> str:
         """Pause, resume, step, speed up or reset a simulator."""
         return self._run_command(
-            f"{requester}: simulator: {order}", lambda print_: control_simulator(order, self._selection, print_)
+            f"{requester}: simulator: {order}",
+            lambda print_: control_simulator(order, self._selection, print_),
         )
 
     def inject_fault(self, requester: str, order: FaultOrder) -> str:
@@ -111,12 +126,17 @@ class RobotOperations:
 
     def change_parameters(self, requester: str, controller: str, parameters: str) -> str:
         """Change the parameters of the running controller. `parameters` are all of them as JSON."""
-        request = ParametersRequest(requester=requester, controller=controller, parameters=parameters)
+        request = ParametersRequest(
+            requester=requester, controller=controller, parameters=parameters
+        )
         return self._run_command(
-            f"{requester}: parameters", lambda print_: self._send_request(keys.PARAMETERS, request, print_)
+            f"{requester}: parameters",
+            lambda print_: self._send_request(keys.PARAMETERS, request, print_),
         )
 
-    def drive(self, requester: str, heading_w_rad: float, speed_m_s: float, acted_ns: int, valid_ns: int) -> None:
+    def drive(
+        self, requester: str, heading_w_rad: float, speed_m_s: float, acted_ns: int, valid_ns: int
+    ) -> None:
         """Publish an intent to go in a direction at a speed. Does not wait; does nothing before `connect`.
 
         Args:

@@ -30,7 +30,10 @@ class StateChangeLog:
     def _note_status(self, status: RobotStatus) -> None:
         previous = self._status
         self._status = status
-        if previous is None or (status.lifecycle, status.reason) != (previous.lifecycle, previous.reason):
+        if previous is None or (status.lifecycle, status.reason) != (
+            previous.lifecycle,
+            previous.reason,
+        ):
             self._write(f"robot {status.lifecycle}: {status.reason}")
         known_faults = () if previous is None else previous.faults
         for fault in status.faults:
@@ -47,4 +50,6 @@ class StateChangeLog:
     def _note_parameters(self, parameters: ControlParameters) -> None:
         self._parameters = parameters
         if parameters.requester is not None:  # None: the controller started with them
-            self._write(f"parameters of {parameters.controller} in force, as {parameters.requester} asked")
+            self._write(
+                f"parameters of {parameters.controller} in force, as {parameters.requester} asked"
+            )

@@ -27,8 +27,12 @@ MAX_TITLE_CHARACTERS = 200  # of a suite
 
 
 def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("suite", metavar="SUITE", help="name of a shipped suite, or path of a suite file")
-    parser.add_argument("--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class")
+    parser.add_argument(
+        "suite", metavar="SUITE", help="name of a shipped suite, or path of a suite file"
+    )
+    parser.add_argument(
+        "--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class"
+    )
     add_fields_argument(parser, "for each row and controller (default: the suite's)")
     _add_rows(parser, "only these rows of the table, by number")
     parser.add_argument(
@@ -60,8 +64,12 @@ def _add_optimize_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _add_rows(parser, "on these rows of a suite, with what it draws")
     _add_vary(parser, "range of a key: KEY=LOW:HIGH (may be repeated)")
-    parser.add_argument("--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m")
-    parser.add_argument("--minimize", action="store_true", help="search the smallest instead of the largest")
+    parser.add_argument(
+        "--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m"
+    )
+    parser.add_argument(
+        "--minimize", action="store_true", help="search the smallest instead of the largest"
+    )
     parser.add_argument(
         "--trials",
         type=make_number_parser(1, 100_000),
@@ -90,11 +98,15 @@ def _add_vary(parser: argparse.ArgumentParser, about: str) -> None:
 
 
 def _add_seeds(parser: argparse.ArgumentParser, about: str) -> None:
-    parser.add_argument("--seeds", type=make_number_parser(1, 100_000), default=1, metavar="N", help=about)
+    parser.add_argument(
+        "--seeds", type=make_number_parser(1, 100_000), default=1, metavar="N", help=about
+    )
 
 
 def _add_shared_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report")
+    parser.add_argument(
+        "--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report"
+    )
     add_output_argument(parser, "folder of the results (default: runs/NAME-TIME)")
     add_resume_argument(parser)
     _add_study_seed(parser)
@@ -117,7 +129,8 @@ def _run_sweep(arguments: argparse.Namespace) -> int:
 
 
 def _run_guarded_if_single_case(
-    arguments: argparse.Namespace, run_command: "Callable[[argparse.Namespace, SharedStepTimes | None], int]"
+    arguments: argparse.Namespace,
+    run_command: "Callable[[argparse.Namespace, SharedStepTimes | None], int]",
 ) -> int:
     """Run a command; with `--only`, run it in a child process that can be ended whatever its controller does.
 
@@ -224,7 +237,9 @@ def _run_optimize(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.folder import choose_default_folder
 
     # Every field of `SearchRequest` has the name of its option; three of them are converted below.
-    values = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchRequest)}
+    values = {
+        field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchRequest)
+    }
     # Without --storage, the file has the name that a new run folder would have.
     storage = arguments.storage or choose_default_folder("optimize").with_suffix(".db")
     values["storage"] = storage
@@ -236,7 +251,9 @@ def _run_optimize(arguments: argparse.Namespace) -> int:
             return run_optimization(SearchRequest(**values))
         except KeyboardInterrupt:  # the storage keeps every finished trial
             if storage.is_file():
-                print_line(f"stopped: {storage} keeps the trials that are done; the same command continues with")
+                print_line(
+                    f"stopped: {storage} keeps the trials that are done; the same command continues with"
+                )
                 print_line(f"  --storage {shlex.quote(str(storage))}")
             return EXIT_INTERRUPTED
 
@@ -256,7 +273,8 @@ def _parse_numbers(text: str, option: str) -> list[int]:
     words = [word.strip() for word in text.split(",") if word.strip()]
     if not all(word.isdecimal() and len(word) < 7 for word in words):
         raise ConfigError(
-            f"{option} {text[:60]}: give whole numbers, such as {option} 1,2", code="command/invalid-option"
+            f"{option} {text[:60]}: give whole numbers, such as {option} 1,2",
+            code="command/invalid-option",
         )
     return [int(word) for word in words]
 

@@ -19,7 +19,11 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import RunConfig, compute_config_hash
 from snakesim_operator.features.evaluate.case import EvaluationCase, compute_code_digest
 from snakesim_operator.features.evaluate.store import Results
-from snakesim_operator.features.evaluate.table import ResultRow, compute_wilson_interval, group_results_by_row
+from snakesim_operator.features.evaluate.table import (
+    ResultRow,
+    compute_wilson_interval,
+    group_results_by_row,
+)
 
 CARD_FILENAME = "card.json"
 
@@ -101,7 +105,9 @@ class ControllerComparison(msgspec.Struct, frozen=True):
     p: float  # corrected for the number of comparisons
 
 
-def make_card(suite: str, cases: Sequence[EvaluationCase], outcome_by_id: Results) -> EvaluationCard:
+def make_card(
+    suite: str, cases: Sequence[EvaluationCase], outcome_by_id: Results
+) -> EvaluationCard:
     """Make the score card of all cases that have an outcome.
 
     Args:
@@ -114,7 +120,13 @@ def make_card(suite: str, cases: Sequence[EvaluationCase], outcome_by_id: Result
         if case.id in outcome_by_id:
             crossed = outcome_by_id[case.id].numbers.get("crossed") is True
             crossings.append(
-                GoalResult(case.controller, case.setting, case.field, _hash_without_controller(case), crossed)
+                GoalResult(
+                    case.controller,
+                    case.setting,
+                    case.field,
+                    _hash_without_controller(case),
+                    crossed,
+                )
             )
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
     return EvaluationCard(
@@ -135,11 +147,14 @@ def read_card(path: Path) -> EvaluationCard:
         return msgspec.json.decode(file.read_bytes(), type=EvaluationCard)
     except (OSError, msgspec.DecodeError) as error:
         raise ConfigError(
-            f"--against {path}: no score card ({error}); give the folder of an evaluation", code="file/not-readable"
+            f"--against {path}: no score card ({error}); give the folder of an evaluation",
+            code="file/not-readable",
         ) from None
 
 
-def compare_cards(card: EvaluationCard, others: Sequence[EvaluationCard]) -> list[ControllerComparison]:
+def compare_cards(
+    card: EvaluationCard, others: Sequence[EvaluationCard]
+) -> list[ControllerComparison]:
     """Compare controllers row by row, with p values corrected for the number of comparisons.
 
     The first controller of the card is compared with each of its other controllers. Then each of its controllers is
@@ -159,7 +174,10 @@ def compare_cards(card: EvaluationCard, others: Sequence[EvaluationCard]) -> lis
                 label = f"{other_name} ({other.version}, {other.code})"
                 comparisons += _compare_controllers(card, name, other, other_name, label=label)
     corrected = correct_p_values_by_holm([comparison.p for comparison in comparisons])
-    return [msgspec.structs.replace(comparison, p=p) for comparison, p in zip(comparisons, corrected, strict=True)]
+    return [
+        msgspec.structs.replace(comparison, p=p)
+        for comparison, p in zip(comparisons, corrected, strict=True)
+    ]
 
 
 def compute_mcnemar_p(only_one: int, only_other: int) -> float:
@@ -194,7 +212,9 @@ def correct_p_values_by_holm(p_values: Sequence[float]) -> list[float]:
 def format_card(card: EvaluationCard, comparisons: Sequence[ControllerComparison]) -> list[str]:
     """Return the card for a terminal: the numbers that the table does not have, and the comparisons."""
     lines = [f"score card: {card.suite}, snakesim {card.version}, code {card.code}, {card.machine}"]
-    lines.append(f"fields {card.fields[0]} to {card.fields[-1]}; medians, speed and cost of the runs that crossed")
+    lines.append(
+        f"fields {card.fields[0]} to {card.fields[-1]}; medians, speed and cost of the runs that crossed"
+    )
     for score in card.scores:
         lines += _format_score(score)
     for comparison in comparisons:
@@ -206,7 +226,9 @@ def format_card(card: EvaluationCard, comparisons: Sequence[ControllerComparison
             f"  {comparison.row}: {comparison.one} against {comparison.other}: {counts}; p = {comparison.p:.2g}"
         )
     if comparisons:
-        lines.append(f"p: McNemar's exact test, Holm's correction for {len(comparisons)} comparisons")
+        lines.append(
+            f"p: McNemar's exact test, Holm's correction for {len(comparisons)} comparisons"
+        )
     return lines
 
 
@@ -227,7 +249,8 @@ def _format_score(score: ControllerScore) -> list[str]:
 
 def _make_score(row: ResultRow) -> ControllerScore:
     medians = {
-        key: _compute_median(row.list_values(key, of_crossed=metric.only_crossed)) for key, metric in METRICS.items()
+        key: _compute_median(row.list_values(key, of_crossed=metric.only_crossed))
+        for key, metric in METRICS.items()
     }
     return ControllerScore(
         controller=row.controller,
@@ -257,7 +280,12 @@ def _list_controllers(card: EvaluationCard) -> list[str]:
 
 
 def _compare_controllers(
-    card: EvaluationCard, controller: str, other: EvaluationCard, other_controller: str, *, label: str
+    card: EvaluationCard,
+    controller: str,
+    other: EvaluationCard,
+    other_controller: str,
+    *,
+    label: str,
 ) -> list[ControllerComparison]:
     """Compare the success of two controllers in each row in which both were tried on the same fields.
 
@@ -274,14 +302,14 @@ def _compare_controllers(
     Returns:
         One comparison for each row with shared fields, in the order of the first card.
     """
-    has_reached_goal_by_config: dict[
-        str, bool
-    ] = {}  # configuration without its controller -> whether it reached the goal
+    # Configuration without its controller -> whether it reached the goal.
+    has_reached_goal_by_config: dict[str, bool] = {}
     for crossing in other.crossings:
         if crossing.controller == other_controller:
             has_reached_goal_by_config[crossing.same] = crossing.crossed
 
-    pairs_by_row: dict[str, list[tuple[bool, bool]]] = {}  # (first, second) reached the goal, for each shared field
+    # (first, second) reached the goal, for each shared field.
+    pairs_by_row: dict[str, list[tuple[bool, bool]]] = {}
     for crossing in card.crossings:
         if crossing.controller == controller and crossing.same in has_reached_goal_by_config:
             pair = (crossing.crossed, has_reached_goal_by_config[crossing.same])
@@ -296,5 +324,7 @@ def _compare_controllers(
         only_first = pairs.count((True, False))
         only_second = pairs.count((False, True))
         p = compute_mcnemar_p(only_first, only_second)
-        comparisons.append(ControllerComparison(row, controller, label, len(pairs), only_first, only_second, p))
+        comparisons.append(
+            ControllerComparison(row, controller, label, len(pairs), only_first, only_second, p)
+        )
     return comparisons

@@ -16,7 +16,8 @@ from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import simulate
 
 Number = bool | int | float | str | None
-WALL_CLOCK_FIELDS = {"wall_s", "real_time_factor", "overruns", "answered_fraction"}  # they differ from run to run
+# They differ from run to run.
+WALL_CLOCK_FIELDS = {"wall_s", "real_time_factor", "overruns", "answered_fraction"}
 GAVE_UP_FIELD = "gave_up"  # the number that is true if a run was ended because it was stuck
 _run_lock = threading.Lock()
 
@@ -38,7 +39,12 @@ class EvaluationCase:
     @property
     def identifying_columns(self) -> dict[str, Number]:
         """The columns that identify this case in the table of results, by name."""
-        return {"row": self.row, "setting": self.setting, "controller": self.controller, "field": self.field}
+        return {
+            "row": self.row,
+            "setting": self.setting,
+            "controller": self.controller,
+            "field": self.field,
+        }
 
 
 class CaseOutcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -66,7 +72,9 @@ def make_case_id(config: RunConfig, stall_timeout_s: float) -> str:
     return f"{compute_config_hash(config)}-{compute_code_digest()}-{stall_timeout_s:g}"
 
 
-def run_case(config_json: bytes, expected_code: str, stall_timeout_s: float, timeout_s: float) -> CaseOutcome:
+def run_case(
+    config_json: bytes, expected_code: str, stall_timeout_s: float, timeout_s: float
+) -> CaseOutcome:
     """Run one case of an evaluation in this process, and return its metrics or its error.
 
     Exceptions that are no SnakesimError, such as those of a controller, are not caught.
@@ -86,7 +94,9 @@ def run_case(config_json: bytes, expected_code: str, stall_timeout_s: float, tim
         )
     with _run_lock:  # a process makes one run at a time, because a run captures what is printed
         try:
-            return _simulate_case(msgspec.json.decode(config_json, type=RunConfig), stall_timeout_s, timeout_s)
+            return _simulate_case(
+                msgspec.json.decode(config_json, type=RunConfig), stall_timeout_s, timeout_s
+            )
         except TimeLimitError:
             return make_timeout_outcome(timeout_s)
         except SnakesimError as error:
@@ -96,7 +106,9 @@ def run_case(config_json: bytes, expected_code: str, stall_timeout_s: float, tim
 def _simulate_case(config: RunConfig, stall_timeout_s: float, timeout_s: float) -> CaseOutcome:
     validate_start_pose(config)
     with closing(StepWatchdog(timeout_s, error_type=TimeLimitError)) as limit, limit:
-        result = simulate(config, until_goal=True, stall_timeout_s=stall_timeout_s, turn_limit_s=timeout_s)
+        result = simulate(
+            config, until_goal=True, stall_timeout_s=stall_timeout_s, turn_limit_s=timeout_s
+        )
     numbers = collect_reproducible_metrics(result.summary)
     numbers[GAVE_UP_FIELD] = result.has_stalled and not result.summary.crossed
     return CaseOutcome(numbers=numbers)
@@ -104,10 +116,16 @@ def _simulate_case(config: RunConfig, stall_timeout_s: float, timeout_s: float) 
 
 def make_timeout_outcome(timeout_s: float) -> CaseOutcome:
     """Return the outcome of a case that was stopped at its limit of wall time."""
-    return CaseOutcome(error=f"stopped after {timeout_s:g} s of wall time; the suite's `limit_s` allows no more")
+    return CaseOutcome(
+        error=f"stopped after {timeout_s:g} s of wall time; the suite's `limit_s` allows no more"
+    )
 
 
 def collect_reproducible_metrics(summary: RunSummary) -> dict[str, Number]:
     """Return every plain field of a summary that depends only on configuration and code."""
-    fields = {name: getattr(summary, name) for name in summary.__struct_fields__ if name not in WALL_CLOCK_FIELDS}
+    fields = {
+        name: getattr(summary, name)
+        for name in summary.__struct_fields__
+        if name not in WALL_CLOCK_FIELDS
+    }
     return {name: value for name, value in fields.items() if isinstance(value, Number)}

@@ -24,7 +24,8 @@ if TYPE_CHECKING:  # Dask takes a second to import, and only `--cluster` needs i
     from distributed import Client, Future
 
 MAX_RETRIES = 2  # of a case that raised in a worker of a cluster
-KILL_GRACE_PERIOD_S = 30.0  # after a case's own timeout, which only Python code obeys; workers take time to start
+# After a case's own timeout, which only Python code obeys; workers take time to start.
+KILL_GRACE_PERIOD_S = 30.0
 
 
 class CaseWorkers(Protocol):
@@ -34,7 +35,9 @@ class CaseWorkers(Protocol):
         """Return how many workers there are now, that is how many cases run at a time."""
         ...
 
-    def run_cases(self, cases: Sequence[EvaluationCase]) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
+    def run_cases(
+        self, cases: Sequence[EvaluationCase]
+    ) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
         """Run all cases, and yield each with its outcome as soon as it is done.
 
         Args:
@@ -74,7 +77,9 @@ class LocalWorkers:
     def count_workers(self) -> int:
         return self._pool.size
 
-    def run_cases(self, cases: Sequence[EvaluationCase]) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
+    def run_cases(
+        self, cases: Sequence[EvaluationCase]
+    ) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
         if not cases:
             return
         calls = [_make_call_arguments(case) for case in cases]
@@ -92,7 +97,9 @@ class ClusterWorkers:
     def count_workers(self) -> int:
         return max(len(self._client.scheduler_info(n_workers=-1)["workers"]), 1)
 
-    def run_cases(self, cases: Sequence[EvaluationCase]) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
+    def run_cases(
+        self, cases: Sequence[EvaluationCase]
+    ) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
         from distributed import as_completed
 
         submitted: dict[Future, EvaluationCase] = {}

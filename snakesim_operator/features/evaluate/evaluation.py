@@ -29,7 +29,11 @@ from snakesim_operator.features.evaluate.case import EvaluationCase
 from snakesim_operator.features.evaluate.cluster import start_workers
 from snakesim_operator.features.evaluate.page import render_evaluation_page
 from snakesim_operator.features.evaluate.progress import CaseProgress
-from snakesim_operator.features.evaluate.suite import EvaluationSuite, make_cases, select_cases_of_rows
+from snakesim_operator.features.evaluate.suite import (
+    EvaluationSuite,
+    make_cases,
+    select_cases_of_rows,
+)
 from snakesim_operator.features.evaluate.table import (
     find_best_controller,
     find_worst_failures,
@@ -40,7 +44,8 @@ from snakesim_operator.run.conclusion import EXIT_INTERRUPTED
 from snakesim_operator.run.folder import choose_default_folder
 from snakesim_operator.run.in_process import run_in_process
 
-FIRST_DRAWN_FIELD = 1_000_000  # fields that a suite draws are beyond any that parameters were tuned on
+# Fields that a suite draws are beyond any that parameters were tuned on.
+FIRST_DRAWN_FIELD = 1_000_000
 LAST_DRAWN_FIELD = 2_000_000_000
 PAGE_FILENAME = "evaluation.html"
 
@@ -103,17 +108,24 @@ def _run_all_cases(request: EvaluationRequest) -> int:
         ConfigError: The request is invalid.
     """
     if request.resume and request.out is None:
-        raise ConfigError("--resume: name the folder of the evaluation with --out", code="command/invalid-option")
+        raise ConfigError(
+            "--resume: name the folder of the evaluation with --out", code="command/invalid-option"
+        )
     validate_address(request.cluster)
     other_cards = [read_card(path) for path in request.against]
     first_seed = choose_first_seed(request)
-    cases = make_cases(request.suite, request.source, request.controllers, request.fields, first_seed)
+    cases = make_cases(
+        request.suite, request.source, request.controllers, request.fields, first_seed
+    )
     cases = select_cases_of_rows(cases, request.rows, request.source)
     output_folder = request.out or choose_default_folder(request.name)
     with store.open_store(output_folder, resume=request.resume) as results:
         # Cases of two rows with the same configuration have the same id, and run once.
-        cases_to_run = list({case.id: case for case in cases if case.id not in results.done}.values())
-        cases_to_run.sort(key=lambda case: case.field)  # if it is stopped, every row has results of the same fields
+        cases_to_run = list(
+            {case.id: case for case in cases if case.id not in results.done}.values()
+        )
+        # If it is stopped, every row has results of the same fields.
+        cases_to_run.sort(key=lambda case: case.field)
         if request.resume:
             print_line(f"{len(cases) - len(cases_to_run)} of {len(cases)} cases are done already")
         try:
@@ -122,7 +134,9 @@ def _run_all_cases(request: EvaluationRequest) -> int:
             _report_results(request, cases, results.done, output_folder, other_cards)
         except KeyboardInterrupt:
             done_count = sum(case.id in results.done for case in cases)
-            print_line(f"stopped: {done_count} of {len(cases)} cases are done; the same command continues with")
+            print_line(
+                f"stopped: {done_count} of {len(cases)} cases are done; the same command continues with"
+            )
             seed_option = f" --seed {first_seed}" if request.suite.fresh else ""
             print_line(f"  --resume --out {shlex.quote(str(output_folder))}{seed_option}")
             return EXIT_INTERRUPTED
@@ -154,7 +168,9 @@ def choose_first_seed(request: EvaluationRequest) -> int:
             code="command/invalid-option",
         )
     seed = secrets.randbelow(LAST_DRAWN_FIELD - FIRST_DRAWN_FIELD) + FIRST_DRAWN_FIELD
-    print_line(f"fields {seed} to {seed + request.fields - 1}, drawn now; --seed {seed} takes them again")
+    print_line(
+        f"fields {seed} to {seed + request.fields - 1}, drawn now; --seed {seed} takes them again"
+    )
     return seed
 
 
@@ -164,7 +180,11 @@ def _run_one_case(request: EvaluationRequest, only: str, step_times: SharedStepT
     print_line(f"{case.setting}, {case.controller}, field {case.field}")
     config = msgspec.json.decode(case.config, type=RunConfig)
     return run_in_process(
-        config, request.out, until_goal=True, stall_timeout_s=case.stall_timeout_s, step_times=step_times
+        config,
+        request.out,
+        until_goal=True,
+        stall_timeout_s=case.stall_timeout_s,
+        step_times=step_times,
     )
 
 
@@ -177,7 +197,9 @@ def find_case(suite: EvaluationSuite, source: str, only: str) -> EvaluationCase:
             code="command/invalid-option",
         )
     cases = make_cases(suite, source, [match["controller"]], 1, int(match["field"]))
-    matching_cases = [case for case in cases if match["row"] is None or case.row == int(match["row"])]
+    matching_cases = [
+        case for case in cases if match["row"] is None or case.row == int(match["row"])
+    ]
     if len(matching_cases) == 1:
         return matching_cases[0]
     rows = ", ".join(f"{case.row} ({case.setting})" for case in cases[:12])
@@ -193,13 +215,21 @@ def format_case_name(case: EvaluationCase) -> str:
 
 
 def _run_and_store_cases(
-    request: EvaluationRequest, cases: Sequence[EvaluationCase], results: store.ResultStore, output_folder: Path
+    request: EvaluationRequest,
+    cases: Sequence[EvaluationCase],
+    results: store.ResultStore,
+    output_folder: Path,
 ) -> None:
     """Run cases on workers, and store each as it is done."""
-    with start_workers(request.cluster, request.workers) as pool, CaseProgress(len(cases)) as progress:
+    with (
+        start_workers(request.cluster, request.workers) as pool,
+        CaseProgress(len(cases)) as progress,
+    ):
         location = request.cluster or "on this computer"
         print_line(f"{len(cases)} cases on {pool.count_workers()} workers, {location}")
-        print_line(f"results: {output_folder}; if this ends early, --resume --out {output_folder} continues")
+        print_line(
+            f"results: {output_folder}; if this ends early, --resume --out {output_folder} continues"
+        )
         for case, outcome in pool.run_cases(cases):
             results.append(case, outcome)
             progress.count_outcome(outcome)
@@ -265,7 +295,9 @@ def _list_worst_failures(
     failures: list[tuple[str, str, str]] = []
     for case, reason in find_worst_failures(cases, done):
         name = format_case_name(case)
-        failures.append((f"{case.setting}, {name}", reason, f"{request.command} --only {shlex.quote(name)}"))
+        failures.append(
+            (f"{case.setting}, {name}", reason, f"{request.command} --only {shlex.quote(name)}")
+        )
     return failures
 
 

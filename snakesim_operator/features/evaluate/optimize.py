@@ -18,7 +18,12 @@ from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.scenario import compose_config_table, parse_set_option
 from snakesim_operator.base.dask_cluster import validate_address
-from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, CaseOutcome, EvaluationCase, compute_code_digest
+from snakesim_operator.features.evaluate.case import (
+    GAVE_UP_FIELD,
+    CaseOutcome,
+    EvaluationCase,
+    compute_code_digest,
+)
 from snakesim_operator.features.evaluate.cluster import CaseWorkers, start_workers
 from snakesim_operator.features.evaluate.search_file import (
     IS_STUCK_ATTRIBUTE,
@@ -83,21 +88,34 @@ def run_optimization(request: SearchRequest) -> int:
             code="command/invalid-option",
         )
     # Both ends of all ranges are configured before anything is started, so that an invalid range is an error now.
-    cases_at_ends = _make_trial_cases(request, {key: value_range.low for key, value_range in range_by_key.items()})
-    cases_at_ends += _make_trial_cases(request, {key: value_range.high for key, value_range in range_by_key.items()})
+    cases_at_ends = _make_trial_cases(
+        request, {key: value_range.low for key, value_range in range_by_key.items()}
+    )
+    cases_at_ends += _make_trial_cases(
+        request, {key: value_range.high for key, value_range in range_by_key.items()}
+    )
     validate_address(request.cluster)
     study = open_study(request.storage, _make_search_command(request, range_by_key, cases_at_ends))
-    study.sampler = optuna.samplers.TPESampler(seed=request.seed + len(study.trials), constant_liar=True)
+    study.sampler = optuna.samplers.TPESampler(
+        seed=request.seed + len(study.trials), constant_liar=True
+    )
     completed_count = len(study.get_trials(states=(TrialState.COMPLETE,)))
-    storage_state = f"holds {completed_count} trials already" if completed_count else "keeps all trials"
-    print_line(f"{request.storage} {storage_state}; --storage {shlex.quote(str(request.storage))} continues with them")
+    storage_state = (
+        f"holds {completed_count} trials already" if completed_count else "keeps all trials"
+    )
+    print_line(
+        f"{request.storage} {storage_state}; --storage {shlex.quote(str(request.storage))} continues with them"
+    )
     if request.trials > completed_count:
         _run_search(request, study, range_by_key, request.trials - completed_count)
     return _report_best(request, study)
 
 
 def _run_search(
-    request: SearchRequest, study: Study, range_by_key: Mapping[str, ParameterRange], trial_count: int
+    request: SearchRequest,
+    study: Study,
+    range_by_key: Mapping[str, ParameterRange],
+    trial_count: int,
 ) -> None:
     """Run trials in batches of as many as there are workers, and print the progress after each batch.
 
@@ -130,13 +148,18 @@ def _run_search(
 
 
 def _make_search_command(
-    request: SearchRequest, range_by_key: Mapping[str, ParameterRange], cases_at_ends: Sequence[EvaluationCase]
+    request: SearchRequest,
+    range_by_key: Mapping[str, ParameterRange],
+    cases_at_ends: Sequence[EvaluationCase],
 ) -> SearchCommand:
     """Collect everything on which the results of trials depend; workers and the number of trials are not included."""
     return SearchCommand(
         scenario=request.scenario,
         rows=list(request.rows),
-        vary={key: f"{value_range.low!r}:{value_range.high!r}" for key, value_range in range_by_key.items()},
+        vary={
+            key: f"{value_range.low!r}:{value_range.high!r}"
+            for key, value_range in range_by_key.items()
+        },
         set=_parse_set_options(request),
         set_words=list(request.set),
         goal=request.goal,
@@ -148,7 +171,9 @@ def _make_search_command(
     )
 
 
-def _run_trials(request: SearchRequest, study: Study, trials: Sequence[Trial], pool: CaseWorkers) -> None:
+def _run_trials(
+    request: SearchRequest, study: Study, trials: Sequence[Trial], pool: CaseWorkers
+) -> None:
     """Run all cases of these trials, store the result of each trial in the study, and print it."""
     cases_by_trial = {trial.number: _make_trial_cases(request, trial.params) for trial in trials}
     unique_cases = {case.id: case for cases in cases_by_trial.values() for case in cases}
@@ -156,13 +181,19 @@ def _run_trials(request: SearchRequest, study: Study, trials: Sequence[Trial], p
     for case, outcome in pool.run_cases(list(unique_cases.values())):
         outcomes[case.id] = outcome
     for trial in trials:
-        _store_result(request, study, trial, [outcomes[case.id] for case in cases_by_trial[trial.number]])
+        _store_result(
+            request, study, trial, [outcomes[case.id] for case in cases_by_trial[trial.number]]
+        )
 
 
-def _store_result(request: SearchRequest, study: Study, trial: Trial, outcomes: Sequence[CaseOutcome]) -> None:
+def _store_result(
+    request: SearchRequest, study: Study, trial: Trial, outcomes: Sequence[CaseOutcome]
+) -> None:
     """Store the mean of a trial's metric in the study, or that the trial failed if a run has none, and print it."""
     values = [outcome.numbers.get(request.goal) for outcome in outcomes]
-    known_values = [float(goal_value) for goal_value in values if isinstance(goal_value, int | float)]
+    known_values = [
+        float(goal_value) for goal_value in values if isinstance(goal_value, int | float)
+    ]
     parameters = ", ".join(f"{key} {value:.4g}" for key, value in trial.params.items())
     label = f"trial {trial.user_attrs[TRIAL_NUMBER_ATTRIBUTE]}: {parameters}"
     if len(known_values) < len(values):
@@ -192,7 +223,9 @@ def _report_best(request: SearchRequest, study: Study) -> int:
         print_line(f"no trial had a {metric}")
         return 1
     best_trial = study.best_trial
-    print_line(f"best {metric}: {best_trial.value:.4g}, trial {best_trial.user_attrs[TRIAL_NUMBER_ATTRIBUTE]}")
+    print_line(
+        f"best {metric}: {best_trial.value:.4g}, trial {best_trial.user_attrs[TRIAL_NUMBER_ATTRIBUTE]}"
+    )
     if request.rows:  # the trial evaluated rows of a suite
         rows = ",".join(map(str, request.rows))
         command = ["snakesim", "study", "evaluate", request.scenario, "--rows", rows]
@@ -200,7 +233,9 @@ def _report_best(request: SearchRequest, study: Study) -> int:
         return 0
     results = best_trial.user_attrs[TRIAL_RESULTS_ATTRIBUTE]
     if len(results) > 1:
-        print_line(f"  the mean of {len(results)} runs; the first of them, {results[0]:.4g}, again:")
+        print_line(
+            f"  the mean of {len(results)} runs; the first of them, {results[0]:.4g}, again:"
+        )
     if best_trial.user_attrs[IS_STUCK_ATTRIBUTE]:
         print_line(
             "  the search ended this run when it was stuck; this command runs it to its end, so its number may differ:"
@@ -214,7 +249,9 @@ def _report_best(request: SearchRequest, study: Study) -> int:
     return 0
 
 
-def _format_command_line(words: Sequence[str], settings: Sequence[str], values: Mapping[str, Any]) -> str:
+def _format_command_line(
+    words: Sequence[str], settings: Sequence[str], values: Mapping[str, Any]
+) -> str:
     """Return a command with `--set` for each setting, as the user typed it, and for each value."""
     words = list(words)
     for setting in (*settings, *(f"{key}={value!r}" for key, value in values.items())):
@@ -228,7 +265,9 @@ def _parse_set_options(request: SearchRequest) -> dict[str, Any]:
     return {override.key: override.value for override in overrides}
 
 
-def _make_trial_cases(request: SearchRequest, parameter_values: dict[str, Any]) -> list[EvaluationCase]:
+def _make_trial_cases(
+    request: SearchRequest, parameter_values: dict[str, Any]
+) -> list[EvaluationCase]:
     """Return the cases of a trial: each seed, in each requested row of a suite. Raises ConfigError."""
     if request.rows:
         suite, _ = read_suite(request.scenario)

@@ -15,7 +15,8 @@ from snakesim_operator.results.page.charts import PlotlyDict
 from snakesim_operator.results.page.html import render_page
 
 FIGURE_HEIGHT_PX = 300
-CONTROLLER_SPREAD = 0.5  # of the distance between two settings, over which the points of the controllers are spread
+# Of the distance between two settings, over which the points of the controllers are spread.
+CONTROLLER_SPREAD = 0.5
 ValueWithInterval = tuple[float, float, float]  # middle, lower and upper end
 ComputeValue = Callable[[ResultRow], ValueWithInterval | None]
 
@@ -41,12 +42,31 @@ def render_evaluation_page(
         runs=sum(row.runs for row in rows),
         figures=[
             _draw_figure("Fields crossed, %", rows, controllers, _compute_success_rate_percent),
-            _draw_figure("Speed, m/s", rows, controllers, _make_quartile_function("advance_m_s", of_crossed=True)),
-            _draw_figure("Energy, J/m", rows, controllers, _make_quartile_function("energy_j_per_m", of_crossed=True)),
+            _draw_figure(
+                "Speed, m/s",
+                rows,
+                controllers,
+                _make_quartile_function("advance_m_s", of_crossed=True),
+            ),
+            _draw_figure(
+                "Energy, J/m",
+                rows,
+                controllers,
+                _make_quartile_function("energy_j_per_m", of_crossed=True),
+            ),
             _draw_figure("Advance, m", rows, controllers, _make_quartile_function("advance_m")),
-            _draw_figure("Net speed, m/s", rows, controllers, _make_quartile_function("displacement_m_s")),
-            _draw_figure("Net energy, J/m", rows, controllers, _make_quartile_function("displacement_energy_j_per_m")),
-            _draw_figure("Stalled time, s", rows, controllers, _make_quartile_function("stalled_s")),
+            _draw_figure(
+                "Net speed, m/s", rows, controllers, _make_quartile_function("displacement_m_s")
+            ),
+            _draw_figure(
+                "Net energy, J/m",
+                rows,
+                controllers,
+                _make_quartile_function("displacement_energy_j_per_m"),
+            ),
+            _draw_figure(
+                "Stalled time, s", rows, controllers, _make_quartile_function("stalled_s")
+            ),
         ],
         goals=any(row.crossed is not None for row in rows),
         head=headings,
@@ -78,7 +98,10 @@ def _make_quartile_function(name: str, *, of_crossed: bool = False) -> ComputeVa
 
 
 def _draw_figure(
-    axis_title: str, rows: Sequence[ResultRow], controllers: Sequence[str], compute_value: ComputeValue
+    axis_title: str,
+    rows: Sequence[ResultRow],
+    controllers: Sequence[str],
+    compute_value: ComputeValue,
 ) -> PlotlyDict | None:
     """Draw a number of the results, with one point for each row and one color for each controller.
 
@@ -104,7 +127,13 @@ def _draw_figure(
             # Controllers are drawn side by side, so that they do not hide each other.
             offset = CONTROLLER_SPREAD * ((color_index + 0.5) / len(controllers) - 0.5)
             traces.append(
-                _draw_trace(controller, color_index, points, has_number_axis=has_number_axis, x_offset=offset)
+                _draw_trace(
+                    controller,
+                    color_index,
+                    points,
+                    has_number_axis=has_number_axis,
+                    x_offset=offset,
+                )
             )
     if not traces:
         return None

@@ -43,5 +43,7 @@ class CaseProgress(StatusLine):
             parts.append(f"{self._crossed} crossed")
         if self._errors:
             parts.append(f"{self._errors} could not run")
-        parts.append(f"{format_duration(elapsed_s)} passed, about {format_duration(remaining_s)} left")
+        parts.append(
+            f"{format_duration(elapsed_s)} passed, about {format_duration(remaining_s)} left"
+        )
         return "  ".join(parts)

@@ -23,10 +23,12 @@ from sqlalchemy.exc import SQLAlchemyError
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.evaluate.case import EvaluationCase
 
-SEARCH_COMMAND_ATTRIBUTE = "snakesim_command"  # attribute of the study: the `SearchCommand` as JSON types
+# Attribute of the study: the `SearchCommand` as JSON types.
+SEARCH_COMMAND_ATTRIBUTE = "snakesim_command"
 TRIAL_NUMBER_ATTRIBUTE = "snakesim_number"  # attribute of a trial: as it was printed, from 1
 TRIAL_RESULTS_ATTRIBUTE = "snakesim_results"  # attribute of a trial: the goal of each of its runs
-IS_STUCK_ATTRIBUTE = "snakesim_stuck"  # attribute of a trial: whether its first run was ended because it was stuck
+# Attribute of a trial: whether its first run was ended because it was stuck.
+IS_STUCK_ATTRIBUTE = "snakesim_stuck"
 
 # What SQLite, SQLAlchemy and Optuna raise for a file of another kind, a folder, a full disk, another version.
 STORAGE_ERRORS = (OSError, sqlite3.Error, SQLAlchemyError, OptunaError, RuntimeError)
@@ -44,7 +46,8 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
     direction: Literal["minimize", "maximize"]
     seeds: int
     seed: int
-    configurations: str  # hash of what scenario, robot and scene files give at the ends of the ranges
+    # Hash of what scenario, robot and scene files give at the ends of the ranges.
+    configurations: str
     code: str  # hash of the installed code
 
     def format_command_line(self, storage: Path) -> str:
@@ -92,7 +95,9 @@ def open_study(path: Path, command: SearchCommand) -> Study:
         storage = _open_storage(path)
         summaries = optuna.get_all_study_summaries(storage)
         started_searches = [
-            summary for summary in summaries if summary.n_trials or SEARCH_COMMAND_ATTRIBUTE in summary.user_attrs
+            summary
+            for summary in summaries
+            if summary.n_trials or SEARCH_COMMAND_ATTRIBUTE in summary.user_attrs
         ]
         if not started_searches:
             for summary in summaries:  # of a process that was killed before its first trial
@@ -104,7 +109,9 @@ def open_study(path: Path, command: SearchCommand) -> Study:
     except STORAGE_ERRORS as error:
         message = getattr(error, "strerror", None) or str(error)
         reason = message.splitlines()[0][:200]
-        raise ConfigError(f"--storage {path}: {reason}; choose another file", code="file/not-writable") from None
+        raise ConfigError(
+            f"--storage {path}: {reason}; choose another file", code="file/not-writable"
+        ) from None
     _requeue_unfinished_trials(study)
     return study
 
@@ -112,7 +119,8 @@ def open_study(path: Path, command: SearchCommand) -> Study:
 def generate_unused_trial_numbers(study: Study) -> Iterator[int]:
     """Yield the numbers from 1 that no trial with a result has, for further trials; there is no end."""
     used_numbers = {
-        trial.user_attrs.get(TRIAL_NUMBER_ATTRIBUTE) for trial in study.get_trials(states=(TrialState.COMPLETE,))
+        trial.user_attrs.get(TRIAL_NUMBER_ATTRIBUTE)
+        for trial in study.get_trials(states=(TrialState.COMPLETE,))
     }
     number = 0
     while True:
@@ -132,7 +140,9 @@ def _open_storage(path: Path) -> RDBStorage:
 
 def _create_study(storage: BaseStorage, command: SearchCommand) -> Study:
     study = optuna.create_study(
-        storage=storage, study_name=f"{command.scenario} {command.goal}", direction=command.direction
+        storage=storage,
+        study_name=f"{command.scenario} {command.goal}",
+        direction=command.direction,
     )
     study.set_user_attr(SEARCH_COMMAND_ATTRIBUTE, msgspec.to_builtins(command))
     return study
@@ -202,13 +212,18 @@ def _describe_differences(stored: SearchCommand, requested: SearchCommand) -> It
         yield "the installed SnakeSIM has changed since then"
     # Other configurations follow from another command. They are a difference only if the command is the same.
     command_with_same_files = msgspec.structs.replace(
-        stored, configurations=requested.configurations, code=requested.code, set_words=requested.set_words
+        stored,
+        configurations=requested.configurations,
+        code=requested.code,
+        set_words=requested.set_words,
     )
     if command_with_same_files == requested and stored.configurations != requested.configurations:
         yield "the same command gives another configuration: the files of scenario, robot, scene or suite have changed"
 
 
-def _describe_differing_keys(option: str, stored: dict[str, Any], requested: dict[str, Any]) -> Iterator[str]:
+def _describe_differing_keys(
+    option: str, stored: dict[str, Any], requested: dict[str, Any]
+) -> Iterator[str]:
     for key in sorted(stored.keys() | requested.keys()):
         stored_value = stored.get(key, "not set")
         requested_value = requested.get(key, "not set")

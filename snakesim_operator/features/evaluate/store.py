@@ -70,7 +70,9 @@ def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
     path = folder / CASES_FILENAME
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file_descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+        file_descriptor = os.open(
+            path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644
+        )
     except OSError as error:
         raise ConfigError(
             f"--out {folder}: {error.strerror}; choose another folder", code="file/not-writable"
@@ -85,7 +87,8 @@ def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
         yield ResultStore(file_descriptor, _read_results(path, file_descriptor))
     except BlockingIOError:
         raise ConfigError(
-            f"--out {folder}: another evaluation is writing there; choose another folder", code="file/in-use"
+            f"--out {folder}: another evaluation is writing there; choose another folder",
+            code="file/in-use",
         ) from None
     finally:
         os.close(file_descriptor)
@@ -108,7 +111,9 @@ def _read_results(path: Path, file_descriptor: int) -> Results:
     return outcome_by_id
 
 
-def write_tables(folder: Path, cases: Sequence[EvaluationCase], outcome_by_id: Results) -> list[Path]:
+def write_tables(
+    folder: Path, cases: Sequence[EvaluationCase], outcome_by_id: Results
+) -> list[Path]:
     """Write the results in the order of the cases, as Parquet and as CSV.
 
     No value depends on the wall clock, so two evaluations of the same cases give the same files.
@@ -130,11 +135,17 @@ def write_tables(folder: Path, cases: Sequence[EvaluationCase], outcome_by_id: R
     parquet_path = folder / PARQUET_FILENAME
     csv_path = folder / CSV_FILENAME
     units = _find_units()
-    fields = [pa.field(name, type_, metadata=_make_unit_metadata(units.get(name))) for name, type_ in columns.items()]
+    fields = [
+        pa.field(name, type_, metadata=_make_unit_metadata(units.get(name)))
+        for name, type_ in columns.items()
+    ]
     schema = pa.schema(fields)
     with export_atomically(parquet_path) as temporary_path:
         pq.write_table(pa.Table.from_pylist(rows, schema=schema), temporary_path)
-    with export_atomically(csv_path) as temporary_path, temporary_path.open("x", newline="", encoding="utf-8") as file:
+    with (
+        export_atomically(csv_path) as temporary_path,
+        temporary_path.open("x", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.DictWriter(file, list(columns), extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
@@ -158,7 +169,9 @@ def _find_column_types() -> dict[str, Any]:
             continue
         alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
         # A column may be empty, so only the type besides None counts.
-        value_types = [alternative for alternative in alternatives if alternative is not types.NoneType]
+        value_types = [
+            alternative for alternative in alternatives if alternative is not types.NoneType
+        ]
         is_plain = len(value_types) == 1 and value_types[0] in ARROW_TYPE_BY_TYPE
         if is_plain:
             columns.setdefault(name, ARROW_TYPE_BY_TYPE[value_types[0]])

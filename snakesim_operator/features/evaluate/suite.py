@@ -38,9 +38,21 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.model.files import ConfigTable, FileStruct, decode_table, read_table, resolve_file_path
+from snakesim_hal.model.files import (
+    ConfigTable,
+    FileStruct,
+    decode_table,
+    read_table,
+    resolve_file_path,
+)
 from snakesim_hal.model.randomization import Randomization
-from snakesim_hal.model.scenario import KeyOverride, RunConfig, compose_config_table, encode_config, validate_start_pose
+from snakesim_hal.model.scenario import (
+    KeyOverride,
+    RunConfig,
+    compose_config_table,
+    encode_config,
+    validate_start_pose,
+)
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.programs.preflight import validate_and_complete_config
 from snakesim_operator.features.evaluate.case import EvaluationCase, make_case_id
@@ -133,12 +145,17 @@ def set_suite_values(suite: EvaluationSuite, values: dict[str, Any]) -> Evaluati
     return msgspec.structs.replace(suite, set={**suite.set, **values}, row=rows)
 
 
-def select_cases_of_rows(cases: Sequence[EvaluationCase], rows: Sequence[int], source: str) -> list[EvaluationCase]:
+def select_cases_of_rows(
+    cases: Sequence[EvaluationCase], rows: Sequence[int], source: str
+) -> list[EvaluationCase]:
     """Return the cases of some rows, by number; all cases without a row. Raises ConfigError for a missing row."""
     known = {case.row for case in cases}
     for row in rows:
         if row not in known:
-            raise ConfigError(f"--rows {row}: {source} has rows 1 to {cases[-1].row}", code="command/invalid-option")
+            raise ConfigError(
+                f"--rows {row}: {source} has rows 1 to {cases[-1].row}",
+                code="command/invalid-option",
+            )
     if not rows:
         return list(cases)
     return [case for case in cases if case.row in rows]
@@ -173,7 +190,8 @@ def make_suite_settings(suite: EvaluationSuite, source: str) -> list[SuiteSettin
                 name_parts.append(f"{label_by_key[key]} {_format_short_value(value)}")
                 varied_overrides.append(KeyOverride(key, value, f"{source}: [vary]"))
             name = ", ".join(name_parts) or "as it is"
-            varied_number = None  # the place of the row on the horizontal axis, if a single number is varied
+            # The place of the row on the horizontal axis, if a single number is varied.
+            varied_number = None
             if len(combination) == 1 and not row.name and _is_number(combination[0]):
                 varied_number = combination[0]
             overrides = [*common_overrides, *row_overrides, *varied_overrides]
@@ -186,11 +204,18 @@ def _validate_unique_names(settings: Sequence[SuiteSetting], source: str) -> Non
     counts = Counter(setting.name for setting in settings)
     repeated = [name for name, count in counts.items() if count > 1]
     if repeated:
-        raise ConfigError(f"{source}: two rows are called {min(repeated)!r}; rename one", code="config/duplicate-name")
+        raise ConfigError(
+            f"{source}: two rows are called {min(repeated)!r}; rename one",
+            code="config/duplicate-name",
+        )
 
 
 def make_cases(
-    suite: EvaluationSuite, source: str, controllers: Sequence[str], field_count: int, first_field: int
+    suite: EvaluationSuite,
+    source: str,
+    controllers: Sequence[str],
+    field_count: int,
+    first_field: int,
 ) -> list[EvaluationCase]:
     """Make every case of a suite in the order of the table, each with its whole configuration.
 
@@ -211,7 +236,8 @@ def make_cases(
     case_count = len(settings) * len(controllers or [""]) * field_count
     if case_count > MAX_CASES:
         raise ConfigError(
-            f"{source}: {case_count} cases; at most {MAX_CASES} are allowed", code="command/invalid-option"
+            f"{source}: {case_count} cases; at most {MAX_CASES} are allowed",
+            code="command/invalid-option",
         )
     cases: list[EvaluationCase] = []
     for row_number, setting in enumerate(settings, 1):
@@ -220,7 +246,9 @@ def make_cases(
             for field in range(first_field, first_field + field_count):
                 config = _configure_field(table, field, setting.randomizations)
                 if field == first_field:
-                    _validate_config(config, table, f"{source}, row {row_number} ({setting.name}), field {field}")
+                    _validate_config(
+                        config, table, f"{source}, row {row_number} ({setting.name}), field {field}"
+                    )
                 cases.append(
                     EvaluationCase(
                         id=make_case_id(config, suite.give_up_s),
@@ -237,7 +265,9 @@ def make_cases(
     return cases
 
 
-def _compose_scenario(suite: EvaluationSuite, setting: SuiteSetting, controller: str | None) -> ConfigTable:
+def _compose_scenario(
+    suite: EvaluationSuite, setting: SuiteSetting, controller: str | None
+) -> ConfigTable:
     """Return the scenario with the values of a setting, and with another controller unless `controller` is None."""
     overrides = [KeyOverride("clock_mode", "lockstep", "--clock-mode lockstep")]
     if controller:
@@ -281,7 +311,9 @@ def list_seed_keys(table: ConfigTable) -> list[str]:
     return ["seed", *(f"scene.random_field.{i}.seed" for i in range(count))]
 
 
-def _configure_field(table: ConfigTable, field: int, randomizations: Sequence[Randomization]) -> RunConfig:
+def _configure_field(
+    table: ConfigTable, field: int, randomizations: Sequence[Randomization]
+) -> RunConfig:
     """Return the configuration of one field, with the values that are drawn for it."""
     for key in list_seed_keys(table):
         table.set_value(key, field, "--seed")
@@ -291,7 +323,9 @@ def _configure_field(table: ConfigTable, field: int, randomizations: Sequence[Ra
     return decode_table(table, RunConfig)
 
 
-def _select_randomizations(suite: EvaluationSuite, excluded_keys: Sequence[str], context: str) -> list[Randomization]:
+def _select_randomizations(
+    suite: EvaluationSuite, excluded_keys: Sequence[str], context: str
+) -> list[Randomization]:
     """Return the suite's randomizations without the keys that a row leaves out.
 
     Args:
@@ -306,7 +340,8 @@ def _select_randomizations(suite: EvaluationSuite, excluded_keys: Sequence[str],
     for key in excluded_keys:
         if key not in randomized_keys:
             raise ConfigError(
-                f"{context}: `without` names {key!r}, which no [[randomize]] sets", code="command/invalid-option"
+                f"{context}: `without` names {key!r}, which no [[randomize]] sets",
+                code="command/invalid-option",
             )
     randomizations: list[Randomization] = []
     for randomization in suite.randomize:
@@ -316,7 +351,9 @@ def _select_randomizations(suite: EvaluationSuite, excluded_keys: Sequence[str],
     return randomizations
 
 
-def _flatten_overrides(values: dict[str, Any], origin: str, prefix: str = "") -> Iterator[KeyOverride]:
+def _flatten_overrides(
+    values: dict[str, Any], origin: str, prefix: str = ""
+) -> Iterator[KeyOverride]:
     """Yield an override for each value; nested tables become dotted keys, and a list replaces the whole list."""
     for key, value in values.items():
         if isinstance(value, dict) and value:
@@ -330,7 +367,10 @@ def _list_values(key: str, values: list[Any] | str, source: str) -> list[Any]:
     if isinstance(values, str):
         return parse_even_spacing(values, f"{source}: `vary.{key}`")
     if not values:
-        raise ConfigError(f"{source}: `vary.{key}` is empty; give at least one value", code="command/invalid-option")
+        raise ConfigError(
+            f"{source}: `vary.{key}` is empty; give at least one value",
+            code="command/invalid-option",
+        )
     return values
 
 
@@ -356,7 +396,10 @@ def parse_even_spacing(values: str, context: str) -> list[float]:
             "0.05:0.2:4, or a list",
             code="command/invalid-option",
         ) from None
-    return [round(first_value + (last_value - first_value) * i / (count - 1), 12) for i in range(int(count))]
+    return [
+        round(first_value + (last_value - first_value) * i / (count - 1), 12)
+        for i in range(int(count))
+    ]
 
 
 def _shorten_keys(keys: list[str]) -> dict[str, str]:

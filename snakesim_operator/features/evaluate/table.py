@@ -73,7 +73,9 @@ class ResultRow:
     @property
     def crossed(self) -> int | None:
         """The number of runs that reached their goal; None if they had no goal."""
-        crossings = [outcome.numbers.get("crossed") for outcome in self.outcomes if outcome.error is None]
+        crossings = [
+            outcome.numbers.get("crossed") for outcome in self.outcomes if outcome.error is None
+        ]
         had_no_goal = crossings and all(crossed is None for crossed in crossings)
         if had_no_goal:
             return None
@@ -135,7 +137,9 @@ class ResultRow:
         They are UNKNOWN for runs with a goal, for which the advance towards the goal counts instead.
         """
         if self.crossed is not None:
-            return dict.fromkeys((NET_M, NET_INTERVAL_M, NET_SPEED_M_S, NET_ENERGY_J_PER_M), UNKNOWN_TEXT)
+            return dict.fromkeys(
+                (NET_M, NET_INTERVAL_M, NET_SPEED_M_S, NET_ENERGY_J_PER_M), UNKNOWN_TEXT
+            )
         return {
             NET_M: _format_median(self.list_values("net_displacement_m"), 2),
             NET_INTERVAL_M: self._format_mean_interval("net_displacement_m"),
@@ -152,13 +156,17 @@ class ResultRow:
         return f"{low:.2f} to {high:.2f}"
 
 
-def group_results_by_row(cases: Sequence[EvaluationCase], outcome_by_id: Results) -> list[ResultRow]:
+def group_results_by_row(
+    cases: Sequence[EvaluationCase], outcome_by_id: Results
+) -> list[ResultRow]:
     """Return a row for each setting and controller that has results, in the order of the cases."""
     rows: dict[tuple[int, str], ResultRow] = {}
     for case in cases:
         if case.id in outcome_by_id:
             key = (case.row, case.controller)
-            row = rows.setdefault(key, ResultRow(case.row, case.setting, case.controller, case.value, []))
+            row = rows.setdefault(
+                key, ResultRow(case.row, case.setting, case.controller, case.value, [])
+            )
             row.outcomes.append(outcome_by_id[case.id])
     return list(rows.values())
 
@@ -196,9 +204,15 @@ def find_best_controller(rows: Sequence[ResultRow]) -> str:
     return max(crossed, key=lambda name: crossed[name], default="")
 
 
-def find_worst_failures(cases: Sequence[EvaluationCase], outcome_by_id: Results) -> list[tuple[EvaluationCase, str]]:
+def find_worst_failures(
+    cases: Sequence[EvaluationCase], outcome_by_id: Results
+) -> list[tuple[EvaluationCase, str]]:
     """Return the cases that failed and advanced least, each with how it ended, as far as that is known."""
-    failed = [case for case in cases if case.id in outcome_by_id and not _has_succeeded(outcome_by_id[case.id])]
+    failed = [
+        case
+        for case in cases
+        if case.id in outcome_by_id and not _has_succeeded(outcome_by_id[case.id])
+    ]
     failed.sort(key=lambda case: _compute_advance_fraction(outcome_by_id[case.id]))
     return [(case, _describe_end(outcome_by_id[case.id])) for case in failed[:MAX_LISTED_FAILURES]]
 
@@ -217,7 +231,9 @@ def compute_wilson_interval(success_count: int, trial_count: int) -> tuple[float
     p = success_count / trial_count
     z2_by_n = Z95**2 / trial_count
     center = (p + z2_by_n / 2) / (1 + z2_by_n)
-    half_width = Z95 * math.sqrt(p * (1 - p) / trial_count + z2_by_n / (4 * trial_count)) / (1 + z2_by_n)
+    half_width = (
+        Z95 * math.sqrt(p * (1 - p) / trial_count + z2_by_n / (4 * trial_count)) / (1 + z2_by_n)
+    )
     return max(center - half_width, 0.0), min(center + half_width, 1.0)
 
 

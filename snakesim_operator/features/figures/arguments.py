@@ -22,11 +22,17 @@ def _add_plot_arguments(parser: argparse.ArgumentParser) -> None:
         help="draw runs that differ in their seeds alone as their mean, with its 95 %% interval by Student's t",
     )
     instead = parser.add_mutually_exclusive_group()
-    instead.add_argument("--path", action="store_true", help="instead: the paths of head and tail, from above")
     instead.add_argument(
-        "--paper", action="store_true", help="instead: the paper's Figures 8 to 13, of this run, one file each"
+        "--path", action="store_true", help="instead: the paths of head and tail, from above"
     )
-    add_output_argument(parser, "FILE.pdf, .svg or .png, or a folder with --paper (default: in RUN)")
+    instead.add_argument(
+        "--paper",
+        action="store_true",
+        help="instead: the paper's Figures 8 to 13, of this run, one file each",
+    )
+    add_output_argument(
+        parser, "FILE.pdf, .svg or .png, or a folder with --paper (default: in RUN)"
+    )
     parser.add_argument(
         "--width-in",
         type=make_number_parser(1.0, 40.0, "inches"),

@@ -74,12 +74,19 @@ def plot_runs(
             if path:
                 figure = draw_head_and_tail_paths(records[0], width_in, span_s)
             else:
-                figure = draw_signals(_make_groups(records, mean=mean), signal_names, width_in, span_s)
+                figure = draw_signals(
+                    _make_groups(records, mean=mean), signal_names, width_in, span_s
+                )
             write_figure(figure, figure_path)
-    return max(report_missing_data(run, record.missing) for run, record in zip(run_paths, records, strict=True))
+    return max(
+        report_missing_data(run, record.missing)
+        for run, record in zip(run_paths, records, strict=True)
+    )
 
 
-def _validate_options(runs: Sequence[Path], names: Sequence[str], *, mean: bool, from_one_run: bool) -> None:
+def _validate_options(
+    runs: Sequence[Path], names: Sequence[str], *, mean: bool, from_one_run: bool
+) -> None:
     """Raise ConfigError for options that do not fit together."""
     if from_one_run and (len(runs) > 1 or names or mean):
         raise ConfigError(
@@ -88,7 +95,8 @@ def _validate_options(runs: Sequence[Path], names: Sequence[str], *, mean: bool,
         )
     if mean and len(runs) == 1:
         raise ConfigError(
-            "--mean: one run has no mean; give several runs that differ in their seeds", code="command/invalid-option"
+            "--mean: one run has no mean; give several runs that differ in their seeds",
+            code="command/invalid-option",
         )
 
 
@@ -107,10 +115,13 @@ def _make_groups(records: Sequence[RunRecord], *, mean: bool) -> list[RunGroup]:
     return groups
 
 
-def _write_paper_figures(record: RunRecord, folder: Path, width_in: float, span_s: tuple[float, float]) -> None:
+def _write_paper_figures(
+    record: RunRecord, folder: Path, width_in: float, span_s: tuple[float, float]
+) -> None:
     if folder.suffix in FILE_SUFFIXES:
         raise ConfigError(
-            f"--out {folder}: the paper's figures are several files; give a folder", code="command/invalid-option"
+            f"--out {folder}: the paper's figures are several files; give a folder",
+            code="command/invalid-option",
         )
     for name, figure in draw_paper_figures(record, width_in, span_s).items():
         write_figure(figure, folder / f"{name}.pdf")

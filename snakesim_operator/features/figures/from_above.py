@@ -21,7 +21,9 @@ MARGIN_M = 0.1  # around everything that is drawn
 MIN_HEIGHT_IN = 1.2
 
 
-def draw_head_and_tail_paths(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> Figure:
+def draw_head_and_tail_paths(
+    record: RunRecord, width_in: float, span_s: tuple[float, float]
+) -> Figure:
     """Draw the paths of head and tail, with the obstacles, and the body where it began and ended.
 
     Args:
@@ -49,7 +51,10 @@ def draw_head_and_tail_paths(record: RunRecord, width_in: float, span_s: tuple[f
     axes.plot(*head_w.T, color=HEAD_COLOR, label="head")
     axes.set_aspect("equal")
     axes.set(
-        xlim=(min_corner_w[0], max_corner_w[0]), ylim=(min_corner_w[1], max_corner_w[1]), xlabel="x [m]", ylabel="y [m]"
+        xlim=(min_corner_w[0], max_corner_w[0]),
+        ylim=(min_corner_w[1], max_corner_w[1]),
+        xlabel="x [m]",
+        ylabel="y [m]",
     )
     axes.locator_params(axis="y", nbins=4)
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
@@ -60,8 +65,12 @@ def _sample_body_points_w(record: RunRecord, span_s: tuple[float, float]) -> Flo
     """Return tail end, joints and head end in the world at evenly chosen ticks, (n, joints + 2, 3)."""
     time_s = record.time_s - get_time_origin_s(record)
     rows = np.flatnonzero(record.has_pose & (time_s >= span_s[0]) & (time_s <= span_s[1]))
-    chosen = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_PATH_POINTS)).astype(int))]
-    nodes_w = [nodes for nodes in map(record.find_body_points_w, chosen.tolist()) if nodes is not None]
+    chosen = rows[
+        np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_PATH_POINTS)).astype(int))
+    ]
+    nodes_w = [
+        nodes for nodes in map(record.find_body_points_w, chosen.tolist()) if nodes is not None
+    ]
     if not nodes_w:
         raise ConfigError(
             f"{record.path}: the pose is unknown in this part of the run, so there is no path; a path needs a robot "
@@ -91,14 +100,27 @@ def plot_body(axes: Axes, record: RunRecord, body_points_w: Floats, *, alpha: fl
         alpha: Opacity; 1: opaque, 0: invisible.
     """
     joints_w = body_points_w[1:-1]
-    for rear, front, link in zip(body_points_w[:-1], body_points_w[1:], record.description.links, strict=True):
+    for rear, front, link in zip(
+        body_points_w[:-1], body_points_w[1:], record.description.links, strict=True
+    ):
         length_m = max(float(np.hypot(*(front - rear))), 1e-9)
         along_link = (front - rear) / length_m
         half_width_w = link.radius_m * np.array([-along_link[1], along_link[0]])
-        corners = [rear + half_width_w, front + half_width_w, front - half_width_w, rear - half_width_w]
+        corners = [
+            rear + half_width_w,
+            front + half_width_w,
+            front - half_width_w,
+            rear - half_width_w,
+        ]
         axes.add_patch(Polygon(corners, closed=True, color=BODY_COLOR, linewidth=0, alpha=alpha))
     for joint_w in joints_w:
         axes.add_patch(
-            Circle(tuple(joint_w), record.description.links[0].radius_m, color=BODY_COLOR, linewidth=0, alpha=alpha)
+            Circle(
+                tuple(joint_w),
+                record.description.links[0].radius_m,
+                color=BODY_COLOR,
+                linewidth=0,
+                alpha=alpha,
+            )
         )
     axes.plot(*joints_w.T, ".", color="white", markersize=2.0)

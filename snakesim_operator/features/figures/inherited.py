@@ -6,7 +6,8 @@ import sys
 from typing import Any
 
 BACKEND_VARIABLE = "MPLBACKEND"
-PLAIN_TEXT_STYLE: Any = {"text.usetex": False}  # LaTeX may be missing, and takes the `_` of our names for a subscript
+# LaTeX may be missing, and takes the `_` of our names for a subscript.
+PLAIN_TEXT_STYLE: Any = {"text.usetex": False}
 
 
 def import_matplotlib() -> None:

@@ -31,7 +31,12 @@ def _place_legend(axes: Axes, names: list[str]) -> float:
     column_count = len(names)
     while True:
         legend = axes.legend(
-            handles, names, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=column_count, borderaxespad=0.2
+            handles,
+            names,
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=column_count,
+            borderaxespad=0.2,
         )
         fits = legend.get_window_extent().width <= axes.get_window_extent().width
         if fits or column_count == 1:
@@ -43,4 +48,6 @@ def _place_legend(axes: Axes, names: list[str]) -> float:
 
 def place_legend_beside_title(axes: Axes) -> None:
     """Place a legend in one row above axes, at the right, where the title at the left leaves room."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(axes.lines), borderaxespad=0.2)
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(axes.lines), borderaxespad=0.2
+    )

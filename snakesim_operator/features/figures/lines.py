@@ -25,7 +25,9 @@ FIGURE_STYLE: Any = {
 }
 
 
-def plot_over_time(axes: Axes, record: RunRecord, values: Floats, name: str = "", **look: str | float) -> None:
+def plot_over_time(
+    axes: Axes, record: RunRecord, values: Floats, name: str = "", **look: str | float
+) -> None:
     """Plot values, (ticks,), over the time since the first tick.
 
     Args:

@@ -19,8 +19,15 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.figures.from_above import OBSTACLE_COLOR, plot_body, plot_obstacles
 from snakesim_operator.features.figures.legends import place_legend_beside_title
 from snakesim_operator.features.figures.lines import Floats, plot_over_time
-from snakesim_operator.results.metrics.propulsion import PropulsionInterval, find_propulsion_intervals
-from snakesim_operator.results.report.snapshots import ForceBalance, RunSnapshot, find_snapshots_with_force_balance
+from snakesim_operator.results.metrics.propulsion import (
+    PropulsionInterval,
+    find_propulsion_intervals,
+)
+from snakesim_operator.results.report.snapshots import (
+    ForceBalance,
+    RunSnapshot,
+    find_snapshots_with_force_balance,
+)
 from snakesim_operator.results.report.timeline import (
     compute_reference_rad,
     find_most_propelling_joints,
@@ -46,7 +53,9 @@ PlotSignal = Callable[[Axes, RunRecord, int], None]
 """Draws a signal of the joint with this index into the axes."""
 
 
-def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, float]) -> dict[str, Figure]:
+def draw_paper_figures(
+    record: RunRecord, width_in: float, span_s: tuple[float, float]
+) -> dict[str, Figure]:
     """Draw figures 8 to 13 of the SnakeSIM paper for a run: its contact forces, joint angles and joint torques.
 
     The docstring of this module lists what each figure shows.
@@ -70,7 +79,9 @@ def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, 
             code="recording/missing-data",
         )
     first_snapshot = snapshots_with_balance[0]
-    selected_indices = np.unique(np.linspace(0, len(snapshots_with_balance) - 1, MAX_SNAPSHOTS).astype(int))
+    selected_indices = np.unique(
+        np.linspace(0, len(snapshots_with_balance) - 1, MAX_SNAPSHOTS).astype(int)
+    )
     selected_snapshots = [snapshots_with_balance[i] for i in selected_indices]
     intervals = find_propulsion_intervals(record)
     propelling_joints = find_most_propelling_joints(intervals, MAX_JOINTS)
@@ -80,8 +91,12 @@ def draw_paper_figures(record: RunRecord, width_in: float, span_s: tuple[float, 
         "figure-9": _draw_propelling_joint(record, first_snapshot, width_in),
         "figure-10": _draw_snapshots(record, selected_snapshots, width_in),
         "figure-11": _draw_all_torques(record, width_in, drawn_span_s),
-        "figure-12": _draw_joint_signals(record, propelling_joints, intervals, width_in, drawn_span_s, _plot_angle),
-        "figure-13": _draw_joint_signals(record, propelling_joints, intervals, width_in, drawn_span_s, _plot_torque),
+        "figure-12": _draw_joint_signals(
+            record, propelling_joints, intervals, width_in, drawn_span_s, _plot_angle
+        ),
+        "figure-13": _draw_joint_signals(
+            record, propelling_joints, intervals, width_in, drawn_span_s, _plot_torque
+        ),
     }
 
 
@@ -114,7 +129,8 @@ def _draw_propelling_joint(record: RunRecord, snapshot: RunSnapshot, width_in: f
     shown_points_w = [contact_w]
     joint = snapshot.propulsion_joint
     if joint is not None:
-        joint_w = find_body_points_xy_w(record, snapshot.row)[joint + 1]  # the first of these points is the tail end
+        # The first of these points is the tail end.
+        joint_w = find_body_points_xy_w(record, snapshot.row)[joint + 1]
         torque_nm = record.torque_nm[snapshot.row, joint]
         axes.plot(*joint_w, "o", color=rcParams["text.color"], markersize=5)
         axes.annotate(f"$\\tau$ {torque_nm:.2f} N·m", joint_w, (6, -12), textcoords="offset points")
@@ -135,7 +151,9 @@ def _draw_snapshots(record: RunRecord, snapshots: Sequence[RunSnapshot], width_i
         balance = _require_balance(snapshot)
         _plot_scene(scene_axes, record, snapshot)
         _plot_forces(scene_axes, balance)
-        scene_axes.set_title(f"({letter}) {snapshot.time_s:.1f} s", loc="left", fontsize=TITLE_FONT_SIZE)
+        scene_axes.set_title(
+            f"({letter}) {snapshot.time_s:.1f} s", loc="left", fontsize=TITLE_FONT_SIZE
+        )
         _plot_force_polygon(polygon_axes, balance)
     return figure
 
@@ -199,7 +217,12 @@ def _draw_joint_signals(
 def _plot_angle(axes: Axes, record: RunRecord, joint_index: int) -> None:
     plot_over_time(axes, record, record.angle_rad[:, joint_index], "measured", color=MEASURED_COLOR)
     plot_over_time(
-        axes, record, compute_reference_rad(record, joint_index), "reference", color=REFERENCE_COLOR, linestyle="--"
+        axes,
+        record,
+        compute_reference_rad(record, joint_index),
+        "reference",
+        color=REFERENCE_COLOR,
+        linestyle="--",
     )
     axes.set_ylabel("angle [rad]")
 
@@ -234,7 +257,11 @@ def _plot_forces(axes: Axes, balance: ForceBalance) -> None:
     for i, contact in enumerate(balance.contacts):
         label = f"$f_{i + 1}$ {balance.magnitudes_n[i]:.1f} N"
         _plot_force(
-            axes, contact.position_w[:2], m_per_n * np.asarray(balance.contact_forces_n[i]), label, SOLVED_COLOR
+            axes,
+            contact.position_w[:2],
+            m_per_n * np.asarray(balance.contact_forces_n[i]),
+            label,
+            SOLVED_COLOR,
         )
     label = f"$f_s$ {balance.commanded_force_n:.1f} N"
     first_w = balance.contacts[0].position_w[:2]
@@ -245,7 +272,12 @@ def _plot_force(axes: Axes, start: Sequence[float], arrow: Floats, label: str, c
     tip = np.array(start) + arrow
     _plot_arrow(axes, start, tip, color)
     axes.annotate(
-        label, (tip[0], tip[1]), LABEL_OFFSET_PT, textcoords="offset points", fontsize=FORCE_FONT_SIZE, color=color
+        label,
+        (tip[0], tip[1]),
+        LABEL_OFFSET_PT,
+        textcoords="offset points",
+        fontsize=FORCE_FONT_SIZE,
+        color=color,
     )
 
 
@@ -264,7 +296,9 @@ def _plot_force_polygon(axes: Axes, balance: ForceBalance) -> None:
         end = corners_n[i + 1]
         _plot_arrow(axes, start, end, COMMANDED_COLOR if i == 0 else SOLVED_COLOR)
         middle = (start + end) / 2
-        axes.annotate(label, middle, LABEL_OFFSET_PT, textcoords="offset points", fontsize=FORCE_FONT_SIZE)
+        axes.annotate(
+            label, middle, LABEL_OFFSET_PT, textcoords="offset points", fontsize=FORCE_FONT_SIZE
+        )
     _plot_arrow(axes, corners_n[1], corners_n[-1], rcParams["text.color"])
     min_corner_n = corners_n.min(axis=0)
     max_corner_n = corners_n.max(axis=0)
@@ -277,7 +311,9 @@ def _plot_force_polygon(axes: Axes, balance: ForceBalance) -> None:
     axes.set_aspect("equal")
 
 
-def _plot_arrow(axes: Axes, start: Floats | Sequence[float], end: Floats | Sequence[float], color: str) -> None:
+def _plot_arrow(
+    axes: Axes, start: Floats | Sequence[float], end: Floats | Sequence[float], color: str
+) -> None:
     style = {
         "arrowstyle": "-|>",
         "color": color,

@@ -50,7 +50,8 @@ def load_armed_runs(paths: Sequence[Path]) -> list[RunRecord]:
         record = RunRecord.load(path)
         if not len(record.time_s):
             raise ConfigError(
-                f"{path}: nothing was recorded in it; the robot was never armed", code="recording/never-armed"
+                f"{path}: nothing was recorded in it; the robot was never armed",
+                code="recording/never-armed",
             )
         records.append(record)
     return records
@@ -92,7 +93,10 @@ def group_runs_by_configuration(records: Sequence[RunRecord]) -> list[RunGroup]:
     for members in records_by_key.values():
         _validate_seeds_differ(members)
     labels = _make_labels(list(settings_by_key.values()), list(records_by_key.values()))
-    return [RunGroup(label, members) for label, members in zip(labels, records_by_key.values(), strict=True)]
+    return [
+        RunGroup(label, members)
+        for label, members in zip(labels, records_by_key.values(), strict=True)
+    ]
 
 
 def _read_settings(record: RunRecord) -> dict[str, Any]:
@@ -119,10 +123,14 @@ def _validate_seeds_differ(members: Sequence[RunRecord]) -> None:
             )
 
 
-def _make_labels(settings: Sequence[dict[str, Any]], groups: Sequence[Sequence[RunRecord]]) -> list[str]:
+def _make_labels(
+    settings: Sequence[dict[str, Any]], groups: Sequence[Sequence[RunRecord]]
+) -> list[str]:
     """Return a label for each group: the settings in which the groups differ, and the number of runs."""
     keys = list(dict.fromkeys(key for values in settings for key in values))
-    differing = [key for key in keys if any(values.get(key) != settings[0].get(key) for values in settings)]
+    differing = [
+        key for key in keys if any(values.get(key) != settings[0].get(key) for values in settings)
+    ]
     labels: list[str] = []
     for values, members in zip(settings, groups, strict=True):
         names = [_describe_setting(key, values) for key in differing]

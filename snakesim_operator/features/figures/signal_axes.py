@@ -17,14 +17,30 @@ from snakesim_operator.features.figures.legends import place_legends
 from snakesim_operator.features.figures.run_groups import RunGroup
 from snakesim_operator.results.metrics.intervals import find_mean_and_half_width
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_operator.results.signals import UNITS, compute_signals, find_unit, make_signal_columns, select_columns
+from snakesim_operator.results.signals import (
+    UNITS,
+    compute_signals,
+    find_unit,
+    make_signal_columns,
+    select_columns,
+)
 from snakesim_operator.results.time_axis import get_time_origin_s
 
 AXES_HEIGHT_IN = 1.5  # height of a pair of axes
 DEFAULT_SIGNALS = ("angle_rad", "torque_nm")
-MODE_BY_UNIT = {"rad": JointMode.POSITION, "rad/s": JointMode.VELOCITY, "N·m": JointMode.TORQUE}  # of a joint's target
+# Of a joint's target.
+MODE_BY_UNIT = {"rad": JointMode.POSITION, "rad/s": JointMode.VELOCITY, "N·m": JointMode.TORQUE}
 LINE_STYLES = ("-", "--", ":", "-.")  # of the columns of one run
-RUN_COLORS = ("#2c6fbb", "#c0392b", "#3a923a", "#8452a3", "#d98c1f", "#2aa0a4", "#9c5a3c", "#d45c9b")
+RUN_COLORS = (
+    "#2c6fbb",
+    "#c0392b",
+    "#3a923a",
+    "#8452a3",
+    "#d98c1f",
+    "#2aa0a4",
+    "#9c5a3c",
+    "#d45c9b",
+)
 MAX_TITLE_LENGTH = 18  # characters of an axis label; its unit needs room in AXES_HEIGHT_IN as well
 INTERVAL_OPACITY = 0.25
 
@@ -56,7 +72,10 @@ class RunSignals:
     def select_columns_of_unit(self, name: str, unit: str) -> dict[str, NDArray[Any]]:
         """Return the columns of a signal. Targets whose mode has another unit are NaN."""
         columns = select_columns(name, self.columns)
-        return {column: self._mask_other_units(column, values, unit) for column, values in columns.items()}
+        return {
+            column: self._mask_other_units(column, values, unit)
+            for column, values in columns.items()
+        }
 
     def _mask_other_units(self, column: str, values: NDArray[Any], unit: str) -> NDArray[Any]:
         """Return the values of a column, with NaN for targets whose mode has another unit."""
@@ -87,14 +106,19 @@ def draw_signals(
     all_axes: list[Axes] = list(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
     legend_entries: list[list[str]] = []
     for axes, joined_names in zip(all_axes, names, strict=True):
-        legend_entries.append(_plot_signals(axes, groups, signals_by_group, joined_names.split(",")))
+        legend_entries.append(
+            _plot_signals(axes, groups, signals_by_group, joined_names.split(","))
+        )
     _set_time_limits(all_axes[-1], groups, span_s)
     place_legends(figure, all_axes, legend_entries)
     return figure
 
 
 def _plot_signals(
-    axes: Axes, groups: Sequence[RunGroup], signals_by_group: Sequence[Sequence[RunSignals]], names: Sequence[str]
+    axes: Axes,
+    groups: Sequence[RunGroup],
+    signals_by_group: Sequence[Sequence[RunSignals]],
+    names: Sequence[str],
 ) -> list[str]:
     """Plot signals over time into one pair of axes.
 
@@ -146,14 +170,20 @@ def _make_curves(
     for run in runs:
         for name in names:
             for column, values in run.select_columns_of_unit(name, unit).items():
-                values_by_column.setdefault(column, []).append((run, np.asarray(values, dtype=float)))
+                values_by_column.setdefault(column, []).append(
+                    (run, np.asarray(values, dtype=float))
+                )
     curves: list[SignalCurve] = []
     for i, (column, runs_with_values) in enumerate(values_by_column.items()):
         label = _label_column(column, names)
         line_style = "-"
         if color is not None:
             is_whole_signal = len(names) == 1 and len(values_by_column) > 1
-            label = group.label if is_whole_signal or len(values_by_column) == 1 else f"{group.label}: {label}"
+            label = (
+                group.label
+                if is_whole_signal or len(values_by_column) == 1
+                else f"{group.label}: {label}"
+            )
             line_style = "-" if is_whole_signal else LINE_STYLES[i % len(LINE_STYLES)]
         elif len(group.records) > 1:
             label = f"{label}, {group.label}"
@@ -173,21 +203,29 @@ def _make_curve(
     if len(runs_with_values) == 1:
         return SignalCurve(label, first_run.time_s, values, color=color, line_style=line_style)
     time_s = first_run.time_s[first_run.time_s <= group.end_s + 1e-9]
-    samples = [_sample_nearest(time_s, run.time_s, run_values) for run, run_values in runs_with_values]
+    samples = [
+        _sample_nearest(time_s, run.time_s, run_values) for run, run_values in runs_with_values
+    ]
     mean, half_width = find_mean_and_half_width(np.array(samples))
     return SignalCurve(label, time_s, mean, half_width, color, line_style)
 
 
 def _sample_nearest(time_s: Floats, own_time_s: Floats, values: Floats) -> Floats:
     """Return the values of the rows that are next to the times, (n,). Runs of one configuration have equal ticks."""
-    after = np.clip(np.searchsorted(own_time_s, time_s), 1, len(own_time_s) - 1) if len(own_time_s) > 1 else 0
+    after = (
+        np.clip(np.searchsorted(own_time_s, time_s), 1, len(own_time_s) - 1)
+        if len(own_time_s) > 1
+        else 0
+    )
     before = np.maximum(np.asarray(after) - 1, 0)
     is_nearer_before = time_s - own_time_s[before] <= own_time_s[after] - time_s
     return values[np.where(is_nearer_before, before, after)]
 
 
 def _plot_curve(axes: Axes, curve: SignalCurve) -> None:
-    (line,) = axes.plot(curve.time_s, curve.values, label=curve.label, color=curve.color, linestyle=curve.line_style)
+    (line,) = axes.plot(
+        curve.time_s, curve.values, label=curve.label, color=curve.color, linestyle=curve.line_style
+    )
     if curve.half_width is not None:
         axes.fill_between(
             curve.time_s,

@@ -12,7 +12,12 @@ from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, LabPlan
 
 ANY_KEY = "**"
 # Tools look for robots with a wildcard in the place of the namespace, as in `**/alive/hal`.
-SEARCH_MESSAGES = ("declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber")
+SEARCH_MESSAGES = (
+    "declare_subscriber",
+    "query",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
 ALL_MESSAGES = (
     "put",
     "delete",
@@ -72,18 +77,20 @@ def _make_rules(identity: CertificateIdentity, lab: LabPlan) -> list[dict[str, A
     Returns:
         The rules as Zenoh's configuration file has them, each with an id.
     """
-    messages_by_key_and_flow: dict[tuple[str, str], set[str]] = defaultdict(set)  # (key, flow) -> messages
+    # (key, flow) -> messages.
+    messages_by_key_and_flow: dict[tuple[str, str], set[str]] = defaultdict(set)
     for flow, message, key in _iterate_permissions(identity, lab):
         messages_by_key_and_flow[key, flow].add(message)
 
-    keys_by_flow_and_messages: dict[tuple[str, tuple[str, ...]], list[str]] = defaultdict(
-        list
-    )  # (flow, messages) -> keys
+    # (flow, messages) -> keys.
+    keys_by_flow_and_messages: dict[tuple[str, tuple[str, ...]], list[str]] = defaultdict(list)
     for (key, flow), messages in messages_by_key_and_flow.items():
         keys_by_flow_and_messages[flow, tuple(sorted(messages))].append(key)
 
     rules: list[dict[str, Any]] = []
-    for rule_number, ((flow, rule_messages), rule_keys) in enumerate(sorted(keys_by_flow_and_messages.items()), 1):
+    for rule_number, ((flow, rule_messages), rule_keys) in enumerate(
+        sorted(keys_by_flow_and_messages.items()), 1
+    ):
         rule = {
             "id": f"{identity.common_name}/{rule_number}",
             "permission": "allow",
@@ -112,7 +119,9 @@ def _iterate_permissions(identity: CertificateIdentity, lab: LabPlan) -> Iterato
         return
     for robot in identity.list_robots(lab):
         faults = lab.file.robots[robot].faults
-        for flow, message, key in iterate_permissions(identity.role, identity.services, allow_fault_injection=faults):
+        for flow, message, key in iterate_permissions(
+            identity.role, identity.services, allow_fault_injection=faults
+        ):
             yield KeyPermission(flow, message, f"{robot}/{key}")
             if key == ANY_KEY or message not in SEARCH_MESSAGES:
                 continue

@@ -23,7 +23,10 @@ def _add_lab_file_argument(parser: argparse.ArgumentParser) -> None:
 def _add_certs_arguments(parser: argparse.ArgumentParser) -> None:
     _add_lab_file_argument(parser)
     parser.add_argument(
-        "--authority", type=Path, metavar="DIR", help="folder of the authority (default: authority in --out)"
+        "--authority",
+        type=Path,
+        metavar="DIR",
+        help="folder of the authority (default: authority in --out)",
     )
     parser.add_argument("--rotate", action="store_true", help="renew every certificate")
 
@@ -61,7 +64,9 @@ def _run_certs(arguments: argparse.Namespace) -> int:
     width = max(len(identity.common_name) for identity in iterate_identities(lab))
     for identity, state, until in done:
         print_line(f"{identity.common_name:<{width}}  {state:<7}  ends {until:%Y-%m-%d %H:%M} UTC")
-    print_line(f"{authority}: keep this folder where no other user can read it; copy it to no machine")
+    print_line(
+        f"{authority}: keep this folder where no other user can read it; copy it to no machine"
+    )
     return 0
 
 
@@ -101,14 +106,20 @@ COMMANDS: Commands = (
         help="Write the routers, sessions and systemd units of each machine into a folder.",
         add=_add_lab_file_argument,
         run=_run_render,
-        examples=("lab render lab.toml --out lab", "lab render /etc/snakesim/lab.toml --out /etc/snakesim/lab"),
+        examples=(
+            "lab render lab.toml --out lab",
+            "lab render /etc/snakesim/lab.toml --out /etc/snakesim/lab",
+        ),
     ),
     Command(
         name="lab certs",
         help="Make the lab's certificate authority, and the certificates that are missing or ending.",
         add=_add_certs_arguments,
         run=_run_certs,
-        examples=("lab certs lab.toml --out lab", "lab certs lab.toml --out lab --authority ~/authority --rotate"),
+        examples=(
+            "lab certs lab.toml --out lab",
+            "lab certs lab.toml --out lab --authority ~/authority --rotate",
+        ),
     ),
     Command(
         name="lab check",

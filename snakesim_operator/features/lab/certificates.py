@@ -58,7 +58,9 @@ def load_or_create_authority(folder: Path, lab: LabPlan) -> CertificateIssuer:
     key = ec.generate_private_key(ec.SECP256R1())
     certificate = _make_authority_certificate(key, lab)
     _write_file_with_mode(key_path, _encode_key(key), 0o600)
-    _write_file_with_mode(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    _write_file_with_mode(
+        certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644
+    )
     return CertificateIssuer(certificate, key)
 
 
@@ -98,7 +100,8 @@ def _make_private_folder(folder: Path) -> None:
     except FileExistsError:
         if not folder.is_dir():
             raise ConfigError(
-                f"--authority {folder}: is a file; name a folder", code="certificate/invalid-authority"
+                f"--authority {folder}: is a file; name a folder",
+                code="certificate/invalid-authority",
             ) from None
         mode = stat.S_IMODE(folder.stat().st_mode)
         if mode & 0o077:
@@ -133,7 +136,10 @@ def _read_authority(certificate_path: Path, key_path: Path) -> CertificateIssuer
             f"{certificate_path.parent}: not an authority of this command: {error}",
             code="certificate/invalid-authority",
         ) from None
-    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+    if (
+        not isinstance(key, ec.EllipticCurvePrivateKey)
+        or key.public_key() != certificate.public_key()
+    ):
         raise ConfigError(
             f"{key_path}: not the key of {certificate_path}; restore the one that belongs to it",
             code="certificate/invalid-authority",
@@ -148,7 +154,10 @@ def _read_authority(certificate_path: Path, key_path: Path) -> CertificateIssuer
 
 
 def issue_certificate(
-    issuer: CertificateIssuer, identity: CertificateIdentity, lab: LabPlan, lifetime: timedelta | None = None
+    issuer: CertificateIssuer,
+    identity: CertificateIdentity,
+    lab: LabPlan,
+    lifetime: timedelta | None = None,
 ) -> tuple[bytes, bytes]:
     """Create a private key and a certificate that identifies one machine of a lab with its role.
 
@@ -173,7 +182,9 @@ def issue_certificate(
         .public_key(key.public_key())
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-        .add_extension(x509.SubjectAlternativeName(_list_alternative_names(identity, lab)), critical=False)
+        .add_extension(
+            x509.SubjectAlternativeName(_list_alternative_names(identity, lab)), critical=False
+        )
     )
     certificate = builder.sign(issuer.key, hashes.SHA256())
     return certificate.public_bytes(serialization.Encoding.PEM), _encode_key(key)
@@ -239,7 +250,9 @@ def read_certificate(path: Path) -> x509.Certificate:
         ) from None
 
 
-def _is_still_valid(path: Path, issuer: CertificateIssuer, identity: CertificateIdentity, lab: LabPlan) -> bool:
+def _is_still_valid(
+    path: Path, issuer: CertificateIssuer, identity: CertificateIdentity, lab: LabPlan
+) -> bool:
     """Return whether the certificate at a path is there, and need not be renewed."""
     if not path.exists() or not path.with_suffix(".key").exists():
         return False
@@ -251,10 +264,15 @@ def _is_still_valid(path: Path, issuer: CertificateIssuer, identity: Certificate
     names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     lifetime = certificate.not_valid_after_utc - certificate.not_valid_before_utc
     remaining = certificate.not_valid_after_utc - datetime.now(UTC)
-    return list(names) == _list_alternative_names(identity, lab) and remaining > lifetime * RENEWAL_FRACTION
+    return (
+        list(names) == _list_alternative_names(identity, lab)
+        and remaining > lifetime * RENEWAL_FRACTION
+    )
 
 
-def _make_certificate_builder(subject: x509.Name, issuer: x509.Name, lifetime: timedelta) -> x509.CertificateBuilder:
+def _make_certificate_builder(
+    subject: x509.Name, issuer: x509.Name, lifetime: timedelta
+) -> x509.CertificateBuilder:
     now = datetime.now(UTC)
     return (
         x509.CertificateBuilder()

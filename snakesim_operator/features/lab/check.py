@@ -37,7 +37,8 @@ from snakesim_operator.features.lab.zenoh_files import make_session_settings, ma
 
 CONNECT_TIMEOUT_MS = 2000
 LISTEN_S = 1.0
-MAX_CLOCK_OFFSET_S = 0.5  # by which a clock may differ; Zenoh's routers restamp what is further in the future
+# By which a clock may differ; Zenoh's routers restamp what is further in the future.
+MAX_CLOCK_OFFSET_S = 0.5
 QUERIED_KEYS = (keys.LEASE, keys.LIFECYCLE)  # an empty query there has no effect
 WRITER_BY_KEY = {  # the process that publishes at a key all the time
     keys.CLOCK: HOST,
@@ -67,7 +68,9 @@ class CheckResults:
         self.print_text(f"! {text}")
 
 
-def check_running_lab(lab: LabPlan, folder: Path, print_text: PrintLine = print_line, *, as_json: bool = False) -> int:
+def check_running_lab(
+    lab: LabPlan, folder: Path, print_text: PrintLine = print_line, *, as_json: bool = False
+) -> int:
     """Check certificates, routers, robots and roles of a running lab, and print the results.
 
     Args:
@@ -103,7 +106,9 @@ def _run_all_checks(lab: LabPlan, folder: Path, results: CheckResults) -> int:
     for identity in iterate_identities(lab):
         _check_certificate(identity, folder, results)
     print_text("routers")
-    reachable_routers = [name for name in lab.file.routers if _check_router(name, lab, folder, results)]
+    reachable_routers = [
+        name for name in lab.file.routers if _check_router(name, lab, folder, results)
+    ]
     if not reachable_routers:
         results.results.append({"passed": False, "text": "no router can be reached"})
         print_text("no router can be reached, and so neither robots nor roles can be looked at")
@@ -130,13 +135,19 @@ def _check_certificate(identity: CertificateIdentity, folder: Path, results: Che
     except ConfigError as error:
         results.report_failed(f"{identity.common_name}: {error}")
         return
-    _check_expiry(identity.common_name, certificate, "run `snakesim lab certs` and install it", results)
+    _check_expiry(
+        identity.common_name, certificate, "run `snakesim lab certs` and install it", results
+    )
     warning = check_permissions(path.with_suffix(".key"))
     if warning:
-        results.report_failed(f"{identity.common_name}: {warning}, and renew it with `snakesim lab certs --rotate`")
+        results.report_failed(
+            f"{identity.common_name}: {warning}, and renew it with `snakesim lab certs --rotate`"
+        )
 
 
-def _check_expiry(name: str, certificate: x509.Certificate, remedy: str, results: CheckResults) -> None:
+def _check_expiry(
+    name: str, certificate: x509.Certificate, remedy: str, results: CheckResults
+) -> None:
     """Check that a certificate is not due for renewal, and report when it ends."""
     end = certificate.not_valid_after_utc
     lifetime = end - certificate.not_valid_before_utc
@@ -185,12 +196,19 @@ def _check_router(name: str, lab: LabPlan, folder: Path, results: CheckResults) 
     presented = _read_presented_certificate(endpoint, settings["transport"]["link"]["tls"])
     stored = read_certificate(_get_certificate_path(router, folder))
     if presented.serial_number != stored.serial_number:
-        _check_expiry(f"{name} shows an earlier certificate", presented, f"restart it on {router.machine}", results)
+        _check_expiry(
+            f"{name} shows an earlier certificate",
+            presented,
+            f"restart it on {router.machine}",
+            results,
+        )
     _check_refuses_unknown_clients(name, settings, results)
     return True
 
 
-def _check_refuses_unknown_clients(name: str, settings: dict[str, Any], results: CheckResults) -> None:
+def _check_refuses_unknown_clients(
+    name: str, settings: dict[str, Any], results: CheckResults
+) -> None:
     """Check that a router refuses clients without a certificate. `settings` are those of a client with one."""
     tls = settings["transport"]["link"]["tls"]
     settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
@@ -206,7 +224,9 @@ def _check_refuses_unknown_clients(name: str, settings: dict[str, Any], results:
 def _connect_without_tls(endpoint: str) -> socket.socket:
     """Connect to a router without TLS. Raises OSError."""
     host, _, port = endpoint.removeprefix("tls/").rpartition(":")
-    return socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT_MS / 1000)
+    return socket.create_connection(
+        (host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT_MS / 1000
+    )
 
 
 def _read_presented_certificate(endpoint: str, tls: dict[str, Any]) -> x509.Certificate:
@@ -214,7 +234,10 @@ def _read_presented_certificate(endpoint: str, tls: dict[str, Any]) -> x509.Cert
     host = endpoint.removeprefix("tls/").rpartition(":")[0].strip("[]")
     context = ssl.create_default_context(cafile=tls["root_ca_certificate"])
     context.load_cert_chain(tls["connect_certificate"], tls["connect_private_key"])
-    with _connect_without_tls(endpoint) as plain, context.wrap_socket(plain, server_hostname=host) as wrapped:
+    with (
+        _connect_without_tls(endpoint) as plain,
+        context.wrap_socket(plain, server_hostname=host) as wrapped,
+    ):
         return x509.load_der_x509_certificate(wrapped.getpeercert(binary_form=True) or b"")
 
 
@@ -226,7 +249,8 @@ class _LabRobotState:
     description: RobotDescription | None
     live_services: frozenset[str]  # names of the services with a liveliness token
     processes: list[ProcessInfo]
-    clock_offsets_s: dict[str, float]  # by key: how far the publisher's clock is ahead of this computer's
+    # By key: how far the publisher's clock is ahead of this computer's.
+    clock_offsets_s: dict[str, float]
 
 
 def _check_robot(robot: str, lab: LabPlan, folder: Path, results: CheckResults) -> None:
@@ -238,10 +262,14 @@ def _check_robot(robot: str, lab: LabPlan, folder: Path, results: CheckResults) 
         folder: The output folder of `lab certs`, with the certificate that the check connects with.
         results: Collects and prints the results.
     """
-    involved_identities = [identity for identity in iterate_identities(lab) if robot in identity.list_robots(lab)]
+    involved_identities = [
+        identity for identity in iterate_identities(lab) if robot in identity.list_robots(lab)
+    ]
     roles = list(Role)
     # Roles are listed from the one with the fewest permissions on; the last one may read the most.
-    observer = max(involved_identities, key=lambda identity: roles.index(identity.role or Role.ROBOT))
+    observer = max(
+        involved_identities, key=lambda identity: roles.index(identity.role or Role.ROBOT)
+    )
     try:
         state = _observe_robot(observer, robot, lab, folder)
     except NotConnectedError as error:
@@ -259,12 +287,16 @@ def _check_robot(robot: str, lab: LabPlan, folder: Path, results: CheckResults) 
             _check_process(process, host, state.clock_offsets_s, results)
 
 
-def _observe_robot(watcher: CertificateIdentity, robot: str, lab: LabPlan, folder: Path) -> _LabRobotState:
+def _observe_robot(
+    watcher: CertificateIdentity, robot: str, lab: LabPlan, folder: Path
+) -> _LabRobotState:
     """Connect as one identity and collect what a robot publishes. Raises NotConnectedError."""
     with _open_session(watcher, robot, lab, folder) as session:
         status = session.wait_for_latched(keys.STATUS, RobotStatus, LISTEN_S)
         description = (
-            session.wait_for_latched(keys.DESCRIPTION, RobotDescription, LISTEN_S) if status is not None else None
+            session.wait_for_latched(keys.DESCRIPTION, RobotDescription, LISTEN_S)
+            if status is not None
+            else None
         )
         live_keys = session.list_tokens(keys.PROCESS_ALL)
         reader = session.declare_latched_reader(keys.PROCESS_ALL, ProcessInfo)
@@ -276,7 +308,9 @@ def _observe_robot(watcher: CertificateIdentity, robot: str, lab: LabPlan, folde
     return _LabRobotState(status, description, live_services, processes, clock_offsets_s)
 
 
-def _find_expected_processes(robot: str, lab: LabPlan, involved: list[CertificateIdentity]) -> dict[str, str]:
+def _find_expected_processes(
+    robot: str, lab: LabPlan, involved: list[CertificateIdentity]
+) -> dict[str, str]:
     """Return the machine of each process that the lab file gives a robot."""
     expected = {HOST: lab.file.robots[robot].machine}
     for identity in involved:
@@ -287,7 +321,9 @@ def _find_expected_processes(robot: str, lab: LabPlan, involved: list[Certificat
     return expected
 
 
-def check_emulation(robot: LabRobot, description: RobotDescription | None, results: CheckResults) -> None:
+def check_emulation(
+    robot: LabRobot, description: RobotDescription | None, results: CheckResults
+) -> None:
     """Check that a robot whose bus the lab file names has real drives, and that a simulated or emulated one has none.
 
     A robot of another kind passes, because the lab file does not tell what moves.
@@ -301,15 +337,22 @@ def check_emulation(robot: LabRobot, description: RobotDescription | None, resul
     if description is None:
         results.report_failed(summary)
     elif has_real_drives(robot) and description.emulated:
-        results.report_failed(f"{summary}, but the lab file names its bus; render again, install, and restart the host")
+        results.report_failed(
+            f"{summary}, but the lab file names its bus; render again, install, and restart the host"
+        )
     elif (robot.backend == SIMULATOR_BACKEND or robot.emulated) and not description.emulated:
-        results.report_failed(f"{summary}, but by the lab file nothing real is to move; see which host runs")
+        results.report_failed(
+            f"{summary}, but by the lab file nothing real is to move; see which host runs"
+        )
     else:
         results.report_passed(summary)
 
 
 def _check_process(
-    process: ProcessInfo, host: ProcessInfo | None, clock_offsets_s: dict[str, float], results: CheckResults
+    process: ProcessInfo,
+    host: ProcessInfo | None,
+    clock_offsets_s: dict[str, float],
+    results: CheckResults,
 ) -> None:
     """Check version and settings of a process against those of the host, and its clock against this computer's.
 
@@ -319,10 +362,14 @@ def _check_process(
         clock_offsets_s: Offsets of clocks ahead of this computer, by the key of the messages that show them.
         results: Collects and prints the results.
     """
-    results.report_passed(f"{process.name}: on {process.machine}, process {process.pid}, snakesim {process.version}")
+    results.report_passed(
+        f"{process.name}: on {process.machine}, process {process.pid}, snakesim {process.version}"
+    )
     if host is not None:
         if process.version != host.version:
-            results.report_failed(f"{process.name}: snakesim {process.version}, but the host has {host.version}")
+            results.report_failed(
+                f"{process.name}: snakesim {process.version}, but the host has {host.version}"
+            )
         for difference in describe_differences(process, host):
             results.report_failed(f"{process.name}: {difference}")
     for key, process_name in WRITER_BY_KEY.items():
@@ -374,7 +421,9 @@ def _check_role_permissions(
 
 
 @contextmanager
-def _open_session(identity: CertificateIdentity, robot: str, lab: LabPlan, folder: Path) -> Iterator[Session]:
+def _open_session(
+    identity: CertificateIdentity, robot: str, lab: LabPlan, folder: Path
+) -> Iterator[Session]:
     """Open a session to a robot as one identity. Raises NotConnectedError."""
     with TemporaryDirectory() as scratch:
         path = Path(scratch) / "session.json5"
@@ -399,7 +448,9 @@ def _make_probe_settings(
     settings.pop("namespace", None)
     settings["connect"]["timeout_ms"] = CONNECT_TIMEOUT_MS
     settings["connect"]["endpoints"] = endpoints or lab.list_endpoints()
-    settings["transport"]["link"]["tls"] |= make_tls_paths(identity, str(_get_tls_folder(identity, folder)), "connect")
+    settings["transport"]["link"]["tls"] |= make_tls_paths(
+        identity, str(_get_tls_folder(identity, folder)), "connect"
+    )
     return settings
 
 

@@ -12,8 +12,10 @@ from typing import Literal
 from snakesim_hal.base.errors import ConfigError, suggest_word
 from snakesim_operator.features.lab.lab_robot import LabRobot
 
-KERNEL_INTERFACE = re.compile(r"v?can[0-9]{1,3}")  # any other bus on CAN is INTERFACE:CHANNEL of python-can
-EMULATED_BUS_PREFIXES = ("vcan", "udp_multicast:", "virtual:", "/dev/pts/")  # no real drive can be on such a bus
+# Any other bus on CAN is INTERFACE:CHANNEL of python-can.
+KERNEL_INTERFACE = re.compile(r"v?can[0-9]{1,3}")
+# No real drive can be on such a bus.
+EMULATED_BUS_PREFIXES = "vcan", "udp_multicast:", "virtual:", "/dev/pts/"
 SIMULATOR_BACKEND = "sim"
 MIXED_BACKEND = "mixed"  # each joint's drive type is in the robot file
 
@@ -31,7 +33,10 @@ class DriveType:
 
 
 OTHER_INTERFACE: dict[BusInterface, BusInterface] = {"can": "serial", "serial": "can"}
-BUS_EXAMPLES: dict[BusInterface, str] = {"can": 'can = ["can0"]', "serial": 'serial = ["/dev/ttyUSB0"]'}
+BUS_EXAMPLES: dict[BusInterface, str] = {
+    "can": 'can = ["can0"]',
+    "serial": 'serial = ["/dev/ttyUSB0"]',
+}
 DRIVE_TYPES: dict[str, DriveType] = {
     "can": DriveType("can", "channels"),
     "odrive": DriveType("can", "channels"),
@@ -85,7 +90,8 @@ def make_host_settings(robot: LabRobot) -> list[str]:
     settings: list[str] = []
     for drive_type_name, buses in group_buses_by_drive_type(robot).items():
         drive_type = DRIVE_TYPES[drive_type_name]
-        quoted_buses = ", ".join(f"'{bus}'" for bus in buses)  # in single quotes, because the unit has double ones
+        # In single quotes, because the unit has double ones.
+        quoted_buses = ", ".join(f"'{bus}'" for bus in buses)
         settings.append(f"backends.{drive_type_name}.{drive_type.buses_key}=[{quoted_buses}]")
         if drive_type.interface == "can":
             settings.append(f"backends.{drive_type_name}.bit_rate={robot.bitrate}")
@@ -262,7 +268,8 @@ def _validate_buses_of_drive_type(robot: LabRobot, drive_type: str, context: str
     buses = robot.buses[drive_type]
     if not buses:
         raise ConfigError(
-            f"{context}.buses.{drive_type}` is empty; name its buses, or leave it out", code="lab/invalid-file"
+            f"{context}.buses.{drive_type}` is empty; name its buses, or leave it out",
+            code="lab/invalid-file",
         )
     interface = DRIVE_TYPES[drive_type].interface
     listed_buses = _get_buses_of_interface(robot, interface)
@@ -276,7 +283,9 @@ def _validate_buses_of_drive_type(robot: LabRobot, drive_type: str, context: str
 
 def _validate_external_backend(robot: LabRobot, context: str) -> None:
     """Check that a backend that is not part of SnakeSIM is configured by settings or by a scenario file."""
-    has_section = any(setting.startswith((f"backends.{robot.backend}.", "backend.")) for setting in robot.set)
+    has_section = any(
+        setting.startswith((f"backends.{robot.backend}.", "backend.")) for setting in robot.set
+    )
     names_scenario_file = "/" in robot.scenario
     if not (has_section or names_scenario_file):
         raise ConfigError(

@@ -11,7 +11,9 @@ MAX_NAME_LENGTH = 24
 
 Name = Annotated[str, Meta(pattern=f"^[a-z][a-z0-9_]{{0,{MAX_NAME_LENGTH - 1}}}$")]
 # An interface of the kernel, or INTERFACE:CHANNEL of python-can.
-CanBus = Annotated[str, Meta(pattern=r"^(v?can[0-9]{1,3}|[a-z][a-z0-9_]*:[A-Za-z0-9_./@+-]+)$", max_length=127)]
+CanBus = Annotated[
+    str, Meta(pattern=r"^(v?can[0-9]{1,3}|[a-z][a-z0-9_]*:[A-Za-z0-9_./@+-]+)$", max_length=127)
+]
 DeviceFile = Annotated[str, Meta(pattern=r"^/dev/[A-Za-z0-9_./+-]+$", max_length=200)]
 # A unit of systemd has the setting in double quotes, so some characters are not allowed.
 Setting = Annotated[str, Meta(pattern=r"^[^=\s\"\\$%]+=[^\r\n%\"\\$]+$")]

@@ -57,24 +57,32 @@ def iterate_programs(lab: LabPlan, machine: str) -> Iterator[MachineProgram]:
         session_file = f"{folder}/{identity.label}.json5"
         match identity.role:
             case None:
-                yield MachineProgram(identity, f"Zenoh router {identity.subject}", ("start", "router", session_file))
+                yield MachineProgram(
+                    identity, f"Zenoh router {identity.subject}", ("start", "router", session_file)
+                )
             case Role.ROBOT:
                 yield _make_host_program(identity, lab, session_file)
             case Role.GNC:
                 scenario = _make_scenario_options(lab.file.robots[identity.subject])
                 for service in identity.services:
                     arguments = ("start", "service", service, *scenario, "--session", session_file)
-                    yield MachineProgram(identity, f"{service} of {identity.subject}", arguments, service)
+                    yield MachineProgram(
+                        identity, f"{service} of {identity.subject}", arguments, service
+                    )
             case Role.RECORDER:
                 for robot_name in identity.list_robots(lab):
                     # Without `--out`, the recording gets a name with the time.
                     arguments = ("record", "--session", session_file, "--namespace", robot_name)
-                    yield MachineProgram(identity, f"recorder of {robot_name}", arguments, recorded_robot=robot_name)
+                    yield MachineProgram(
+                        identity, f"recorder of {robot_name}", arguments, recorded_robot=robot_name
+                    )
             case _:
                 pass  # operators, viewers and administrators start their programs by hand
 
 
-def _make_host_program(identity: CertificateIdentity, lab: LabPlan, session_file: str) -> MachineProgram:
+def _make_host_program(
+    identity: CertificateIdentity, lab: LabPlan, session_file: str
+) -> MachineProgram:
     """Return the program that runs the HAL host of a robot."""
     robot = lab.file.robots[identity.subject]
     out = f"{STATE_FOLDER}/{identity.subject}"
@@ -91,7 +99,8 @@ def _make_scenario_options(robot: LabRobot) -> tuple[str, ...]:
     """Return the options for the scenario. Host and services get the same, because they compare them."""
     words = [robot.scenario, "--backend", robot.backend]
     if is_on_bus(robot):
-        words += ["--clock-mode", "realtime"]  # the only one of drives on a bus, whatever mode the scenario has
+        # The only one of drives on a bus, whatever mode the scenario has.
+        words += ["--clock-mode", "realtime"]
     for setting in (*make_host_settings(robot), *robot.set):
         words += ["--set", setting]
     return tuple(words)

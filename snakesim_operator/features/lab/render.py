@@ -11,9 +11,8 @@ from snakesim_operator.features.lab.lab_file import LabPlan
 from snakesim_operator.features.lab.units import render_unit_files
 from snakesim_operator.features.lab.zenoh_files import make_router_settings, make_session_settings
 
-WRITTEN_FILES_LIST = (
-    "rendered.txt"  # names of the files that were written, so that the next time leaves none of an earlier lab
-)
+# Names of the files that were written, so that the next time leaves none of an earlier lab.
+WRITTEN_FILES_LIST = "rendered.txt"
 
 
 def write_lab_files(lab: LabPlan, folder: Path) -> list[Path]:
@@ -21,7 +20,9 @@ def write_lab_files(lab: LabPlan, folder: Path) -> list[Path]:
     files = dict(render_files(lab))
     written: list[Path] = []
     for machine in lab.file.machines:
-        machine_files = {name: text for (file_machine, name), text in files.items() if file_machine == machine}
+        machine_files = {
+            name: text for (file_machine, name), text in files.items() if file_machine == machine
+        }
         machine_folder = folder / machine
         for old_name in _read_written_files(machine_folder):
             if old_name not in machine_files:
@@ -47,7 +48,9 @@ def render_files(lab: LabPlan) -> Iterator[tuple[tuple[str, str], str]]:
     """Yield every file as ((machine, path in the machine's folder), text)."""
     for identity in iterate_identities(lab):
         settings = (
-            make_router_settings(identity, lab) if identity.role is None else make_session_settings(identity, lab)
+            make_router_settings(identity, lab)
+            if identity.role is None
+            else make_session_settings(identity, lab)
         )
         text = f"// {_describe_origin(lab, identity.common_name)}\n{json.dumps(settings, indent=2)}\n"  # JSON is JSON5
         yield (identity.machine, f"{identity.label}.json5"), text

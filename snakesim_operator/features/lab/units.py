@@ -47,7 +47,10 @@ def render_unit_files(lab: LabPlan, machine: str, origin: str) -> Iterator[tuple
     for program in machine_programs:
         command = _format_command_line(lab, program)
         text = unit_template.render(
-            **template_variables, program=program, command=command, addresses=_list_router_addresses(lab)
+            **template_variables,
+            program=program,
+            command=command,
+            addresses=_list_router_addresses(lab),
         )
         yield f"systemd/{program.name}.service", text
     can_template = templates.get_template("can.j2")
@@ -59,7 +62,10 @@ def render_unit_files(lab: LabPlan, machine: str, origin: str) -> Iterator[tuple
             yield f"systemd/snakesim-{interface.name}.service", text
     if machine_programs:
         commands = [(program, ["snakesim", *program.arguments]) for program in machine_programs]
-        yield "compose.yaml", templates.get_template("compose.j2").render(**template_variables, programs=commands)
+        yield (
+            "compose.yaml",
+            templates.get_template("compose.j2").render(**template_variables, programs=commands),
+        )
 
 
 def _format_command_line(lab: LabPlan, program: MachineProgram) -> str:
@@ -70,7 +76,9 @@ def _format_command_line(lab: LabPlan, program: MachineProgram) -> str:
 
 def _list_router_addresses(lab: LabPlan) -> list[str]:
     """Return the addresses of the routers, or none if one of them is a name."""
-    addresses = [lab.file.machines[router.machine].address or "" for router in lab.file.routers.values()]
+    addresses = [
+        lab.file.machines[router.machine].address or "" for router in lab.file.routers.values()
+    ]
     try:
         return sorted({str(ip_address(address)) for address in addresses})
     except ValueError:

@@ -3,7 +3,11 @@
 from typing import Any
 
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
-from snakesim_operator.features.lab.access import MAX_ENVELOPE_BYTES, make_access_control, make_size_limits
+from snakesim_operator.features.lab.access import (
+    MAX_ENVELOPE_BYTES,
+    make_access_control,
+    make_size_limits,
+)
 from snakesim_operator.features.lab.identities import CertificateIdentity
 from snakesim_operator.features.lab.lab_file import ALL_ROBOTS, LabPlan
 
@@ -59,7 +63,9 @@ def make_session_settings(identity: CertificateIdentity, lab: LabPlan) -> dict[s
         "scouting": NO_SCOUTING,
         "timestamping": TIMESTAMPS,
         "transport": {
-            "link": _make_link_settings({**make_tls_paths(identity, folder, "connect"), "enable_mtls": True}),
+            "link": _make_link_settings(
+                {**make_tls_paths(identity, folder, "connect"), "enable_mtls": True}
+            ),
             "shared_memory": {"enabled": False},
         },
     }
@@ -72,7 +78,10 @@ def _make_link_settings(tls: dict[str, Any]) -> dict[str, Any]:
     # `close_link_on_expiration`: an expired certificate ends its session too.
     return {
         "protocols": ["tls"],
-        "tx": {"lease": LINK_LEASE_MS, "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}}},
+        "tx": {
+            "lease": LINK_LEASE_MS,
+            "queue": {"congestion_control": {"drop": {"wait_before_drop": 100}}},
+        },
         "rx": {"max_message_size": MAX_IMAGE_BYTES + MAX_ENVELOPE_BYTES},
         "tls": {**tls, "verify_name_on_connect": True, "close_link_on_expiration": True},
     }

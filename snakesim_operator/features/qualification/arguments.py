@@ -9,17 +9,33 @@ from snakesim_hal.programs.commands import Command, Commands
 
 
 def _add_qualify(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("driver_type", metavar="TYPE", help="driver type, such as odrive, moteus or can")
     parser.add_argument(
-        "--channel", metavar="CHANNEL", help="bus of the real drive: can0 or /dev/ttyUSB0 (default: an emulated drive)"
+        "driver_type", metavar="TYPE", help="driver type, such as odrive, moteus or can"
     )
     parser.add_argument(
-        "--scenario", type=Path, metavar="FILE", help="scenario of one drive (default: one with low limits)"
+        "--channel",
+        metavar="CHANNEL",
+        help="bus of the real drive: can0 or /dev/ttyUSB0 (default: an emulated drive)",
+    )
+    parser.add_argument(
+        "--scenario",
+        type=Path,
+        metavar="FILE",
+        help="scenario of one drive (default: one with low limits)",
     )
     add_set_argument(parser)
-    add_output_argument(parser, "folder of the record, also to continue there (default: ./qualify-TYPE)")
-    parser.add_argument("--operator", metavar="NAME", default="", help="your name in the record (default: the user's)")
-    parser.add_argument("--adapter", metavar="TEXT", default="", help="adapter (default: its kernel driver)")
+    add_output_argument(
+        parser, "folder of the record, also to continue there (default: ./qualify-TYPE)"
+    )
+    parser.add_argument(
+        "--operator",
+        metavar="NAME",
+        default="",
+        help="your name in the record (default: the user's)",
+    )
+    parser.add_argument(
+        "--adapter", metavar="TEXT", default="", help="adapter (default: its kernel driver)"
+    )
     parser.add_argument(
         "--firmware-version",
         metavar="TEXT",
@@ -27,9 +43,14 @@ def _add_qualify(parser: argparse.ArgumentParser) -> None:
         help="version that the vendor's tool shows, if the drive reports none",
     )
     parser.add_argument(
-        "--key", type=Path, metavar="FILE", help="Ed25519 key that signs (default: one in the user's state folder)"
+        "--key",
+        type=Path,
+        metavar="FILE",
+        help="Ed25519 key that signs (default: one in the user's state folder)",
     )
-    parser.add_argument("--yes", action="store_true", help="do not wait before steps; only for emulated drives")
+    parser.add_argument(
+        "--yes", action="store_true", help="do not wait before steps; only for emulated drives"
+    )
     parser.add_argument(
         "--emulator-set",
         action="append",
@@ -42,7 +63,9 @@ def _add_qualify(parser: argparse.ArgumentParser) -> None:
 
 def _add_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("record", type=Path, metavar="FILE", help="record.json of a qualification")
-    parser.add_argument("--public-key", metavar="TEXT", help="public key in base64 that must have signed it")
+    parser.add_argument(
+        "--public-key", metavar="TEXT", help="public key in base64 that must have signed it"
+    )
     add_json_argument(parser)
 
 
@@ -76,7 +99,10 @@ COMMANDS: Commands = (
             "command continues.\n\nExit code: 0 every step is confirmed, 1 a step is refuted or unknown, 2 wrong "
             "input, 130 interrupted."
         ),
-        examples=("drive qualify odrive --yes", "drive qualify odrive --channel can0 --scenario bench.toml"),
+        examples=(
+            "drive qualify odrive --yes",
+            "drive qualify odrive --channel can0 --scenario bench.toml",
+        ),
     ),
     Command(
         name="drive verify",

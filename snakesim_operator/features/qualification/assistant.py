@@ -11,7 +11,14 @@ from snakesim_operator.features.qualification.emulated_drive import EmulatedDriv
 from snakesim_operator.features.qualification.protocol.checks import Source
 
 Action = Literal[
-    "unplug_bus", "plug_bus", "lower_supply", "restore_supply", "cut_relay", "close_relay", "restart_drive", "block"
+    "unplug_bus",
+    "plug_bus",
+    "lower_supply",
+    "restore_supply",
+    "cut_relay",
+    "close_relay",
+    "restart_drive",
+    "block",
 ]
 Actor = Literal["program", "operator"]
 
@@ -85,12 +92,12 @@ class Person(Assistant):
 
     def ask_turned_positive(self, start_ns: int) -> str:
         del start_ns
-        return self.ask("Did the shaft turn the positive way, by about 3 degrees?")
+        return self.read_yes_or_no("Did the shaft turn the positive way, by about 3 degrees?")
 
     def ask_without_torque(self) -> str:
-        return self.ask("Turn the shaft by hand: is the motor without torque?")
+        return self.read_yes_or_no("Turn the shaft by hand: is the motor without torque?")
 
-    def ask(self, question: str) -> str:
+    def read_yes_or_no(self, question: str) -> str:
         """Return "yes", "no", or an empty text if the operator does not know."""
         while True:
             self._print(f"       > {question} y, n, or Enter if you do not know:")
@@ -125,12 +132,16 @@ class EmulatedBench(Assistant):
 
     def pause(self, text: str) -> None:
         if self._should_pause:
-            self._print("       > Press Enter for this step. The drive is emulated: a program acts for you.")
+            self._print(
+                "       > Press Enter for this step. The drive is emulated: a program acts for you."
+            )
             _read_answer()
 
     def perform(self, action: Action) -> int | None:
         text = TYPED_FAULTS.get(action)
-        if text is None:  # "block" is friction of the emulated joint, and "close_relay" is part of the restart
+        if (
+            text is None
+        ):  # "block" is friction of the emulated joint, and "close_relay" is part of the restart
             return time.monotonic_ns()
         acted_ns = self._drive.type_fault(text)
         if text.startswith("reboot"):
@@ -138,7 +149,9 @@ class EmulatedBench(Assistant):
         return acted_ns
 
     def ask_turned_positive(self, start_ns: int) -> str:
-        angles = [state.angle_rad for state in self._drive.read_log() if state.monotonic_ns >= start_ns]
+        angles = [
+            state.angle_rad for state in self._drive.read_log() if state.monotonic_ns >= start_ns
+        ]
         if not angles:
             return ""
         return "yes" if angles[-1] > angles[0] else "no"

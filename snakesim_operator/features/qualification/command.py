@@ -5,11 +5,25 @@ import sys
 from pathlib import Path
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.base.process import SERVICE_PRIORITY, get_user_name, raise_on_stop_signals, set_realtime_priority
+from snakesim_hal.base.process import (
+    SERVICE_PRIORITY,
+    get_user_name,
+    raise_on_stop_signals,
+    set_realtime_priority,
+)
 from snakesim_hal.base.terminal import PrintLine, print_json, print_line, print_stderr
 from snakesim_hal.network.local_registry import get_state_folder
-from snakesim_operator.features.qualification.protocol.record import RECORD, SUMMARY, Record, judge_claims, read_record
-from snakesim_operator.features.qualification.protocol.signature import compute_fingerprint, find_signature_problem
+from snakesim_operator.features.qualification.protocol.record import (
+    RECORD,
+    SUMMARY,
+    Record,
+    judge_claims,
+    read_record,
+)
+from snakesim_operator.features.qualification.protocol.signature import (
+    compute_fingerprint,
+    find_signature_problem,
+)
 from snakesim_operator.features.qualification.protocol.summary import EMULATED_BANNER
 from snakesim_operator.features.qualification.runner import Options, qualify_drive
 from snakesim_operator.features.qualification.setup import Request
@@ -72,7 +86,9 @@ def verify(arguments: argparse.Namespace) -> int:
     problem = find_signature_problem(record, arguments.public_key) or find_claim_problem(record)
     key = record.signature.public_key if record.signature is not None else ""
     if arguments.json:
-        print_json({"valid": not problem, "problem": problem, "public_key": key, **_summarize(record)})
+        print_json(
+            {"valid": not problem, "problem": problem, "public_key": key, **_summarize(record)}
+        )
         return FAILED if problem else OK
     if problem:
         print_line(f"{arguments.record}: NOT VALID: {problem}")
@@ -80,7 +96,9 @@ def verify(arguments: argparse.Namespace) -> int:
     print_line(f"{arguments.record}: the signature is valid")
     print_line(f"  signed by  {key} ({compute_fingerprint(key)})")
     print_line(f"  operator   {record.operator}")
-    print_line(f"  drive      {record.subject.driver_type}, serial number {record.subject.serial or 'not reported'}")
+    print_line(
+        f"  drive      {record.subject.driver_type}, serial number {record.subject.serial or 'not reported'}"
+    )
     for name, count in _count_verdicts(record).items():
         print_line(f"  {name:<10} {count} claims")
     if record.subject.emulated:
@@ -107,7 +125,9 @@ def _print_result(record: Record, folder: Path, print_text: PrintLine) -> None:
     if record.subject.emulated:
         print_text(EMULATED_BANNER.strip("*"))
     assert record.signature is not None
-    print_text(f"record:  {folder / RECORD}, signed by {compute_fingerprint(record.signature.public_key)}")
+    print_text(
+        f"record:  {folder / RECORD}, signed by {compute_fingerprint(record.signature.public_key)}"
+    )
     print_text(f"summary: {folder / SUMMARY}")
 
 

@@ -45,7 +45,11 @@ class CommandThread:
     """Holds the lease of the robot from `start` to `stop`. The limiter of the host limits each command."""
 
     def __init__(
-        self, connection: ConnectionSettings, robot: RobotDescription, plan: MotionPlan, center_rad: float | None
+        self,
+        connection: ConnectionSettings,
+        robot: RobotDescription,
+        plan: MotionPlan,
+        center_rad: float | None,
     ) -> None:
         """Prepare to command a robot with one joint.
 
@@ -117,7 +121,9 @@ class CommandThread:
             return
         angle_rad = joints.angle_rad[0]
         is_armed = clock.lifecycle == "armed"
-        sample = MotionSample(time.monotonic_ns(), is_armed, angle_rad, joints.velocity_rad_s[0], joints.torque_nm[0])
+        sample = MotionSample(
+            time.monotonic_ns(), is_armed, angle_rad, joints.velocity_rad_s[0], joints.torque_nm[0]
+        )
         with self._lock:
             if self._center_rad is None:
                 self._center_rad = angle_rad
@@ -130,4 +136,6 @@ class CommandThread:
         target_rad = angle_rad
         if is_armed:
             target_rad = center_rad + plan.compute_offset_rad(time_s)
-        client.send_setpoints(RequestedSetpoints([JointMode.POSITION], [target_rad], [plan.torque_limit_nm]))
+        client.send_setpoints(
+            RequestedSetpoints([JointMode.POSITION], [target_rad], [plan.torque_limit_nm])
+        )

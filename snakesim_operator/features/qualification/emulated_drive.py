@@ -29,7 +29,12 @@ class EmulatedDrive:
     """`snakesim drive emulate` as a child that dies with this process."""
 
     def __init__(
-        self, config: RunConfig, channel: str, folder: Path, sets: Sequence[str], module: Sequence[str]
+        self,
+        config: RunConfig,
+        channel: str,
+        folder: Path,
+        sets: Sequence[str],
+        module: Sequence[str],
     ) -> None:
         """Start the process, and wait until the drive is on its bus.
 
@@ -48,15 +53,31 @@ class EmulatedDrive:
         config_path = folder / "drive.json"
         write_config(config, config_path)
         options = [option for text in sets for option in ("--set", text)]
-        arguments = ["drive", "emulate", config.backend, str(config_path), "--channel", channel, *options]
-        arguments += ["--interactive", "--drive-log", str(self._log_path), "--parent", str(os.getpid())]
+        arguments = [
+            "drive",
+            "emulate",
+            config.backend,
+            str(config_path),
+            "--channel",
+            channel,
+            *options,
+        ]
+        arguments += [
+            "--interactive",
+            "--drive-log",
+            str(self._log_path),
+            "--parent",
+            str(os.getpid()),
+        ]
         if config.backend == "can":
             arguments += ["--pose", "none"]
         self._child = start_python_emulator(["-m", *module, *arguments], folder / "drive.txt")
         if not self._child.wait_until_ready(READY_TEXT):
             output = self._child.read_output().strip().splitlines()[-5:]
             self.close()
-            raise BackendError("the emulated drive did not start:", *output, code="emulator/not-started")
+            raise BackendError(
+                "the emulated drive did not start:", *output, code="emulator/not-started"
+            )
 
     def type_fault(self, text: str) -> int:
         """Type a fault such as `cut bus_1 off`, and return when, by the monotonic clock in ns.
@@ -68,7 +89,9 @@ class EmulatedDrive:
         try:
             self._child.write_line(text)
         except OSError as error:
-            raise BackendError(f"the emulated drive has ended: {error}", code="emulator/not-started") from error
+            raise BackendError(
+                f"the emulated drive has ended: {error}", code="emulator/not-started"
+            ) from error
         return now_ns
 
     def read_log(self) -> list[LoggedState]:
@@ -79,7 +102,11 @@ class EmulatedDrive:
                 if not line.endswith("\n"):  # still being written
                     continue
                 values = json.loads(line)
-                states.append(LoggedState(values["monotonic_ns"], values["enabled"][0], values["angle_rad"][0]))
+                states.append(
+                    LoggedState(
+                        values["monotonic_ns"], values["enabled"][0], values["angle_rad"][0]
+                    )
+                )
         return states
 
     def close(self) -> None:

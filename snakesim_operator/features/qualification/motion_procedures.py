@@ -128,7 +128,11 @@ def check_motion(rig: Rig, assistant: Assistant) -> list[Check]:
         ),
     ]
     if rig.emulated_drive is not None:
-        angles = [state.angle_rad for state in rig.emulated_drive.read_log() if state.monotonic_ns >= begun_ns]
+        angles = [
+            state.angle_rad
+            for state in rig.emulated_drive.read_log()
+            if state.monotonic_ns >= begun_ns
+        ]
         true_rad = angles[-1] - start_rad if angles else None
         checks.append(_make_motion_check("true rotation of the shaft", true_rad, "drive log"))
     return checks
@@ -158,7 +162,9 @@ def check_torque(rig: Rig, assistant: Assistant) -> list[Check]:
     rig.commands.set_plan(MotionPlan(limit_nm, BLOCKED_OFFSET_RAD))
     time.sleep(MOTION_S)
     _require_armed(rig)
-    torque_nm = max((abs(sample.torque_nm) for sample in rig.commands.list_samples(begun_ns)), default=0.0)
+    torque_nm = max(
+        (abs(sample.torque_nm) for sample in rig.commands.list_samples(begun_ns)), default=0.0
+    )
     if torque_nm < steps.MIN_TORQUE_FRACTION * limit_nm:
         note = f"it reached only {torque_nm:.3f} N·m, so that the limit was not tested"
         return [_make_torque_check(limit_nm, None, note)]
@@ -196,4 +202,6 @@ def _require_armed(rig: Rig) -> None:
     """Raise RefusedError if the robot has stopped by itself, so that a motion was not carried out."""
     if rig.read_lifecycle() != "armed":
         faults = ", ".join(rig.list_faults())
-        raise RefusedError(f"the robot stopped by itself during the motion: {faults}", code="robot/not-armed")
+        raise RefusedError(
+            f"the robot stopped by itself during the motion: {faults}", code="robot/not-armed"
+        )

@@ -18,7 +18,12 @@ from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import LifecycleRequest, RobotDescription, RobotStatus, make_arm_request
+from snakesim_hal.wire.messages import (
+    LifecycleRequest,
+    RobotDescription,
+    RobotStatus,
+    make_arm_request,
+)
 from snakesim_operator.features.qualification.command_thread import CommandThread, MotionPlan
 from snakesim_operator.features.qualification.emulated_drive import EmulatedDrive
 from snakesim_operator.features.qualification.protocol.torque_timeline import (
@@ -47,7 +52,11 @@ class Rig:
     """One drive, and everything that a qualification does with it."""
 
     def __init__(
-        self, setup: Setup, folder: Path, emulated_drive: EmulatedDrive | None, typed_firmware: str = ""
+        self,
+        setup: Setup,
+        folder: Path,
+        emulated_drive: EmulatedDrive | None,
+        typed_firmware: str = "",
     ) -> None:
         """Prepare; nothing is started.
 
@@ -105,7 +114,9 @@ class Rig:
         self._session = session
         self._robot = session.wait_for_latched(keys.DESCRIPTION, RobotDescription, START_TIMEOUT_S)
         if self._robot is None:
-            raise NotConnectedError("the host does not publish its description; see host.txt", code="network/no-answer")
+            raise NotConnectedError(
+                "the host does not publish its description; see host.txt", code="network/no-answer"
+            )
         self._status_reader = session.declare_latched_reader(keys.STATUS, RobotStatus)
         joint = self._robot.joints[0]
         plan = MotionPlan(joint.torque_limit_nm)
@@ -119,7 +130,9 @@ class Rig:
             assert self._host is not None
             ending = self._host.describe_exit()
             if ending is not None:
-                raise RefusedError(ending, *self._host.output.last_lines()[-5:], code="robot/not-running")
+                raise RefusedError(
+                    ending, *self._host.output.last_lines()[-5:], code="robot/not-running"
+                )
             try:
                 return self._exit_stack.enter_context(open_session(self._link, 0.5))
             except NotConnectedError:
@@ -219,7 +232,8 @@ class Rig:
         if self.wait_for_lifecycle("armed", timeout_s=2.0) != "armed":
             reason = self._status.reason if self._status is not None else ""
             raise RefusedError(
-                f"the robot is {self.read_lifecycle()} after it was armed: {reason}", code="robot/not-armed"
+                f"the robot is {self.read_lifecycle()} after it was armed: {reason}",
+                code="robot/not-armed",
             )
         time.sleep(0.3)
 
@@ -269,7 +283,9 @@ class Rig:
     @contextlib.contextmanager
     def quiet_bus(self) -> Iterator[None]:
         """Freeze the host meanwhile if the bus is half duplex, so that the probe may read. Only while disarmed."""
-        should_freeze = not self.probe.has_own_line and not self._is_frozen and self._is_host_running()
+        should_freeze = (
+            not self.probe.has_own_line and not self._is_frozen and self._is_host_running()
+        )
         if should_freeze:
             self.freeze_host()
             time.sleep(0.02)  # what the host has requested is answered
@@ -302,7 +318,9 @@ class Rig:
             What the drive has answered.
         """
         deadline_s = time.monotonic() + duration_s
-        may_poll = should_poll and (self.probe.has_own_line or self._is_frozen or not self._is_host_running())
+        may_poll = should_poll and (
+            self.probe.has_own_line or self._is_frozen or not self._is_host_running()
+        )
         if not may_poll:
             time.sleep(duration_s)
             with self.quiet_bus():
@@ -310,7 +328,9 @@ class Rig:
             return [] if status is None else [TorqueReading(time.monotonic_ns(), status.is_enabled)]
         readings: list[TorqueReading] = []
         while time.monotonic() < deadline_s:
-            status = self.probe.read_status(min(STATUS_TIMEOUT_S, max(deadline_s - time.monotonic(), 0.01)))
+            status = self.probe.read_status(
+                min(STATUS_TIMEOUT_S, max(deadline_s - time.monotonic(), 0.01))
+            )
             if status is not None:
                 readings.append(TorqueReading(time.monotonic_ns(), status.is_enabled))
                 if until(status.is_enabled):
@@ -321,6 +341,9 @@ class Rig:
     def make_timeline(self, readings: list[TorqueReading]) -> TorqueTimeline:
         """Return when the drive had torque: by its own log if it has one, otherwise by its status."""
         if self.emulated_drive is not None:
-            logged = [TorqueReading(state.monotonic_ns, state.is_enabled) for state in self.emulated_drive.read_log()]
+            logged = [
+                TorqueReading(state.monotonic_ns, state.is_enabled)
+                for state in self.emulated_drive.read_log()
+            ]
             return make_timeline(logged, "drive log", lists_changes=True)
         return make_timeline(readings, "drive status", lists_changes=False)

@@ -29,9 +29,16 @@ from snakesim_operator.features.qualification.protocol.record import (
     replace_step,
     write_record,
 )
-from snakesim_operator.features.qualification.protocol.signature import load_or_create_key, sign_record
+from snakesim_operator.features.qualification.protocol.signature import (
+    load_or_create_key,
+    sign_record,
+)
 from snakesim_operator.features.qualification.protocol.steps import STEPS, Step, describe_criterion
-from snakesim_operator.features.qualification.protocol.summary import EMULATED_BANNER, describe_subject, make_summary
+from snakesim_operator.features.qualification.protocol.summary import (
+    EMULATED_BANNER,
+    describe_subject,
+    make_summary,
+)
 from snakesim_operator.features.qualification.rig import Rig
 from snakesim_operator.features.qualification.setup import (
     Request,
@@ -101,7 +108,9 @@ def qualify_drive(request: Request, options: Options, print_text: PrintLine) -> 
     with ExitStack() as exit_stack:
         drive = None
         if setup.is_emulated:
-            drive = EmulatedDrive(setup.config, setup.bus, folder, request.emulator_sets, options.emulator_module)
+            drive = EmulatedDrive(
+                setup.config, setup.bus, folder, request.emulator_sets, options.emulator_module
+            )
             exit_stack.callback(drive.close)
         rig = Rig(setup, folder, drive, options.firmware)
         exit_stack.callback(rig.close)
@@ -130,15 +139,19 @@ def _resolve_folder(request: Request) -> Request:
 def _confirm_safety(person: Person) -> tuple[str, ...]:
     """Ask what must be true before a motor may turn. Raises RefusedError."""
     for confirmation in CONFIRMATIONS:
-        if person.ask(confirmation) != "yes":
-            raise RefusedError(f"not started: {confirmation} That must be true first.", code="robot/not-armed")
+        if person.read_yes_or_no(confirmation) != "yes":
+            raise RefusedError(
+                f"not started: {confirmation} That must be true first.", code="robot/not-armed"
+            )
     return CONFIRMATIONS
 
 
 def _describe_subject(rig: Rig, options: Options) -> Subject:
     setup: Setup = rig.setup
     joint = rig.robot.joints[0]
-    adapter = options.adapter or ("none, an emulated bus" if setup.is_emulated else detect_adapter(setup.bus))
+    adapter = options.adapter or (
+        "none, an emulated bus" if setup.is_emulated else detect_adapter(setup.bus)
+    )
     return Subject(
         driver_type=setup.config.backend,
         emulated=rig.robot.emulated,
@@ -151,7 +164,9 @@ def _describe_subject(rig: Rig, options: Options) -> Subject:
     )
 
 
-def _begin_record(folder: Path, subject: Subject, options: Options, confirmations: tuple[str, ...]) -> Record:
+def _begin_record(
+    folder: Path, subject: Subject, options: Options, confirmations: tuple[str, ...]
+) -> Record:
     """Return a new record, or an interrupted one of the same drive. Raises ConfigError if that is another drive."""
     progress = folder / PROGRESS
     if progress.exists():
@@ -173,7 +188,12 @@ def _begin_record(folder: Path, subject: Subject, options: Options, confirmation
 
 
 def _run_steps(
-    rig: Rig, assistant: Assistant, record: Record, options: Options, folder: Path, print_text: PrintLine
+    rig: Rig,
+    assistant: Assistant,
+    record: Record,
+    options: Options,
+    folder: Path,
+    print_text: PrintLine,
 ) -> Record:
     done = {step.key for step in record.steps if step.verdict != "unknown"}
     for number, step in enumerate(STEPS, start=1):
@@ -192,7 +212,9 @@ def _run_steps(
         for _ in range(MAX_REPETITIONS if record.subject.emulated else 0):
             if not result.problem:
                 break
-            print_text(f"       repeated, because an emulated drive needs a computer with time: {result.problem}")
+            print_text(
+                f"       repeated, because an emulated drive needs a computer with time: {result.problem}"
+            )
             result = _run_step(step, criterion, rig, assistant)
         for check in result.checks:
             print_text(f"       {MARKS[judge_check(check)]}  {describe_check(check)}")
@@ -225,7 +247,8 @@ def _run_step(step: Step, criterion: str, rig: Rig, assistant: Assistant) -> Ste
         checks=tuple(checks),
         problem=problem,
     )
-    return msgspec.json.decode(msgspec.json.encode(result), type=StepResult)  # as it is read from a file
+    # As it is read from a file.
+    return msgspec.json.decode(msgspec.json.encode(result), type=StepResult)
 
 
 def _restart_host(rig: Rig) -> None:

@@ -13,14 +13,19 @@ from snakesim_hal.backend import Backend
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario, parse_set_option
 from snakesim_hal.model.textfiles import write_text
-from snakesim_hal.programs.preflight import decode_backend_settings, load_backend_class, validate_and_complete_config
+from snakesim_hal.programs.preflight import (
+    decode_backend_settings,
+    load_backend_class,
+    validate_and_complete_config,
+)
 from snakesim_operator.features.qualification.protocol.record import Computer
 from snakesim_operator.features.qualification.protocol.steps import Bounds
 
 MAX_TORQUE_NM = 2.0  # of the joint in its robot file; the first hour needs no more
 MAX_TRAVEL_RAD = 0.35  # of the joint to either side, in its robot file
 SERIAL_BUS = "servos"  # link to the pseudo terminal of emulated servos
-EMULATED_DRAG_NM = 0.35  # friction of the emulated joint: it is more than the blocked joint's torque limit
+# Friction of the emulated joint: it is more than the blocked joint's torque limit.
+EMULATED_DRAG_NM = 0.35
 
 ROBOT = """\
 extends = "planar13"
@@ -110,7 +115,9 @@ def make_setup(request: Request) -> Setup:
         overrides += [
             KeyOverride(f"backend.{port_key}", [channel], "drive qualify"),
             KeyOverride("backend.physics_model", "inertia", "drive qualify"),
-            KeyOverride("backend.physics_model_settings.drag_nm", EMULATED_DRAG_NM, "drive qualify"),
+            KeyOverride(
+                "backend.physics_model_settings.drag_nm", EMULATED_DRAG_NM, "drive qualify"
+            ),
         ]
         loaded = load_scenario(scenario, overrides)
         settings = decode_backend_settings(loaded.config, backend, loaded.table)

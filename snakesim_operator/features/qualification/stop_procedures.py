@@ -15,7 +15,10 @@ from snakesim_operator.features.qualification.assistant import Assistant
 from snakesim_operator.features.qualification.command_thread import MotionPlan
 from snakesim_operator.features.qualification.protocol import steps
 from snakesim_operator.features.qualification.protocol.checks import Check, judge_check
-from snakesim_operator.features.qualification.protocol.torque_timeline import TorqueReading, TorqueTimeline
+from snakesim_operator.features.qualification.protocol.torque_timeline import (
+    TorqueReading,
+    TorqueTimeline,
+)
 from snakesim_operator.features.qualification.rig import Rig, make_requester
 
 SWING_RAD = 0.03  # of the slow oscillation, in which drives are interrupted
@@ -51,7 +54,13 @@ def _check_killed_host(rig: Rig) -> list[Check]:
     rig.start_host()
     state = rig.wait_for_lifecycle("disarmed", timeout_s=5.0)
     checks.append(
-        Check(name="state of a new host", value=state, equals="disarmed", source="host", claims=("never-arms-itself",))
+        Check(
+            name="state of a new host",
+            value=state,
+            equals="disarmed",
+            source="host",
+            claims=("never-arms-itself",),
+        )
     )
     return checks
 
@@ -76,7 +85,12 @@ def _check_frozen_host_without_watchdog(rig: Rig) -> list[Check]:
 
 
 def _check_polling(readings: list[TorqueReading]) -> Check:
-    return Check(name="answers to the second program", value=float(len(readings)), minimum=1.0, source="drive status")
+    return Check(
+        name="answers to the second program",
+        value=float(len(readings)),
+        minimum=1.0,
+        source="drive status",
+    )
 
 
 def _check_keeps_torque(torque_off: Check) -> Check:
@@ -209,12 +223,18 @@ def _swing(rig: Rig) -> None:
         if rig.read_lifecycle() == "armed":
             return
         rig.disarm()
-    raise RefusedError(f"the robot stopped by itself {MAX_ARMINGS} times after arming", code="robot/not-armed")
+    raise RefusedError(
+        f"the robot stopped by itself {MAX_ARMINGS} times after arming", code="robot/not-armed"
+    )
 
 
 def _check_state(state: str, expected: str, claim: str = "") -> Check:
     return Check(
-        name="state of the robot", value=state, equals=expected, source="host", claims=(claim,) if claim else ()
+        name="state of the robot",
+        value=state,
+        equals=expected,
+        source="host",
+        claims=(claim,) if claim else (),
     )
 
 
@@ -222,7 +242,9 @@ def _check_faults(rig: Rig) -> Check:
     return Check(name="faults", value=", ".join(dict.fromkeys(rig.list_faults())), source="host")
 
 
-def _check_torque_off(timeline: TorqueTimeline, start_ns: int, limit_s: float, claim: str = "") -> Check:
+def _check_torque_off(
+    timeline: TorqueTimeline, start_ns: int, limit_s: float, claim: str = ""
+) -> Check:
     off_s = timeline.find_torque_off_s(start_ns)
     note = ""
     if timeline.lists_changes and timeline.was_enabled_at(start_ns) is False:
@@ -265,7 +287,9 @@ def _check_estop(rig: Rig, start_ns: int, claim: str = "") -> list[Check]:
         readings = rig.watch_torque(max(remaining_s - LAST_READING_S, 0.0))
     state = rig.wait_for_lifecycle("estop", timeout_s=2.0)
     return [
-        _check_torque_off(rig.make_timeline(readings), start_ns, bounds.estop_s, "estop-off-at-once"),
+        _check_torque_off(
+            rig.make_timeline(readings), start_ns, bounds.estop_s, "estop-off-at-once"
+        ),
         _check_state(state, "estop", claim),
     ]
 
@@ -284,7 +308,11 @@ def _check_restarted(rig: Rig) -> list[Check]:
 
 def _check_operator_sees_no_torque(assistant: Assistant) -> list[Check]:
     answer = assistant.ask_without_torque()
-    return [Check(name="the motor is without torque", value=answer, equals="yes", source=assistant.source)]
+    return [
+        Check(
+            name="the motor is without torque", value=answer, equals="yes", source=assistant.source
+        )
+    ]
 
 
 def _add_claim(check: Check, claim: str) -> Check:

@@ -2,19 +2,30 @@
 
 import argparse
 
-from snakesim_hal.programs.arguments import add_json_argument, add_output_argument, make_number_parser
+from snakesim_hal.programs.arguments import (
+    add_json_argument,
+    add_output_argument,
+    make_number_parser,
+)
 from snakesim_hal.programs.commands import Command, Commands
 
 
 def _add_reproduce(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim reproduce`."""
     parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="experiments, as --list names them; `all` runs every one"
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help="experiments, as --list names them; `all` runs every one",
     )
     parser.add_argument(
-        "--list", action="store_true", help="list name, year and source of each experiment, and run none"
+        "--list",
+        action="store_true",
+        help="list name, year and source of each experiment, and run none",
     )
-    add_output_argument(parser, "folder for a picture of each experiment, NAME.png (default: no pictures)")
+    add_output_argument(
+        parser, "folder for a picture of each experiment, NAME.png (default: no pictures)"
+    )
     parser.add_argument(
         "--seeds",
         type=make_number_parser(1, 1000),
@@ -29,7 +40,9 @@ def _add_reproduce(parser: argparse.ArgumentParser) -> None:
         help="processes on this computer (default: one a core)",
     )
     parser.add_argument(
-        "--quick", action="store_true", help="make fewer runs, to try the command; the results are rougher"
+        "--quick",
+        action="store_true",
+        help="make fewer runs, to try the command; the results are rougher",
     )
     add_json_argument(parser)
 

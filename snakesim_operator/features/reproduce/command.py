@@ -6,7 +6,12 @@ from pathlib import Path
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_operator.base.worker_pool import WorkerPool
-from snakesim_operator.features.reproduce.comparison_text import describe_lines, list_lines, make_entry, make_record
+from snakesim_operator.features.reproduce.comparison_text import (
+    describe_lines,
+    list_lines,
+    make_entry,
+    make_record,
+)
 from snakesim_operator.features.reproduce.experiment import Experiment, ExperimentFindings
 from snakesim_operator.features.reproduce.experiments import EXPERIMENTS
 from snakesim_operator.features.reproduce.trials import ExperimentTrials
@@ -25,7 +30,13 @@ def list_experiments(*, as_json: bool) -> int:
 
 
 def reproduce(
-    names: Sequence[str], out: Path | None, *, seeds: int, worker_count: int | None, is_quick: bool, as_json: bool
+    names: Sequence[str],
+    out: Path | None,
+    *,
+    seeds: int,
+    worker_count: int | None,
+    is_quick: bool,
+    as_json: bool,
 ) -> int:
     """Run experiments, and print what they found.
 
@@ -45,7 +56,9 @@ def reproduce(
     """
     experiments = select_experiments(names)
     records = []
-    for experiment, findings in run_experiments(experiments, seeds=seeds, worker_count=worker_count, is_quick=is_quick):
+    for experiment, findings in run_experiments(
+        experiments, seeds=seeds, worker_count=worker_count, is_quick=is_quick
+    ):
         if as_json:
             records.append(make_record(experiment, findings))
         else:
@@ -62,7 +75,11 @@ def reproduce(
 
 
 def run_experiments(
-    experiments: Sequence[Experiment], *, seeds: int, worker_count: int | None, is_quick: bool = False
+    experiments: Sequence[Experiment],
+    *,
+    seeds: int,
+    worker_count: int | None,
+    is_quick: bool = False,
 ) -> Iterator[tuple[Experiment, ExperimentFindings]]:
     """Run experiments one after the other, and yield what each found."""
     with WorkerPool(worker_count) as pool:
@@ -71,7 +88,9 @@ def run_experiments(
             yield experiment, experiment.run(trials)
 
 
-def write_experiment_picture(experiment: Experiment, findings: ExperimentFindings, folder: Path) -> Path:
+def write_experiment_picture(
+    experiment: Experiment, findings: ExperimentFindings, folder: Path
+) -> Path:
     """Write the picture of an experiment into a folder, and return its path. Raises ConfigError if that fails."""
     from snakesim_operator.features.reproduce.picture import write_picture
 

@@ -33,19 +33,25 @@ def describe_lines(experiment: Experiment, findings: ExperimentFindings) -> Iter
     """Yield what an experiment states and found, line by line."""
     source = experiment.source
     yield experiment.name
-    yield from _labeled("source", f"{source.short_text}. {source.published_in}, {source.year}: {source.place}")
+    yield from _labeled(
+        "source", f"{source.short_text}. {source.published_in}, {source.year}: {source.place}"
+    )
     yield from _labeled("seen", source.seen)
     yield from _labeled("claim", experiment.claim)
     yield from _labeled("conditions", f"Published: {experiment.published_conditions}")
     yield from _labeled("", f"Ours: {experiment.our_conditions}")
     yield from _labeled("method", experiment.method)
     if not experiment.depends_on_seed:
-        yield from _labeled("", "The gait has no feedback, so that every seed gives the same motion.")
+        yield from _labeled(
+            "", "The gait has no feedback, so that every seed gives the same motion."
+        )
     for comparison in findings.comparisons:
         yield ""
         yield f"{comparison.quantity}{format_unit(comparison.unit)}"
         yield from _labeled(
-            "published", f"{format_value(comparison.published)} ({BASIS_TEXTS[comparison.basis]})", indent=2
+            "published",
+            f"{format_value(comparison.published)} ({BASIS_TEXTS[comparison.basis]})",
+            indent=2,
         )
         yield from _labeled("ours", describe_ours(comparison), indent=2)
         yield from _labeled("difference", describe_difference(comparison), indent=2)
@@ -93,7 +99,9 @@ def format_effect(reason: DifferenceReason) -> str:
 
 def format_signed(value: float, digits: int) -> str:
     """Return a number with its sign, with so many significant digits and without an exponent."""
-    return np.format_float_positional(value, precision=digits, fractional=False, sign=True, trim="-")
+    return np.format_float_positional(
+        value, precision=digits, fractional=False, sign=True, trim="-"
+    )
 
 
 def format_value(value: float | str) -> str:

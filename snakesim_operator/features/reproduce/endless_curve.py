@@ -16,7 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.features.reproduce.gait_motion import MIN_SLIP_M_S, GroundFriction, find_friction_per_load
+from snakesim_operator.features.reproduce.gait_motion import (
+    MIN_SLIP_M_S,
+    GroundFriction,
+    find_friction_per_load,
+)
 
 PHASES = np.linspace(0.0, 2 * np.pi, 720, endpoint=False)
 BISECTIONS = 60
@@ -36,7 +40,9 @@ def find_axis_ratio(winding_angle_rad: float) -> float:
     return float(np.mean(np.cos(winding_angle_rad * np.cos(PHASES))))
 
 
-def find_endless_motion(winding_angle_rad: float, friction: GroundFriction, wave_m_s: float = 1.0) -> EndlessMotion:
+def find_endless_motion(
+    winding_angle_rad: float, friction: GroundFriction, wave_m_s: float = 1.0
+) -> EndlessMotion:
     """Return how an endless body moves.
 
     Args:
@@ -70,7 +76,9 @@ def _find_slips(slip: float, angles_rad: Floats, wave_m_s: float) -> NDArray[np.
     return (wave_m_s * (along + 1j * across)).astype(np.complex128)
 
 
-def _find_force(slip: float, angles_rad: Floats, friction: GroundFriction, wave_m_s: float) -> float:
+def _find_force(
+    slip: float, angles_rad: Floats, friction: GroundFriction, wave_m_s: float
+) -> float:
     """Return the mean force of friction along the axis of the curve, divided by the load."""
     forces = find_friction_per_load(_find_slips(slip, angles_rad, wave_m_s), friction, MIN_SLIP_M_S)
     # The axis has the direction (cos theta, -sin theta) along the body and across it.

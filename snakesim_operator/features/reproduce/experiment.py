@@ -41,7 +41,8 @@ class PublishedComparison:
     published: float | str
     basis: Basis
     ours: float | str
-    interval: tuple[float, float] | None = None  # 95 % of the mean over seeds; None: the result does not depend on it
+    # 95 % of the mean over seeds; None: the result does not depend on it.
+    interval: tuple[float, float] | None = None
     runs: int
 
     @property
@@ -131,7 +132,9 @@ class Experiment(ABC):
         """
 
 
-def explain_by_steps(values: Sequence[tuple[str, float]], unit: str, rest: str) -> list[DifferenceReason]:
+def explain_by_steps(
+    values: Sequence[tuple[str, float]], unit: str, rest: str
+) -> list[DifferenceReason]:
     """Return the reasons of a difference from values that come closer to the simulator step by step.
 
     Args:

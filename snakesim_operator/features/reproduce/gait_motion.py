@@ -7,7 +7,11 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.friction import DirectionalFriction, ViscousFriction, compute_surface_friction
+from snakesim_hal.model.friction import (
+    DirectionalFriction,
+    ViscousFriction,
+    compute_surface_friction,
+)
 from snakesim_hal.model.kinematics import ForwardKinematics
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.solids import GRAVITY_M_S2
@@ -43,7 +47,8 @@ class GaitMotion:
 
     speed_m_s: float  # of the center of mass, along the mean direction from tail to head
     ground_power_w: float  # mean work against friction per time
-    angle_harmonics: NDArray[np.complex128]  # (HARMONICS, joints): angle = real part of sum c_h exp(i h phase)
+    # (HARMONICS, joints): angle = real part of sum c_h exp(i h phase).
+    angle_harmonics: NDArray[np.complex128]
     body_length_m: float
     weight_n: float
 
@@ -71,13 +76,17 @@ def measure_gait(record: RunRecord, period_s: float, skipped_periods: int) -> Ga
     return GaitMotion(
         speed_m_s=float(way_w @ axis_w / np.linalg.norm(axis_w)) / time_s,
         ground_power_w=_measure_ground_power_w(record, nodes_w),
-        angle_harmonics=_find_harmonics(record.angle_rad[rows[:-1]], period_s, record.config.rate_hz),
+        angle_harmonics=_find_harmonics(
+            record.angle_rad[rows[:-1]], period_s, record.config.rate_hz
+        ),
         body_length_m=get_body_length_m(record),
         weight_n=get_weight_n(record),
     )
 
 
-def _select_whole_periods(record: RunRecord, period_s: float, skipped_periods: int) -> NDArray[np.int64]:
+def _select_whole_periods(
+    record: RunRecord, period_s: float, skipped_periods: int
+) -> NDArray[np.int64]:
     """Return the numbers of the rows of the last whole periods, both ends included."""
     rows_per_period = round(period_s * record.config.rate_hz)
     last = len(record.time_s) - 1
@@ -95,7 +104,9 @@ def _find_harmonics(angles_rad: Floats, period_s: float, rate_hz: float) -> NDAr
     """Return the Fourier series of the joint angles, (HARMONICS, joints). Phase 0 is the first row."""
     phases = 2 * np.pi * np.arange(len(angles_rad)) / (period_s * rate_hz)
     waves = np.exp(-1j * np.outer(np.arange(HARMONICS), phases))
-    series: NDArray[np.complex128] = (2 * waves @ angles_rad / len(angles_rad)).astype(np.complex128)
+    series: NDArray[np.complex128] = (2 * waves @ angles_rad / len(angles_rad)).astype(
+        np.complex128
+    )
     series[0] /= 2
     return series
 
@@ -132,7 +143,9 @@ def find_foot_tangents(links: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """
     directions = links / np.abs(links)
     zeros = np.zeros_like(directions[..., :1])
-    sums = np.concatenate((directions, zeros), axis=-1) + np.concatenate((zeros, directions), axis=-1)
+    sums = np.concatenate((directions, zeros), axis=-1) + np.concatenate(
+        (zeros, directions), axis=-1
+    )
     return sums / np.abs(sums)
 
 

@@ -36,7 +36,9 @@ class JointWaves:
     period_s: float
 
     @staticmethod
-    def from_serpenoid(robot: RobotFile, winding_angle_rad: float, wavelength: float, period_s: float) -> "JointWaves":
+    def from_serpenoid(
+        robot: RobotFile, winding_angle_rad: float, wavelength: float, period_s: float
+    ) -> "JointWaves":
         """Return the angles of a robot on Hirose's serpenoid curve, whose wave travels from head to tail.
 
         Each link has the heading of the curve at its middle.
@@ -85,7 +87,9 @@ class PlanarChain:
         self._mass_kg = float(self._masses_kg.sum())
         radius_m = robot.module.radius_m
         # As of cylinders with caps, about their middles.
-        self._inertias_kg_m2 = self._masses_kg * (3 * radius_m**2 + (self._lengths_m + 2 * radius_m) ** 2) / 12
+        self._inertias_kg_m2 = (
+            self._masses_kg * (3 * radius_m**2 + (self._lengths_m + 2 * radius_m) ** 2) / 12
+        )
         self._has_middle_contacts = has_middle_contacts
         if has_middle_contacts:
             self._loads_n = GRAVITY_M_S2 * self._masses_kg
@@ -115,9 +119,11 @@ class PlanarChain:
         """
         masses_kg = self._masses_kg
         headings_rad = self._tail_heading_rad + np.append(0.0, np.cumsum(angles_rad))
-        relative_rates_rad_s = np.append(0.0, np.cumsum(rates_rad_s))  # of the links, relative to the tail link
+        # Of the links, relative to the tail link.
+        relative_rates_rad_s = np.append(0.0, np.cumsum(rates_rad_s))
         links = (self._lengths_m * np.exp(1j * headings_rad)).astype(np.complex128)
-        ends = self._tail_end + np.append(0.0, np.cumsum(links))  # both ends of the body, and the joints
+        # Both ends of the body, and the joints.
+        ends = self._tail_end + np.append(0.0, np.cumsum(links))
         middles = ends[:-1] + 0.5 * links
         center = complex(masses_kg @ middles / self._mass_kg)
 
@@ -128,7 +134,10 @@ class PlanarChain:
 
         # The velocity of the tail end and the yaw rate that give the whole body its momenta.
         arms = middles - center
-        joint_part = masses_kg @ (np.conj(arms) * middle_rates).imag + self._inertias_kg_m2 @ relative_rates_rad_s
+        joint_part = (
+            masses_kg @ (np.conj(arms) * middle_rates).imag
+            + self._inertias_kg_m2 @ relative_rates_rad_s
+        )
         inertia_kg_m2 = masses_kg @ np.abs(arms) ** 2 + self._inertias_kg_m2.sum()
         yaw_rate_rad_s = float((self._angular_momentum - joint_part) / inertia_kg_m2)
         center_velocity = (self._momentum - masses_kg @ middle_rates) / self._mass_kg
@@ -142,8 +151,14 @@ class PlanarChain:
             contacts = ends
             contact_rates = end_rates
             tangents = find_foot_tangents(links)
-        velocities = tail_velocity + 1j * yaw_rate_rad_s * (contacts - self._tail_end) + contact_rates
-        forces_n = self._loads_n * tangents * find_friction((velocities * np.conj(tangents)).astype(np.complex128))
+        velocities = (
+            tail_velocity + 1j * yaw_rate_rad_s * (contacts - self._tail_end) + contact_rates
+        )
+        forces_n = (
+            self._loads_n
+            * tangents
+            * find_friction((velocities * np.conj(tangents)).astype(np.complex128))
+        )
 
         self._momentum += step_s * forces_n.sum()
         self._angular_momentum += step_s * float((np.conj(contacts - center) * forces_n).imag.sum())

@@ -8,7 +8,11 @@ from typing import Any
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_operator.base.worker_pool import WorkerPool
-from snakesim_operator.features.reproduce.gait_motion import GaitMotion, GroundFriction, measure_gait
+from snakesim_operator.features.reproduce.gait_motion import (
+    GaitMotion,
+    GroundFriction,
+    measure_gait,
+)
 from snakesim_operator.results.metrics.intervals import compute_mean_interval
 from snakesim_operator.run.in_process import simulate
 
@@ -55,7 +59,11 @@ class GaitRun:
 
 
 def make_serpenoid_run(
-    winding_angle_rad: float, wavelength: float, period_s: float, friction: Sequence[str], module_count: int = LINKS - 1
+    winding_angle_rad: float,
+    wavelength: float,
+    period_s: float,
+    friction: Sequence[str],
+    module_count: int = LINKS - 1,
 ) -> GaitRun:
     """Return a run of Hirose's serpenoid curve without directional control.
 

@@ -11,7 +11,9 @@ def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim robot import`, which converts a URDF into a robot file."""
     parser.add_argument("file", type=Path, metavar="FILE.urdf", help="the URDF")
     add_output_argument(parser, "robot file to write (default: NAME.toml)")
-    parser.add_argument("--tail", metavar="LINK", help="a link at the tail end (default: the root link)")
+    parser.add_argument(
+        "--tail", metavar="LINK", help="a link at the tail end (default: the root link)"
+    )
     parser.add_argument(
         "--up",
         choices=["x", "y", "z", "-x", "-y", "-z"],
@@ -35,7 +37,9 @@ def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("robot", metavar="ROBOT", help="name of a shipped robot, or path of a robot file")
+    parser.add_argument(
+        "robot", metavar="ROBOT", help="name of a shipped robot, or path of a robot file"
+    )
     add_output_argument(parser, "URDF to write (default: NAME.urdf)")
 
 
@@ -59,7 +63,10 @@ COMMANDS: Commands = (
         help="Make a robot file from a URDF. Reports what cannot be carried over.",
         add=_add_import_arguments,
         run=_run_import,
-        examples=("robot import snake.urdf", "robot import snake.urdf --out snake.toml --scale 0.001 --json"),
+        examples=(
+            "robot import snake.urdf",
+            "robot import snake.urdf --out snake.toml --scale 0.001 --json",
+        ),
     ),
     Command(
         name="robot export",

@@ -12,24 +12,33 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable
 from snakesim_hal.model.links import compute_capsule_inertia
-from snakesim_operator.features.robots.imported import VECTOR_BY_UP_AXIS, ImportOptions, ImportResult
+from snakesim_operator.features.robots.imported import (
+    VECTOR_BY_UP_AXIS,
+    ImportOptions,
+    ImportResult,
+)
 from snakesim_operator.features.robots.urdf_tree import BodyChain, UrdfBody, UrdfJoint
 from snakesim_operator.features.robots.xml_tree import XmlElement
 
-LENGTH_DIGITS = 9  # lengths are rounded to a nanometer, which removes the noise of adding transforms
+# Lengths are rounded to a nanometer, which removes the noise of adding transforms.
+LENGTH_DIGITS = 9
 VALUE_DIGITS = 10  # significant digits of masses and inertias
-MAX_OFFSET_RATIO = 0.05  # of a joint from the line of all joints, relative to the mean distance between joints
+# Of a joint from the line of all joints, relative to the mean distance between joints.
+MAX_OFFSET_RATIO = 0.05
 MIN_AXIS_COSINE = math.cos(math.radians(1.0))  # a joint's axis may be tilted by 1 degree
 MIN_REPORTED_TILT_RAD = 1e-5  # of an axis; less is the rounding of the file
 MIN_REPORTED_OFFSET_M = 1e-6  # of a joint; less is the rounding of the file
-ASSUMED_RADIUS_RATIO = 0.35  # radius of a link without geometry, relative to the mean distance between joints
+# Radius of a link without geometry, relative to the mean distance between joints.
+ASSUMED_RADIUS_RATIO = 0.35
 MIN_LENGTH_M = 0.001
 MAX_JOINT_DISTANCE_M = 2
 MIN_MASS_KG = 0.001
 MOMENT_INDICES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # ixx, iyy, izz, ixy, ixz, iyz
 
 
-def convert_body(result: ImportResult, chain: BodyChain, options: ImportOptions, urdf: XmlElement) -> list[Floats]:
+def convert_body(
+    result: ImportResult, chain: BodyChain, options: ImportOptions, urdf: XmlElement
+) -> list[Floats]:
     """Convert the bodies of a URDF into chain, module and links of a robot file.
 
     Args:
@@ -54,12 +63,15 @@ def convert_body(result: ImportResult, chain: BodyChain, options: ImportOptions,
 
     # Joints, in the body frame.
     positions_b = np.array([body_from_root @ joint.origin for joint in chain.joints]) * scale
-    line_b = np.array([0.0, *positions_b[0][1:]])  # y and z of the line are those of the first joint
+    # Y and z of the line are those of the first joint.
+    line_b = np.array([0.0, *positions_b[0][1:]])
     on_line = positions_b - line_b
     joints_x = on_line[:, 0]
     joint_distance_m = float(np.mean(np.diff(joints_x)))
     _validate_joint_distance(chain, joints_x, joint_distance_m, urdf)
-    axis_names = [_classify_joint_axis(result, joint, body_from_root @ joint.axis) for joint in chain.joints]
+    axis_names = [
+        _classify_joint_axis(result, joint, body_from_root @ joint.axis) for joint in chain.joints
+    ]
     for joint, axis, offset_m in zip(chain.joints, axis_names, on_line, strict=True):
         _validate_joint_on_line(result, joint, axis, offset_m, joint_distance_m)
 
@@ -71,7 +83,9 @@ def convert_body(result: ImportResult, chain: BodyChain, options: ImportOptions,
 
     # Links.
     starts_x = [joints_x[0] - lengths[0], *joints_x]
-    link_frames = [_make_link_frame(body_from_root, np.array([x, *positions_b[0][1:]])) for x in starts_x]
+    link_frames = [
+        _make_link_frame(body_from_root, np.array([x, *positions_b[0][1:]])) for x in starts_x
+    ]
     links: list[dict[str, Any]] = []
     for i, body in enumerate(chain.bodies):
         links.append(_convert_link(result, i, body, link_frames[i], lengths[i], radius_m, scale))
@@ -84,13 +98,17 @@ def _find_body_axes(chain: BodyChain, options: ImportOptions, urdf: XmlElement) 
     """Return body_from_root, (3, 3): x from tail to head, z up. Raises ConfigError."""
     along = chain.joints[-1].origin - chain.joints[0].origin
     if np.linalg.norm(along) < 1e-9:
-        raise urdf.make_error("has its first and last joint at the same place, so that the chain has no direction")
+        raise urdf.make_error(
+            "has its first and last joint at the same place, so that the chain has no direction"
+        )
     x = along / np.linalg.norm(along)
     up = np.array(VECTOR_BY_UP_AXIS[options.up], dtype=np.float64)
     z = up - (up @ x) * x
     if np.linalg.norm(z) < 0.1:
         others = [
-            name for name in VECTOR_BY_UP_AXIS if abs(np.array(VECTOR_BY_UP_AXIS[name]) @ x) < 0.9 and "-" not in name
+            name
+            for name in VECTOR_BY_UP_AXIS
+            if abs(np.array(VECTOR_BY_UP_AXIS[name]) @ x) < 0.9 and "-" not in name
         ]
         raise urdf.make_error(
             f"lies along its {options.up} axis: choose which one points up: --up {' or --up '.join(others)}"
@@ -99,7 +117,9 @@ def _find_body_axes(chain: BodyChain, options: ImportOptions, urdf: XmlElement) 
     return np.vstack([x, np.cross(z, x), z])
 
 
-def _validate_joint_distance(chain: BodyChain, joints_x: Floats, gap_m: float, urdf: XmlElement) -> None:
+def _validate_joint_distance(
+    chain: BodyChain, joints_x: Floats, gap_m: float, urdf: XmlElement
+) -> None:
     """Raise ConfigError when the joints are so far apart that the unit of length must be wrong."""
     if gap_m <= MAX_JOINT_DISTANCE_M:
         return
@@ -110,7 +130,9 @@ def _validate_joint_distance(chain: BodyChain, joints_x: Floats, gap_m: float, u
     )
 
 
-def _report_renamed_parts(result: ImportResult, chain: BodyChain, axes: list[str], body_from_root: Floats) -> None:
+def _report_renamed_parts(
+    result: ImportResult, chain: BodyChain, axes: list[str], body_from_root: Floats
+) -> None:
     """Report the new names of links and joints, and keep which joints turn the other way round."""
     for i, body in enumerate(chain.bodies):
         if body.links != [f"link_{i}"]:
@@ -143,7 +165,8 @@ def _classify_joint_axis(result: ImportResult, joint: UrdfJoint, axis_b: Floats)
         tilt_rad = float(np.linalg.norm(np.delete(axis_b, component)))
         if tilt_rad > MIN_REPORTED_TILT_RAD:
             result.changes.add(
-                f"<axis xyz>, tilted by {math.degrees(tilt_rad):.4f}°, became {letter}", joint.format_place("axis")
+                f"<axis xyz>, tilted by {math.degrees(tilt_rad):.4f}°, became {letter}",
+                joint.format_place("axis"),
             )
         return name
     raise joint.element.make_error(
@@ -192,7 +215,9 @@ def _validate_joint_on_line(
         )
 
 
-def _transform_outline(body: UrdfBody, body_from_root: Floats, line_b: Floats, scale: float) -> Floats | None:
+def _transform_outline(
+    body: UrdfBody, body_from_root: Floats, line_b: Floats, scale: float
+) -> Floats | None:
     """Return the outline of a body, (n, 3): x along the robot, y and z from the line through the joints.
 
     None means that the body has no geometry.
@@ -219,10 +244,14 @@ def _is_capsule(body: UrdfBody, radius: float) -> bool:
     """Return whether the shapes of a body are an exported capsule of this radius: a cylinder and two spheres."""
     if sorted(shape.tag for shape in body.shapes) != ["cylinder", "sphere", "sphere"]:
         return False
-    return all(math.isclose(shape.read_number("radius"), radius, rel_tol=1e-6) for shape in body.shapes)
+    return all(
+        math.isclose(shape.read_number("radius"), radius, rel_tol=1e-6) for shape in body.shapes
+    )
 
 
-def _choose_common_radius(outlines: list[Floats | None], joint_distance_m: float, result: ImportResult) -> float:
+def _choose_common_radius(
+    outlines: list[Floats | None], joint_distance_m: float, result: ImportResult
+) -> float:
     """Choose a common radius of all links in m, that of the widest link, and report what that changes.
 
     Args:
@@ -255,7 +284,9 @@ def _choose_common_radius(outlines: list[Floats | None], joint_distance_m: float
         if radius_m < widest_m * 0.99:  # a difference of 1 % is not reported
             narrower_links.append(f"{name} ({radius_m * 1e3:.1f} mm)")
     if narrower_links:
-        result.changes.add(f"every link is a capsule of {widest_mm}, the widest; narrower: {', '.join(narrower_links)}")
+        result.changes.add(
+            f"every link is a capsule of {widest_mm}, the widest; narrower: {', '.join(narrower_links)}"
+        )
     return widest_m
 
 
@@ -265,7 +296,11 @@ def _measure_radius(points: Floats) -> float:
 
 
 def _measure_link_lengths(
-    joints_x: Floats, outlines: list[Floats | None], radius_m: float, result: ImportResult, chain: BodyChain
+    joints_x: Floats,
+    outlines: list[Floats | None],
+    radius_m: float,
+    result: ImportResult,
+    chain: BodyChain,
 ) -> list[float]:
     """Measure the length of every link in m, tail to head, without the rounded caps of its capsule.
 
@@ -282,7 +317,8 @@ def _measure_link_lengths(
     gaps_m = [round(float(gap), LENGTH_DIGITS) for gap in np.diff(joints_x)]
     if min(gaps_m) < 0:
         raise ConfigError(
-            "the joints are not in order along the chain at zero angles: it is folded", code="urdf/invalid"
+            "the joints are not in order along the chain at zero angles: it is folded",
+            code="urdf/invalid",
         )
     inner_lengths_m: list[float] = []  # of the links between tail and head
     for i, gap_m in enumerate(gaps_m):
@@ -293,7 +329,9 @@ def _measure_link_lengths(
             )
         inner_lengths_m.append(max(gap_m, MIN_LENGTH_M))
     head_index = len(outlines) - 1
-    tail_m = _measure_end_link_length(result, 0, outlines[0], joints_x[0], -1, radius_m, inner_lengths_m)
+    tail_m = _measure_end_link_length(
+        result, 0, outlines[0], joints_x[0], -1, radius_m, inner_lengths_m
+    )
     head_m = _measure_end_link_length(
         result, head_index, outlines[head_index], joints_x[-1], 1, radius_m, inner_lengths_m
     )
@@ -338,7 +376,13 @@ def _measure_end_link_length(
 
 
 def _convert_link(
-    result: ImportResult, index: int, body: UrdfBody, frame: Floats, length_m: float, radius_m: float, scale: float
+    result: ImportResult,
+    index: int,
+    body: UrdfBody,
+    frame: Floats,
+    length_m: float,
+    radius_m: float,
+    scale: float,
 ) -> dict[str, Any]:
     """Convert a body into the entry of a link in [[links]] of the robot file.
 
@@ -375,7 +419,9 @@ def _convert_link(
         moments_kg_m2 = capsule_moments
 
     link: dict[str, Any] = {"length_m": length_m, "mass_kg": mass_kg}
-    has_capsule_inertia = np.allclose(moments_kg_m2, capsule_moments, rtol=1e-6, atol=1e-6 * capsule_moments.max())
+    has_capsule_inertia = np.allclose(
+        moments_kg_m2, capsule_moments, rtol=1e-6, atol=1e-6 * capsule_moments.max()
+    )
     is_centered = np.allclose(center_m, [length_m / 2, 0, 0], atol=1e-8)
     if not (has_capsule_inertia and is_centered):
         # Adding 0.0 turns -0.0 into 0.0.
@@ -388,7 +434,9 @@ def _convert_link(
 def _list_moments(inertia: Floats) -> Floats:
     """Return ixx, iyy, izz, ixy, ixz, iyz of a matrix, (3, 3); the noise of rotating it becomes 0."""
     noise = 1e-9 * np.abs(inertia).max()
-    return np.array([inertia[index] if abs(inertia[index]) > noise else 0.0 for index in MOMENT_INDICES])
+    return np.array(
+        [inertia[index] if abs(inertia[index]) > noise else 0.0 for index in MOMENT_INDICES]
+    )
 
 
 def _is_possible_inertia(inertia: Floats) -> bool:
@@ -409,13 +457,19 @@ def _round_value(value: float) -> float:
     return float(f"{value:.{VALUE_DIGITS}g}")
 
 
-def _set_links(table: ConfigTable, links: list[dict[str, Any]], axes: list[str], radius_m: float, source: str) -> None:
+def _set_links(
+    table: ConfigTable, links: list[dict[str, Any]], axes: list[str], radius_m: float, source: str
+) -> None:
     """Put [chain] and [module]; [[links]] follow unless the links are a row of equal modules."""
     inner = links[1:-1]
     length_m = _find_common_value([link["length_m"] for link in inner])
     mass_kg = _find_common_value([link["mass_kg"] for link in inner])
-    table.set_value("chain", {"modules": len(axes), "axes": axes[: _find_axes_period(axes)]}, source)
-    table.set_value("module", {"length_m": length_m, "radius_m": radius_m, "mass_kg": mass_kg}, source)
+    table.set_value(
+        "chain", {"modules": len(axes), "axes": axes[: _find_axes_period(axes)]}, source
+    )
+    table.set_value(
+        "module", {"length_m": length_m, "radius_m": radius_m, "mass_kg": mass_kg}, source
+    )
     fractions = [0.5] + [1.0] * len(inner) + [0.5]  # tail and head are half a module each
     for link, fraction in zip(links, fractions, strict=True):
         if not _is_fraction_of_module(link, fraction, length_m, mass_kg):
@@ -438,7 +492,11 @@ def _find_common_value(values: list[float]) -> float:
     return _round_value(float(np.mean(values)))
 
 
-def _is_fraction_of_module(link: dict[str, Any], fraction: float, length_m: float, mass_kg: float) -> bool:
+def _is_fraction_of_module(
+    link: dict[str, Any], fraction: float, length_m: float, mass_kg: float
+) -> bool:
     """Return whether a link is this fraction of a module, and has no other values of its own."""
-    is_same = np.allclose([link["length_m"], link["mass_kg"]], [fraction * length_m, fraction * mass_kg], rtol=1e-9)
+    is_same = np.allclose(
+        [link["length_m"], link["mass_kg"]], [fraction * length_m, fraction * mass_kg], rtol=1e-9
+    )
     return is_same and len(link) == 2

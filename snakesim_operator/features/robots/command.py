@@ -22,7 +22,9 @@ HEADING_BY_KEY = {
 }
 
 
-def import_robot(file: Path, options: ImportOptions, output_path: Path | None, *, as_json: bool = False) -> int:
+def import_robot(
+    file: Path, options: ImportOptions, output_path: Path | None, *, as_json: bool = False
+) -> int:
     """Write a robot file from a URDF, and print what the import has changed, assumed or left out.
 
     Args:
@@ -95,7 +97,9 @@ def export_robot(name: str, output_path: Path | None) -> int:
     path = output_path or Path(f"{robot.name}.urdf")
     _validate_output_path(path, ".urdf", None)
     write_text(path, format_urdf(robot))
-    print_line(f"{path}: {robot.chain.modules + 1} links, link_0 (tail, the root) to link_{robot.chain.modules} (head)")
+    print_line(
+        f"{path}: {robot.chain.modules + 1} links, link_0 (tail, the root) to link_{robot.chain.modules} (head)"
+    )
     sections = dict.fromkeys(key.partition(".")[0] for key in list_values_beside_urdf(robot))
     print_line(f"in <snakesim> elements, which other readers skip: {', '.join(sections)}")
     return 0
@@ -103,6 +107,10 @@ def export_robot(name: str, output_path: Path | None) -> int:
 
 def _validate_output_path(path: Path, suffix: str, source: Path | None) -> None:
     if path.suffix != suffix:
-        raise ConfigError(f"--out {path}: give a name that ends with {suffix}", code="command/invalid-option")
+        raise ConfigError(
+            f"--out {path}: give a name that ends with {suffix}", code="command/invalid-option"
+        )
     if path == source or path.exists():
-        raise ConfigError(f"{path} is there already; remove it, or give another --out", code="file/already-exists")
+        raise ConfigError(
+            f"{path} is there already; remove it, or give another --out", code="file/already-exists"
+        )

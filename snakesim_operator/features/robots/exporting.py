@@ -16,7 +16,8 @@ from snakesim_hal.model.links import Link
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.robots.urdf_sensors import format_gazebo_elements
 
-GEOMETRY_SECTIONS = ("name", "chain", "module", "links")  # which links, joints and the robot's own name contain
+# Which links, joints and the robot's own name contain.
+GEOMETRY_SECTIONS = "name", "chain", "module", "links"
 AXIS_XYZ = {"yaw": "0 0 1", "pitch": "0 1 0"}
 COLOR = "0.87 0.45 0.12 1"
 MATERIAL_ELEMENT = f'<material name="orange"><color rgba="{COLOR}"/></material>'
@@ -36,13 +37,19 @@ def format_urdf(robot: RobotFile) -> str:
         lines += _format_link(i, link, robot.module.radius_m)
     lines += format_gazebo_elements(robot)
     for key, value in list_values_beside_urdf(robot).items():
-        lines.append(f"  <snakesim key={quoteattr(key)} value={quoteattr(json.dumps(value, ensure_ascii=False))}/>")
+        lines.append(
+            f"  <snakesim key={quoteattr(key)} value={quoteattr(json.dumps(value, ensure_ascii=False))}/>"
+        )
     return "\n".join([*lines, "</robot>", ""])
 
 
 def list_values_beside_urdf(robot: RobotFile) -> dict[str, Any]:
     """Return the values that URDF cannot express, or that not all readers of URDF take, by dotted key."""
-    rest = {key: value for key, value in msgspec.to_builtins(robot).items() if key not in GEOMETRY_SECTIONS}
+    rest = {
+        key: value
+        for key, value in msgspec.to_builtins(robot).items()
+        if key not in GEOMETRY_SECTIONS
+    }
     return dict(_flatten_values(rest))
 
 
@@ -83,7 +90,9 @@ def _format_link(number: int, link: Link, radius_m: float) -> list[str]:
     """
     center = " ".join(map(repr, link.center))
     names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    moments = " ".join(f'{name}="{value!r}"' for name, value in zip(names, link.inertia(radius_m), strict=True))
+    moments = " ".join(
+        f'{name}="{value!r}"' for name, value in zip(names, link.inertia(radius_m), strict=True)
+    )
     lines = [
         f'  <link name="link_{number}">',
         "    <inertial>",
@@ -97,7 +106,9 @@ def _format_link(number: int, link: Link, radius_m: float) -> list[str]:
     return [*lines, "  </link>"]
 
 
-def _format_shapes(tag: str, length_m: float, radius_m: float, additional_lines: list[str]) -> list[str]:
+def _format_shapes(
+    tag: str, length_m: float, radius_m: float, additional_lines: list[str]
+) -> list[str]:
     """Format three elements, <visual> or <collision>, that together are a capsule along x.
 
     Args:

@@ -63,11 +63,16 @@ class ImportResult:
 
     table: ConfigTable  # the values of the robot file
     names: list[str] = field(default_factory=list[str])  # ours, and those of the URDF
-    is_negated: list[bool] = field(default_factory=list[bool])  # for each joint: our angle is minus the URDF's
-    changes: ReportNotes = field(default_factory=ReportNotes)  # values of the file that became others
-    assumptions: ReportNotes = field(default_factory=ReportNotes)  # values that the file does not give
-    doubts: ReportNotes = field(default_factory=ReportNotes)  # values that are allowed, and unusual for a snake robot
-    omissions: ReportNotes = field(default_factory=ReportNotes)  # what is in the file and not in the robot file
+    # For each joint: our angle is minus the URDF's.
+    is_negated: list[bool] = field(default_factory=list[bool])
+    # Values of the file that became others.
+    changes: ReportNotes = field(default_factory=ReportNotes)
+    # Values that the file does not give.
+    assumptions: ReportNotes = field(default_factory=ReportNotes)
+    # Values that are allowed, and unusual for a snake robot.
+    doubts: ReportNotes = field(default_factory=ReportNotes)
+    # What is in the file and not in the robot file.
+    omissions: ReportNotes = field(default_factory=ReportNotes)
 
     @property
     def changed(self) -> list[str]:

@@ -16,7 +16,12 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten
-from snakesim_hal.model.files import ConfigTable, iterate_leaves, list_shipped_names, read_table_with_base
+from snakesim_hal.model.files import (
+    ConfigTable,
+    iterate_leaves,
+    list_shipped_names,
+    read_table_with_base,
+)
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_operator.features.robots.body import convert_body
@@ -55,8 +60,11 @@ def import_urdf(file: Path, options: ImportOptions) -> ImportResult:
     if urdf.tag != "robot":
         raise urdf.make_error("is no URDF; its outermost element is <robot>")
     urdf.read = True
-    is_exported = urdf.find_child("snakesim") is not None  # SnakeSIM exported it, with the values that URDF cannot hold
-    initial_values = _read_exported_values(urdf) if is_exported else _read_values_of_similar_robot(urdf, options)
+    # SnakeSIM exported it, with the values that URDF cannot hold.
+    is_exported = urdf.find_child("snakesim") is not None
+    initial_values = (
+        _read_exported_values(urdf) if is_exported else _read_values_of_similar_robot(urdf, options)
+    )
     result = ImportResult(initial_values)
 
     # Each step changes the values that are known so far, and reports what it changed.
@@ -90,7 +98,9 @@ def _set_robot_name(result: ImportResult, urdf: XmlElement, file: Path) -> None:
     """Put the name of the robot; without one, that of the file."""
     name = urdf.read_optional_attribute("name")
     if name is None:
-        result.assumptions.add(f"<robot> without `name`: {file.stem}, as the file is called", f"line {urdf.line}")
+        result.assumptions.add(
+            f"<robot> without `name`: {file.stem}, as the file is called", f"line {urdf.line}"
+        )
         name = file.stem
     result.table.set_value("name", result.make_plain_name(name, "robot", urdf), str(file))
 
@@ -127,12 +137,16 @@ def _read_exported_values(urdf: XmlElement) -> ConfigTable:
                 f"has `key` = {shorten(key)!r}, which links and joints contain; remove this element"
             )
         if key in read_keys:
-            raise element.make_error(f"has `key` = {shorten(key)!r}, as another one has; remove one of them")
+            raise element.make_error(
+                f"has `key` = {shorten(key)!r}, as another one has; remove one of them"
+            )
         read_keys.add(key)
         try:
             table.set_value(key, json.loads(element.read_attribute("value")), urdf.source)
         except ValueError as error:
-            raise element.make_error(f"has a `value` that is not JSON: {shorten(str(error))}") from None
+            raise element.make_error(
+                f"has a `value` that is not JSON: {shorten(str(error))}"
+            ) from None
     return table
 
 
@@ -152,9 +166,13 @@ def _report_values_of_similar_robot(result: ImportResult, options: ImportOptions
             if not is_from_urdf and value not in ({}, []):
                 taken_values.append(f"{key.removeprefix(f'{section}.')} = {value}")
         if taken_values:
-            result.assumptions.add(f"[{section}] as of robot {options.like!r}: {', '.join(taken_values)}")
+            result.assumptions.add(
+                f"[{section}] as of robot {options.like!r}: {', '.join(taken_values)}"
+            )
     absent = [
-        section for section in SECTION_ORDER if section not in result.table.values and section not in UNSHARED_SECTIONS
+        section
+        for section in SECTION_ORDER
+        if section not in result.table.values and section not in UNSHARED_SECTIONS
     ]
     if absent:
         result.assumptions.add(f"[{'], ['.join(absent)}]: the defaults of a robot file")
@@ -178,5 +196,9 @@ def _mark_exported_as_read(urdf: XmlElement, robot: RobotFile) -> None:
 def _mark_material_as_read(parent: XmlElement, exported: XmlElement) -> None:
     """Mark a reference to the exported material as read."""
     for child in parent.children:
-        if child.tag == "material" and child.attributes == exported.attributes and not child.children:
+        if (
+            child.tag == "material"
+            and child.attributes == exported.attributes
+            and not child.children
+        ):
             child.mark_all_as_read()

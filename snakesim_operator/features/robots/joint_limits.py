@@ -39,9 +39,20 @@ class JointNumber:
 
 
 JOINT_NUMBERS = (
-    JointNumber("limit", "velocity", "limits", "speed_rad_s", "rad/s", 100.0, 20.0, "degrees per second"),
+    JointNumber(
+        "limit", "velocity", "limits", "speed_rad_s", "rad/s", 100.0, 20.0, "degrees per second"
+    ),
     JointNumber("limit", "effort", "limits", "torque_nm", "N·m", 1000.0, 50.0, "N·mm"),
-    JointNumber("dynamics", "damping", "motor", "viscous_nm_s_per_rad", "N·m·s/rad", 100.0, 5.0, "N·mm·s/rad"),
+    JointNumber(
+        "dynamics",
+        "damping",
+        "motor",
+        "viscous_nm_s_per_rad",
+        "N·m·s/rad",
+        100.0,
+        5.0,
+        "N·mm·s/rad",
+    ),
     JointNumber("dynamics", "friction", "motor", "friction_nm", "N·m", 100.0, 5.0, "N·mm"),
 )
 
@@ -54,7 +65,9 @@ class AngleRange:
     upper_rad: float
 
 
-def convert_joint_limits(result: ImportResult, joints: list[UrdfJoint], source: str, *, is_exported: bool) -> None:
+def convert_joint_limits(
+    result: ImportResult, joints: list[UrdfJoint], source: str, *, is_exported: bool
+) -> None:
     """Convert the angle limits, motor limits and friction of a URDF's joints into values of a robot file.
 
     A number that most joints share goes into the section for all joints; the others become exceptions.
@@ -70,7 +83,8 @@ def convert_joint_limits(result: ImportResult, joints: list[UrdfJoint], source: 
         ConfigError: A number is out of its range.
     """
     ranges = [
-        _read_angle_range(result, joint, negated) for joint, negated in zip(joints, result.is_negated, strict=True)
+        _read_angle_range(result, joint, negated)
+        for joint, negated in zip(joints, result.is_negated, strict=True)
     ]
     if not is_exported:
         _set_common_range(result, ranges, source)
@@ -83,7 +97,9 @@ def convert_joint_limits(result: ImportResult, joints: list[UrdfJoint], source: 
     if not is_exported:
         for joint_number in JOINT_NUMBERS:
             [(most_common, _)] = Counter(columns[joint_number.key]).most_common(1)
-            result.table.set_value(f"{joint_number.section}.{joint_number.key}", most_common, source)
+            result.table.set_value(
+                f"{joint_number.section}.{joint_number.key}", most_common, source
+            )
     _set_joint_exceptions(result, joints, ranges, columns, source)
 
 
@@ -124,7 +140,9 @@ def _read_angle_range(result: ImportResult, joint: UrdfJoint, is_negated: bool) 
     return AngleRange(lower_rad, upper_rad)
 
 
-def _read_limit_rad(result: ImportResult, joint: UrdfJoint, limit: XmlElement, attribute: str) -> float:
+def _read_limit_rad(
+    result: ImportResult, joint: UrdfJoint, limit: XmlElement, attribute: str
+) -> float:
     """Read one end of a joint's angle range in rad, cut to half a revolution.
 
     Args:
@@ -186,7 +204,9 @@ def _read_number_of_all_joints(
             continue
         if value is not None and positive_values:
             raise _make_motorless_error(joint_number, joint, max(positive_values))
-        assumed, origin = _assume_number(joint_number, joint_so_far, positive_values, is_exported=is_exported)
+        assumed, origin = _assume_number(
+            joint_number, joint_so_far, positive_values, is_exported=is_exported
+        )
         value_text = "no value" if value is None else f"{value:g}"
         result.assumptions.add(
             f"<{joint_number.tag} {joint_number.attribute}> has {value_text}: {assumed:g} {joint_number.unit}, "
@@ -262,7 +282,9 @@ def _set_common_range(result: ImportResult, ranges: list[AngleRange], source: st
     limits = table.values.get("limits", {})
     for side in ("angle_min_rad", "angle_max_rad"):
         limits.pop(side, None)
-    table.set_value("limits.angle_rad", max(-common_range.lower_rad, common_range.upper_rad), source)
+    table.set_value(
+        "limits.angle_rad", max(-common_range.lower_rad, common_range.upper_rad), source
+    )
     if -common_range.lower_rad < common_range.upper_rad:
         table.set_value("limits.angle_min_rad", common_range.lower_rad, source)
     if -common_range.lower_rad > common_range.upper_rad:

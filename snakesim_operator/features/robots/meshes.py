@@ -11,7 +11,9 @@ from snakesim_hal.base.errors import ConfigError
 MAX_FILE_BYTES = 64 * 1024 * 1024
 STL_HEADER_BYTES = 84
 STL_TRIANGLE_BYTES = 50
-STL_TRIANGLE_DTYPE = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attributes", "<u2")])
+STL_TRIANGLE_DTYPE = np.dtype(
+    [("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attributes", "<u2")]
+)
 
 
 def find_mesh_file(name: str, urdf: Path) -> Path | None:
@@ -45,14 +47,20 @@ def read_mesh_vertices(path: Path) -> Floats:
         with path.open("rb") as file:
             data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}", code="urdf/invalid") from None
+        raise ConfigError(
+            f"{path}: cannot be read: {error.strerror}", code="urdf/invalid"
+        ) from None
     if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(f"{path}: is larger than {MAX_FILE_BYTES // 1024 // 1024} MB", code="urdf/invalid")
+        raise ConfigError(
+            f"{path}: is larger than {MAX_FILE_BYTES // 1024 // 1024} MB", code="urdf/invalid"
+        )
     points = _parse_binary_stl(data) if path.suffix.lower() == ".stl" else None
     if points is None:
         points = _parse_text(data, path)
     if not len(points) or not np.isfinite(points).all():
-        raise ConfigError(f"{path}: holds no vertices, or numbers that are not finite", code="urdf/invalid")
+        raise ConfigError(
+            f"{path}: holds no vertices, or numbers that are not finite", code="urdf/invalid"
+        )
     return points
 
 

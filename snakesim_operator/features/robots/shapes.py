@@ -20,7 +20,8 @@ class UrdfShape:
     """A shape with its sizes, in the file's unit of length."""
 
     kind: str
-    sizes: list[float]  # box: x, y, z; cylinder and capsule: radius, length; sphere: radius; mesh: its scale
+    # Box: x, y, z; cylinder and capsule: radius, length; sphere: radius; mesh: its scale.
+    sizes: list[float]
     mesh: str = ""  # the name of its file
 
 
@@ -35,13 +36,17 @@ def read_shape(element: XmlElement) -> UrdfShape:
     """
     match element.tag:
         case "box":
-            return UrdfShape("box", _require_positive(element, "size", element.read_numbers("size", 3)))
+            return UrdfShape(
+                "box", _require_positive(element, "size", element.read_numbers("size", 3))
+            )
         case "cylinder" | "capsule":
             radius = _require_positive(element, "radius", [element.read_number("radius")])
             length = _require_positive(element, "length", [element.read_number("length")])
             return UrdfShape(element.tag, radius + length)
         case "sphere":
-            return UrdfShape("sphere", _require_positive(element, "radius", [element.read_number("radius")]))
+            return UrdfShape(
+                "sphere", _require_positive(element, "radius", [element.read_number("radius")])
+            )
         case "mesh":
             scale = element.read_numbers("scale", 3, "1 1 1")
             if not all(1e-12 < abs(factor) < 1e12 for factor in scale):
@@ -53,7 +58,9 @@ def read_shape(element: XmlElement) -> UrdfShape:
             raise element.make_error("is no shape of URDF: box, cylinder, sphere or mesh")
 
 
-def sample_outline(shape: UrdfShape, element: XmlElement, file: Path, omissions: ReportNotes) -> Floats | None:
+def sample_outline(
+    shape: UrdfShape, element: XmlElement, file: Path, omissions: ReportNotes
+) -> Floats | None:
     """Sample points whose convex hull encloses a shape.
 
     Args:
@@ -81,7 +88,9 @@ def sample_outline(shape: UrdfShape, element: XmlElement, file: Path, omissions:
 def _require_positive(element: XmlElement, attribute: str, sizes: list[float]) -> list[float]:
     """Return the sizes. Raises ConfigError unless all of them are above 0."""
     if not all(0 < size < 1e9 for size in sizes):
-        raise element.make_error(f"has `{attribute}` = {element.read_attribute(attribute)!r}; expected sizes above 0")
+        raise element.make_error(
+            f"has `{attribute}` = {element.read_attribute(attribute)!r}; expected sizes above 0"
+        )
     return sizes
 
 
@@ -94,7 +103,9 @@ def _compute_circle() -> tuple[Floats, Floats]:
 def _sample_cylinder(radius: float, half_length: float, *, with_caps: bool) -> Floats:
     """Return both rims of a cylinder along z; with caps also the tips of a capsule."""
     cosines, sines = _compute_circle()
-    upper_rim = np.column_stack([radius * cosines, radius * sines, np.full(RIM_POINTS, half_length)])
+    upper_rim = np.column_stack(
+        [radius * cosines, radius * sines, np.full(RIM_POINTS, half_length)]
+    )
     lower_rim = upper_rim * [1, 1, -1]
     if not with_caps:
         return np.vstack([upper_rim, lower_rim])
@@ -111,7 +122,9 @@ def _sample_sphere(radius: float) -> Floats:
     return radius * np.vstack([in_xy, in_xz, in_yz])
 
 
-def _read_mesh_points(shape: UrdfShape, element: XmlElement, file: Path, omissions: ReportNotes) -> Floats | None:
+def _read_mesh_points(
+    shape: UrdfShape, element: XmlElement, file: Path, omissions: ReportNotes
+) -> Floats | None:
     """Return the vertices of a mesh file, or None, with a note, if it cannot be read."""
     path = find_mesh_file(shape.mesh, file)
     try:

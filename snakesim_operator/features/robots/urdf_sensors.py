@@ -18,23 +18,25 @@ from snakesim_operator.features.robots.imported import ImportResult
 from snakesim_operator.features.robots.urdf_tree import BodyChain, make_rotation_from_rpy
 from snakesim_operator.features.robots.xml_tree import XmlElement
 
-SECTION_BY_SENSOR_TYPE = {"imu": "imu", "contact": "contacts"}  # Gazebo's type -> its section in [sensors]
+# Gazebo's type -> its section in [sensors].
+SECTION_BY_SENSOR_TYPE = {"imu": "imu", "contact": "contacts"}
 DEPTH_SENSOR_TYPES = ("depth", "depth_camera", "rgbd_camera")
 RANGE_SENSOR_TYPES = ("ray", "gpu_ray", "lidar", "gpu_lidar")
 DEFAULT_BEAMS = "one beam"  # of a lidar without <horizontal>, as the report of the import says it
-DEFAULT_LIDAR_RANGE = "0.02 to 5 m"  # of a lidar without <range>, as the report of the import says it
+# Of a lidar without <range>, as the report of the import says it.
+DEFAULT_LIDAR_RANGE = "0.02 to 5 m"
 MAX_ROLL_RAD = 0.01  # about the viewing direction; more is reported
 POSE_DIGITS = 9  # decimals, which removes the noise of multiplying transforms
-DEFAULT_RATE_HZ_BY_SECTION = {
-    "imu": 100.0,
-    "contacts": 100.0,
-    "depth": 20.0,
-    "range": 20.0,
-}  # as in snakesim_hal.model.sensors
+# As in snakesim_hal.model.sensors.
+DEFAULT_RATE_HZ_BY_SECTION = {"imu": 100.0, "contacts": 100.0, "depth": 20.0, "range": 20.0}
 
 
 def convert_sensors(
-    result: ImportResult, urdf: XmlElement, chain: BodyChain, link_frames: list[Floats], scale: float
+    result: ImportResult,
+    urdf: XmlElement,
+    chain: BodyChain,
+    link_frames: list[Floats],
+    scale: float,
 ) -> None:
     """Convert the sensors of a URDF into values of a robot file, and report those that a robot file cannot hold.
 
@@ -55,11 +57,18 @@ def convert_sensors(
             sensor_type = sensor.attributes.get("type", "")
             if sensor_type in SECTION_BY_SENSOR_TYPE:
                 gazebo.read_optional_attribute("reference")
-                _add_sensor_of_all_links(result, sensor, SECTION_BY_SENSOR_TYPE[sensor_type], reference)
-            elif sensor_type in (*DEPTH_SENSOR_TYPES, *RANGE_SENSOR_TYPES) and reference in link_indices:
+                _add_sensor_of_all_links(
+                    result, sensor, SECTION_BY_SENSOR_TYPE[sensor_type], reference
+                )
+            elif (
+                sensor_type in (*DEPTH_SENSOR_TYPES, *RANGE_SENSOR_TYPES)
+                and reference in link_indices
+            ):
                 gazebo.read_optional_attribute("reference")
                 link = link_indices[reference]
-                root_from_reference = _scale_translation(chain.bodies[link].frames[reference], scale)
+                root_from_reference = _scale_translation(
+                    chain.bodies[link].frames[reference], scale
+                )
                 link_from_reference = link_frames[link] @ root_from_reference
                 _add_sensor_of_one_link(result, sensor, link, link_from_reference, scale)
             else:
@@ -79,7 +88,9 @@ def _report_unsupported_sensor(
     )
 
 
-def _add_sensor_of_all_links(result: ImportResult, sensor: XmlElement, section: str, reference: str) -> None:
+def _add_sensor_of_all_links(
+    result: ImportResult, sensor: XmlElement, section: str, reference: str
+) -> None:
     """Add an IMU or a contact sensor, which a robot file has on every link."""
     sensor.read_optional_attribute("type")
     name = sensor.read_optional_attribute("name") or ""
@@ -95,7 +106,11 @@ def _add_sensor_of_all_links(result: ImportResult, sensor: XmlElement, section: 
 
 
 def _add_sensor_of_one_link(
-    result: ImportResult, sensor: XmlElement, link_index: int, link_from_reference: Floats, scale: float
+    result: ImportResult,
+    sensor: XmlElement,
+    link_index: int,
+    link_from_reference: Floats,
+    scale: float,
 ) -> None:
     """Convert a depth camera or a lidar with its pose on a link, and add it to the values of the robot file.
 
@@ -137,9 +152,13 @@ def _read_rate(result: ImportResult, sensor: XmlElement, section: str) -> dict[s
     existing_hz = existing.get("rate_hz") if isinstance(existing, dict) else None
     assumed_hz = DEFAULT_RATE_HZ_BY_SECTION[section] if existing_hz is None else existing_hz
     if element is None:
-        result.assumptions.add(f"<sensor><update_rate> has no value: {assumed_hz:g} Hz", f"line {sensor.line}")
+        result.assumptions.add(
+            f"<sensor><update_rate> has no value: {assumed_hz:g} Hz", f"line {sensor.line}"
+        )
     else:
-        result.assumptions.add(f"<sensor><update_rate> has 0: {assumed_hz:g} Hz", f"line {element.line}")
+        result.assumptions.add(
+            f"<sensor><update_rate> has 0: {assumed_hz:g} Hz", f"line {element.line}"
+        )
     return {}
 
 
@@ -163,7 +182,9 @@ def _scale_translation(frame: Floats, scale: float) -> Floats:
     return scaled
 
 
-def _convert_pose(result: ImportResult, link_from_sensor: Floats, sensor: XmlElement) -> dict[str, Any]:
+def _convert_pose(
+    result: ImportResult, link_from_sensor: Floats, sensor: XmlElement
+) -> dict[str, Any]:
     """Convert the pose of a sensor on its link into position, yaw and pitch, as a robot file has it.
 
     A roll is reported, because a robot file has none.
@@ -248,7 +269,9 @@ def _read_lidar(result: ImportResult, sensor: XmlElement, mounted_yaw_rad: float
     return values
 
 
-def _read_scan(result: ImportResult, horizontal: XmlElement, mounted_yaw_rad: float) -> dict[str, Any]:
+def _read_scan(
+    result: ImportResult, horizontal: XmlElement, mounted_yaw_rad: float
+) -> dict[str, Any]:
     """Read beams and field of view of a scan; also the sensor's yaw if the scan is not symmetric.
 
     Args:
@@ -273,7 +296,8 @@ def _read_scan(result: ImportResult, horizontal: XmlElement, mounted_yaw_rad: fl
         )
     if beams == 1 and last_rad != first_rad:
         result.changes.add(
-            f"<samples> 1 from {first_rad:g} to {last_rad:g} rad: one beam in the middle", f"line {horizontal.line}"
+            f"<samples> 1 from {first_rad:g} to {last_rad:g} rad: one beam in the middle",
+            f"line {horizontal.line}",
         )
     return values
 
@@ -286,7 +310,9 @@ def _read_whole_number(element: XmlElement, tag: str, default: int) -> int:
     return int(value)
 
 
-def _read_distance_range(owner: XmlElement, tag: str, min_tag: str, max_tag: str, default: str) -> dict[str, Any]:
+def _read_distance_range(
+    owner: XmlElement, tag: str, min_tag: str, max_tag: str, default: str
+) -> dict[str, Any]:
     """Read the range of a sensor in m. `default` is the text for the range that is assumed if the file has none."""
     element = owner.find_child(tag)
     if element is None:
@@ -321,7 +347,8 @@ def _read_noise(result: ImportResult, element: XmlElement) -> dict[str, Any]:
         line = noise.line
     if noise_type != "gaussian":
         result.changes.add(
-            f"<noise><type> {shorten(noise_type)!r} became gaussian, the one that there is", f"line {line}"
+            f"<noise><type> {shorten(noise_type)!r} became gaussian, the one that there is",
+            f"line {line}",
         )
     return {"noise_m": noise.read_child_number("stddev", 0.0)}
 
@@ -334,7 +361,9 @@ def format_gazebo_elements(robot: RobotFile) -> list[str]:
         if sensor is None:
             continue
         for link in link_names:
-            lines += _format_gazebo_element(link, sensor_type, f"{sensor_type}_{link}", sensor.rate_hz, [])
+            lines += _format_gazebo_element(
+                link, sensor_type, f"{sensor_type}_{link}", sensor.rate_hz, []
+            )
     for sensor in (*robot.sensors.depth, *robot.sensors.range):
         link_index = robot.link_index(sensor.link)
         nose_m = (robot.link_lengths_m[link_index] + robot.module.radius_m, 0.0, 0.0)
@@ -346,7 +375,9 @@ def format_gazebo_elements(robot: RobotFile) -> list[str]:
         else:
             sensor_type = "gpu_lidar"
             body = _format_lidar_element(sensor)
-        lines += _format_gazebo_element(link_names[link_index], sensor_type, sensor.name, sensor.rate_hz, [pose, body])
+        lines += _format_gazebo_element(
+            link_names[link_index], sensor_type, sensor.name, sensor.rate_hz, [pose, body]
+        )
     return lines
 
 
@@ -373,7 +404,9 @@ def _format_noise_element(noise_m: float) -> str:
     return f"<noise><type>gaussian</type><stddev>{noise_m!r}</stddev></noise>"
 
 
-def _format_gazebo_element(link: str, kind: str, name: str, rate_hz: float, body: list[str]) -> list[str]:
+def _format_gazebo_element(
+    link: str, kind: str, name: str, rate_hz: float, body: list[str]
+) -> list[str]:
     content = "".join([f"<update_rate>{escape(repr(rate_hz))}</update_rate>", *body])
     return [
         f"  <gazebo reference={quoteattr(link)}>",

@@ -29,15 +29,21 @@ class UrdfBody:
 
     # The links.
     links: list[str] = field(default_factory=list[str])
-    link_places: list[str] = field(default_factory=list[str])  # name and line of each link in the file, for a report
-    frames: dict[str, Floats] = field(default_factory=dict[str, Floats])  # root_from_link of each link, (4, 4)
+    # Name and line of each link in the file, for a report.
+    link_places: list[str] = field(default_factory=list[str])
+    # root_from_link of each link, (4, 4).
+    frames: dict[str, Floats] = field(default_factory=dict[str, Floats])
 
     # Mass, summed over the links.
     mass_kg: float = 0.0
-    first_moment: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) sum of mass times center of mass
-    inertia_about_root: Floats = field(default_factory=lambda: np.zeros((3, 3)))  # (3, 3) about the root's origin
-    masses: list[XmlElement] = field(default_factory=list[XmlElement])  # the <mass> elements that were summed
-    inertias: list[XmlElement] = field(default_factory=list[XmlElement])  # the <inertia> elements that were summed
+    # (3,) sum of mass times center of mass.
+    first_moment: Floats = field(default_factory=lambda: np.zeros(3))
+    # (3, 3) about the root's origin.
+    inertia_about_root: Floats = field(default_factory=lambda: np.zeros((3, 3)))
+    # The <mass> elements that were summed.
+    masses: list[XmlElement] = field(default_factory=list[XmlElement])
+    # The <inertia> elements that were summed.
+    inertias: list[XmlElement] = field(default_factory=list[XmlElement])
 
     # Outline.
     points: list[Floats] = field(default_factory=list[Floats])  # of each shape, (n, 3)
@@ -53,7 +59,9 @@ class UrdfBody:
         """
         self.mass_kg += mass_kg
         self.first_moment += mass_kg * center
-        self.inertia_about_root += inertia + mass_kg * (center @ center * np.eye(3) - np.outer(center, center))
+        self.inertia_about_root += inertia + mass_kg * (
+            center @ center * np.eye(3) - np.outer(center, center)
+        )
 
     @property
     def center(self) -> Floats:
@@ -112,7 +120,9 @@ class _LinkTree:
     connections: list[_JointConnection] = field(default_factory=list[_JointConnection])
 
 
-def read_body_chain(result: ImportResult, urdf: XmlElement, file: Path, *, tail: str | None) -> BodyChain:
+def read_body_chain(
+    result: ImportResult, urdf: XmlElement, file: Path, *, tail: str | None
+) -> BodyChain:
     """Read the bodies and rotary joints of a URDF, and order them from tail to head.
 
     Links that fixed joints connect become one body, with the sum of their masses and all their outlines.
@@ -188,7 +198,10 @@ def make_rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
 
 
 def _build_tree(
-    result: ImportResult, urdf: XmlElement, links: dict[str, XmlElement], joints: dict[str, XmlElement]
+    result: ImportResult,
+    urdf: XmlElement,
+    links: dict[str, XmlElement],
+    joints: dict[str, XmlElement],
 ) -> _LinkTree:
     """Build the tree of links: follow the joints from the root link, and compute the frame of every link.
 
@@ -202,12 +215,15 @@ def _build_tree(
         ConfigError: The links are no tree, or a joint has a type that no snake has.
     """
     parent_by_child: dict[str, str] = {}  # child link -> parent link
-    joints_by_parent: dict[str, list[tuple[str, XmlElement]]] = {}  # parent link -> child links with their joints
+    # Parent link -> child links with their joints.
+    joints_by_parent: dict[str, list[tuple[str, XmlElement]]] = {}
     for joint in joints.values():
         parent = _read_joint_link(joint, "parent", links)
         child = _read_joint_link(joint, "child", links)
         if child in parent_by_child:
-            raise joint.make_error(f"and another joint both have the child {child!r}; a link has one parent")
+            raise joint.make_error(
+                f"and another joint both have the child {child!r}; a link has one parent"
+            )
         parent_by_child[child] = parent
         joints_by_parent.setdefault(parent, []).append((child, joint))
 
@@ -220,7 +236,9 @@ def _build_tree(
         children = joints_by_parent.get(parent, [])
         is_only_joint_of_root = parent == root and len(children) == 1
         for child, element in children:
-            _add_joint(result, tree, element, parent, child, is_only_joint_of_root=is_only_joint_of_root)
+            _add_joint(
+                result, tree, element, parent, child, is_only_joint_of_root=is_only_joint_of_root
+            )
             links_to_visit.append(child)
     unreached = sorted(links.keys() - tree.frames.keys())
     if unreached:
@@ -247,7 +265,13 @@ def _read_joint_link(joint: XmlElement, tag: str, links: dict[str, XmlElement]) 
 
 
 def _add_joint(
-    result: ImportResult, tree: _LinkTree, element: XmlElement, parent: str, child: str, *, is_only_joint_of_root: bool
+    result: ImportResult,
+    tree: _LinkTree,
+    element: XmlElement,
+    parent: str,
+    child: str,
+    *,
+    is_only_joint_of_root: bool,
 ) -> None:
     """Add the child link of a joint with its frame to the tree, and the joint itself if it rotates.
 
@@ -278,7 +302,9 @@ def _add_joint(
     tree.frames[child] = root_from_joint
     if joint_type in ROTARY_JOINT_TYPES:
         tree.body_of[child] = child
-        tree.connections.append(_JointConnection(parent, child, _read_joint(result, element, root_from_joint)))
+        tree.connections.append(
+            _JointConnection(parent, child, _read_joint(result, element, root_from_joint))
+        )
     elif joint_type == "fixed":
         tree.body_of[child] = tree.body_of[parent]
         result.changes.add("fixed joints: the links on both sides became one", element.place)
@@ -294,7 +320,9 @@ def _read_joint(result: ImportResult, element: XmlElement, frame: Floats) -> Urd
     frame: root_from_joint, (4, 4).
     """
     if element.find_child("mimic") is not None:
-        raise element.make_error("mimics another joint; every joint of a snake has a motor of its own: remove <mimic>")
+        raise element.make_error(
+            "mimics another joint; every joint of a snake has a motor of its own: remove <mimic>"
+        )
     axis = _read_unit_axis(result, element)
     return UrdfJoint(element, element.read_attribute("name"), frame[:3, 3], frame[:3, :3] @ axis)
 
@@ -328,7 +356,9 @@ def _read_unit_axis(result: ImportResult, joint: XmlElement) -> Floats:
     return axis / length
 
 
-def _add_mass(result: ImportResult, body: UrdfBody, link: XmlElement, root_from_link: Floats) -> None:
+def _add_mass(
+    result: ImportResult, body: UrdfBody, link: XmlElement, root_from_link: Floats
+) -> None:
     """Add mass and inertia of a link to its body, which is all links that fixed joints connect.
 
     Args:
@@ -352,7 +382,9 @@ def _add_mass(result: ImportResult, body: UrdfBody, link: XmlElement, root_from_
     body.inertias.append(moments)
     mass_kg = mass.read_number("value")
     if not 0 <= mass_kg <= MAX_MASS_KG:
-        raise mass.make_error(f"is {mass_kg:g} kg; expected 0 or more and at most {MAX_MASS_KG:g} kg. Is it in grams?")
+        raise mass.make_error(
+            f"is {mass_kg:g} kg; expected 0 or more and at most {MAX_MASS_KG:g} kg. Is it in grams?"
+        )
     xx, xy, xz, yy, yz, zz = (_read_moment(moments, name) for name in MOMENT_ATTRIBUTES)
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     root_from_inertial = root_from_link @ read_origin(inertial)
@@ -365,11 +397,15 @@ def _read_moment(moments: XmlElement, name: str) -> float:
     """Return a moment of inertia in the file's unit of length. Raises ConfigError for one that is too large."""
     value = moments.read_number(name, "0")
     if abs(value) > 1e15:
-        raise moments.make_error(f"has `{name}` = {value:g}; expected at most {MAX_INERTIA_KG_M2:g} kg·m²")
+        raise moments.make_error(
+            f"has `{name}` = {value:g}; expected at most {MAX_INERTIA_KG_M2:g} kg·m²"
+        )
     return value
 
 
-def _add_shapes(result: ImportResult, body: UrdfBody, link: XmlElement, root_from_link: Floats, file: Path) -> None:
+def _add_shapes(
+    result: ImportResult, body: UrdfBody, link: XmlElement, root_from_link: Floats, file: Path
+) -> None:
     """Add the outline of a link to its body: that of <collision> or, without one, that of <visual>.
 
     Args:
@@ -385,7 +421,9 @@ def _add_shapes(result: ImportResult, body: UrdfBody, link: XmlElement, root_fro
         _mark_repeated_visuals(visuals, collisions)
     elif visuals:
         link.find_children("visual")  # marks them as read
-        result.assumptions.add("<link> without <collision>: its outline is that of <visual>", link.place)
+        result.assumptions.add(
+            "<link> without <collision>: its outline is that of <visual>", link.place
+        )
     for element in collisions or visuals:
         geometry = element.find_child("geometry")
         if geometry is None or not geometry.children:
@@ -445,9 +483,13 @@ def _order_bodies_from_tail(
     neighbors = _find_neighbors(bodies, tree)
     bodies_at_forks = [name for name, joints in neighbors.items() if len(joints) > 2]
     if bodies_at_forks:
-        raise urdf.make_error(f"is no chain: more than two joints meet at link {shorten(bodies_at_forks[0])!r}")
+        raise urdf.make_error(
+            f"is no chain: more than two joints meet at link {shorten(bodies_at_forks[0])!r}"
+        )
     if len(tree.connections) < 2:
-        raise urdf.make_error(f"has {len(tree.connections)} joints that turn; a snake has 2 or more")
+        raise urdf.make_error(
+            f"has {len(tree.connections)} joints that turn; a snake has 2 or more"
+        )
     tail_body = tree.body_of[tail] if tail is not None else next(iter(tree.body_of))
     end_bodies = [name for name, joints in neighbors.items() if len(joints) == 1]
     if tail_body not in end_bodies:
@@ -480,7 +522,9 @@ def _follow_chain(
         joints.append(joint)
 
 
-def _find_neighbors(bodies: dict[str, UrdfBody], tree: _LinkTree) -> dict[str, list[tuple[str, UrdfJoint]]]:
+def _find_neighbors(
+    bodies: dict[str, UrdfBody], tree: _LinkTree
+) -> dict[str, list[tuple[str, UrdfJoint]]]:
     """Return the neighbors of each body, and the joints to them, as if the neighbor were in front of the body.
 
     A joint whose parent is in front turns the other way round, so its axis is negated.

@@ -123,7 +123,9 @@ class XmlElement:
         except ValueError:
             numbers = []
         if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
-            raise self.make_error(f"{what} = {shorten(text)!r}; expected {count} finite number{'s' * (count > 1)}")
+            raise self.make_error(
+                f"{what} = {shorten(text)!r}; expected {count} finite number{'s' * (count > 1)}"
+            )
         return numbers
 
     def make_error(self, why: str) -> ConfigError:
@@ -131,7 +133,9 @@ class XmlElement:
         name = ""
         if "name" in self.attributes:
             name = f" name={shorten(self.attributes['name'])!r}"
-        return ConfigError(f"{self.source}, line {self.line}: <{self.tag}{name}> {why}", code="urdf/invalid")
+        return ConfigError(
+            f"{self.source}, line {self.line}: <{self.tag}{name}> {why}", code="urdf/invalid"
+        )
 
     def mark_all_as_read(self) -> None:
         """Mark the element and everything in it as read."""
@@ -147,7 +151,10 @@ class XmlElement:
             return False
         if self.text.strip() != other.text.strip() or len(self.children) != len(other.children):
             return False
-        return all(mine.is_equal_to(theirs) for mine, theirs in zip(self.children, other.children, strict=True))
+        return all(
+            mine.is_equal_to(theirs)
+            for mine, theirs in zip(self.children, other.children, strict=True)
+        )
 
     def iterate_unused(self, path: str = "") -> Iterator[UnusedPart]:
         """Yield every value in the element and below it that was not read.
@@ -168,12 +175,16 @@ class XmlElement:
         own_tag = path or f"<{self.tag}>"
         for name, value in self.attributes.items():
             if everything or name not in self.read_attributes:
-                yield UnusedPart(outermost, outermost_line, f"{own_tag[:-1]} {name}>", value, self.line)
+                yield UnusedPart(
+                    outermost, outermost_line, f"{own_tag[:-1]} {name}>", value, self.line
+                )
         text = self.text.strip()
         if text and (everything or not self.read_text):
             yield UnusedPart(outermost, outermost_line, own_tag, text, self.line)
 
-    def _iterate_all_values(self, path: str, outermost: str, outermost_line: int) -> Iterator[UnusedPart]:
+    def _iterate_all_values(
+        self, path: str, outermost: str, outermost_line: int
+    ) -> Iterator[UnusedPart]:
         """Yield all values of an element that was not read."""
         if not (self.attributes or self.text.strip() or self.children):
             yield UnusedPart(outermost, outermost_line, path, None, self.line)
@@ -242,6 +253,7 @@ def parse_xml(data: bytes, source: str) -> XmlElement:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(
-            f"{source}: is no URDF: not valid XML: {error}; give a file that ends with .urdf", code="urdf/invalid"
+            f"{source}: is no URDF: not valid XML: {error}; give a file that ends with .urdf",
+            code="urdf/invalid",
         ) from None
     return top.children[0]

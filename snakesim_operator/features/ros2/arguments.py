@@ -6,7 +6,11 @@ import re
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.network.endpoint import check_endpoint
-from snakesim_hal.programs.arguments import add_network_arguments, add_output_argument, make_number_parser
+from snakesim_hal.programs.arguments import (
+    add_network_arguments,
+    add_output_argument,
+    make_number_parser,
+)
 from snakesim_hal.programs.commands import Command, Commands
 from snakesim_operator.playback.arguments import add_recording_argument
 
@@ -22,7 +26,11 @@ ROS_NAMESPACE = r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*"
 def _add_bridge_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `snakesim start ros2`, which bridges a robot to ROS 2."""
     parser.add_argument(
-        "--domain", type=make_number_parser(0, MAX_DOMAIN_ID), default=0, metavar="N", help="ROS_DOMAIN_ID (default: 0)"
+        "--domain",
+        type=make_number_parser(0, MAX_DOMAIN_ID),
+        default=0,
+        metavar="N",
+        help="ROS_DOMAIN_ID (default: 0)",
     )
     parser.add_argument(
         "--ros-router",
@@ -30,16 +38,24 @@ def _add_bridge_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ENDPOINT",
         help=f"router of the ROS nodes (default: {DEFAULT_ROS_ROUTER})",
     )
-    parser.add_argument("--ros-namespace", metavar="NAME", help="of topics and frames, for several robots in one graph")
+    parser.add_argument(
+        "--ros-namespace",
+        metavar="NAME",
+        help="of topics and frames, for several robots in one graph",
+    )
     _add_rate_option(parser, "--hz", DEFAULT_HZ, "messages a second of a topic")
     _add_rate_option(parser, "--image-hz", DEFAULT_IMAGE_HZ, "images a second of a camera")
-    parser.add_argument("--cmd-vel", action="store_true", help="let ROS ask for speed and direction, on cmd_vel")
+    parser.add_argument(
+        "--cmd-vel", action="store_true", help="let ROS ask for speed and direction, on cmd_vel"
+    )
     parser.add_argument(
         "--joint-commands",
         action="store_true",
         help="be the robot's controller: ROS commands joints, on joint_commands",
     )
-    parser.add_argument("--operate", action="store_true", help="let ROS arm, disarm, reset and set parameters")
+    parser.add_argument(
+        "--operate", action="store_true", help="let ROS arm, disarm, reset and set parameters"
+    )
     parser.add_argument(
         "--stamps",
         choices=["robot", "wall"],
@@ -49,7 +65,9 @@ def _add_bridge_arguments(parser: argparse.ArgumentParser) -> None:
     add_network_arguments(parser)
 
 
-def _add_rate_option(parser: argparse.ArgumentParser, option: str, default_hz: float, subject: str) -> None:
+def _add_rate_option(
+    parser: argparse.ArgumentParser, option: str, default_hz: float, subject: str
+) -> None:
     """Add an option for a maximum rate in Hz. `subject` is what is counted, for the help text."""
     parser.add_argument(
         option,
@@ -104,7 +122,9 @@ def _run_rosbag_command(arguments: argparse.Namespace) -> int:
     from snakesim_operator.features.ros2.bag import convert_recording_to_rosbag
 
     wall_time = arguments.stamps == "wall"
-    return convert_recording_to_rosbag(arguments.recording, arguments.out, print_line, wall_time=wall_time)
+    return convert_recording_to_rosbag(
+        arguments.recording, arguments.out, print_line, wall_time=wall_time
+    )
 
 
 COMMANDS: Commands = (
@@ -128,6 +148,9 @@ COMMANDS: Commands = (
         run=_run_bridge_command,
         details="Publishes joint states, transforms, markers, images, IMUs, scans, the robot's URDF, diagnostics and "
         "/clock. ROS may stop the robot, and nothing else without --cmd-vel, --joint-commands or --operate.",
-        examples=("start ros2 --endpoint tcp/127.0.0.1:7448", "start ros2 --domain 3 --cmd-vel --operate"),
+        examples=(
+            "start ros2 --endpoint tcp/127.0.0.1:7448",
+            "start ros2 --domain 3 --cmd-vel --operate",
+        ),
     ),
 )

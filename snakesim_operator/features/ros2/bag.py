@@ -4,7 +4,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from snakesim_hal.base.errors import ConfigError, WireError
@@ -51,7 +58,9 @@ MESSAGE_TYPES: dict[str, type[Any]] = {
 BagMessage = tuple[str, RosType, bytes]  # topic, type and message in CDR
 
 
-def convert_recording_to_rosbag(run: Path, output_path: Path | None, print_text: PrintLine, *, wall_time: bool) -> int:
+def convert_recording_to_rosbag(
+    run: Path, output_path: Path | None, print_text: PrintLine, *, wall_time: bool
+) -> int:
     """Write a recording as a ROS 2 bag with MCAP storage.
 
     Args:
@@ -70,11 +79,13 @@ def convert_recording_to_rosbag(run: Path, output_path: Path | None, print_text:
     rosbag_path = output_path or recording.with_name(f"{recording.stem}-rosbag")
     if rosbag_path.exists():
         raise ConfigError(
-            f"{rosbag_path}: there is such a folder already; choose another one with --out", code="file/already-exists"
+            f"{rosbag_path}: there is such a folder already; choose another one with --out",
+            code="file/already-exists",
         )
     reader = RecordingReader(recording)
     with export_atomically(rosbag_path) as temporary_folder:
-        bag_folder = temporary_folder / rosbag_path.name  # the library names the file in the bag after this folder
+        # The library names the file in the bag after this folder.
+        bag_folder = temporary_folder / rosbag_path.name
         temporary_folder.mkdir()
         message_count = _write_bag(reader, bag_folder, wall_time=wall_time)
         for file in list(bag_folder.iterdir()):
@@ -127,7 +138,9 @@ class MessageConverter:
     def __init__(self, *, wall_time: bool) -> None:
         """Start without a robot. `wall_time` is whether stamps are wall-clock time instead of robot time."""
         self._wall_time = wall_time
-        self._decoders = {key: MessageDecoder(message_type) for key, message_type in MESSAGE_TYPES.items()}
+        self._decoders = {
+            key: MessageDecoder(message_type) for key, message_type in MESSAGE_TYPES.items()
+        }
         self._robot: m.RobotDescription | None = None
         self._frames: RobotFrames | None = None
         self._known_imu_links: set[int] = set()  # whose frames are known
@@ -146,7 +159,9 @@ class MessageConverter:
         except WireError:
             return []
         stamp_ns = (
-            recorded.wall_time_ns if self._wall_time else getattr(message, "timestamp_ns", recorded.robot_time_ns)
+            recorded.wall_time_ns
+            if self._wall_time
+            else getattr(message, "timestamp_ns", recorded.robot_time_ns)
         )
         if isinstance(message, m.RobotDescription):
             return self._use_robot(message, stamp_ns)
@@ -165,7 +180,13 @@ class MessageConverter:
             case m.Imu():
                 return self._convert_imus(message, frames, stamp_ns)
             case m.RobotStatus():
-                return [("/diagnostics", ros.DIAGNOSTICS, robot_in_ros.encode_diagnostics(stamp_ns, message))]
+                return [
+                    (
+                        "/diagnostics",
+                        ros.DIAGNOSTICS,
+                        robot_in_ros.encode_diagnostics(stamp_ns, message),
+                    )
+                ]
             case m.Clock() if not self._wall_time:
                 return [("/clock", ros.CLOCK, ros.encode_clock(stamp_ns))]
             case _:
@@ -188,7 +209,11 @@ class MessageConverter:
         names = [joint.name for joint in robot.joints]
         transforms = frames.make_joint_transforms(joints)
         return [
-            ("/joint_states", ros.JOINT_STATE, robot_in_ros.encode_joint_state(stamp_ns, names, joints)),
+            (
+                "/joint_states",
+                ros.JOINT_STATE,
+                robot_in_ros.encode_joint_state(stamp_ns, names, joints),
+            ),
             ("/tf", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, transforms)),
         ]
 
@@ -199,7 +224,9 @@ class MessageConverter:
             if link not in self._known_imu_links:
                 self._known_imu_links.add(link)
                 transforms = [frames.make_imu_transform(link)]
-                outputs.append(("/tf_static", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, transforms)))
+                outputs.append(
+                    ("/tf_static", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, transforms))
+                )
             topic = f"/{make_ros_name(frames.get_link_frame(link))}/imu"
             data = robot_in_ros.encode_imu(stamp_ns, frames.get_imu_frame(link), imus, entry)
             outputs.append((topic, ros.IMU, data))

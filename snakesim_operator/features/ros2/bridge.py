@@ -58,7 +58,9 @@ def _accept_any_clock(_clock: m.Clock) -> bool:
 class RosBridge:
     """One robot as one ROS node."""
 
-    def __init__(self, session: Session, node: RosNode, robot: m.RobotDescription, options: BridgeOptions) -> None:
+    def __init__(
+        self, session: Session, node: RosNode, robot: m.RobotDescription, options: BridgeOptions
+    ) -> None:
         """Declare the ROS topics, and publish the description of the robot.
 
         Args:
@@ -78,11 +80,14 @@ class RosBridge:
         # Robot time.
         self._clock_reader = session.declare_reader(keys.CLOCK, m.Clock)
         self._clock: m.Clock | None = None
-        self._clock_arrival_s: float | None = time.monotonic()  # None: the user knows that the robot is silent
+        # None: the user knows that the robot is silent.
+        self._clock_arrival_s: float | None = time.monotonic()
         self._ros_time = RosTime(wall_time=options.wall_time)
 
         # The newest messages of the robot.
-        self._description_reader = session.declare_latched_reader(keys.DESCRIPTION, m.RobotDescription)
+        self._description_reader = session.declare_latched_reader(
+            keys.DESCRIPTION, m.RobotDescription
+        )
         self._joint_state: m.JointState | None = None
         self._world: m.WorldModel | None = None
         self._world_arrival_s = 0.0
@@ -90,7 +95,9 @@ class RosBridge:
 
         # ROS topics.
         self._declare_topics()
-        self._sensor_topics = SensorTopics(session, node, self.prefix, self._ros_time, self._static_frames)
+        self._sensor_topics = SensorTopics(
+            session, node, self.prefix, self._ros_time, self._static_frames
+        )
         self._cmd_vel: CmdVelInput | None = None
         if options.cmd_vel:
             self._cmd_vel = self._make_cmd_vel_input()
@@ -121,7 +128,9 @@ class RosBridge:
         static_topic = RosTopic("/tf_static", ros.TRANSFORMS, depth=1, latched=True)
         static_publisher = self._node.declare_publisher(static_topic)
         self._static_frames = StaticFrames(static_publisher, self._ros_time)
-        self._description_publisher = self._declare_publisher("robot_description", ros.STRING, depth=1, latched=True)
+        self._description_publisher = self._declare_publisher(
+            "robot_description", ros.STRING, depth=1, latched=True
+        )
         self._contact_marker_publisher = self._declare_publisher("contacts", ros.MARKERS)
         self._obstacle_marker_publisher = self._declare_publisher("obstacles", ros.MARKERS)
         diagnostics_topic = RosTopic("/diagnostics", ros.DIAGNOSTICS)
@@ -135,7 +144,9 @@ class RosBridge:
         return self._node.declare_publisher(RosTopic(f"/{self.prefix}{name}", ros_type, **quality))
 
     def _make_cmd_vel_input(self) -> CmdVelInput:
-        twists = self._node.declare_subscription(RosTopic(f"/{self.prefix}cmd_vel", ros.TWIST, depth=1))
+        twists = self._node.declare_subscription(
+            RosTopic(f"/{self.prefix}cmd_vel", ros.TWIST, depth=1)
+        )
         return CmdVelInput(twists, self._session, print_line)
 
     def _set_robot(self, robot: m.RobotDescription) -> None:
@@ -179,7 +190,9 @@ class RosBridge:
         clock = self._clock_reader.pop_newest(_accept_any_clock)
         if clock is not None:
             self._update_clock(clock, now_s)
-        elif self._clock_arrival_s is not None and now_s - self._clock_arrival_s > SILENCE_TIMEOUT_S:
+        elif (
+            self._clock_arrival_s is not None and now_s - self._clock_arrival_s > SILENCE_TIMEOUT_S
+        ):
             print_line(f"no clock from the robot for {SILENCE_TIMEOUT_S:g} s; waiting for it")
             self._clock_arrival_s = None
 
@@ -211,7 +224,9 @@ class RosBridge:
         self._world = world
         self._unpublished_world = world
         self._world_arrival_s = time.monotonic()
-        self._publish_transforms(_find_pose_time_ns(world), [self._frames.make_base_transform(world)])
+        self._publish_transforms(
+            _find_pose_time_ns(world), [self._frames.make_base_transform(world)]
+        )
 
     def _forward_pose(self, pose: m.Pose) -> None:
         """Publish the measured pose of the base, while no world model gives an estimate of it."""

@@ -25,7 +25,9 @@ def sum_wrenches(contacts: Iterable[Contact], link_count: int) -> Floats:
         if contact.link < link_count:
             force_n = np.asarray(contact.force_l)
             wrenches[contact.link, :3] += force_n
-            wrenches[contact.link, 3:] += np.cross(contact.position_l, force_n) + np.asarray(contact.torque_l)
+            wrenches[contact.link, 3:] += np.cross(contact.position_l, force_n) + np.asarray(
+                contact.torque_l
+            )
     return wrenches
 
 
@@ -38,10 +40,14 @@ def encode_wrenches(timestamp_ns: int, frames: list[str], sample: Contacts) -> l
         sample: The contacts of all links.
     """
     encoded: list[bytes] = []
-    for frame, wrench in zip(frames, sum_wrenches(sample.contacts, len(frames)).tolist(), strict=True):
+    for frame, wrench in zip(
+        frames, sum_wrenches(sample.contacts, len(frames)).tolist(), strict=True
+    ):
         fx, fy, fz, tx, ty, tz = wrench
         force_and_torque = ros.make_message(
             "geometry_msgs/msg/Wrench", ros.make_vector((fx, fy, fz)), ros.make_vector((tx, ty, tz))
         )
-        encoded.append(ros.encode_message(ros.WRENCH, ros.make_header(timestamp_ns, frame), force_and_torque))
+        encoded.append(
+            ros.encode_message(ros.WRENCH, ros.make_header(timestamp_ns, frame), force_and_torque)
+        )
     return encoded

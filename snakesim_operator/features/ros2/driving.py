@@ -28,7 +28,9 @@ THREAD_END_TIMEOUT_S = 5.0  # for the thread
 class JointCommander:
     """Commands every joint in every tick from the messages of one topic; reconnects after a loss of the robot."""
 
-    def __init__(self, session: Session, messages: RawReader, print_text: PrintLine, *, wall_time: bool) -> None:
+    def __init__(
+        self, session: Session, messages: RawReader, print_text: PrintLine, *, wall_time: bool
+    ) -> None:
         """Start the thread that commands a robot from the joint targets on a ROS topic.
 
         Args:
@@ -85,7 +87,8 @@ class JointCommander:
         status = session.wait_for_latched(keys.STATUS, RobotStatus, DESCRIPTION_TIMEOUT_S)
         if robot is None or status is None:
             raise NotConnectedError(
-                "the robot does not describe itself; is its HAL host running?", code="network/no-robot"
+                "the robot does not describe itself; is its HAL host running?",
+                code="network/no-robot",
             )
         command_client = CommandingClient(session, robot, status.clock_mode)
         targets = RosJointTargets(robot)

@@ -73,7 +73,9 @@ class RobotFrames:
     def make_imu_transform(self, link_index: int) -> RosTransform:
         """Return the pose of an IMU, which sits in the middle of its link."""
         middle = (self._robot.links[link_index].length_m / 2, 0.0, 0.0)
-        return RosTransform(self.get_link_frame(link_index), self.get_imu_frame(link_index), middle, NO_ROTATION)
+        return RosTransform(
+            self.get_link_frame(link_index), self.get_imu_frame(link_index), middle, NO_ROTATION
+        )
 
     def make_base_transform(self, pose: WorldModel | Pose) -> RosTransform:
         """Return the pose of the base in `odom`."""
@@ -89,20 +91,38 @@ class RobotFrames:
                 continue
             position = (self._robot.links[i].length_m, 0.0, 0.0)
             orientation = _make_joint_rotation(joint.axis, joints.angle_rad[i])
-            transforms.append(RosTransform(self.get_link_frame(i), self.get_link_frame(i + 1), position, orientation))
+            transforms.append(
+                RosTransform(
+                    self.get_link_frame(i), self.get_link_frame(i + 1), position, orientation
+                )
+            )
         return transforms
 
-    def make_camera_transforms(self, kind: str, camera: str, image: DepthImage | ColorImage) -> list[RosTransform]:
+    def make_camera_transforms(
+        self, kind: str, camera: str, image: DepthImage | ColorImage
+    ) -> list[RosTransform]:
         """Return the pose of a camera on its link, and of its optical frame in the camera frame."""
         optical_frame = self.get_optical_frame(kind, camera)
         camera_frame = optical_frame.replace("_optical_frame", "_frame")
-        mount = RosTransform(self.get_link_frame(image.link), camera_frame, image.position_l, image.orientation_l_wxyz)
+        mount = RosTransform(
+            self.get_link_frame(image.link),
+            camera_frame,
+            image.position_l,
+            image.orientation_l_wxyz,
+        )
         return [mount, RosTransform(camera_frame, optical_frame, ORIGIN, OPTICAL_IN_CAMERA)]
 
     def make_mount_transforms(self, sensor: str, sample: MountedSample) -> list[RosTransform]:
         """Return the pose of a sensor on its link, as its sample states it."""
         link_frame = self.get_link_frame(sample.link)
-        return [RosTransform(link_frame, self.get_mount_frame(sensor), sample.position_l, sample.orientation_l_wxyz)]
+        return [
+            RosTransform(
+                link_frame,
+                self.get_mount_frame(sensor),
+                sample.position_l,
+                sample.orientation_l_wxyz,
+            )
+        ]
 
 
 def _make_joint_rotation(axis: str, angle_rad: float) -> Wxyz:

@@ -10,7 +10,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
 
-from snakesim_hal.network.foreign_network import ForeignNetwork, RawPublisher, RawQueryable, RawReader
+from snakesim_hal.network.foreign_network import (
+    ForeignNetwork,
+    RawPublisher,
+    RawQueryable,
+    RawReader,
+)
 
 # Kinds of entities in liveliness tokens.
 NODE = "NN"
@@ -24,7 +29,8 @@ TRANSIENT_LOCAL = 1
 
 NODE_ID = 0  # a process of this bridge has a single node
 GID_BYTES = 16
-ATTACHMENT = struct.Struct("<qqB16s")  # sequence, sender's wall clock in ns, length of the GID, sender's GID
+# Sequence, sender's wall clock in ns, length of the GID, sender's GID.
+ATTACHMENT = struct.Struct("<qqB16s")
 
 
 @dataclass(frozen=True)
@@ -78,7 +84,12 @@ def make_topic_key(domain: int, topic: RosTopic) -> str:
 
 
 def make_token(
-    domain: int, zenoh_id: str, entity: int, kind: str, node: NodeName, topic: RosTopic | None = None
+    domain: int,
+    zenoh_id: str,
+    entity: int,
+    kind: str,
+    node: NodeName,
+    topic: RosTopic | None = None,
 ) -> str:
     """Return the liveliness token of a node (without a topic) or of one of its endpoints."""
     security_enclave = _escape_slashes("/")
@@ -156,7 +167,9 @@ class RosNode:
     def declare_publisher(self, topic: RosTopic) -> RosPublisher:
         """Declare a publisher, which `ros2 topic info` then shows."""
         key = make_topic_key(self._domain, topic)
-        publisher = self._network.declare_publisher(key, latched=topic.latched, background=topic.images)
+        publisher = self._network.declare_publisher(
+            key, latched=topic.latched, background=topic.images
+        )
         token = self._make_next_token(PUBLISHER, topic)
         self._network.declare_token(token)
         return RosPublisher(publisher, token)
@@ -179,4 +192,6 @@ class RosNode:
 
     def _make_next_token(self, kind: str, topic: RosTopic | None = None) -> str:
         """Return the liveliness token of the next entity of this node."""
-        return make_token(self._domain, self._network.id, next(self._entities), kind, self._name, topic)
+        return make_token(
+            self._domain, self._network.id, next(self._entities), kind, self._name, topic
+        )

@@ -50,10 +50,13 @@ def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
             code="network/invalid-address",
         )
     with open_session(replace(connection, max_bytes=MAX_IMAGE_BYTES)) as session:
-        robot = session.wait_for_latched(keys.DESCRIPTION, RobotDescription, START_TIMEOUT_S, is_consistent)
+        robot = session.wait_for_latched(
+            keys.DESCRIPTION, RobotDescription, START_TIMEOUT_S, is_consistent
+        )
         if robot is None:
             raise NotConnectedError(
-                f"{connection.namespace} does not describe itself within {START_TIMEOUT_S:g} s", code="network/no-robot"
+                f"{connection.namespace} does not describe itself within {START_TIMEOUT_S:g} s",
+                code="network/no-robot",
             )
         options = _make_options(arguments, robot)
         with contextlib.ExitStack() as exit_stack:
@@ -61,13 +64,19 @@ def run_bridge(arguments: argparse.Namespace, selection: RobotSelection) -> int:
             name = NodeName(NODE_NAME, f"/{options.namespace}")
             node = RosNode(network, arguments.domain, name)
             bridge = RosBridge(session, node, robot, options)
-            servers = _make_servers(session, node, connection, bridge.prefix, operate=arguments.operate)
+            servers = _make_servers(
+                session, node, connection, bridge.prefix, operate=arguments.operate
+            )
             for server in servers:
                 exit_stack.callback(server.close)
             if arguments.joint_commands:
-                topic = RosTopic(f"/{bridge.prefix}joint_commands", JOINT_STATE, depth=MAX_JOINT_COMMANDS)
+                topic = RosTopic(
+                    f"/{bridge.prefix}joint_commands", JOINT_STATE, depth=MAX_JOINT_COMMANDS
+                )
                 messages = node.declare_subscription(topic)
-                commander = JointCommander(session, messages, print_line, wall_time=options.wall_time)
+                commander = JointCommander(
+                    session, messages, print_line, wall_time=options.wall_time
+                )
                 exit_stack.callback(commander.close)
             time_name = "robot"
             if options.wall_time:
@@ -95,7 +104,9 @@ def _make_options(arguments: argparse.Namespace, robot: RobotDescription) -> Bri
 
 def _connect_to_ros(endpoint: str, cleanup: contextlib.ExitStack) -> ForeignNetwork:
     try:
-        return cleanup.enter_context(open_foreign_network(endpoint, max_bytes=MAX_ROS_MESSAGE_BYTES))
+        return cleanup.enter_context(
+            open_foreign_network(endpoint, max_bytes=MAX_ROS_MESSAGE_BYTES)
+        )
     except NotConnectedError:
         raise NotConnectedError(
             f"no router of ROS nodes on {endpoint}; start it by "
@@ -108,7 +119,9 @@ def _make_servers(
     session: Session, node: RosNode, connection: ConnectionSettings, prefix: str, *, operate: bool
 ) -> list[ServiceServer]:
     operating_servers = make_operating_servers(session, node, connection, prefix, operate=operate)
-    parameter_servers = make_parameter_servers(session, node, f"/{prefix}{NODE_NAME}", operate=operate)
+    parameter_servers = make_parameter_servers(
+        session, node, f"/{prefix}{NODE_NAME}", operate=operate
+    )
     return operating_servers + parameter_servers
 
 

@@ -17,7 +17,11 @@ from snakesim_operator.features.ros2.message_age import find_age_problem
 from snakesim_operator.features.ros2.messages import JOINT_STATE, TYPE_STORE
 
 TARGET_LIFETIME_NS = 500_000_000  # of a joint's target in robot time
-MODE_FIELDS = ((JointMode.POSITION, "position"), (JointMode.VELOCITY, "velocity"), (JointMode.TORQUE, "effort"))
+MODE_FIELDS = (
+    (JointMode.POSITION, "position"),
+    (JointMode.VELOCITY, "velocity"),
+    (JointMode.TORQUE, "effort"),
+)
 MAX_NAME_SHOWN = 40  # characters of an unknown joint name in a message to the user
 
 
@@ -51,11 +55,14 @@ class RosJointTargets:
         self._joint_indices = {joint.name: i for i, joint in enumerate(robot.joints)}
         self._torque_limits_nm = [joint.torque_limit_nm for joint in robot.joints]
         self._targets: list[_JointTarget | None] = [None] * len(robot.joints)
-        self._held_angles_rad: list[float | None] = [None] * len(robot.joints)  # None: not holding yet
+        # None: not holding yet.
+        self._held_angles_rad: list[float | None] = [None] * len(robot.joints)
         self.rejected_count = 0  # messages
         self.reason = ""  # for the newest rejection
 
-    def accept_message(self, payload: bytes, now_ns: int, ros_now_ns: int | None = None, age_ns: int = 0) -> bool:
+    def accept_message(
+        self, payload: bytes, now_ns: int, ros_now_ns: int | None = None, age_ns: int = 0
+    ) -> bool:
         """Accept the targets of a message as the newest ones of their joints: either all of them or none.
 
         Args:
@@ -143,7 +150,9 @@ class RosJointTargets:
         """Raise _RefusedMessageError for a target that this robot's joint cannot follow."""
         if name not in self._joint_indices:
             known_names = ", ".join(self._joint_indices)
-            raise _RefusedMessageError(f"names {name[:MAX_NAME_SHOWN]!r}; {self._robot.robot} has {known_names}")
+            raise _RefusedMessageError(
+                f"names {name[:MAX_NAME_SHOWN]!r}; {self._robot.robot} has {known_names}"
+            )
         if not math.isfinite(value):
             raise _RefusedMessageError(f"has {field} {value} for {name}, must be finite")
         joint = self._robot.joints[self._joint_indices[name]]

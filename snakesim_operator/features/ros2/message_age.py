@@ -28,7 +28,8 @@ class _SlidingMinimumOffset:
     """
 
     def __init__(self) -> None:
-        self._parts: deque[tuple[int, int]] = deque(maxlen=WINDOW_PARTS)  # number of the part, smallest offset in ns
+        # Number of the part, smallest offset in ns.
+        self._parts: deque[tuple[int, int]] = deque(maxlen=WINDOW_PARTS)
 
     def update_and_get_delay(self, offset_ns: int, monotonic_ns: int) -> int:
         """Record the offset of a message, and return by how many ns it exceeds the minimum of the last two minutes."""
@@ -48,9 +49,8 @@ class SenderClocks:
     """Measures the delay of each message by comparison with the fastest message of its sender."""
 
     def __init__(self) -> None:
-        self._min_offset_by_sender: OrderedDict[bytes, _SlidingMinimumOffset] = (
-            OrderedDict()
-        )  # by sender, longest silent first
+        # By sender, longest silent first.
+        self._min_offset_by_sender: OrderedDict[bytes, _SlidingMinimumOffset] = OrderedDict()
 
     def estimate_age_ns(self, sample: RawSample, wall_ns: int, monotonic_ns: int) -> int:
         """Estimate the age of a message in ns: its delay relative to the minimum observed clock offset of its sender.

@@ -164,7 +164,9 @@ def _make_marker(header: Any, marker_id: int, action: int, shape: RosMarker) -> 
     position = _make_point(shape.position_m)
     orientation = make_quaternion(shape.orientation_wxyz)
     until_replaced = make_message("builtin_interfaces/msg/Duration", 0, 0)
-    no_image = make_message("sensor_msgs/msg/CompressedImage", make_header(0, ""), "", _make_octets(b""))
+    no_image = make_message(
+        "sensor_msgs/msg/CompressedImage", make_header(0, ""), "", _make_octets(b"")
+    )
     no_mesh = make_message("visualization_msgs/msg/MeshFile", "", _make_octets(b""))
     return make_message(
         "visualization_msgs/msg/Marker",
@@ -190,7 +192,9 @@ def _make_marker(header: Any, marker_id: int, action: int, shape: RosMarker) -> 
     )
 
 
-def encode_image(timestamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes) -> bytes:
+def encode_image(
+    timestamp_ns: int, frame: str, width: int, height: int, encoding: str, pixels: bytes
+) -> bytes:
     """Encode a camera image as a sensor_msgs/Image in CDR.
 
     Args:
@@ -217,7 +221,9 @@ def encode_image(timestamp_ns: int, frame: str, width: int, height: int, encodin
 
 def encode_compressed_image(timestamp_ns: int, frame: str, format_: str, data: bytes) -> bytes:
     """Encode a sensor_msgs/CompressedImage in CDR. `format_` is the text that plug-ins of image_transport read."""
-    return encode_message(COMPRESSED_IMAGE, make_header(timestamp_ns, frame), format_, _make_octets(data))
+    return encode_message(
+        COMPRESSED_IMAGE, make_header(timestamp_ns, frame), format_, _make_octets(data)
+    )
 
 
 def decode_twist(payload: bytes) -> tuple[float, ...] | None:

@@ -8,7 +8,12 @@ from snakesim_hal.base.errors import NotConnectedError, RefusedError
 from snakesim_hal.base.process import get_user_name
 from snakesim_hal.network.session import ConnectionSettings, Session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import LifecycleRequest, RobotDescription, RobotStatus, make_arm_request
+from snakesim_hal.wire.messages import (
+    LifecycleRequest,
+    RobotDescription,
+    RobotStatus,
+    make_arm_request,
+)
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.features.ros2.graph import RosNode
 from snakesim_operator.features.ros2.message_age import find_request_age_problem
@@ -52,7 +57,9 @@ def make_operating_servers(
 
 
 def _make_trigger_server(node: RosNode, name: str, action: Callable[[], str]) -> ServiceServer:
-    return ServiceServer(node, name, TRIGGER, _make_trigger_handler(action), make_refusal=_make_trigger_refusal)
+    return ServiceServer(
+        node, name, TRIGGER, _make_trigger_handler(action), make_refusal=_make_trigger_refusal
+    )
 
 
 def _make_trigger_handler(action: Callable[[], str]) -> Callable[[Any], bytes]:
@@ -93,22 +100,31 @@ class _RobotOperator:
 
     def arm(self) -> str:
         """Arm the robot that the host describes at present."""
-        robot = self._session.wait_for_latched(keys.DESCRIPTION, RobotDescription, DESCRIPTION_TIMEOUT_S)
+        robot = self._session.wait_for_latched(
+            keys.DESCRIPTION, RobotDescription, DESCRIPTION_TIMEOUT_S
+        )
         if robot is None:
             raise NotConnectedError(
-                f"{self._link.namespace} publishes no description; is its HAL host running?", code="network/no-robot"
+                f"{self._link.namespace} publishes no description; is its HAL host running?",
+                code="network/no-robot",
             )
         # If it does not become ready, the host's answer to the request gives the reason.
-        self._session.wait_for_latched(keys.STATUS, RobotStatus, READY_TIMEOUT_S, lambda status: status.ready_to_arm)
+        self._session.wait_for_latched(
+            keys.STATUS, RobotStatus, READY_TIMEOUT_S, lambda status: status.ready_to_arm
+        )
         return self._send_lifecycle_request(make_arm_request(robot, REQUESTER), "armed")
 
     def disarm(self) -> str:
         """Disarm the robot."""
-        return self._send_lifecycle_request(LifecycleRequest(action="disarm", requester=REQUESTER), "disarmed")
+        return self._send_lifecycle_request(
+            LifecycleRequest(action="disarm", requester=REQUESTER), "disarmed"
+        )
 
     def reset(self) -> str:
         """Reset the robot's fault."""
-        return self._send_lifecycle_request(LifecycleRequest(action="reset", requester=REQUESTER), "reset")
+        return self._send_lifecycle_request(
+            LifecycleRequest(action="reset", requester=REQUESTER), "reset"
+        )
 
     def _send_lifecycle_request(self, request: LifecycleRequest, done: str) -> str:
         lines: list[str] = []

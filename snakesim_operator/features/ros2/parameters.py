@@ -37,15 +37,26 @@ INTEGERS = 7
 DOUBLES = 8
 STRINGS = 9
 
-_SCALAR_FIELDS = {BOOL: "bool_value", INTEGER: "integer_value", DOUBLE: "double_value", STRING: "string_value"}
-_ARRAY_FIELDS = {BOOLS: "bool_array_value", INTEGERS: "integer_array_value", DOUBLES: "double_array_value"}
+_SCALAR_FIELDS = {
+    BOOL: "bool_value",
+    INTEGER: "integer_value",
+    DOUBLE: "double_value",
+    STRING: "string_value",
+}
+_ARRAY_FIELDS = {
+    BOOLS: "bool_array_value",
+    INTEGERS: "integer_array_value",
+    DOUBLES: "double_array_value",
+}
 _SCALAR_TYPES = {bool: BOOL, int: INTEGER, float: DOUBLE, str: STRING}
 
 QUEUE_DEPTH = 1000  # of a node's parameter services, as rmw's profile has it
 NOT_ALLOWED = "this bridge only watches: start it with --operate to let ROS set parameters"
 
 
-def make_parameter_servers(session: Session, node: RosNode, node_name: str, *, operate: bool) -> list[ServiceServer]:
+def make_parameter_servers(
+    session: Session, node: RosNode, node_name: str, *, operate: bool
+) -> list[ServiceServer]:
     """Declare the six parameter services of a ROS node, and return their servers.
 
     Args:
@@ -61,7 +72,11 @@ def make_parameter_servers(session: Session, node: RosNode, node_name: str, *, o
         ("get_parameter_types", types.GET_PARAMETER_TYPES, services.get_parameter_types),
         ("describe_parameters", types.DESCRIBE_PARAMETERS, services.describe_parameters),
         ("set_parameters", types.SET_PARAMETERS, services.set_parameters),
-        ("set_parameters_atomically", types.SET_PARAMETERS_ATOMICALLY, services.set_parameters_atomically),
+        (
+            "set_parameters_atomically",
+            types.SET_PARAMETERS_ATOMICALLY,
+            services.set_parameters_atomically,
+        ),
     )
     return [
         ServiceServer(node, f"{node_name}/{name}", service, handle_request, QUEUE_DEPTH)
@@ -80,7 +95,9 @@ class ParameterServices:
         """List the names below one of the requested prefixes; without a prefix, list all."""
         names: list[str] = []
         for name in self._read_parameters():
-            if not request.prefixes or any(_has_prefix(name, prefix) for prefix in request.prefixes):
+            if not request.prefixes or any(
+                _has_prefix(name, prefix) for prefix in request.prefixes
+            ):
                 names.append(name)
         prefixes: list[str] = []
         if names:
@@ -111,7 +128,9 @@ class ParameterServices:
 
     def set_parameters_atomically(self, request: Any) -> bytes:
         """Set all of the parameters or none of them."""
-        return types.SET_PARAMETERS_ATOMICALLY.encode_response(self._set_and_make_result(request.parameters))
+        return types.SET_PARAMETERS_ATOMICALLY.encode_response(
+            self._set_and_make_result(request.parameters)
+        )
 
     def _read_parameters(self) -> dict[str, RobotParameter]:
         """Return the controller's parameters by name; none if no controller publishes any."""
@@ -169,7 +188,14 @@ def _encode_value(value: Any) -> Any:
     does not have becomes a text of JSON.
     """
     type_number = _find_parameter_type(value)
-    value_by_type: dict[int, Any] = {BOOL: False, INTEGER: 0, DOUBLE: 0.0, STRING: "", DOUBLES: [], STRINGS: []}
+    value_by_type: dict[int, Any] = {
+        BOOL: False,
+        INTEGER: 0,
+        DOUBLE: 0.0,
+        STRING: "",
+        DOUBLES: [],
+        STRINGS: [],
+    }
     if type_number == STRING:
         value_by_type[STRING] = format_value(value)
     elif type_number == STRINGS:
@@ -213,7 +239,9 @@ def _make_descriptor(name: str, parameter: RobotParameter | None) -> Any:
         parameter: The parameter of the controller; None if the controller has none of this name.
     """
     if parameter is None:
-        return make_message("rcl_interfaces/msg/ParameterDescriptor", name, NOT_SET, "", "", False, False, [], [])
+        return make_message(
+            "rcl_interfaces/msg/ParameterDescriptor", name, NOT_SET, "", "", False, False, [], []
+        )
     type_number = _find_parameter_type(parameter.value)
     description = parameter.description
     if parameter.unit not in ("", "1"):

@@ -12,7 +12,8 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageT
 from snakesim_hal.wire.messages import Imu, Message
 
-MAX_CLOCK_OFFSETS = 256  # a delayed clock message must not move the offset, so several seconds of clocks count
+# A delayed clock message must not move the offset, so several seconds of clocks count.
+MAX_CLOCK_OFFSETS = 256
 MAX_SAMPLES = 4  # some malformed samples must not displace the newest valid one
 
 
@@ -58,10 +59,13 @@ class TopicRelay(ABC, Generic[MessageT]):
         self._message_type = message_type
         self._every_cycles = every_cycles
         self._has_subscriber = has_subscriber
-        self._reader: SampleReader[MessageT] | None = None  # None while no subscriber needs the samples
+        # None while no subscriber needs the samples.
+        self._reader: SampleReader[MessageT] | None = None
 
     @abstractmethod
-    def forward_new_samples(self, reader: SampleReader[MessageT], is_valid: Callable[[Message], bool]) -> None:
+    def forward_new_samples(
+        self, reader: SampleReader[MessageT], is_valid: Callable[[Message], bool]
+    ) -> None:
         """Forward what has arrived since the last poll, at most once for each topic.
 
         Args:
@@ -82,7 +86,9 @@ class TopicRelay(ABC, Generic[MessageT]):
             self._unsubscribe()
             return
         if self._reader is None:
-            self._reader = self._session.declare_reader(self._key, self._message_type, depth=self.depth)
+            self._reader = self._session.declare_reader(
+                self._key, self._message_type, depth=self.depth
+            )
         self.forward_new_samples(self._reader, is_valid)
 
     def _unsubscribe(self) -> None:
@@ -107,7 +113,9 @@ class NewestRelay(TopicRelay[MessageT]):
         super().__init__(session, key, message_type, every_cycles, has_subscriber)
         self._forward = forward
 
-    def forward_new_samples(self, reader: SampleReader[MessageT], is_valid: Callable[[Message], bool]) -> None:
+    def forward_new_samples(
+        self, reader: SampleReader[MessageT], is_valid: Callable[[Message], bool]
+    ) -> None:
         newest = reader.pop_newest(is_valid)
         if newest is not None:
             self._forward(newest)
@@ -121,16 +129,22 @@ class ImuRelay(TopicRelay[Imu]):
 
     depth = None
 
-    def __init__(self, session: Session, forward: Callable[[dict[int, ImuMeasurement]], None]) -> None:
+    def __init__(
+        self, session: Session, forward: Callable[[dict[int, ImuMeasurement]], None]
+    ) -> None:
         """Prepare the relay; `forward` is called with the newest measurement of each IMU by the index of its link."""
         super().__init__(session, keys.IMU, Imu)
         self._forward = forward
 
-    def forward_new_samples(self, reader: SampleReader[Imu], is_valid: Callable[[Message], bool]) -> None:
+    def forward_new_samples(
+        self, reader: SampleReader[Imu], is_valid: Callable[[Message], bool]
+    ) -> None:
         newest: dict[int, ImuMeasurement] = {}
         for sample in reader.drain():
             if is_valid(sample):
-                newest |= {link: ImuMeasurement(sample, entry) for entry, link in enumerate(sample.link)}
+                newest |= {
+                    link: ImuMeasurement(sample, entry) for entry, link in enumerate(sample.link)
+                }
         if newest:
             self._forward(newest)
 

@@ -40,7 +40,8 @@ ERROR = 2
 PLUMB_BOB = "plumb_bob"  # distortion model; all its coefficients are 0 here
 MILLIMETER_M = 0.001
 MAX_DEPTH_COUNTS = 65535  # 16 bits
-INVERSE_DEPTH_UNUSED = struct.pack("<i2f", 0, 0.0, 0.0)  # format and two parameters, for depth in float alone
+# Format and two parameters, for depth in float alone.
+INVERSE_DEPTH_UNUSED = struct.pack("<i2f", 0, 0.0, 0.0)
 
 
 def encode_joint_state(timestamp_ns: int, names: list[str], joints: JointState) -> bytes:
@@ -73,7 +74,9 @@ def make_contact_markers(contacts: Iterable[WorldContact]) -> list[RosMarker]:
     markers: list[RosMarker] = []
     for contact in contacts:
         points = (contact.position_w, _find_arrow_tip(contact))
-        markers.append(RosMarker("contacts", ros.ARROW, ARROW_SIZE_M, CONTACT_COLOR, points_m=points))
+        markers.append(
+            RosMarker("contacts", ros.ARROW, ARROW_SIZE_M, CONTACT_COLOR, points_m=points)
+        )
     return markers
 
 
@@ -161,7 +164,8 @@ def encode_imu(timestamp_ns: int, frame: str, imus: Imu, imu_index: int) -> byte
         imu_index: Index of this IMU within the measurements.
     """
     unknown_covariance = np.zeros(9)
-    no_orientation = np.array([-1.0, *[0.0] * 8])  # a covariance of -1: this IMU measures no orientation
+    # A covariance of -1: this IMU measures no orientation.
+    no_orientation = np.array([-1.0, *[0.0] * 8])
     return ros.encode_message(
         ros.IMU,
         ros.make_header(timestamp_ns, frame),
@@ -227,7 +231,9 @@ def encode_laser_scan(timestamp_ns: int, frame: str, scan: RangeScan) -> bytes:
     )
 
 
-def encode_numbers(kind: CustomMessage, field: str, _timestamp_ns: int, _frame: str, sample: CustomSample) -> bytes:
+def encode_numbers(
+    kind: CustomMessage, field: str, _timestamp_ns: int, _frame: str, sample: CustomSample
+) -> bytes:
     """Return a std_msgs/Float64MultiArray with one field of a custom sensor's sample.
 
     The array has one dimension, labeled with the field's name and unit. This type has neither timestamp nor frame.
@@ -262,11 +268,16 @@ def encode_diagnostics(timestamp_ns: int, status: RobotStatus) -> bytes:
     }
     for i, fault in enumerate(status.faults):
         values[f"fault {i}"] = f"{fault.what}: {fault.cause}"
-    pairs = [ros.make_message("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
+    pairs = [
+        ros.make_message("diagnostic_msgs/msg/KeyValue", key, value)
+        for key, value in values.items()
+    ]
     level = _find_diagnostic_level(status)
     summary = f"{status.lifecycle}: {status.reason}"
     hardware_id = status.robot
-    entry = ros.make_message("diagnostic_msgs/msg/DiagnosticStatus", level, status.robot, summary, hardware_id, pairs)
+    entry = ros.make_message(
+        "diagnostic_msgs/msg/DiagnosticStatus", level, status.robot, summary, hardware_id, pairs
+    )
     return ros.encode_message(ros.DIAGNOSTICS, ros.make_header(timestamp_ns, ""), [entry])
 
 

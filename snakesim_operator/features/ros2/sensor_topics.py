@@ -17,10 +17,18 @@ from snakesim_operator.features.ros2.contact_wrenches import encode_wrenches
 from snakesim_operator.features.ros2.frames import RobotFrames, make_ros_name
 from snakesim_operator.features.ros2.graph import RosNode, RosPublisher, RosTopic, RosType
 from snakesim_operator.features.ros2.messages import RosTransform
-from snakesim_operator.features.ros2.relay import ImuMeasurement, ImuRelay, NewestRelay, RosTime, TopicRelay
+from snakesim_operator.features.ros2.relay import (
+    ImuMeasurement,
+    ImuRelay,
+    NewestRelay,
+    RosTime,
+    TopicRelay,
+)
 
-ImageEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and image to a message in CDR
-SampleEncoder = Callable[[int, str, Any], bytes]  # from ROS time in ns, frame and sample to a message in CDR
+# From ROS time in ns, frame and image to a message in CDR.
+ImageEncoder = Callable[[int, str, Any], bytes]
+# From ROS time in ns, frame and sample to a message in CDR.
+SampleEncoder = Callable[[int, str, Any], bytes]
 
 
 def _get_sensor_name(key: str) -> str:
@@ -61,7 +69,12 @@ class SensorTopics:
     """Publishes the samples of one robot's sensors."""
 
     def __init__(
-        self, session: Session, node: RosNode, prefix: str, ros_time: RosTime, static_frames: StaticFrames
+        self,
+        session: Session,
+        node: RosNode,
+        prefix: str,
+        ros_time: RosTime,
+        static_frames: StaticFrames,
     ) -> None:
         """Prepare the ROS topics of one robot's sensors; `set_robot` and `make_relays` must be called next.
 
@@ -108,7 +121,9 @@ class SensorTopics:
         for key, custom_type in find_custom_messages(self._robot).items():
             for field in custom_type.units:
                 encode_field = partial(robot_in_ros.encode_numbers, custom_type, field)
-                relays.append(self._make_mounted_sensor_relay(key, field, ros.FLOAT64_ARRAY, encode_field))
+                relays.append(
+                    self._make_mounted_sensor_relay(key, field, ros.FLOAT64_ARRAY, encode_field)
+                )
         return relays
 
     def _declare_publisher(self, name: str, ros_type: RosType, **quality: Any) -> RosPublisher:
@@ -122,7 +137,9 @@ class SensorTopics:
         def forward(sample: m.Contacts) -> None:
             frames = [self._frames.get_link_frame(link) for link in range(len(publishers))]
             timestamp_ns = self._ros_time.convert(sample.timestamp_ns)
-            for publisher, encoded in zip(publishers, encode_wrenches(timestamp_ns, frames, sample), strict=True):
+            for publisher, encoded in zip(
+                publishers, encode_wrenches(timestamp_ns, frames, sample), strict=True
+            ):
                 publisher.publish(encoded)
 
         every_cycle = 1
@@ -173,12 +190,16 @@ class SensorTopics:
             every_cycles: Number of bridge cycles from one image to the next.
         """
         name = _get_sensor_name(key)
-        camera_info = self._declare_publisher(f"{make_ros_name(name)}/{kind}/camera_info", ros.CAMERA_INFO, depth=1)
+        camera_info = self._declare_publisher(
+            f"{make_ros_name(name)}/{kind}/camera_info", ros.CAMERA_INFO, depth=1
+        )
 
         def forward(image: m.DepthImage | m.ColorImage) -> None:
             frame = self._frames.get_optical_frame(kind, name)
             timestamp_ns = self._ros_time.convert(image.timestamp_ns)
-            self._static_frames.place_sensor(key, self._frames.make_camera_transforms(kind, name, image))
+            self._static_frames.place_sensor(
+                key, self._frames.make_camera_transforms(kind, name, image)
+            )
             camera_info.publish(robot_in_ros.encode_camera_info(timestamp_ns, frame, image))
             for publisher, encode in publishers_and_encoders:
                 if publisher.has_subscribers():
@@ -213,9 +234,15 @@ class SensorTopics:
             if link not in self._imu_publishers:
                 link_name = make_ros_name(self._robot.links[link].name)
                 self._imu_publishers[link] = self._declare_publisher(f"{link_name}/imu", ros.IMU)
-            self._static_frames.place_sensor(f"{keys.IMU}/{link}", [self._frames.make_imu_transform(link)])
+            self._static_frames.place_sensor(
+                f"{keys.IMU}/{link}", [self._frames.make_imu_transform(link)]
+            )
             publisher = self._imu_publishers[link]
             if publisher.has_subscribers():
                 timestamp_ns = self._ros_time.convert(measurement.sample.timestamp_ns)
                 frame = self._frames.get_imu_frame(link)
-                publisher.publish(robot_in_ros.encode_imu(timestamp_ns, frame, measurement.sample, measurement.entry))
+                publisher.publish(
+                    robot_in_ros.encode_imu(
+                        timestamp_ns, frame, measurement.sample, measurement.entry
+                    )
+                )

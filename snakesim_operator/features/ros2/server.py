@@ -53,7 +53,9 @@ class ServiceServer:
         self._handle_request = answer
         self._make_refusal = make_refusal
         self._find_refusal_reason = explain_refusal
-        self._request_queue: RawQueryable = node.declare_service(RosTopic(name, service.type, depth=depth))
+        self._request_queue: RawQueryable = node.declare_service(
+            RosTopic(name, service.type, depth=depth)
+        )
         self._executor = ThreadPoolExecutor(1)
         self._running_request: Future[None] | None = None  # the request that is being answered
         self._error_report = ErrorReporter(name)
@@ -81,7 +83,9 @@ class ServiceServer:
         if reply_attachment is None or request is None:
             self.rejected_count += 1
             return
-        self._running_request = self._executor.submit(self._send_response, query, request, reply_attachment)
+        self._running_request = self._executor.submit(
+            self._send_response, query, request, reply_attachment
+        )
 
     def close(self) -> None:
         """Wait until the running request is answered, and drop the others."""

@@ -15,10 +15,13 @@ from snakesim_operator.features.ros2.messages import TYPE_STORE, make_message
 
 # ROS turns char into uint8 before it hashes a definition, and rosbags does not. So the definition uses uint8.
 _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
-_EVENT_INFO_FIELDS = "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number"
+_EVENT_INFO_FIELDS = (
+    "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number"
+)
 TYPE_STORE.fielddefs[_EVENT_INFO] = get_types_from_msg(_EVENT_INFO_FIELDS, _EVENT_INFO)[_EVENT_INFO]
 
-EMPTY_DEFINITION = "uint8 structure_needs_at_least_one_member"  # what ROS puts into a message without fields
+# What ROS puts into a message without fields.
+EMPTY_DEFINITION = "uint8 structure_needs_at_least_one_member"
 _PARAMETER_VALUES = "rcl_interfaces/msg/ParameterValue[] values"
 
 
@@ -90,7 +93,9 @@ LIST_PARAMETERS = _define_parameter_service(
     "rcl_interfaces/msg/ListParametersResult result",
 )
 GET_PARAMETERS = _define_parameter_service("GetParameters", "string[] names", _PARAMETER_VALUES)
-GET_PARAMETER_TYPES = _define_parameter_service("GetParameterTypes", "string[] names", "uint8[] types")
+GET_PARAMETER_TYPES = _define_parameter_service(
+    "GetParameterTypes", "string[] names", "uint8[] types"
+)
 DESCRIBE_PARAMETERS = _define_parameter_service(
     "DescribeParameters", "string[] names", "rcl_interfaces/msg/ParameterDescriptor[] descriptors"
 )

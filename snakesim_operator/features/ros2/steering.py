@@ -17,9 +17,8 @@ from snakesim_hal.wire.messages import LocomotionIntent
 from snakesim_operator.features.ros2.message_age import SenderClocks, find_age_problem
 from snakesim_operator.features.ros2.messages import decode_twist
 
-INTENT_LIFETIME_NS = (
-    500_000_000  # of an intent in robot time; teleop_twist_keyboard and joysticks repeat at 10 Hz and more
-)
+# Of an intent in robot time; teleop_twist_keyboard and joysticks repeat at 10 Hz and more.
+INTENT_LIFETIME_NS = 500_000_000
 MAX_SPEED_M_S = 10.0  # the limit that navigation sets for an intent
 MAX_TURN_RATE_RAD_S = 10.0
 MAX_LEAD_RAD = math.pi / 2  # beyond this, "ahead of the body" becomes ambiguous
@@ -44,7 +43,9 @@ class CmdVelInput:
         self._sender_clocks = SenderClocks()
         self._reported_reason = ""  # the last reason for dropping that the user has seen
 
-    def publish_newest_intent(self, robot_ns: int | None, find_heading: Callable[[], float | None]) -> None:
+    def publish_newest_intent(
+        self, robot_ns: int | None, find_heading: Callable[[], float | None]
+    ) -> None:
         """Publish an intent for the newest Twist, if one has arrived.
 
         Args:
@@ -64,7 +65,9 @@ class CmdVelInput:
             self._intent_publisher.put(intent)
         elif self._steering.reason != self._reported_reason:
             self._reported_reason = self._steering.reason
-            self._print_text(f"a message on cmd_vel {self._reported_reason}; it is dropped, with all that are alike")
+            self._print_text(
+                f"a message on cmd_vel {self._reported_reason}; it is dropped, with all that are alike"
+            )
 
 
 class CmdVelSteering:
@@ -113,7 +116,9 @@ class CmdVelSteering:
             heading_w_rad=self._heading_w_rad,
         )
 
-    def _update_heading(self, turn_rate_rad_s: float, now_ns: int, body_heading_w_rad: float | None) -> None:
+    def _update_heading(
+        self, turn_rate_rad_s: float, now_ns: int, body_heading_w_rad: float | None
+    ) -> None:
         """Rotate the desired direction for the time since the last Twist; after a silence, start at the body's."""
         elapsed_ns = INTENT_LIFETIME_NS + 1  # before the first Twist: as after a silence
         if self._last_twist_ns is not None:
@@ -123,9 +128,13 @@ class CmdVelSteering:
         if self._heading_w_rad is None or was_silent:
             self._heading_w_rad = body_heading_w_rad
         elif body_heading_w_rad is not None:
-            lead_rad = self._heading_w_rad + turn_rate_rad_s * elapsed_ns * 1e-9 - body_heading_w_rad
+            lead_rad = (
+                self._heading_w_rad + turn_rate_rad_s * elapsed_ns * 1e-9 - body_heading_w_rad
+            )
             lead_rad = math.remainder(lead_rad, 2 * math.pi)
-            self._heading_w_rad = body_heading_w_rad + min(max(lead_rad, -MAX_LEAD_RAD), MAX_LEAD_RAD)
+            self._heading_w_rad = body_heading_w_rad + min(
+                max(lead_rad, -MAX_LEAD_RAD), MAX_LEAD_RAD
+            )
 
 
 def _find_twist_problem(components: tuple[float, ...] | None) -> str:

@@ -33,7 +33,9 @@ def make_urdf(robot: RobotDescription, prefix: str = "") -> str:
     rear_links = robot.links[:-1]
     front_links = robot.links[1:]
     for rear, joint, front in zip(rear_links, robot.joints, front_links, strict=True):
-        element = _add_joint(root, joint.name, "revolute", prefix + rear.name, prefix + front.name, rear.length_m)
+        element = _add_joint(
+            root, joint.name, "revolute", prefix + rear.name, prefix + front.name, rear.length_m
+        )
         _add_limits(element, joint)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
@@ -50,9 +52,18 @@ def _add_link(root: ElementTree.Element, link: LinkDescription, prefix: str) -> 
     length = f"{link.length_m:.9g}"
     radius = f"{link.radius_m:.9g}"
     for element_name in ("visual", "collision"):
-        _add_shape(element, element_name, middle_xyz, z_to_x_rpy, "cylinder", {"radius": radius, "length": length})
+        _add_shape(
+            element,
+            element_name,
+            middle_xyz,
+            z_to_x_rpy,
+            "cylinder",
+            {"radius": radius, "length": length},
+        )
         _add_shape(element, element_name, "0 0 0", unrotated_rpy, "sphere", {"radius": radius})
-        _add_shape(element, element_name, front_end_xyz, unrotated_rpy, "sphere", {"radius": radius})
+        _add_shape(
+            element, element_name, front_end_xyz, unrotated_rpy, "sphere", {"radius": radius}
+        )
 
 
 def _add_inertia(element: ElementTree.Element, link: LinkDescription) -> None:
@@ -65,11 +76,18 @@ def _add_inertia(element: ElementTree.Element, link: LinkDescription) -> None:
     inertial = ElementTree.SubElement(element, "inertial")
     ElementTree.SubElement(inertial, "origin", xyz=f"{link.length_m / 2:.9g} 0 0")
     ElementTree.SubElement(inertial, "mass", value=f"{link.mass_kg:.9g}")
-    ElementTree.SubElement(inertial, "inertia", ixx=axial, iyy=lateral, izz=lateral, ixy="0", ixz="0", iyz="0")
+    ElementTree.SubElement(
+        inertial, "inertia", ixx=axial, iyy=lateral, izz=lateral, ixy="0", ixz="0", iyz="0"
+    )
 
 
 def _add_shape(
-    element: ElementTree.Element, use: str, xyz: str, rpy: str, shape: str, attributes: dict[str, str]
+    element: ElementTree.Element,
+    use: str,
+    xyz: str,
+    rpy: str,
+    shape: str,
+    attributes: dict[str, str],
 ) -> None:
     """Add one shape to a link. `use` is `visual` or `collision`."""
     part = ElementTree.SubElement(element, use)

@@ -63,7 +63,9 @@ def align_runs(a: RunRecord, b: RunRecord) -> AlignedRuns:
     else:
         grid_s = common_time_b_s
         how = f"{_describe_rates(a, b)}: A is interpolated at the ticks of B"
-    return AlignedRuns(grid_s, _sample_joints(a, time_a_s, grid_s), _sample_joints(b, time_b_s, grid_s), how)
+    return AlignedRuns(
+        grid_s, _sample_joints(a, time_a_s, grid_s), _sample_joints(b, time_b_s, grid_s), how
+    )
 
 
 def _describe_rates(a: RunRecord, b: RunRecord) -> str:

@@ -43,7 +43,9 @@ def compare_runs(
             f"--within {within_percent:g}: give a percentage that is not negative, such as --within 10",
             code="command/invalid-option",
         )
-    difference = compute_difference(RunRecord.load(run_a.resolve()), RunRecord.load(run_b.resolve()))
+    difference = compute_difference(
+        RunRecord.load(run_a.resolve()), RunRecord.load(run_b.resolve())
+    )
     check = None
     if within_percent is not None:
         check = check_tolerance(difference, within_percent)
@@ -57,7 +59,9 @@ def compare_runs(
     try:
         write_text(path, render_comparison_page(difference, check))
     except ConfigError as error:
-        raise ConfigError(f"{error}; name another file with --out FILE.html", code="file/not-writable") from None
+        raise ConfigError(
+            f"{error}; name another file with --out FILE.html", code="file/not-writable"
+        ) from None
     if as_json:
         print_json({**make_json_values(difference), "page": str(path), "within": check})
     else:

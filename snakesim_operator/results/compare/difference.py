@@ -10,7 +10,12 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.run_log.host_record import BLACK_BOX
 from snakesim_hal.wire.messages import JointMode
-from snakesim_operator.results.compare.alignment import TIME_TOLERANCE_S, AlignedRuns, JointSeries, align_runs
+from snakesim_operator.results.compare.alignment import (
+    TIME_TOLERANCE_S,
+    AlignedRuns,
+    JointSeries,
+    align_runs,
+)
 from snakesim_operator.results.compare.following import LagAndGain, fit_lag_and_gain
 from snakesim_operator.results.compare.settings import (
     SettingDifference,
@@ -19,12 +24,17 @@ from snakesim_operator.results.compare.settings import (
     list_identifying_settings,
 )
 from snakesim_operator.results.metrics.propulsion import PropulsionInterval, find_propulsion_periods
-from snakesim_operator.results.report.timeline import TimelineSeries, measure_distance, read_reported_distance
+from snakesim_operator.results.report.timeline import (
+    TimelineSeries,
+    measure_distance,
+    read_reported_distance,
+)
 from snakesim_operator.results.run_log import RunRecord
 
 DIVERGENCE_THRESHOLD_RAD = 0.05  # three degrees: a hundred times the noise of an angle sensor
 MAX_HAND_OVERS_NAMED = 12
-STATIONARY_THRESHOLD_M = 0.001  # a run that moved less did not move; a percentage of that is meaningless
+# A run that moved less did not move; a percentage of that is meaningless.
+STATIONARY_THRESHOLD_M = 0.001
 TARGET_QUANTITIES = (
     (JointMode.POSITION, "angle target", "rad"),
     (JointMode.VELOCITY, "speed target", "rad/s"),
@@ -58,13 +68,19 @@ class QuantityDifference:
     max_difference_by_joint: list[MaxDifference | None]
     rms: float | None  # over all joints
     max_difference: MaxDifference | None
-    correlation: float | None  # Pearson, over all joints and times; None if one of the runs is constant
-    unknown_fraction: float  # fraction of the compared values that are not finite in one of the runs, or in both
+    # Pearson, over all joints and times; None if one of the runs is constant.
+    correlation: float | None
+    # Fraction of the compared values that are not finite in one of the runs, or in both.
+    unknown_fraction: float
 
     @property
     def is_same(self) -> bool:
         """Whether every value is known in both runs, and equal."""
-        return self.unknown_fraction == 0 and self.max_difference is not None and not self.max_difference.difference
+        return (
+            self.unknown_fraction == 0
+            and self.max_difference is not None
+            and not self.max_difference.difference
+        )
 
 
 @dataclass(frozen=True)
@@ -146,13 +162,15 @@ class RunDifference:
     differing_settings: list[SettingDifference]  # settings that differ
     drive_difference: str  # a sentence about drives that differ; empty if all drives are the same
     advance: AdvanceComparison | None
-    lag_and_gain_by_joint: list[LagAndGain | None]  # how the angle in B follows that in A; None if unknown
+    # How the angle in B follows that in A; None if unknown.
+    lag_and_gain_by_joint: list[LagAndGain | None]
     angle: QuantityDifference
     speed: QuantityDifference
     torque: QuantityDifference
     targets: list[QuantityDifference]  # one for each mode that was used in both at the same time
     other_mode_fraction: float  # fraction of ticks and joints whose modes differ
-    tracking_errors_rad: tuple[float | None, float | None]  # RMS of angle - target in position mode, in A and in B
+    # RMS of angle - target in position mode, in A and in B.
+    tracking_errors_rad: tuple[float | None, float | None]
     hand_overs: HandOvers
     divergence: FirstDivergence | None
 
@@ -195,12 +213,18 @@ def compute_difference(a: RunRecord, b: RunRecord) -> RunDifference:
     end_s = float(time_s[-1])
     same_mode = joints_a.mode == joints_b.mode  # (n, joints)
     angle = _compare_quantity("angle", "rad", time_s, joints_a.angle_rad, joints_b.angle_rad)
-    speed = _compare_quantity("speed", "rad/s", time_s, joints_a.velocity_rad_s, joints_b.velocity_rad_s)
+    speed = _compare_quantity(
+        "speed", "rad/s", time_s, joints_a.velocity_rad_s, joints_b.velocity_rad_s
+    )
     torque = _compare_quantity("torque", "N·m", time_s, joints_a.torque_nm, joints_b.torque_nm)
     angles_by_joint = zip(joints_a.angle_rad.T, joints_b.angle_rad.T, strict=True)
-    lags_and_gains = [fit_lag_and_gain(time_s, angle_a, angle_b) for angle_a, angle_b in angles_by_joint]
+    lags_and_gains = [
+        fit_lag_and_gain(time_s, angle_a, angle_b) for angle_a, angle_b in angles_by_joint
+    ]
     hand_overs = HandOvers(
-        _find_hand_overs_until(a, end_s), _find_hand_overs_until(b, end_s), _describe_unreported(a, b)
+        _find_hand_overs_until(a, end_s),
+        _find_hand_overs_until(b, end_s),
+        _describe_unreported(a, b),
     )
     return RunDifference(
         a=a,
@@ -220,7 +244,10 @@ def compute_difference(a: RunRecord, b: RunRecord) -> RunDifference:
         # What was commanded and reported.
         targets=_compare_targets(aligned, same_mode),
         other_mode_fraction=float(1 - same_mode.mean()),
-        tracking_errors_rad=(_compute_tracking_error_rad(joints_a), _compute_tracking_error_rad(joints_b)),
+        tracking_errors_rad=(
+            _compute_tracking_error_rad(joints_a),
+            _compute_tracking_error_rad(joints_b),
+        ),
         hand_overs=hand_overs,
         divergence=_find_divergence(time_s, angle.difference),
     )
@@ -262,7 +289,11 @@ def _check_array_shapes(record: RunRecord) -> None:
     """Raise ConfigError for arrays of a wrong shape or type, which a damaged black box may hold."""
     tick_count = len(record.time_s)
     joint_count = len(record.description.joints)
-    shapes = {"time_s": (tick_count,), "position_w_m": (tick_count, 3), "orientation_wxyz": (tick_count, 4)}
+    shapes = {
+        "time_s": (tick_count,),
+        "position_w_m": (tick_count, 3),
+        "orientation_wxyz": (tick_count, 4),
+    }
     for name in ("angle_rad", "velocity_rad_s", "torque_nm", "mode", "target"):
         shapes[name] = (tick_count, joint_count)
     for name, shape in shapes.items():
@@ -280,7 +311,9 @@ def _check_array_shapes(record: RunRecord) -> None:
         )
 
 
-def _compare_targets(aligned: AlignedRuns, same_mode: NDArray[np.bool_]) -> list[QuantityDifference]:
+def _compare_targets(
+    aligned: AlignedRuns, same_mode: NDArray[np.bool_]
+) -> list[QuantityDifference]:
     """Compare the targets of each mode that was used in both runs at the same time.
 
     Args:
@@ -293,12 +326,19 @@ def _compare_targets(aligned: AlignedRuns, same_mode: NDArray[np.bool_]) -> list
         if both_in_mode.any():
             target_a = np.where(both_in_mode, aligned.a.target, np.nan)
             target_b = np.where(both_in_mode, aligned.b.target, np.nan)
-            gaps.append(_compare_quantity(what, unit, aligned.time_s, target_a, target_b, both_in_mode))
+            gaps.append(
+                _compare_quantity(what, unit, aligned.time_s, target_a, target_b, both_in_mode)
+            )
     return gaps
 
 
 def _compare_quantity(
-    what: str, unit: str, time_s: Floats, a: Floats, b: Floats, compared: NDArray[np.bool_] | None = None
+    what: str,
+    unit: str,
+    time_s: Floats,
+    a: Floats,
+    b: Floats,
+    compared: NDArray[np.bool_] | None = None,
 ) -> QuantityDifference:
     """Compare one quantity of every joint, such as the angle, between two runs.
 
@@ -328,7 +368,9 @@ def _compare_quantity(
     if known.any():
         total_rms = float(np.sqrt(squares.sum() / known.sum()))
 
-    joint_worst = [_find_max_difference(joint, time_s, a, b, known) for joint in range(difference.shape[1])]
+    joint_worst = [
+        _find_max_difference(joint, time_s, a, b, known) for joint in range(difference.shape[1])
+    ]
     known_worst = [worst for worst in joint_worst if worst is not None]
     return QuantityDifference(
         quantity=what,
@@ -360,7 +402,9 @@ def _find_max_difference(
         return None
     squares = (b[known_rows, joint_index] - a[known_rows, joint_index]) ** 2
     row = known_rows[np.argmax(squares)]
-    return MaxDifference(joint_index, float(time_s[row]), float(a[row, joint_index]), float(b[row, joint_index]))
+    return MaxDifference(
+        joint_index, float(time_s[row]), float(a[row, joint_index]), float(b[row, joint_index])
+    )
 
 
 def _compute_correlation(a: Floats, b: Floats) -> float | None:
@@ -404,7 +448,11 @@ def _describe_unreported(a: RunRecord, b: RunRecord) -> str:
 
 def _find_hand_overs_until(record: RunRecord, end_s: float) -> list[PropulsionInterval]:
     """Return the propulsion periods that begin within the common time."""
-    return [period for period in find_propulsion_periods(record) if period.start_s <= end_s + TIME_TOLERANCE_S]
+    return [
+        period
+        for period in find_propulsion_periods(record)
+        if period.start_s <= end_s + TIME_TOLERANCE_S
+    ]
 
 
 def _find_divergence(time_s: Floats, difference_rad: Floats) -> FirstDivergence | None:

@@ -3,7 +3,11 @@
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.results.compare.difference import AdvanceComparison, QuantityDifference, RunDifference
+from snakesim_operator.results.compare.difference import (
+    AdvanceComparison,
+    QuantityDifference,
+    RunDifference,
+)
 from snakesim_operator.results.metrics.propulsion import find_propulsion_intervals
 from snakesim_operator.results.page.charts import (
     ChartBar,
@@ -32,8 +36,17 @@ def draw_advance(difference: RunDifference, moved: AdvanceComparison) -> list[Pl
     gap = ChartLine("B − A", time_s, ahead_mm)
     marks = mark_divergence(difference)
     return [
-        make_line_chart("Advance of both runs over time", "advance, m", drawn, end_s, markers=marks),
-        make_line_chart("Difference of the advance over time", "B − A, mm", [gap], end_s, markers=marks, height=170),
+        make_line_chart(
+            "Advance of both runs over time", "advance, m", drawn, end_s, markers=marks
+        ),
+        make_line_chart(
+            "Difference of the advance over time",
+            "B − A, mm",
+            [gap],
+            end_s,
+            markers=marks,
+            height=170,
+        ),
     ]
 
 
@@ -45,7 +58,13 @@ def draw_difference_map(difference: RunDifference, gap: QuantityDifference) -> P
     label = f"Difference of every joint's {gap.quantity} over time"
     until_s = float(difference.aligned.time_s[-1])
     return make_joint_heatmap(
-        label, difference.joints, gap.difference, gap.unit, full, until_s, markers=mark_divergence(difference)
+        label,
+        difference.joints,
+        gap.difference,
+        gap.unit,
+        full,
+        until_s,
+        markers=mark_divergence(difference),
     )
 
 
@@ -71,7 +90,9 @@ def draw_joint_in_both_runs(
     if worst is not None and worst.difference:
         marks.append(TimeMarker(worst.time_s, "worst"))
     label = f"{gap.quantity.capitalize()} of {difference.joints[joint_index]} in both runs"
-    return make_line_chart(label, f"{gap.quantity}, {gap.unit}", drawn, float(time_s[-1]), markers=marks)
+    return make_line_chart(
+        label, f"{gap.quantity}, {gap.unit}", drawn, float(time_s[-1]), markers=marks
+    )
 
 
 def draw_hand_overs(difference: RunDifference) -> PlotlyDict:
@@ -81,13 +102,23 @@ def draw_hand_overs(difference: RunDifference) -> PlotlyDict:
     for run, record, color in (("A", difference.a, COLOR_A), ("B", difference.b, COLOR_B)):
         for interval in find_propulsion_intervals(record):
             row = f"{difference.joints[interval.joint_index]} {run}"
-            drawn.append(ChartBar(row, interval.start_s, interval.end_s, f"{run} {interval.duration_s:.1f} s", color))
+            drawn.append(
+                ChartBar(
+                    row,
+                    interval.start_s,
+                    interval.end_s,
+                    f"{run} {interval.duration_s:.1f} s",
+                    color,
+                )
+            )
             propelled.add(interval.joint_index)
     rows: list[str] = []
     for joint in sorted(propelled, reverse=True):
         rows += [f"{difference.joints[joint]} A", f"{difference.joints[joint]} B"]
     end_s = max([float(difference.aligned.time_s[-1]), *(bar.end_s for bar in drawn)])
-    return make_bar_chart("Propulsion joints of both runs over time", rows, drawn, end_s, mark_divergence(difference))
+    return make_bar_chart(
+        "Propulsion joints of both runs over time", rows, drawn, end_s, mark_divergence(difference)
+    )
 
 
 def mark_divergence(difference: RunDifference) -> list[TimeMarker]:

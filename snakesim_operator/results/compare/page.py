@@ -7,14 +7,20 @@ import numpy as np
 
 from snakesim_operator.results.compare import figures
 from snakesim_operator.results.compare.difference import DIVERGENCE_THRESHOLD_RAD, RunDifference
-from snakesim_operator.results.compare.verdict import ToleranceCheck, describe_difference, describe_propulsion_order
+from snakesim_operator.results.compare.verdict import (
+    ToleranceCheck,
+    describe_difference,
+    describe_propulsion_order,
+)
 from snakesim_operator.results.page.html import format_number, render_page
 
 UNKNOWN = "–"
 HAND_OVERS_SHOWN = 40
 
 
-def render_comparison_page(difference: RunDifference, tolerance_check: ToleranceCheck | None = None) -> str:
+def render_comparison_page(
+    difference: RunDifference, tolerance_check: ToleranceCheck | None = None
+) -> str:
     """Render the page that compares two runs as HTML.
 
     Args:
@@ -61,4 +67,8 @@ def _list_most_different_joints(difference: RunDifference) -> list[tuple[int, st
 
 def _format_known_value(value: float | None, unit: str = "") -> str:
     """Format a number with three digits and its unit, or a dash if it is unknown."""
-    return UNKNOWN if value is None or not np.isfinite(value) else f"{format_number(value, 3)} {unit}".strip()
+    return (
+        UNKNOWN
+        if value is None or not np.isfinite(value)
+        else f"{format_number(value, 3)} {unit}".strip()
+    )

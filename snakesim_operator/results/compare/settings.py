@@ -20,7 +20,8 @@ IGNORED_DESCRIPTION_KEYS = (
     "host",
     "proof",
 )
-DRIVE_IDENTITY_FIELDS = ("serial", "firmware")  # fields of a joint that identify its drive, and are not settings
+# Fields of a joint that identify its drive, and are not settings.
+DRIVE_IDENTITY_FIELDS = "serial", "firmware"
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,16 @@ class SettingDifference:
 def list_identifying_settings(a: RunRecord, b: RunRecord) -> list[SettingDifference]:
     """List the settings that identify a run for people, whether they differ or not."""
     rows = [("scenario", "name"), ("robot", "robot.name"), ("scene", "scene.name")]
-    rows += [(key, key) for key in ("backend", "clock_mode", "rate_hz", "duration_s", "controller", "seed")]
+    rows += [
+        (key, key)
+        for key in ("backend", "clock_mode", "rate_hz", "duration_s", "controller", "seed")
+    ]
     values_a = dict(iterate_leaves(msgspec.to_builtins(a.config)))
     values_b = dict(iterate_leaves(msgspec.to_builtins(b.config)))
-    return [SettingDifference(name, _format_value(values_a, key), _format_value(values_b, key)) for name, key in rows]
+    return [
+        SettingDifference(name, _format_value(values_a, key), _format_value(values_b, key))
+        for name, key in rows
+    ]
 
 
 def find_differing_settings(a: RunRecord, b: RunRecord) -> list[SettingDifference]:
@@ -55,7 +62,9 @@ def find_differing_settings(a: RunRecord, b: RunRecord) -> list[SettingDifferenc
             is_in_both = key in values_a and key in values_b
             if not is_in_both or values_a[key] != values_b[key]:
                 settings.append(
-                    SettingDifference(prefix + key, _format_value(values_a, key), _format_value(values_b, key))
+                    SettingDifference(
+                        prefix + key, _format_value(values_a, key), _format_value(values_b, key)
+                    )
                 )
     return settings
 
@@ -89,8 +98,12 @@ def describe_drive_differences(a: RunRecord, b: RunRecord) -> str:
             f"drives: {unreported_runs[0]} reports no serial numbers and no firmware versions, {other_run} those of "
             f"{known_count[other_run]} of {total} joints"
         )
-    serial_count = sum(identities["a"]["serial"] != identities["b"]["serial"] for identities in differing)
-    version_count = sum(identities["a"]["firmware"] != identities["b"]["firmware"] for identities in differing)
+    serial_count = sum(
+        identities["a"]["serial"] != identities["b"]["serial"] for identities in differing
+    )
+    version_count = sum(
+        identities["a"]["firmware"] != identities["b"]["firmware"] for identities in differing
+    )
     return (
         f"drives: another serial number at {serial_count} of {total} joints, another firmware version at "
         f"{version_count}"
@@ -99,12 +112,19 @@ def describe_drive_differences(a: RunRecord, b: RunRecord) -> str:
 
 def _count_known_drives(record: RunRecord) -> int:
     """Count the joints whose drive reported a serial number or a firmware version."""
-    return sum(any(getattr(joint, field) for field in DRIVE_IDENTITY_FIELDS) for joint in record.description.joints)
+    return sum(
+        any(getattr(joint, field) for field in DRIVE_IDENTITY_FIELDS)
+        for joint in record.description.joints
+    )
 
 
 def _flatten_config(record: RunRecord) -> dict[str, Any]:
     """Return the values of the configuration by dotted key, without empty sections."""
-    return {key: value for key, value in iterate_leaves(msgspec.to_builtins(record.config)) if value != {}}
+    return {
+        key: value
+        for key, value in iterate_leaves(msgspec.to_builtins(record.config))
+        if value != {}
+    }
 
 
 def _flatten_description(record: RunRecord) -> dict[str, Any]:
@@ -117,7 +137,11 @@ def _flatten_description(record: RunRecord) -> dict[str, Any]:
     for joint in fields["joints"]:
         for field in DRIVE_IDENTITY_FIELDS:
             joint.pop(field, None)
-    return dict(iterate_leaves({key: value for key, value in fields.items() if key not in IGNORED_DESCRIPTION_KEYS}))
+    return dict(
+        iterate_leaves(
+            {key: value for key, value in fields.items() if key not in IGNORED_DESCRIPTION_KEYS}
+        )
+    )
 
 
 def _format_value(values: dict[str, Any], key: str) -> str:

@@ -4,9 +4,17 @@ from typing import Any
 
 import numpy as np
 
-from snakesim_operator.results.compare.difference import QuantityDifference, RunDifference, format_joint_order
+from snakesim_operator.results.compare.difference import (
+    QuantityDifference,
+    RunDifference,
+    format_joint_order,
+)
 from snakesim_operator.results.compare.settings import SettingDifference, find_drive_differences
-from snakesim_operator.results.compare.verdict import SAME_TEXT, describe_difference, describe_relative_distance
+from snakesim_operator.results.compare.verdict import (
+    SAME_TEXT,
+    describe_difference,
+    describe_relative_distance,
+)
 from snakesim_operator.results.metrics.propulsion import PropulsionInterval
 
 NAME_WIDTH = 24
@@ -27,12 +35,17 @@ def format_comparison(difference: RunDifference) -> list[str]:
         summary in sentences.
     """
     common_s = difference.aligned.time_s[-1]
-    difference_heading = f"  {'B - A':<{NAME_WIDTH}}{'RMS':<{VALUE_WIDTH}}{'worst':<{VALUE_WIDTH}}where and when"
+    difference_heading = (
+        f"  {'B - A':<{NAME_WIDTH}}{'RMS':<{VALUE_WIDTH}}{'worst':<{VALUE_WIDTH}}where and when"
+    )
     lines = [_format_row("", "A", "B"), *_format_identifying_settings(difference)]
     lines += ["", *_format_differing_settings(difference.differing_settings)]
     if difference.drive_difference:
         lines.append(difference.drive_difference)
-    lines += ["", f"over {common_s:.2f} s from the first arming, {difference.aligned.sampling_description}"]
+    lines += [
+        "",
+        f"over {common_s:.2f} s from the first arming, {difference.aligned.sampling_description}",
+    ]
     lines += _format_distance(difference)
     lines += _format_controller_handovers(difference)
     lines += ["", difference_heading]
@@ -63,12 +76,20 @@ def make_json_values(difference: RunDifference) -> dict[str, Any]:
     divergence = None
     first_divergence = difference.divergence
     if first_divergence is not None:
-        divergence = {"joint": joint_names[first_divergence.joint], "time_s": first_divergence.time_s}
-    settings = {setting.key: {"a": setting.a, "b": setting.b} for setting in difference.differing_settings}
+        divergence = {
+            "joint": joint_names[first_divergence.joint],
+            "time_s": first_divergence.time_s,
+        }
+    settings = {
+        setting.key: {"a": setting.a, "b": setting.b} for setting in difference.differing_settings
+    }
     return {
         "identical": difference.is_identical,
         "missing": {"a": difference.a.missing, "b": difference.b.missing},
-        "command_digest": {"a": difference.a.host.command_digest, "b": difference.b.host.command_digest},
+        "command_digest": {
+            "a": difference.a.host.command_digest,
+            "b": difference.b.host.command_digest,
+        },
         "settings": settings,
         "drives": find_drive_differences(difference.a, difference.b),
         "time_s": float(difference.aligned.time_s[-1]),
@@ -99,7 +120,10 @@ def _make_joint_values(difference: RunDifference) -> dict[str, dict[str, float |
     """Return lag, gain and RMS of the angle of each joint by name, as plain values."""
     values: dict[str, dict[str, float | None]] = {}
     for name, rms, fit in zip(
-        difference.joints, difference.angle.rms_by_joint, difference.lag_and_gain_by_joint, strict=True
+        difference.joints,
+        difference.angle.rms_by_joint,
+        difference.lag_and_gain_by_joint,
+        strict=True,
     ):
         values[name] = {
             "angle_rms_rad": None if np.isnan(rms) else float(rms),
@@ -110,7 +134,9 @@ def _make_joint_values(difference: RunDifference) -> dict[str, dict[str, float |
     return values
 
 
-def _make_hand_over_values(periods: list[PropulsionInterval], joints: list[str]) -> list[dict[str, Any]]:
+def _make_hand_over_values(
+    periods: list[PropulsionInterval], joints: list[str]
+) -> list[dict[str, Any]]:
     return [{"joint": joints[period.joint_index], "time_s": period.start_s} for period in periods]
 
 
@@ -131,7 +157,11 @@ def _format_identifying_settings(difference: RunDifference) -> list[str]:
         lines += [f"  not known of {name}: {sentence}" for sentence in record.missing]
     digest_a = host_a.command_digest[:16]
     digest_b = host_b.command_digest[:16]
-    lines.append(_format_row("command digest", digest_a, digest_b, "the same" if digest_a == digest_b else ""))
+    lines.append(
+        _format_row(
+            "command digest", digest_a, digest_b, "the same" if digest_a == digest_b else ""
+        )
+    )
     return lines
 
 
@@ -157,7 +187,10 @@ def _format_distance(difference: RunDifference) -> list[str]:
     note = describe_relative_distance(advance)
     if note != SAME_TEXT:
         note = f"{advance.difference_m:+.3f} m, {note}"
-    return [_format_row("moved", f"{advance.a_m:.3f} m", f"{advance.b_m:.3f} m", note), f"    ({advance.measure})"]
+    return [
+        _format_row("moved", f"{advance.a_m:.3f} m", f"{advance.b_m:.3f} m", note),
+        f"    ({advance.measure})",
+    ]
 
 
 def _format_controller_handovers(difference: RunDifference) -> list[str]:
@@ -174,15 +207,23 @@ def _format_controller_handovers(difference: RunDifference) -> list[str]:
     if not hand_overs.a and not hand_overs.b:
         return ["  no joint propelled in either"]
 
-    lines = [_format_row("propulsion joints", f"{len(hand_overs.a)} in a row", f"{len(hand_overs.b)} in a row")]
+    lines = [
+        _format_row(
+            "propulsion joints", f"{len(hand_overs.a)} in a row", f"{len(hand_overs.b)} in a row"
+        )
+    ]
     for i, delay_s in enumerate(hand_overs.delays_s[:MAX_HAND_OVERS_SHOWN]):
         in_a = hand_overs.a[i]
         in_b = hand_overs.b[i]
         name = f"  {joint_names[in_a.joint_index]}"
-        lines.append(_format_row(name, f"{in_a.start_s:.2f} s", f"{in_b.start_s:.2f} s", f"{delay_s:+.2f} s"))
+        lines.append(
+            _format_row(name, f"{in_a.start_s:.2f} s", f"{in_b.start_s:.2f} s", f"{delay_s:+.2f} s")
+        )
     hidden_count = hand_overs.common_count - MAX_HAND_OVERS_SHOWN
     if hidden_count > 0:
-        lines.append(f"    and {hidden_count} more that agree; the last is {hand_overs.delays_s[-1]:+.2f} s")
+        lines.append(
+            f"    and {hidden_count} more that agree; the last is {hand_overs.delays_s[-1]:+.2f} s"
+        )
     if not hand_overs.has_same_order:
         rest_a = hand_overs.a[hand_overs.common_count :]
         rest_b = hand_overs.b[hand_overs.common_count :]
@@ -211,7 +252,10 @@ def _format_joint_rows(difference: RunDifference) -> list[str]:
     value_heads = f"{'RMS of B - A':<{VALUE_WIDTH}}{'B later by':<{VALUE_WIDTH}}"
     lines = [f"  {joint_head}{value_heads}gain, and RMS left"]
     for name, rms, fit in zip(
-        difference.joints, difference.angle.rms_by_joint, difference.lag_and_gain_by_joint, strict=True
+        difference.joints,
+        difference.angle.rms_by_joint,
+        difference.lag_and_gain_by_joint,
+        strict=True,
     ):
         apart = "unknown" if np.isnan(rms) else f"{rms:.5f} rad"
         lag = "unknown"
@@ -227,8 +271,13 @@ def _format_torques_and_tracking(difference: RunDifference) -> list[str]:
     lines: list[str] = []
     if difference.torque.correlation is not None:
         lines.append(f"  torques correlate by {difference.torque.correlation:.3f}")
-    tracking = [f"{error:.4f} rad" if error is not None else "unknown" for error in difference.tracking_errors_rad]
-    lines.append(f"  angle off its own target, RMS in position mode: A {tracking[0]}, B {tracking[1]}")
+    tracking = [
+        f"{error:.4f} rad" if error is not None else "unknown"
+        for error in difference.tracking_errors_rad
+    ]
+    lines.append(
+        f"  angle off its own target, RMS in position mode: A {tracking[0]}, B {tracking[1]}"
+    )
     if difference.other_mode_fraction:
         lines.append(
             f"  joints in another mode: {100 * difference.other_mode_fraction:.1f} % of the time; targets are not "

@@ -36,7 +36,9 @@ def check_tolerance(difference: RunDifference, percent: float) -> ToleranceCheck
         return ToleranceCheck(percent, False, f"not within {percent:g} %: {words}")
     holds = abs(actual_percent) <= percent
     result = "within" if holds else "not within"
-    return ToleranceCheck(percent, holds, f"{result} {percent:g} %: {describe_relative_distance(advance)}")
+    return ToleranceCheck(
+        percent, holds, f"{result} {percent:g} %: {describe_relative_distance(advance)}"
+    )
 
 
 def describe_difference(difference: RunDifference) -> list[str]:
@@ -44,10 +46,15 @@ def describe_difference(difference: RunDifference) -> list[str]:
     partial = _describe_partial(difference)
     if difference.is_identical:
         how_long = "in what both records hold:" if partial else "for all of their"
-        return [*partial, f"The runs are the same, joint by joint, {how_long} {_describe_common_times(difference)}."]
+        return [
+            *partial,
+            f"The runs are the same, joint by joint, {how_long} {_describe_common_times(difference)}.",
+        ]
     words = [*partial, *_describe_unknown(difference), *_describe_replays(difference)]
     if difference.advance is None:
-        words.append("How far they moved cannot be compared: there is no measure of it that both runs have.")
+        words.append(
+            "How far they moved cannot be compared: there is no measure of it that both runs have."
+        )
     else:
         words.append(f"{_capitalize(describe_distances(difference.advance))}.")
     words.append(_describe_divergence(difference))
@@ -81,16 +88,22 @@ def _describe_divergence(difference: RunDifference) -> str:
 
 def _describe_partial(difference: RunDifference) -> list[str]:
     """Describe by a sentence which records are incomplete; empty if both are complete."""
-    incomplete = [run for run, record in (("A", difference.a), ("B", difference.b)) if record.missing]
+    incomplete = [
+        run for run, record in (("A", difference.a), ("B", difference.b)) if record.missing
+    ]
     if not incomplete:
         return []
     incomplete_runs = "A and B" if len(incomplete) == 2 else incomplete[0]
-    return [f"Only a part of the runs is compared, because the record of {incomplete_runs} is incomplete."]
+    return [
+        f"Only a part of the runs is compared, because the record of {incomplete_runs} is incomplete."
+    ]
 
 
 def _describe_unknown(difference: RunDifference) -> list[str]:
     unknown = [
-        f"{gap.quantity} {100 * gap.unknown_fraction:.2g} %" for gap in difference.quantities if gap.unknown_fraction
+        f"{gap.quantity} {100 * gap.unknown_fraction:.2g} %"
+        for gap in difference.quantities
+        if gap.unknown_fraction
     ]
     if not unknown:
         return []
@@ -129,7 +142,9 @@ def describe_propulsion_order(difference: RunDifference) -> str:
     for run, periods in (("A", hand_overs.a), ("B", hand_overs.b)):
         if common_count < len(periods):
             name = difference.joints[periods[common_count].joint_index]
-            next_joints.append(f"{run} continues with {name} at {periods[common_count].start_s:.2f} s")
+            next_joints.append(
+                f"{run} continues with {name} at {periods[common_count].start_s:.2f} s"
+            )
         else:
             next_joints.append(f"{run} with none")
     return f"the order of propulsion agrees for the first {common_count}; then {', '.join(next_joints)}"

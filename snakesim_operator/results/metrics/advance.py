@@ -15,7 +15,8 @@ from snakesim_hal.wire.messages import JointMode, RobotDescription
 from snakesim_operator.results.run_log import RunRecord
 
 SAMPLE_PERIOD_S = 0.1
-GOAL_HOLD_DURATION_S = 0.5  # a run continues that long at its goal: noise may move the body back over the line
+# A run continues that long at its goal: noise may move the body back over the line.
+GOAL_HOLD_DURATION_S = 0.5
 MIN_PROGRESS_M = 0.03  # a run that advances less than this within the stall timeout is stuck
 MIN_DISTANCE_M = 0.1  # energy per meter is meaningless for a shorter distance
 
@@ -57,11 +58,16 @@ class ForwardProgress:
         rows = np.unique(np.concatenate([periodic_rows, last_row, end_rows]))
         body_points_w = np.array([record.find_body_points_w(int(row)) for row in rows])
         time_s = record.time_s[rows] - record.time_s[0]
-        return ForwardProgress.from_body_points(record.config.mission.goal, record.description, time_s, body_points_w)
+        return ForwardProgress.from_body_points(
+            record.config.mission.goal, record.description, time_s, body_points_w
+        )
 
     @staticmethod
     def from_body_points(
-        goal: HeadingGoal | WaypointGoal | None, robot: RobotDescription, time_s: Floats, body_points_w: Floats
+        goal: HeadingGoal | WaypointGoal | None,
+        robot: RobotDescription,
+        time_s: Floats,
+        body_points_w: Floats,
     ) -> "ForwardProgress":
         """Compute the advance towards a goal from sampled positions of the body.
 
@@ -112,7 +118,8 @@ class ForwardProgress:
         first_beyond = int(np.argmax(self.max_advance_m >= goal_m))
         if first_beyond == 0:
             return 0.0
-        pair = slice(first_beyond - 1, first_beyond + 1)  # the samples before and after the goal was reached
+        # The samples before and after the goal was reached.
+        pair = slice(first_beyond - 1, first_beyond + 1)
         return float(np.interp(goal_m, self.max_advance_m[pair], self.time_s[pair]))
 
     @property
@@ -154,11 +161,15 @@ class ForwardProgress:
         next_point = 0
         advance_m: list[float] = []
         for head in self.head_w:
-            while next_point < len(points) and np.hypot(*(points[next_point] - head)) <= goal.within_m:
+            while (
+                next_point < len(points) and np.hypot(*(points[next_point] - head)) <= goal.within_m
+            ):
                 next_point += 1
             remaining_m = 0.0
             if next_point < len(points):
-                remaining_m = np.hypot(*(points[next_point] - head)) + remaining_after_point_m[next_point]
+                remaining_m = (
+                    np.hypot(*(points[next_point] - head)) + remaining_after_point_m[next_point]
+                )
             advance_m.append(total_m - float(remaining_m))
         return np.array(advance_m)
 
@@ -166,7 +177,9 @@ class ForwardProgress:
 class GoalMonitor:
     """Monitors a run, and detects its end: the goal was reached GOAL_HOLD_DURATION_S ago, or the robot is stuck."""
 
-    def __init__(self, config: RunConfig, robot: RobotDescription, stall_timeout_s: float | None = None) -> None:
+    def __init__(
+        self, config: RunConfig, robot: RobotDescription, stall_timeout_s: float | None = None
+    ) -> None:
         """Prepare to monitor a run.
 
         Args:
@@ -200,9 +213,12 @@ class GoalMonitor:
         if progress.goal_reached_s is not None:
             return now_s > progress.goal_reached_s + GOAL_HOLD_DURATION_S
         # The first sample that is less than MIN_PROGRESS_M behind the newest one: no real advance since then.
-        last_progress = int(np.argmax(progress.max_advance_m > progress.max_advance_m[-1] - MIN_PROGRESS_M))
+        last_progress = int(
+            np.argmax(progress.max_advance_m > progress.max_advance_m[-1] - MIN_PROGRESS_M)
+        )
         self.has_stalled = (
-            self._stall_timeout_s is not None and now_s - self._time_s[last_progress] >= self._stall_timeout_s
+            self._stall_timeout_s is not None
+            and now_s - self._time_s[last_progress] >= self._stall_timeout_s
         )
         return self.has_stalled
 
@@ -246,7 +262,9 @@ def compute_energy_j(record: RunRecord, rows: NDArray[np.bool_] | slice = slice(
 
     Each row stands for a control period. Unknown values count as 0.
     """
-    return float(np.nansum(np.abs(_compute_joint_power_w(record)[rows])) * _get_control_period_s(record))
+    return float(
+        np.nansum(np.abs(_compute_joint_power_w(record)[rows])) * _get_control_period_s(record)
+    )
 
 
 def compute_work_j(record: RunRecord, mode: JointMode) -> float:
@@ -261,7 +279,8 @@ def compute_work_j(record: RunRecord, mode: JointMode) -> float:
         mode: Mode of the joints whose rows are added.
     """
     return float(
-        np.nansum(np.where(record.mode == mode, _compute_joint_power_w(record), 0.0)) * _get_control_period_s(record)
+        np.nansum(np.where(record.mode == mode, _compute_joint_power_w(record), 0.0))
+        * _get_control_period_s(record)
     )
 
 

@@ -10,8 +10,17 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import ForwardKinematics
-from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, SAMPLE_PERIOD_S, ForwardProgress, compute_energy_j
-from snakesim_operator.results.metrics.effort import compute_propulsive_efficiency, get_body_length_m, get_weight_n
+from snakesim_operator.results.metrics.advance import (
+    MIN_DISTANCE_M,
+    SAMPLE_PERIOD_S,
+    ForwardProgress,
+    compute_energy_j,
+)
+from snakesim_operator.results.metrics.effort import (
+    compute_propulsive_efficiency,
+    get_body_length_m,
+    get_weight_n,
+)
 from snakesim_operator.results.run_log import RunRecord
 
 
@@ -48,7 +57,9 @@ class HeadingEffort:
         if progress is None or tracked_duration_s <= 0:
             return cls()
         distance_m = float(progress.max_heading_advance_m[-1])
-        cost = _compute_energy_cost(record, distance_m, has_torque_and_velocity=has_torque_and_velocity)
+        cost = _compute_energy_cost(
+            record, distance_m, has_torque_and_velocity=has_torque_and_velocity
+        )
         return cls(
             heading_advance_m=distance_m,
             heading_energy_j_per_m=cost.energy_j_per_m,
@@ -66,8 +77,10 @@ class DisplacementMetrics:
     displacement_energy_j_per_m: float | None = None
     displacement_body_lengths_s: float | None = None
     displacement_cost_of_transport: float | None = None
-    displacement_efficiency: float | None = None  # friction of the whole weight over the distance, over energy
-    displacement_slip: float | None = None  # 1 minus the displacement over the mean path length of the links
+    # Friction of the whole weight over the distance, over energy.
+    displacement_efficiency: float | None = None
+    # 1 minus the displacement over the mean path length of the links.
+    displacement_slip: float | None = None
     lateral_slip: float | None = None  # fraction of the links' paths that is across their own axes
 
     @classmethod
@@ -95,7 +108,9 @@ class DisplacementMetrics:
             return cls()
         displacement_w = progress.center_w[-1] - progress.center_w[0]
         distance_m = float(np.linalg.norm(displacement_w))
-        cost = _compute_energy_cost(record, distance_m, has_torque_and_velocity=has_torque_and_velocity)
+        cost = _compute_energy_cost(
+            record, distance_m, has_torque_and_velocity=has_torque_and_velocity
+        )
         slip = measure_slip(record, distance_m)
         return cls(
             displacement_m_s=distance_m / tracked_duration_s,
@@ -155,7 +170,9 @@ def measure_slip(record: RunRecord, distance_m: float) -> SlipFractions:
     lateral_path_m = float((lateral_steps_m @ masses_kg).sum() / masses_kg.sum())
     if path_m < MIN_DISTANCE_M:
         return SlipFractions()
-    return SlipFractions(longitudinal=max(1.0 - distance_m / path_m, 0.0), lateral=lateral_path_m / path_m)
+    return SlipFractions(
+        longitudinal=max(1.0 - distance_m / path_m, 0.0), lateral=lateral_path_m / path_m
+    )
 
 
 def _find_bearing_rad(progress: ForwardProgress, displacement_w: Floats) -> float | None:
@@ -163,7 +180,11 @@ def _find_bearing_rad(progress: ForwardProgress, displacement_w: Floats) -> floa
     if np.linalg.norm(displacement_w) < MIN_DISTANCE_M:
         return None
     forward_w = progress.head_w[0] - progress.center_w[0]
-    return float(np.arctan2(_compute_cross_product(forward_w, displacement_w), np.dot(forward_w, displacement_w)))
+    return float(
+        np.arctan2(
+            _compute_cross_product(forward_w, displacement_w), np.dot(forward_w, displacement_w)
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -174,7 +195,9 @@ class _EnergyCost:
     cost_of_transport: float | None = None  # energy over weight times distance
 
 
-def _compute_energy_cost(record: RunRecord, distance_m: float, *, has_torque_and_velocity: bool) -> _EnergyCost:
+def _compute_energy_cost(
+    record: RunRecord, distance_m: float, *, has_torque_and_velocity: bool
+) -> _EnergyCost:
     """Compute the energy of the whole run for a distance, per meter and relative to the weight.
 
     Args:

@@ -7,8 +7,15 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.friction import compute_surface_friction
 from snakesim_hal.model.outlines import ObstacleOutlines
-from snakesim_operator.results.metrics.advance import MIN_DISTANCE_M, ForwardProgress, compute_energy_j_per_m
-from snakesim_operator.results.metrics.form_closure import compute_form_closure_margin, find_body_contacts
+from snakesim_operator.results.metrics.advance import (
+    MIN_DISTANCE_M,
+    ForwardProgress,
+    compute_energy_j_per_m,
+)
+from snakesim_operator.results.metrics.form_closure import (
+    compute_form_closure_margin,
+    find_body_contacts,
+)
 from snakesim_operator.results.run_log import RunRecord
 
 FORM_CLOSURE_PERIOD_NS = 0.1e9  # form closure is expensive to compute, and changes slowly
@@ -21,12 +28,16 @@ class EffortMetrics:
 
     body_lengths_s: float | None = None
     cost_of_transport: float | None = None  # energy over weight times advance
-    propulsive_efficiency: float | None = None  # friction of the whole weight over the advance, over energy
+    # Friction of the whole weight over the advance, over energy.
+    propulsive_efficiency: float | None = None
     jam_ratio: float | None = None  # fraction of the time in which the body was stationary
     impulse_n_s_per_m: float | None = None  # of all contacts, over the advance
-    torque_headroom: float | None = None  # fraction of its limit that every joint had left, in 95 % of the ticks
-    form_closure: float | None = None  # fraction of the time in which obstacles would have held a stiff body
-    planning_fraction: float | None = None  # fraction of navigation's cycles in which it searched for a path
+    # Fraction of its limit that every joint had left, in 95 % of the ticks.
+    torque_headroom: float | None = None
+    # Fraction of the time in which obstacles would have held a stiff body.
+    form_closure: float | None = None
+    # Fraction of navigation's cycles in which it searched for a path.
+    planning_fraction: float | None = None
 
     @staticmethod
     def from_run(
@@ -48,7 +59,9 @@ class EffortMetrics:
         if has_torque_and_velocity:
             cost_of_transport = _compute_cost_of_transport(record, progress)
         return EffortMetrics(
-            body_lengths_s=progress.final_advance_m / progress.goal_or_end_s / get_body_length_m(record),
+            body_lengths_s=progress.final_advance_m
+            / progress.goal_or_end_s
+            / get_body_length_m(record),
             cost_of_transport=cost_of_transport,
             propulsive_efficiency=compute_propulsive_efficiency(record, cost_of_transport),
             jam_ratio=min(progress.stationary_duration_s / progress.goal_or_end_s, 1.0),
@@ -69,7 +82,9 @@ def get_weight_n(record: RunRecord) -> float:
     return record.config.scene.gravity_m_s2 * sum(link.mass_kg for link in record.description.links)
 
 
-def compute_propulsive_efficiency(record: RunRecord, cost_of_transport: float | None) -> float | None:
+def compute_propulsive_efficiency(
+    record: RunRecord, cost_of_transport: float | None
+) -> float | None:
     """Compute the energy that dragging the robot over flat ground takes, divided by the energy that its joints used.
 
     Dragging takes the weight times the coefficient of friction for forward sliding, per meter.
@@ -100,7 +115,9 @@ def _compute_cost_of_transport(record: RunRecord, progress: ForwardProgress) -> 
     return energy_j_per_m / get_weight_n(record)
 
 
-def _compute_contact_impulse_n_s_per_m(record: RunRecord, progress: ForwardProgress) -> float | None:
+def _compute_contact_impulse_n_s_per_m(
+    record: RunRecord, progress: ForwardProgress
+) -> float | None:
     """Integrate the forces of all contacts over time, and divide the impulse by the progress.
 
     The contacts are those in the world models of guidance, twenty per second. Returns None if the robot has no contact
@@ -114,7 +131,9 @@ def _compute_contact_impulse_n_s_per_m(record: RunRecord, progress: ForwardProgr
     for world in record.worlds:
         if 0 <= (world.timestamp_ns - start_ns) * 1e-9 <= progress.goal_or_end_s:
             times_s.append(world.timestamp_ns * 1e-9)
-            force_sums_n.append(sum(float(np.linalg.norm(contact.force_w)) for contact in world.contacts))
+            force_sums_n.append(
+                sum(float(np.linalg.norm(contact.force_w)) for contact in world.contacts)
+            )
     if len(times_s) < 2:
         return None
     return float(np.trapezoid(force_sums_n, times_s)) / progress.final_advance_m

@@ -33,7 +33,9 @@ class EstimateMetrics:
         if not record.worlds or len(record.time_s) == 0:
             return EstimateMetrics()
         last_world = record.worlds[-1]
-        dead_reckoned_worlds = [world for world in record.worlds if world.pose_from == "dead_reckoning"]
+        dead_reckoned_worlds = [
+            world for world in record.worlds if world.pose_from == "dead_reckoning"
+        ]
         known_errors_m: list[float] = []
         for world in dead_reckoned_worlds:
             error_m = _measure_position_error_m(record, world)
@@ -41,7 +43,9 @@ class EstimateMetrics:
                 known_errors_m.append(error_m)
         distance_m = None
         if len(dead_reckoned_worlds) > 1:
-            distance_m = _measure_estimated_advance_m(record, dead_reckoned_worlds[0], dead_reckoned_worlds[-1])
+            distance_m = _measure_estimated_advance_m(
+                record, dead_reckoned_worlds[0], dead_reckoned_worlds[-1]
+            )
         return EstimateMetrics(
             pose_from=last_world.pose_from,
             contacts_from=last_world.contacts_from,
@@ -73,7 +77,9 @@ def _measure_position_error_m(record: RunRecord, world: WorldModel) -> float | N
     return math.dist((x, y), world.base_position_w[:2])
 
 
-def _measure_estimated_advance_m(record: RunRecord, first: WorldModel, last: WorldModel) -> float | None:
+def _measure_estimated_advance_m(
+    record: RunRecord, first: WorldModel, last: WorldModel
+) -> float | None:
     """Return the advance along the route between two estimated poses, in m.
 
     Without a route, the displacement of the mean of the body points is used. Returns None if an angle is unknown.
@@ -93,6 +99,6 @@ def _measure_estimated_advance_m(record: RunRecord, first: WorldModel, last: Wor
 def _find_estimated_body_points_w(record: RunRecord, world: WorldModel) -> Floats:
     """Compute the horizontal positions of tail end, joints and head end at the estimated pose, (joints + 2, 2)."""
     angles_rad = record.angle_rad[record.find_nearest_row(world.timestamp_ns * 1e-9)]
-    return compute_body_points_w(record.description, world.base_position_w, world.base_orientation_wxyz, angles_rad)[
-        :, :2
-    ]
+    return compute_body_points_w(
+        record.description, world.base_position_w, world.base_orientation_wxyz, angles_rad
+    )[:, :2]

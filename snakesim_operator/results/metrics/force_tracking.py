@@ -15,7 +15,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import ControlState, WorldContact
 
 MEASUREMENT_DELAY_S = 0.06  # from the setpoint to the averaged measurement that contains it
-MIN_DESIRED_FORCE_N = 1.0  # about a quarter of the drag of the bundled robots; a smaller desired force is ignored
+# About a quarter of the drag of the bundled robots; a smaller desired force is ignored.
+MIN_DESIRED_FORCE_N = 1.0
 MIN_CONTACT_FORCE_N = 0.1  # a smaller measured force counts as no contact
 MIN_PAIRS = 20  # a correlation of fewer pairs is meaningless
 
@@ -69,7 +70,10 @@ def pair_forces(states: Sequence[ControlState]) -> list[ForcePair]:
         if state.state != "Locomoting" or not has_all_forces:
             continue
         requested_ns = state.timestamp_ns - delay_ns
-        while request_index + 1 < len(states) and states[request_index + 1].timestamp_ns <= requested_ns:
+        while (
+            request_index + 1 < len(states)
+            and states[request_index + 1].timestamp_ns <= requested_ns
+        ):
             request_index += 1
         request = states[request_index]
         if not requested_ns - delay_ns <= request.timestamp_ns <= requested_ns:
@@ -82,7 +86,9 @@ def pair_forces(states: Sequence[ControlState]) -> list[ForcePair]:
                 continue
             desired_n = desired_n_by_obstacle.get(point.obstacle, 0.0)
             if desired_n >= MIN_DESIRED_FORCE_N:
-                force_pairs.append(ForcePair(state.timestamp_ns, point.obstacle, desired_n, measured_n))
+                force_pairs.append(
+                    ForcePair(state.timestamp_ns, point.obstacle, desired_n, measured_n)
+                )
     return force_pairs
 
 
@@ -98,7 +104,9 @@ def measure_force_tracking(states: Sequence[ControlState]) -> ForceTracking | No
     force_pairs = pair_forces(states)
     if not force_pairs:
         return None
-    desired_n, measured_n = np.array([(pair.desired_force_n, pair.measured_force_n) for pair in force_pairs]).T
+    desired_n, measured_n = np.array(
+        [(pair.desired_force_n, pair.measured_force_n) for pair in force_pairs]
+    ).T
     return ForceTracking(
         correlation=_compute_correlation(desired_n, measured_n),
         median_error=float(np.median(np.abs(measured_n - desired_n) / desired_n)),

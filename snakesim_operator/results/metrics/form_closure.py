@@ -18,7 +18,9 @@ MAX_GAP_M = 0.02  # an obstacle at most this far from the body counts as a conta
 SINGULARITY_TOLERANCE = 1e-6  # norm of the twist of two contacts whose normals are on one line
 
 
-def find_body_contacts(body_points_w: Floats, radius_m: float, outlines: ObstacleOutlines) -> tuple[Floats, Floats]:
+def find_body_contacts(
+    body_points_w: Floats, radius_m: float, outlines: ObstacleOutlines
+) -> tuple[Floats, Floats]:
     """Find the contacts of a body with the obstacles beside it: for each obstacle the point nearest to the body.
 
     Args:
@@ -37,7 +39,9 @@ def find_body_contacts(body_points_w: Floats, radius_m: float, outlines: Obstacl
     return axis_points_w - radius_m * normals, normals
 
 
-def compute_form_closure_margin(contact_points_w: Floats, normals_w: Floats, length_m: float) -> float:
+def compute_form_closure_margin(
+    contact_points_w: Floats, normals_w: Floats, length_m: float
+) -> float:
     """Compute how well frictionless contacts hold a planar body in form closure.
 
     Each contact blocks the planar twists x with w_k . x < 0, where w_k = (normal, moment / length) is its wrench. A

@@ -8,16 +8,8 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 
 Z95 = 1.959964  # two-sided 95 % quantile of the normal distribution
-STUDENT_T_QUANTILES_95 = (
-    12.706,
-    4.303,
-    3.182,
-    2.776,
-    2.571,
-    2.447,
-    2.365,
-    2.306,
-)  # of Student's t, for 1 to 8 degrees of freedom
+# Of Student's t, for 1 to 8 degrees of freedom.
+STUDENT_T_QUANTILES_95 = 12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306
 
 
 def compute_mean_interval(values: Sequence[float]) -> tuple[float, float]:

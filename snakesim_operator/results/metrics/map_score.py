@@ -18,7 +18,8 @@ from snakesim_hal.wire.messages import KnownObstacle
 
 MAX_RANGE_M = 1.0
 FOV_RAD = math.pi / 2  # of the camera
-HALF_FOV_FRACTION = 0.45  # of the full field of view, on each side; at 0.5 half of an obstacle would be outside
+# Of the full field of view, on each side; at 0.5 half of an obstacle would be outside.
+HALF_FOV_FRACTION = 0.45
 MIN_RANGE_M = 0.15  # minimum range of the camera
 MAX_MATCH_DISTANCE_M = 0.05  # mean distance between the outlines of a match
 OUTLINE_POINTS = 48
@@ -29,14 +30,14 @@ LINE_OF_SIGHT_FRACTIONS = np.linspace(0.0, 1.0, 24)[1:-1]  # where occlusion is 
 class MapScore:
     """Errors of one map, or of several added up. Each list has an entry for each matched obstacle near the head."""
 
-    position_errors_m: list[float] = field(default_factory=list[float])  # distance from the reported to the true center
-    surface_errors_m: list[float] = field(
-        default_factory=list[float]
-    )  # mean distance of the side that faces the head to the true outline
-    size_errors_m: list[float] = field(default_factory=list[float])  # reported minus true radius, or longer half edge
-    position_errors_in_sd: list[float] = field(
-        default_factory=list[float]
-    )  # position error divided by the reported standard deviation
+    # Distance from the reported to the true center.
+    position_errors_m: list[float] = field(default_factory=list[float])
+    # Mean distance of the side that faces the head to the true outline.
+    surface_errors_m: list[float] = field(default_factory=list[float])
+    # Reported minus true radius, or longer half edge.
+    size_errors_m: list[float] = field(default_factory=list[float])
+    # Position error divided by the reported standard deviation.
+    position_errors_in_sd: list[float] = field(default_factory=list[float])
     missed_count: int = 0  # true obstacles that are visible, but not reported
     ghost_count: int = 0  # reported obstacles without a true obstacle there
     reported_count: int = 0  # reported obstacles near the head
@@ -44,7 +45,12 @@ class MapScore:
 
     def add(self, other: "MapScore") -> None:
         """Add the errors and counts of another map to this score."""
-        for name in ("position_errors_m", "surface_errors_m", "size_errors_m", "position_errors_in_sd"):
+        for name in (
+            "position_errors_m",
+            "surface_errors_m",
+            "size_errors_m",
+            "position_errors_in_sd",
+        ):
             getattr(self, name).extend(getattr(other, name))
         self.missed_count += other.missed_count
         self.ghost_count += other.ghost_count
@@ -74,7 +80,9 @@ def score_map(
         Errors of the matched obstacles, and numbers of ghosts and misses.
     """
     head = np.asarray(head_w, dtype=np.float64)[:2]
-    near_true_obstacles = _select_nearby_obstacles(true_obstacles, head, MAX_RANGE_M + MAX_MATCH_DISTANCE_M)
+    near_true_obstacles = _select_nearby_obstacles(
+        true_obstacles, head, MAX_RANGE_M + MAX_MATCH_DISTANCE_M
+    )
     true_outlines = ObstacleOutlines.from_obstacles(near_true_obstacles)
     map_score = MapScore()
     matched_names: set[str] = set()
@@ -129,7 +137,8 @@ def find_visible_obstacles(
             continue
         # Sample the line of sight to each point of the facing side, and look for other obstacles on it.
         facing_w = find_facing_points_w(obstacle, head_w)
-        sight_w = head_w + LINE_OF_SIGHT_FRACTIONS[:, None, None] * (facing_w - head_w)  # (steps, points, 2)
+        # (steps, points, 2).
+        sight_w = head_w + LINE_OF_SIGHT_FRACTIONS[:, None, None] * (facing_w - head_w)
         is_inside = outlines.compute_distances_m(sight_w) < 0  # (steps, points, obstacles)
         is_inside[..., i] = False  # an obstacle does not hide itself
         is_hidden = is_inside.any(axis=(0, 2))  # (points,)
@@ -164,9 +173,12 @@ def _sample_box_outline(obstacle: KnownObstacle) -> tuple[Floats, Floats]:
     side_points = OUTLINE_POINTS // 4
     half_size = np.array(obstacle.half_size_m[:2])
     along = (np.arange(side_points) + 0.5) / side_points * 2 - 1  # -1 to 1
-    sides = [(np.array([sign, 0.0]), np.array([0.0, 1.0])) for sign in (1.0, -1.0)]  # normal and direction
+    # Normal and direction.
+    sides = [(np.array([sign, 0.0]), np.array([0.0, 1.0])) for sign in (1.0, -1.0)]
     sides += [(np.array([0.0, sign]), np.array([1.0, 0.0])) for sign in (1.0, -1.0)]
-    points = np.vstack([(normal + along[:, None] * direction) * half_size for normal, direction in sides])
+    points = np.vstack(
+        [(normal + along[:, None] * direction) * half_size for normal, direction in sides]
+    )
     normals = np.vstack([np.broadcast_to(normal, (len(along), 2)) for normal, _ in sides])
     cos = math.cos(obstacle.yaw_rad)
     sin = math.sin(obstacle.yaw_rad)
@@ -174,7 +186,9 @@ def _sample_box_outline(obstacle: KnownObstacle) -> tuple[Floats, Floats]:
     return points @ rotation, normals @ rotation
 
 
-def align_map(reported: Sequence[KnownObstacle], from_w: Sequence[float], to_w: Sequence[float]) -> list[KnownObstacle]:
+def align_map(
+    reported: Sequence[KnownObstacle], from_w: Sequence[float], to_w: Sequence[float]
+) -> list[KnownObstacle]:
     """Align a map with the true pose: move it rigidly, as the estimated pose of the base moves to the true pose.
 
     This removes the pose error from the errors of a map, so that only the errors of perception remain.
@@ -207,8 +221,14 @@ def _select_nearby_obstacles(
     obstacles: Sequence[KnownObstacle], head_w: Floats, max_distance_m: float
 ) -> list[KnownObstacle]:
     """Return the obstacles whose outline is within a distance of the head, in m."""
-    is_near_by_obstacle = ObstacleOutlines.from_obstacles(obstacles).compute_distances_m(head_w) <= max_distance_m
-    return [obstacle for obstacle, is_near in zip(obstacles, is_near_by_obstacle.tolist(), strict=True) if is_near]
+    is_near_by_obstacle = (
+        ObstacleOutlines.from_obstacles(obstacles).compute_distances_m(head_w) <= max_distance_m
+    )
+    return [
+        obstacle
+        for obstacle, is_near in zip(obstacles, is_near_by_obstacle.tolist(), strict=True)
+        if is_near
+    ]
 
 
 def _get_half_size_m(obstacle: KnownObstacle) -> float:

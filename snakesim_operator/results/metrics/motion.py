@@ -149,7 +149,9 @@ def _find_true_segments(values: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the first and the last index of each segment of adjacent true values."""
     padded = np.concatenate([[False], values, [False]]).astype(int)
     edges = np.flatnonzero(np.diff(padded))
-    return [(int(first), int(after) - 1) for first, after in zip(edges[::2], edges[1::2], strict=True)]
+    return [
+        (int(first), int(after) - 1) for first, after in zip(edges[::2], edges[1::2], strict=True)
+    ]
 
 
 def _find_stop_start_s(time_s: Floats, center_w: Floats, first: int) -> float:

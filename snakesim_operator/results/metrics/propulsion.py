@@ -28,7 +28,9 @@ def find_propulsion_intervals(record: RunRecord) -> list[PropulsionInterval]:
     intervals: list[PropulsionInterval] = []
     for band in merge_equal_reports(record, names):
         if band.label in joint_index_by_name:
-            intervals.append(PropulsionInterval(band.start_s, band.end_s, joint_index_by_name[band.label]))
+            intervals.append(
+                PropulsionInterval(band.start_s, band.end_s, joint_index_by_name[band.label])
+            )
     return intervals
 
 

@@ -45,7 +45,12 @@ class ChartLine:
             "name": self.name,
             "x": np.round(self.time_s[rows], 4).tolist(),
             "y": round_values(self.values[rows]),
-            "line": {"color": self.color, "dash": self.dash, "width": self.width, "shape": self.shape},
+            "line": {
+                "color": self.color,
+                "dash": self.dash,
+                "width": self.width,
+                "shape": self.shape,
+            },
         }
 
 
@@ -95,14 +100,21 @@ def make_line_chart(
         from_zero: Whether the vertical axis begins at 0.
     """
     shapes = [
-        _make_rectangle(span.start_s, span.end_s, 0, 1, "paper", fillcolor=span.color, opacity=0.16) for span in shades
+        _make_rectangle(span.start_s, span.end_s, 0, 1, "paper", fillcolor=span.color, opacity=0.16)
+        for span in shades
     ]
     annotations: list[PlotlyDict] = []
     for value, name in levels:
         level_line = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": value, "y1": value}
         shapes.append({**level_line, "line": _make_line_style("--soft", "dot")})
         if name:
-            position = {"xref": "paper", "x": 1, "xanchor": "right", "y": value, "yanchor": "bottom"}
+            position = {
+                "xref": "paper",
+                "x": 1,
+                "xanchor": "right",
+                "y": value,
+                "yanchor": "bottom",
+            }
             annotations.append({**position, "text": name, "showarrow": False})
     range_mode = "tozero" if from_zero else "normal"
     layout = {
@@ -112,12 +124,23 @@ def make_line_chart(
     }
     traces = [line.make_trace() for line in drawn_lines]
     return _make_time_figure(
-        title, traces, height, end_s, shapes=shapes, annotations=annotations, markers=markers, layout=layout
+        title,
+        traces,
+        height,
+        end_s,
+        shapes=shapes,
+        annotations=annotations,
+        markers=markers,
+        layout=layout,
     )
 
 
 def make_bar_chart(
-    title: str, rows: Sequence[str], bars: Sequence[ChartBar], end_s: float, markers: Sequence[TimeMarker] = ()
+    title: str,
+    rows: Sequence[str],
+    bars: Sequence[ChartBar],
+    end_s: float,
+    markers: Sequence[TimeMarker] = (),
 ) -> PlotlyDict:
     """Make a Plotly chart of horizontal bars over time, such as the states of a run.
 
@@ -154,10 +177,16 @@ def make_bar_chart(
         "barmode": "overlay",
         "bargap": 0.12,
         "hovermode": "closest",
-        "yaxis": {"type": "category", "categoryarray": bottom_to_top, "range": [-0.5, len(rows) - 0.5]},
+        "yaxis": {
+            "type": "category",
+            "categoryarray": bottom_to_top,
+            "range": [-0.5, len(rows) - 0.5],
+        },
     }
     height = BAR_CHART_MARGIN_PX + ROW_HEIGHT_PX * len(rows)
-    return _make_time_figure(title, [trace], height, end_s, shapes=[], annotations=[], markers=markers, layout=layout)
+    return _make_time_figure(
+        title, [trace], height, end_s, shapes=[], annotations=[], markers=markers, layout=layout
+    )
 
 
 def make_joint_heatmap(
@@ -203,9 +232,19 @@ def make_joint_heatmap(
         outline = {"color": "--ink", "width": 1.2}
         shapes.append(_make_rectangle(start_s, end_s, joint - 0.5, joint + 0.5, "y", line=outline))
     rows_height = min(max(len(joints) * 18, 120), 420)
-    layout = {"hovermode": "closest", "yaxis": {"type": "category", "nticks": 16, "showgrid": False}}
+    layout = {
+        "hovermode": "closest",
+        "yaxis": {"type": "category", "nticks": 16, "showgrid": False},
+    }
     return _make_time_figure(
-        title, [trace], 60 + rows_height, end_s, shapes=shapes, annotations=[], markers=markers, layout=layout
+        title,
+        [trace],
+        60 + rows_height,
+        end_s,
+        shapes=shapes,
+        annotations=[],
+        markers=markers,
+        layout=layout,
     )
 
 
@@ -273,7 +312,13 @@ def _make_time_figure(
         if marker.text:
             all_annotations.append(_make_marker_annotation(marker, end_s))
     time_axis = {"range": [0, round(end_s, 4)], "title": {"text": "time, s"}}
-    full_layout = {**layout, "height": height, "xaxis": time_axis, "shapes": all_shapes, "annotations": all_annotations}
+    full_layout = {
+        **layout,
+        "height": height,
+        "xaxis": time_axis,
+        "shapes": all_shapes,
+        "annotations": all_annotations,
+    }
     return {"label": title, "data": traces, "layout": full_layout}
 
 
@@ -286,7 +331,9 @@ def _make_marker_annotation(marker: TimeMarker, end_s: float) -> PlotlyDict:
     return {**position, "showarrow": False, "text": marker.text, "xanchor": anchor, "xshift": shift}
 
 
-def _make_rectangle(x0: float, x1: float, y0: float, y1: float, yref: str, **style: Any) -> PlotlyDict:
+def _make_rectangle(
+    x0: float, x1: float, y0: float, y1: float, yref: str, **style: Any
+) -> PlotlyDict:
     layer = "below" if yref == "paper" else "above"
     corners = {"x0": x0, "x1": x1, "y0": y0, "y1": y1, "yref": yref}
     return {"type": "rect", "layer": layer, "line": {"width": 0}, **corners, **style}

@@ -15,7 +15,8 @@ from snakesim_operator.results.page.charts import LIBRARY, PlotlyDict
 from snakesim_operator.results.page.palette import make_theme_css
 
 HERE = Path(__file__).parent
-ALLOWED_CHARACTERS = "\n\u202f\u00a0"  # line breaks of a configuration, and the spaces in large numbers
+# Line breaks of a configuration, and the spaces in large numbers.
+ALLOWED_CHARACTERS = "\n\u202f\u00a0"
 MINUS = str.maketrans({"-": "−"})
 
 

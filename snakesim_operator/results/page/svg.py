@@ -40,14 +40,22 @@ def make_element(name: str, *children: str, **attributes: Attribute) -> str:
     for key, value in attributes.items():
         if value is None:
             continue
-        shown = escape(escape_invisible(value)) if isinstance(value, str) else format_coordinate(value)
+        shown = (
+            escape(escape_invisible(value)) if isinstance(value, str) else format_coordinate(value)
+        )
         parts.append(f'{key.rstrip("_").replace("_", "-")}="{shown}"')
     opening = " ".join(parts)
     return f"<{opening}>{''.join(children)}</{name}>" if children else f"<{opening}/>"
 
 
 def draw_text(
-    x: float, y: float, words: str, class_: str = "", *, anchor: str = "start", **attributes: Attribute
+    x: float,
+    y: float,
+    words: str,
+    class_: str = "",
+    *,
+    anchor: str = "start",
+    **attributes: Attribute,
 ) -> str:
     """Draw a line of text.
 
@@ -77,7 +85,9 @@ def make_tooltip(words: str) -> str:
 
 def draw_line(a: Point, b: Point, class_: str = "", **attributes: Attribute) -> str:
     """Draw a straight line from a to b, with further attributes such as `stroke` on pages without the style sheet."""
-    return make_element("line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_ or None, **attributes)
+    return make_element(
+        "line", x1=a[0], y1=a[1], x2=b[0], y2=b[1], class_=class_ or None, **attributes
+    )
 
 
 def format_points(points: list[Point]) -> str:
@@ -90,7 +100,9 @@ def draw_polyline(points: list[Point], class_: str) -> str:
     return make_element("polyline", points=format_points(points), class_=class_)
 
 
-def draw_arrow(tail: Point, tip: Point, class_: str = "", *, head: float = 9.0, color: str | None = None) -> str:
+def draw_arrow(
+    tail: Point, tip: Point, class_: str = "", *, head: float = 9.0, color: str | None = None
+) -> str:
     """Draw an arrow with a shaft and a filled head, or a dot if the arrow would be too short.
 
     Args:
@@ -104,7 +116,9 @@ def draw_arrow(tail: Point, tip: Point, class_: str = "", *, head: float = 9.0, 
     dy = tip[1] - tail[1]
     length = math.hypot(dx, dy)
     if length < 1.5:
-        return make_element("circle", cx=tip[0], cy=tip[1], r=1.5, class_=f"{class_} head", fill=color)
+        return make_element(
+            "circle", cx=tip[0], cy=tip[1], r=1.5, class_=f"{class_} head", fill=color
+        )
 
     # Unit vector along the arrow.
     ux = dx / length
@@ -117,7 +131,9 @@ def draw_arrow(tail: Point, tip: Point, class_: str = "", *, head: float = 9.0, 
     back_y = tip[1] - uy * head_length
     left = (back_x - uy * half_width, back_y + ux * half_width)
     right = (back_x + uy * half_width, back_y - ux * half_width)
-    head_shape = make_element("polygon", points=format_points([tip, left, right]), class_=f"{class_} head", fill=color)
+    head_shape = make_element(
+        "polygon", points=format_points([tip, left, right]), class_=f"{class_} head", fill=color
+    )
 
     # The shaft ends a little inside the head, so that no gap shows between them.
     shaft_end = (tip[0] - ux * head_length * 0.8, tip[1] - uy * head_length * 0.8)
@@ -152,5 +168,11 @@ def round_down_to_1_2_5(value: float) -> float:
 
 def draw_scale_bar(x: float, y: float, length: float, words: str, class_: str = "bar") -> str:
     """Draw a scale bar with its text beside it; (x, y) is its left end."""
-    ends = draw_line((x, y - 4), (x, y + 4), class_) + draw_line((x + length, y - 4), (x + length, y + 4), class_)
-    return draw_line((x, y), (x + length, y), class_) + ends + draw_text(x + length + 7, y + 4.5, words, "small")
+    ends = draw_line((x, y - 4), (x, y + 4), class_) + draw_line(
+        (x + length, y - 4), (x + length, y + 4), class_
+    )
+    return (
+        draw_line((x, y), (x + length, y), class_)
+        + ends
+        + draw_text(x + length + 7, y + 4.5, words, "small")
+    )

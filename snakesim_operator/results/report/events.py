@@ -46,7 +46,11 @@ def find_events(record: RunRecord, summary: RunSummary) -> list[ReportEvent]:
     events += _find_largest_force_events(record)
     events += [ReportEvent(band.start_s, "Jam") for band in find_jam_intervals(record)[:1]]
     stop_intervals = find_stops(record)
-    stop = find_final_stop(record, stop_intervals) if stop_intervals and summary.locomoting_fraction else None
+    stop = (
+        find_final_stop(record, stop_intervals)
+        if stop_intervals and summary.locomoting_fraction
+        else None
+    )
     if stop is None:
         events.append(ReportEvent(get_run_end_s(record), "End"))
     else:
@@ -81,7 +85,9 @@ def select_listed_events(events: list[ReportEvent]) -> list[ReportEvent]:
     return [event for event in events if event not in hidden_events]
 
 
-def select_snapshots_to_draw(record: RunRecord, events: list[ReportEvent]) -> list[tuple[ReportEvent, RunSnapshot]]:
+def select_snapshots_to_draw(
+    record: RunRecord, events: list[ReportEvent]
+) -> list[tuple[ReportEvent, RunSnapshot]]:
     """Select the events of a run that get a drawing, and the snapshot of the snake that is drawn for each.
 
     Only a few hand-overs are drawn. Events whose snapshots look the same share one drawing with both descriptions.
@@ -95,9 +101,8 @@ def select_snapshots_to_draw(record: RunRecord, events: list[ReportEvent]) -> li
     """
     hand_over_times_s = _hand_over_times_to_draw(events)
     drawn_events: list[tuple[ReportEvent, RunSnapshot]] = []
-    hand_overs_first = sorted(
-        events, key=lambda event: event.joint_index is None
-    )  # their snapshots show forces, so others join them
+    # Their snapshots show forces, so others join them.
+    hand_overs_first = sorted(events, key=lambda event: event.joint_index is None)
     for event in hand_overs_first:
         is_hand_over = event.joint_index is not None
         if is_hand_over and event.time_s not in hand_over_times_s:
@@ -157,7 +162,9 @@ def _find_event_snapshot(record: RunRecord, event: ReportEvent) -> RunSnapshot |
 
 
 def _find_similar_snapshot(
-    record: RunRecord, snapshot: RunSnapshot, drawn_events: Sequence[tuple[ReportEvent, RunSnapshot]]
+    record: RunRecord,
+    snapshot: RunSnapshot,
+    drawn_events: Sequence[tuple[ReportEvent, RunSnapshot]],
 ) -> int | None:
     """Return the index of the first drawn event whose snapshot looks like this one; None if there is none."""
     for index, (_, other) in enumerate(drawn_events):
@@ -168,5 +175,7 @@ def _find_similar_snapshot(
 
 def _looks_alike(record: RunRecord, a: RunSnapshot, b: RunSnapshot) -> bool:
     """Return whether two snapshots have nearly the same body points, or nearly the same time."""
-    moved_m = np.abs(find_body_points_xy_w(record, a.row) - find_body_points_xy_w(record, b.row)).max()
+    moved_m = np.abs(
+        find_body_points_xy_w(record, a.row) - find_body_points_xy_w(record, b.row)
+    ).max()
     return bool(moved_m < SAME_SHAPE_M or abs(a.time_s - b.time_s) < SAME_TIME_S)

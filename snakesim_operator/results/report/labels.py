@@ -5,16 +5,8 @@ import math
 from snakesim_operator.results.page.svg import Point, draw_text, estimate_text_width
 
 TEXT_HEIGHT = 13.0
-DIRECTIONS_DEG = (
-    -90,
-    90,
-    -45,
-    -135,
-    45,
-    135,
-    0,
-    180,
-)  # directions to try, from the named point to the label; the first ones are preferred
+# Directions to try, from the named point to the label; the first ones are preferred.
+DIRECTIONS_DEG = -90, 90, -45, -135, 45, 135, 0, 180
 LABEL_WEIGHT = 4.0  # a label on another label is unreadable
 OUTSIDE_WEIGHT = 10.0  # a label that leaves the drawing is cut
 GAP_WEIGHT = 0.15  # a near label is better than a far one
@@ -33,13 +25,17 @@ class LabelPlacer:
         """Keep later labels away from a box. `weight` is the cost of covering it, per area."""
         self._occupied.append((box, weight))
 
-    def reserve_line(self, a: Point, b: Point, half_width: float = 4.0, weight: float = 1.0) -> None:
+    def reserve_line(
+        self, a: Point, b: Point, half_width: float = 4.0, weight: float = 1.0
+    ) -> None:
         """Keep later labels away from a line from a to b. `weight` is the cost of covering it, per area."""
         steps = max(int(math.hypot(b[0] - a[0], b[1] - a[1]) / (2 * half_width)), 1)
         for k in range(steps + 1):
             x = a[0] + (b[0] - a[0]) * k / steps
             y = a[1] + (b[1] - a[1]) * k / steps
-            self._occupied.append(((x - half_width, y - half_width, x + half_width, y + half_width), weight))
+            self._occupied.append(
+                ((x - half_width, y - half_width, x + half_width, y + half_width), weight)
+            )
 
     def place_label(
         self,
@@ -91,7 +87,9 @@ class LabelPlacer:
 
     def _compute_covering_cost(self, box: Box) -> float:
         """Return the cost of a label in a box: the weighted areas that it covers, and its area outside the drawing."""
-        covered = sum(weight * _compute_overlap_area(box, occupied) for occupied, weight in self._occupied)
+        covered = sum(
+            weight * _compute_overlap_area(box, occupied) for occupied, weight in self._occupied
+        )
         area = (box[2] - box[0]) * (box[3] - box[1])
         return covered + OUTSIDE_WEIGHT * (area - _compute_overlap_area(box, self._frame))
 

@@ -8,7 +8,10 @@ from markupsafe import Markup
 from msgspec import Meta
 
 from snakesim_hal.wire.messages import TICK_TIMES
-from snakesim_operator.results.metrics.propulsion import PropulsionInterval, find_propulsion_intervals
+from snakesim_operator.results.metrics.propulsion import (
+    PropulsionInterval,
+    find_propulsion_intervals,
+)
 from snakesim_operator.results.page.html import render_page
 from snakesim_operator.results.report import figures
 from snakesim_operator.results.report.events import (
@@ -18,7 +21,11 @@ from snakesim_operator.results.report.events import (
     select_snapshots_to_draw,
 )
 from snakesim_operator.results.report.playback import make_playback
-from snakesim_operator.results.report.polygon import draw_force_polygon, find_common_force_scale, format_subscript
+from snakesim_operator.results.report.polygon import (
+    draw_force_polygon,
+    find_common_force_scale,
+    format_subscript,
+)
 from snakesim_operator.results.report.pushing import make_pushing_section
 from snakesim_operator.results.report.reasons import (
     explain_late_commands,
@@ -61,7 +68,9 @@ def render_report(record: RunRecord, summary: RunSummary) -> str:
     shown_intervals = join_intervals(all_intervals, get_run_end_s(record) / MAX_INTERVALS_SHOWN)
     intervals_by_joint: list[tuple[int, list[PropulsionInterval]]] = []
     for joint in find_most_propelling_joints(shown_intervals):
-        intervals_of_joint = [interval for interval in all_intervals if interval.joint_index == joint]
+        intervals_of_joint = [
+            interval for interval in all_intervals if interval.joint_index == joint
+        ]
         intervals_by_joint.append((joint, intervals_of_joint))
     propelling_joints = {interval.joint_index for interval in shown_intervals}
     config_json = msgspec.json.format(msgspec.json.encode(summary.config), indent=2).decode()
@@ -96,7 +105,8 @@ def render_report(record: RunRecord, summary: RunSummary) -> str:
         why_refused=explain_refused_commands(summary),
         # Lists and tables.
         tick_times=TICK_TIMES,
-        first_faults=len(summary.faults) // 2,  # if faults are left out, the first half are the first ones of the run
+        first_faults=len(summary.faults)
+        // 2,  # if faults are left out, the first half are the first ones of the run
         numbers=_list_summary_fields(summary),
         config_file=_find_config_path(record),
         config=config_json,
@@ -137,7 +147,9 @@ def _make_snapshot_cards(record: RunRecord, events: list[ReportEvent]) -> list[d
     drawn_events = select_snapshots_to_draw(record, events)
     snapshots = [snapshot for _, snapshot in drawn_events]
     viewports = compute_viewports(record, snapshots, VIEW_WIDTH)
-    force_balances = [snapshot.force_balance for snapshot in snapshots if snapshot.force_balance is not None]
+    force_balances = [
+        snapshot.force_balance for snapshot in snapshots if snapshot.force_balance is not None
+    ]
     cards: list[dict[str, Any]] = []
     for (event, snapshot), viewport in zip(drawn_events, viewports, strict=True):
         force_balance = snapshot.force_balance
@@ -147,9 +159,15 @@ def _make_snapshot_cards(record: RunRecord, events: list[ReportEvent]) -> list[d
             polygon = None
         else:
             forward_w = force_balance.resultant_force_n
-            scale = find_common_force_scale(force_balances, *POLYGON_SIZE, upright=viewport.is_rotated)
+            scale = find_common_force_scale(
+                force_balances, *POLYGON_SIZE, upright=viewport.is_rotated
+            )
             drawing = draw_force_polygon(
-                force_balance, snapshot.measured_contacts, *POLYGON_SIZE, scale, upright=viewport.is_rotated
+                force_balance,
+                snapshot.measured_contacts,
+                *POLYGON_SIZE,
+                scale,
+                upright=viewport.is_rotated,
             )
             polygon = Markup(drawing)
         cards.append(

@@ -29,7 +29,9 @@ def describe_distance(record: RunRecord, summary: RunSummary) -> str:
         return f"Moved {abs(summary.path_distance_m):.2f} m{back} along the path {duration}"
     if summary.net_displacement_m is not None:
         return f"Moved {summary.net_displacement_m:.2f} m {duration}"
-    reason = ", because the robot has no pose sensor" if record.config.robot.sensors.pose is None else ""
+    reason = (
+        ", because the robot has no pose sensor" if record.config.robot.sensors.pose is None else ""
+    )
     return f"Ran for {summary.duration_s:.1f} s; the distance is unknown{reason}"
 
 

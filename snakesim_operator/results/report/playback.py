@@ -15,12 +15,22 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, WorldContact, WorldModel
-from snakesim_operator.results.metrics.motion import MOVING_LABEL, STATIONARY_LABEL, StopIntervals, find_stops
+from snakesim_operator.results.metrics.motion import (
+    MOVING_LABEL,
+    STATIONARY_LABEL,
+    StopIntervals,
+    find_stops,
+)
 from snakesim_operator.results.page.svg import Point, make_element, make_svg
 from snakesim_operator.results.report.labels import LabelPlacer
 from snakesim_operator.results.report.snapshots import make_force_balance
 from snakesim_operator.results.report.timeline import describe_state
-from snakesim_operator.results.report.top_view import draw_body, draw_ground, draw_scales, find_outline_w
+from snakesim_operator.results.report.top_view import (
+    draw_body,
+    draw_ground,
+    draw_scales,
+    find_outline_w,
+)
 from snakesim_operator.results.report.view import (
     MAX_ARROW_LENGTH,
     MAX_MEASURED_ARROW_RATIO,
@@ -37,8 +47,10 @@ MAX_MAPS = 80  # of a whole run
 MAX_PATH_POINTS = 60
 WIDTH = 1040.0
 SAME_TICK_S = 1e-6
-FULL_SIZE_QUANTILE = 0.9  # fraction of the forces that are drawn in full length; longer arrows are cut
-SHOWN_FOR_S = 0.3  # an older message is not shown: control and guidance publish many times per second
+# Fraction of the forces that are drawn in full length; longer arrows are cut.
+FULL_SIZE_QUANTILE = 0.9
+# An older message is not shown: control and guidance publish many times per second.
+SHOWN_FOR_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -56,7 +68,9 @@ def make_playback(record: RunRecord) -> MapPlayback | None:
     rows_with_pose = np.flatnonzero(record.has_pose)
     if not len(rows_with_pose):
         return None
-    evenly_spaced = np.linspace(0, len(rows_with_pose) - 1, min(len(rows_with_pose), MAX_FRAMES)).astype(int)
+    evenly_spaced = np.linspace(
+        0, len(rows_with_pose) - 1, min(len(rows_with_pose), MAX_FRAMES)
+    ).astype(int)
     rows = rows_with_pose[np.unique(evenly_spaced)]
     body_points_w = [find_body_points_xy_w(record, int(row)) for row in rows]
     states = _find_latest_messages(record, rows, record.control_states)
@@ -71,7 +85,9 @@ def make_playback(record: RunRecord) -> MapPlayback | None:
     frames: list[list[Any]] = []
     has_desired_forces = False
     has_measured_forces = False
-    for i, (row, frame_points_w, state, world) in enumerate(zip(rows, body_points_w, states, worlds, strict=True)):
+    for i, (row, frame_points_w, state, world) in enumerate(
+        zip(rows, body_points_w, states, worlds, strict=True)
+    ):
         time_s = float(record.time_s[row]) - get_time_origin_s(record)
         propelling = state.propulsion_joint if state is not None else None
         caption = _describe_motion(stop_intervals, time_s, state)
@@ -103,7 +119,10 @@ def make_playback(record: RunRecord) -> MapPlayback | None:
         "paths": paths,
     }
     return MapPlayback(
-        Markup(_draw_first_frame(record, view, body_points_w[0])), data, has_desired_forces, has_measured_forces
+        Markup(_draw_first_frame(record, view, body_points_w[0])),
+        data,
+        has_desired_forces,
+        has_measured_forces,
     )
 
 
@@ -123,14 +142,22 @@ def _draw_first_frame(record: RunRecord, view: MapViewport, nodes: Floats) -> st
     )
 
 
-def _describe_motion(stop_intervals: StopIntervals | None, time_s: float, state: ControlState | None) -> str:
+def _describe_motion(
+    stop_intervals: StopIntervals | None, time_s: float, state: ControlState | None
+) -> str:
     """Describe the measured motion of the body at a time, and what control reported then if that differs."""
-    reported = "control reported nothing" if state is None else f"{describe_state(state.state)}: {state.reason}"
+    reported = (
+        "control reported nothing"
+        if state is None
+        else f"{describe_state(state.state)}: {state.reason}"
+    )
     if stop_intervals is None:
         return reported
     is_stationary = stop_intervals.is_stationary_at(time_s)
     measured = STATIONARY_LABEL if is_stationary else MOVING_LABEL
-    if state is None or state.reason == STANDING_STILL:  # measured by control over a preceding window
+    if (
+        state is None or state.reason == STANDING_STILL
+    ):  # measured by control over a preceding window
         return measured
     reports_stationary = state.state != "Locomoting"
     if is_stationary == reports_stationary:
@@ -167,14 +194,18 @@ def _collect_planned_paths(
         The paths, each as x, y, x, y, ...; and for each row the index of its path, or -1. If navigation planned fewer
         than two paths there are none, because the map shows the route of the scene.
     """
-    planned = [trajectory for trajectory in record.trajectories if trajectory.timestamp_ns is not None]
+    planned = [
+        trajectory for trajectory in record.trajectories if trajectory.timestamp_ns is not None
+    ]
     if len({trajectory.path_id for trajectory in planned}) < 2:
         return [], [-1] * len(rows)
     paths: list[list[float]] = []
     for trajectory in planned:
         step = max(len(trajectory.path_w) // MAX_PATH_POINTS, 1)
         paths.append(_flatten_coordinates(view, np.array(trajectory.path_w)[::step]))
-    return paths, _find_latest_indices(record, rows, [trajectory.timestamp_ns or 0 for trajectory in planned])
+    return paths, _find_latest_indices(
+        record, rows, [trajectory.timestamp_ns or 0 for trajectory in planned]
+    )
 
 
 def _flatten_coordinates(view: MapViewport, points_w: Floats) -> list[float]:
@@ -182,7 +213,9 @@ def _flatten_coordinates(view: MapViewport, points_w: Floats) -> list[float]:
     return [round(part, 1) for point in points_w for part in view.to_pixels(point)]
 
 
-def _find_latest_indices(record: RunRecord, rows: NDArray[np.intp], timestamps_ns: Sequence[int]) -> list[int]:
+def _find_latest_indices(
+    record: RunRecord, rows: NDArray[np.intp], timestamps_ns: Sequence[int]
+) -> list[int]:
     """Find for each row the index of the last timestamp up to its time, or -1."""
     timestamps_s = np.array(timestamps_ns) * 1e-9
     after = np.searchsorted(timestamps_s, record.time_s[rows] + SAME_TICK_S, side="right")
@@ -204,7 +237,9 @@ def _find_latest_messages(
     return latest
 
 
-def _find_force_scale(states: Sequence[ControlState | None], worlds: Sequence[WorldModel | None]) -> float:
+def _find_force_scale(
+    states: Sequence[ControlState | None], worlds: Sequence[WorldModel | None]
+) -> float:
     """Find the force scale, in units of the drawing per newton, at which most arrows have their full length.
 
     The desired forces set the scale; without any, the measured forces.
@@ -214,7 +249,9 @@ def _find_force_scale(states: Sequence[ControlState | None], worlds: Sequence[Wo
         balance = make_force_balance(state) if state is not None else None
         if balance is not None:
             desired_n += [*balance.magnitudes_n, float(np.hypot(*balance.resultant_force_n))]
-    measured_n = [math.hypot(*contact.force_w[:2]) for world in worlds for contact in _get_contacts(world)]
+    measured_n = [
+        math.hypot(*contact.force_w[:2]) for world in worlds for contact in _get_contacts(world)
+    ]
     usual_n = float(np.quantile(desired_n or measured_n or [0.0], FULL_SIZE_QUANTILE))
     return MAX_ARROW_LENGTH / usual_n if usual_n > 0 else 0.0
 
@@ -233,8 +270,13 @@ def _make_desired_arrows(
     return _make_arrow_coordinates(view, forces, pixels_per_n), [*contact_classes, resultant_class]
 
 
-def _make_measured_arrows(view: MapViewport, world: WorldModel | None, pixels_per_n: float) -> list[float]:
-    forces = [(view.to_pixels(contact.position_w), np.array(contact.force_w[:2])) for contact in _get_contacts(world)]
+def _make_measured_arrows(
+    view: MapViewport, world: WorldModel | None, pixels_per_n: float
+) -> list[float]:
+    forces = [
+        (view.to_pixels(contact.position_w), np.array(contact.force_w[:2]))
+        for contact in _get_contacts(world)
+    ]
     return _make_arrow_coordinates(view, forces, pixels_per_n)
 
 
@@ -242,7 +284,9 @@ def _get_contacts(world: WorldModel | None) -> list[WorldContact]:
     return world.contacts if world is not None else []
 
 
-def _make_arrow_coordinates(view: MapViewport, forces: list[tuple[Point, Floats]], pixels_per_n: float) -> list[float]:
+def _make_arrow_coordinates(
+    view: MapViewport, forces: list[tuple[Point, Floats]], pixels_per_n: float
+) -> list[float]:
     """Return four coordinates for each arrow: x and y of its tail, then of its tip.
 
     An arrow that is too long is cut, so that one impact does not dwarf the other forces.
@@ -254,7 +298,12 @@ def _make_arrow_coordinates(view: MapViewport, forces: list[tuple[Point, Floats]
     """
     coordinates: list[float] = []
     for foot, force in forces:
-        cut = min(1.0, MAX_MEASURED_ARROW_RATIO * MAX_ARROW_LENGTH / max(pixels_per_n * math.hypot(*force), 1e-9))
+        cut = min(
+            1.0,
+            MAX_MEASURED_ARROW_RATIO
+            * MAX_ARROW_LENGTH
+            / max(pixels_per_n * math.hypot(*force), 1e-9),
+        )
         tip = view.offset_pixels(foot, force, cut * pixels_per_n)
         coordinates += [*foot, *tip]
     return [round(coordinate, 1) for coordinate in coordinates]

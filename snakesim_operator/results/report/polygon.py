@@ -93,7 +93,9 @@ def _rotate_corners_n(balance: ForceBalance, upright: bool) -> NDArray[np.float6
     return np.column_stack([corners_n[:, 1], -corners_n[:, 0]])
 
 
-def _scale_corners(corners_n: NDArray[np.float64], width: float, height: float, scale: float) -> list[Point]:
+def _scale_corners(
+    corners_n: NDArray[np.float64], width: float, height: float, scale: float
+) -> list[Point]:
     """Convert corners from N to coordinates of the drawing, with the polygon in its middle."""
     middle = (corners_n.min(axis=0) + corners_n.max(axis=0)) / 2
     corners: list[Point] = []
@@ -119,7 +121,9 @@ def _label_sides(balance: ForceBalance, corners: list[Point], labels: LabelPlace
     for name, size_n, a, b in zip(names, sizes_n, corners[:-1], corners[1:], strict=True):
         class_ = "halo commanded-text" if name == "F" else "halo solved-text"
         middle = ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2)
-        label = labels.place_label(middle, f"{name} {size_n:.0f} N", class_, gaps=(5, 9, 14, 22), away_from=inside)
+        label = labels.place_label(
+            middle, f"{name} {size_n:.0f} N", class_, gaps=(5, 9, 14, 22), away_from=inside
+        )
         parts.append(label)
     return parts
 

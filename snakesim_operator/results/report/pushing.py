@@ -11,7 +11,13 @@ from snakesim_hal.model.scene import compute_normal_gravity_m_s2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.metrics.map_score import MapScore, score_map
 from snakesim_operator.results.metrics.motion import find_stops
-from snakesim_operator.results.page.charts import ChartBar, ChartLine, PlotlyDict, make_bar_chart, make_line_chart
+from snakesim_operator.results.page.charts import (
+    ChartBar,
+    ChartLine,
+    PlotlyDict,
+    make_bar_chart,
+    make_line_chart,
+)
 from snakesim_operator.results.report.timeline import find_longest_reason, find_state_intervals
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import (
@@ -64,9 +70,8 @@ class PushingSection:
     stops: list[StationaryInterval]  # the longest, in order of time
     hidden_stop_count: int  # number of shorter stops that are not shown
     map_score: MapScore | None  # of the perceived map; None if the map was given
-    position_error_percentiles_mm: tuple[
-        float, float
-    ]  # 50th and 90th percentile of the position errors of perceived obstacles
+    # 50th and 90th percentile of the position errors of perceived obstacles.
+    position_error_percentiles_mm: tuple[float, float]
     map_errors: PlotlyDict | None
 
 
@@ -112,23 +117,39 @@ def _draw_contact_forces(record: RunRecord) -> PlotlyDict:
     desired: list[ForceSample] = []
     for state in record.control_states:
         desired.append(
-            ForceSample(get_report_time_s(record, state), state.timestamp_ns, _sum_forces(state.push_points))
+            ForceSample(
+                get_report_time_s(record, state), state.timestamp_ns, _sum_forces(state.push_points)
+            )
         )
     measured: list[ForceSample] = []
     for world in record.worlds:
         time_s = world.timestamp_ns * 1e-9 - get_time_origin_s(record)
         measured.append(ForceSample(time_s, world.timestamp_ns, _sum_forces(world.contacts)))
     drawn = [
-        ChartLine("desired at all push-points", _times_s(desired), _forward_forces_n(record, desired), "--reference"),
-        ChartLine("measured contacts", _times_s(measured), _forward_forces_n(record, measured), "--measured"),
+        ChartLine(
+            "desired at all push-points",
+            _times_s(desired),
+            _forward_forces_n(record, desired),
+            "--reference",
+        ),
+        ChartLine(
+            "measured contacts",
+            _times_s(measured),
+            _forward_forces_n(record, measured),
+            "--measured",
+        ),
     ]
     normal_gravity_m_s2 = compute_normal_gravity_m_s2(record.config.scene)
     load_n = normal_gravity_m_s2 * sum(link.mass_kg for link in record.description.links)
     ground = record.config.scene.ground
     robot = record.config.robot
-    drag_n = compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels).forward * load_n
+    drag_n = (
+        compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels).forward * load_n
+    )
     label = "Contact forces along the body over time"
-    return make_line_chart(label, "force, N", drawn, get_run_end_s(record), levels=[(drag_n, "friction of the ground")])
+    return make_line_chart(
+        label, "force, N", drawn, get_run_end_s(record), levels=[(drag_n, "friction of the ground")]
+    )
 
 
 def _times_s(samples: list[ForceSample]) -> Floats:
@@ -139,10 +160,14 @@ def _forward_forces_n(record: RunRecord, samples: list[ForceSample]) -> Floats:
     """Project each force onto the direction from tail to head at its time; NaN if the pose is unknown."""
     forward_n = np.full(len(samples), np.nan)
     for i, sample in enumerate(samples):
-        body_points_w = record.find_body_points_w(record.find_nearest_row(sample.timestamp_ns * 1e-9))
+        body_points_w = record.find_body_points_w(
+            record.find_nearest_row(sample.timestamp_ns * 1e-9)
+        )
         if body_points_w is not None:
             tail_to_head = body_points_w[-1, :2] - body_points_w[0, :2]
-            forward_n[i] = float(sample.force_w @ tail_to_head) / max(float(np.hypot(*tail_to_head)), 1e-9)
+            forward_n[i] = float(sample.force_w @ tail_to_head) / max(
+                float(np.hypot(*tail_to_head)), 1e-9
+            )
     return forward_n
 
 
@@ -165,7 +190,9 @@ def _draw_pushed_obstacles(record: RunRecord) -> PlotlyDict:
     drawn: list[ChartBar] = []
     for name in shown:
         for span in _merge_adjacent(spans[name]):
-            drawn.append(ChartBar(name, span.start_s, span.end_s, f"{span.force_n:.0f} N", "--reference"))
+            drawn.append(
+                ChartBar(name, span.start_s, span.end_s, f"{span.force_n:.0f} N", "--reference")
+            )
     return make_bar_chart("Obstacles pushed off over time", shown, drawn, get_run_end_s(record))
 
 
@@ -206,7 +233,9 @@ def _find_stops(record: RunRecord) -> list[StationaryInterval]:
     stops: list[StationaryInterval] = []
     for span in intervals:
         if span.end_s - span.start_s >= MIN_STOP_S:
-            stops.append(StationaryInterval(span.start_s, span.end_s, find_longest_reason(record, span)))
+            stops.append(
+                StationaryInterval(span.start_s, span.end_s, find_longest_reason(record, span))
+            )
     return stops
 
 
@@ -236,7 +265,9 @@ def _score_maps(record: RunRecord) -> tuple[MapScore | None, PlotlyDict | None]:
             continue
         head_w = body_points_w[-1]
         forward_x, forward_y = body_points_w[-1, :2] - body_points_w[-2, :2]  # along the head link
-        map_score = score_map(world.obstacles, true_obstacles, head_w, math.atan2(forward_y, forward_x))
+        map_score = score_map(
+            world.obstacles, true_obstacles, head_w, math.atan2(forward_y, forward_x)
+        )
         total.add(map_score)
         median_error_mm = math.nan
         if map_score.position_errors_m:
@@ -251,7 +282,11 @@ def _score_maps(record: RunRecord) -> tuple[MapScore | None, PlotlyDict | None]:
     drawn = [
         ChartLine("position error, median, mm", time_s, np.array(median_errors_mm), "--measured"),
         ChartLine("missed", time_s, np.array(miss_counts, dtype=np.float64), "--bad", shape="hv"),
-        ChartLine("ghosts", time_s, np.array(ghost_counts, dtype=np.float64), "--commanded", shape="hv"),
+        ChartLine(
+            "ghosts", time_s, np.array(ghost_counts, dtype=np.float64), "--commanded", shape="hv"
+        ),
     ]
     label = "Map against truth over time"
-    return total, make_line_chart(label, "mm, or how many", drawn, get_run_end_s(record), height=190, from_zero=True)
+    return total, make_line_chart(
+        label, "mm, or how many", drawn, get_run_end_s(record), height=190, from_zero=True
+    )

@@ -7,7 +7,11 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import KnownObstacle
-from snakesim_operator.results.metrics.force_tracking import MIN_CONTACT_FORCE_N, ForcePair, pair_forces
+from snakesim_operator.results.metrics.force_tracking import (
+    MIN_CONTACT_FORCE_N,
+    ForcePair,
+    pair_forces,
+)
 from snakesim_operator.results.report.top_view import find_outline_w
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import SATURATION_RATIO, RunSummary
@@ -27,7 +31,9 @@ def explain_push_points_without_contact(record: RunRecord) -> str:
         The explanation, or UNKNOWN if the record does not show the gaps.
     """
     pairs_without_force = [
-        pair for pair in pair_forces(record.control_states) if pair.measured_force_n < MIN_CONTACT_FORCE_N
+        pair
+        for pair in pair_forces(record.control_states)
+        if pair.measured_force_n < MIN_CONTACT_FORCE_N
     ]
     gaps_m = _measure_gaps_m(record, pairs_without_force)
     if not gaps_m:
@@ -39,11 +45,15 @@ def explain_push_points_without_contact(record: RunRecord) -> str:
     causes: list[str] = []
     if no_obstacle_count:
         percent = _format_percent(no_obstacle_count, total_count)
-        causes.append(f"no obstacle stood within {MAX_OBSTACLE_DISTANCE_M:g} m of {percent} of them")
+        causes.append(
+            f"no obstacle stood within {MAX_OBSTACLE_DISTANCE_M:g} m of {percent} of them"
+        )
     if apart_m:
         percent = _format_percent(len(apart_m), total_count)
         median_mm = 1e3 * float(np.median(apart_m))
-        causes.append(f"the body was off the obstacle in {percent} of them, by {median_mm:.1f} mm (median)")
+        causes.append(
+            f"the body was off the obstacle in {percent} of them, by {median_mm:.1f} mm (median)"
+        )
     if touching_count:
         causes.append(f"it touched in {_format_percent(touching_count, total_count)} of them")
     obstacle_counts = Counter(pair.obstacle for pair in pairs_without_force)
@@ -62,11 +72,16 @@ def _measure_gaps_m(record: RunRecord, force_pairs: Sequence[ForcePair]) -> list
     push_point_by_time_and_obstacle_w: dict[tuple[int, str | None], Floats] = {}
     for state in record.control_states:
         for point in state.push_points:
-            push_point_by_time_and_obstacle_w[state.timestamp_ns, point.obstacle] = np.array(point.position_w[:2])
+            push_point_by_time_and_obstacle_w[state.timestamp_ns, point.obstacle] = np.array(
+                point.position_w[:2]
+            )
     gaps_m: list[float] = []
     for pair in force_pairs:
         gap_m = _measure_gap_m(
-            record, pair, push_point_by_time_and_obstacle_w[pair.timestamp_ns, pair.obstacle], outlines
+            record,
+            pair,
+            push_point_by_time_and_obstacle_w[pair.timestamp_ns, pair.obstacle],
+            outlines,
         )
         if gap_m is not None:
             gaps_m.append(gap_m)
@@ -95,7 +110,9 @@ def explain_late_commands(summary: RunSummary) -> str:
 
 def explain_refused_commands(summary: RunSummary) -> str:
     """List the reasons for which the limiter refused commands, each with its count."""
-    return ", ".join(f"{reason} {count}" for reason, count in sorted(summary.rejected_commands.items()) if count)
+    return ", ".join(
+        f"{reason} {count}" for reason, count in sorted(summary.rejected_commands.items()) if count
+    )
 
 
 def _measure_gap_m(
@@ -129,8 +146,11 @@ def _measure_gap_m(
     link_vectors = np.diff(points_w, axis=0)  # (links, 2)
     from_link_rear = outlines[nearest][:, None] - points_w[:-1]  # (points, links, 2)
     fraction = (from_link_rear * link_vectors).sum(axis=2) / (link_vectors**2).sum(axis=1)
-    clipped_fraction = np.clip(fraction, 0.0, 1.0)  # (points, links): position along the link, 0 at its rear end
-    axis_distances_m = np.linalg.norm(from_link_rear - clipped_fraction[..., None] * link_vectors, axis=2)
+    # (points, links): position along the link, 0 at its rear end.
+    clipped_fraction = np.clip(fraction, 0.0, 1.0)
+    axis_distances_m = np.linalg.norm(
+        from_link_rear - clipped_fraction[..., None] * link_vectors, axis=2
+    )
     radii_m = np.array([link.radius_m for link in record.description.links])
     return float((axis_distances_m - radii_m).min())
 
@@ -139,7 +159,9 @@ def _sample_outline_w(obstacle: KnownObstacle) -> Floats:
     """Sample points on the outline of an obstacle, also between the corners of a box, (n, 2)."""
     corners = find_outline_w(obstacle)
     next_corners = np.roll(corners, -1, axis=0)
-    return np.concatenate([corners + part * (next_corners - corners) for part in np.arange(0.0, 1.0, 0.1)])
+    return np.concatenate(
+        [corners + part * (next_corners - corners) for part in np.arange(0.0, 1.0, 0.1)]
+    )
 
 
 def _format_percent(part: int, whole: int) -> str:

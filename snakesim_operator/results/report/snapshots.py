@@ -17,10 +17,10 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.time_axis import get_report_time_s
 
 MIN_CONTACTS = 3  # fewer contact forces cannot be in balance
-MAX_GAP_FRACTION = (
-    0.05  # gap of the force polygon over the commanded force; with a larger gap, the forces are not balanced
-)
-SIMULTANEOUS_S = 0.021  # maximum time between desired and measured forces that count as simultaneous
+# Gap of the force polygon over the commanded force; with a larger gap, the forces are not balanced.
+MAX_GAP_FRACTION = 0.05
+# Maximum time between desired and measured forces that count as simultaneous.
+SIMULTANEOUS_S = 0.021
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,9 @@ class ForceBalance:
         """
         push_point = self.contacts[index]
         forces_n = [
-            np.hypot(*contact.force_w[:2]) for contact in measured if is_contact_measured(push_point, [contact])
+            np.hypot(*contact.force_w[:2])
+            for contact in measured
+            if is_contact_measured(push_point, [contact])
         ]
         return float(sum(forces_n)) if forces_n else None
 
@@ -166,7 +168,9 @@ def find_snapshot(record: RunRecord, time_s: float) -> RunSnapshot | None:
     row = record.find_nearest_row(float(record.time_s[0]) + time_s)
     if record.find_body_points_w(row) is None:
         return None
-    earlier = [state for state in record.control_states if get_report_time_s(record, state) <= time_s]
+    earlier = [
+        state for state in record.control_states if get_report_time_s(record, state) <= time_s
+    ]
     last_state = earlier[-1] if earlier else None
     return _make_snapshot(record, time_s, last_state, None)
 
@@ -182,7 +186,8 @@ def count_unmeasured_contacts(snapshot: RunSnapshot) -> int:
     if snapshot.force_balance is None:
         return 0
     return sum(
-        not is_contact_measured(contact, snapshot.measured_contacts) for contact in snapshot.force_balance.contacts
+        not is_contact_measured(contact, snapshot.measured_contacts)
+        for contact in snapshot.force_balance.contacts
     )
 
 
@@ -204,9 +209,13 @@ def _make_snapshot(
     )
 
 
-def _find_world_near(record: RunRecord, robot_time_s: float, tolerance_s: float) -> WorldModel | None:
+def _find_world_near(
+    record: RunRecord, robot_time_s: float, tolerance_s: float
+) -> WorldModel | None:
     """Return the world model whose timestamp is nearest to a robot time, or None if none is within a tolerance in s."""
-    nearest = min(record.worlds, key=lambda world: abs(world.timestamp_ns * 1e-9 - robot_time_s), default=None)
+    nearest = min(
+        record.worlds, key=lambda world: abs(world.timestamp_ns * 1e-9 - robot_time_s), default=None
+    )
     if nearest is None or abs(nearest.timestamp_ns * 1e-9 - robot_time_s) > tolerance_s:
         return None
     return nearest

@@ -21,7 +21,12 @@ from snakesim_operator.results.time_axis import (
 )
 
 POSE_SAMPLES = 400
-STATES = {"Locomoting": "moving as meant", "NotLocomoting": "not moving", "Idle": "idle", "PowerOff": "power off"}
+STATES = {
+    "Locomoting": "moving as meant",
+    "NotLocomoting": "not moving",
+    "Idle": "idle",
+    "PowerOff": "power off",
+}
 MIN_MISMATCH_S = 1.0  # control measures motion over a preceding window of this length
 
 
@@ -69,15 +74,23 @@ def find_false_not_locomoting_reports(
     start_times_s: list[float] = []
     for start_s, end_s, state in list_control_state_spans(record):
         claims_no_locomotion = state.state == "NotLocomoting" and state.reason != STANDING_STILL
-        if not claims_no_locomotion or end_s <= start_s or stop_intervals.is_stationary_at((start_s + end_s) / 2):
+        if (
+            not claims_no_locomotion
+            or end_s <= start_s
+            or stop_intervals.is_stationary_at((start_s + end_s) / 2)
+        ):
             continue
-        duration_s_by_reason[state.reason] = duration_s_by_reason.get(state.reason, 0.0) + end_s - start_s
+        duration_s_by_reason[state.reason] = (
+            duration_s_by_reason.get(state.reason, 0.0) + end_s - start_s
+        )
         start_times_s.append(start_s)
     total_s = sum(duration_s_by_reason.values())
     if total_s < MIN_MISMATCH_S:
         return None
     return FalseNotLocomotingReports(
-        total_s, start_times_s[0], max(duration_s_by_reason, key=lambda reason: duration_s_by_reason[reason])
+        total_s,
+        start_times_s[0],
+        max(duration_s_by_reason, key=lambda reason: duration_s_by_reason[reason]),
     )
 
 
@@ -87,13 +100,20 @@ def find_longest_reason(record: RunRecord, interval: LabeledInterval) -> str:
     for start_s, end_s, state in list_control_state_spans(record):
         overlap_s = min(end_s, interval.end_s) - max(start_s, interval.start_s)
         if state.state != "Locomoting" and overlap_s > 0:
-            duration_s_by_reason[state.reason] = duration_s_by_reason.get(state.reason, 0.0) + overlap_s
-    return max(duration_s_by_reason, key=lambda reason: duration_s_by_reason[reason], default="") or STANDING_STILL
+            duration_s_by_reason[state.reason] = (
+                duration_s_by_reason.get(state.reason, 0.0) + overlap_s
+            )
+    return (
+        max(duration_s_by_reason, key=lambda reason: duration_s_by_reason[reason], default="")
+        or STANDING_STILL
+    )
 
 
 def find_jam_intervals(record: RunRecord) -> list[LabeledInterval]:
     """Find the intervals in which the controller reported a jam."""
-    intervals = merge_equal_reports(record, ["jammed" if state.jammed else None for state in record.control_states])
+    intervals = merge_equal_reports(
+        record, ["jammed" if state.jammed else None for state in record.control_states]
+    )
     return [interval for interval in intervals if interval.label == "jammed"]
 
 
@@ -104,14 +124,18 @@ def join_intervals(intervals: list[PropulsionInterval], gap_s: float) -> list[Pr
     for interval in intervals:
         index = newest_index.get(interval.joint_index)
         if index is not None and interval.start_s - merged[index].end_s < gap_s:
-            merged[index] = PropulsionInterval(merged[index].start_s, interval.end_s, interval.joint_index)
+            merged[index] = PropulsionInterval(
+                merged[index].start_s, interval.end_s, interval.joint_index
+            )
         else:
             newest_index[interval.joint_index] = len(merged)
             merged.append(interval)
     return merged
 
 
-def find_most_propelling_joints(intervals: list[PropulsionInterval], max_count: int = 6) -> list[int]:
+def find_most_propelling_joints(
+    intervals: list[PropulsionInterval], max_count: int = 6
+) -> list[int]:
     """Find the indices of the joints that propelled longest, from head to tail, the usual order of hand-overs."""
     duration_s_by_joint: dict[int, float] = {}
     for interval in intervals:
@@ -136,7 +160,9 @@ def compute_reference_rad(record: RunRecord, joint_index: int) -> Floats:
 
 def select_commanded_torque_nm(record: RunRecord, joint_index: int) -> Floats:
     """Return the commanded torque of a joint in torque mode, (n,); NaN in all other modes."""
-    return np.where(record.mode[:, joint_index] == JointMode.TORQUE, record.target[:, joint_index], np.nan)
+    return np.where(
+        record.mode[:, joint_index] == JointMode.TORQUE, record.target[:, joint_index], np.nan
+    )
 
 
 @lru_cache(maxsize=2)  # chart and comparison of two runs need the same series
@@ -164,9 +190,13 @@ def measure_distance(record: RunRecord) -> TimelineSeries | None:
     route_positions_m = [measure_route_position_m(record, int(row)) for row in rows]
     if None not in route_positions_m:
         along_m = np.array(route_positions_m, dtype=np.float64)
-        return TimelineSeries(time_s, along_m - along_m[0], "advance along the route, mean over the body")
+        return TimelineSeries(
+            time_s, along_m - along_m[0], "advance along the route, mean over the body"
+        )
     displacement_w = record.position_w_m[rows, :2] - record.position_w_m[rows[0], :2]
-    return TimelineSeries(time_s, np.hypot(*displacement_w.T), "distance of the tail end from where it was")
+    return TimelineSeries(
+        time_s, np.hypot(*displacement_w.T), "distance of the tail end from where it was"
+    )
 
 
 def read_reported_distance(record: RunRecord) -> TimelineSeries | None:
@@ -177,5 +207,7 @@ def read_reported_distance(record: RunRecord) -> TimelineSeries | None:
     along = np.array([state.path_s_m for state in states], dtype=np.float64)
     timestamps_s = np.array([get_report_time_s(record, state) for state in states])
     return TimelineSeries(
-        timestamps_s, along - along[0], "advance of the tail along the path, as the controller knew it"
+        timestamps_s,
+        along - along[0],
+        "advance of the tail along the path, as the controller knew it",
     )

@@ -41,7 +41,8 @@ SCALE_SPACING = 40.0  # between the scales of length and of force
 PROPULSION_DOT_RADIUS = 6.5
 JOINT_DOT_RADIUS = 2.4
 NAME_GAPS = (16.0, 24.0, 34.0)  # distances of the labels of head and tail to try
-MEASURED_OFFSET = 7.0  # of a measured force from its contact, so that its arrow does not cover the desired force
+# Of a measured force from its contact, so that its arrow does not cover the desired force.
+MEASURED_OFFSET = 7.0
 
 
 def draw_top_view(record: RunRecord, snapshot: RunSnapshot, view: MapViewport) -> str:
@@ -65,15 +66,24 @@ def draw_top_view(record: RunRecord, snapshot: RunSnapshot, view: MapViewport) -
     if joint is not None:
         name = record.description.joints[joint].name
         description += f", {name} propels"
-        x, y = view.to_pixels(body_points_w[joint + 1])  # point 0 is the tail end, before the first joint
+        # Point 0 is the tail end, before the first joint.
+        x, y = view.to_pixels(body_points_w[joint + 1])
         fill = f"fill:var(--joint-{joint})"
-        parts.append(make_element("circle", cx=x, cy=y, r=PROPULSION_DOT_RADIUS, class_="propelling", style=fill))
+        parts.append(
+            make_element(
+                "circle", cx=x, cy=y, r=PROPULSION_DOT_RADIUS, class_="propelling", style=fill
+            )
+        )
         parts.append(labels.place_label((x, y), name, "halo strong", gaps=(16, 22, 30, 40)))
     if snapshot.force_balance is not None:
         for index in range(len(snapshot.force_balance.contacts)):
             parts.append(_label_push_point(index, snapshot.force_balance, view, labels))
-    parts.append(labels.place_label(view.to_pixels(body_points_w[0]), "tail", "halo soft", gaps=NAME_GAPS))
-    parts.append(labels.place_label(view.to_pixels(body_points_w[-1]), "head", "halo soft", gaps=NAME_GAPS))
+    parts.append(
+        labels.place_label(view.to_pixels(body_points_w[0]), "tail", "halo soft", gaps=NAME_GAPS)
+    )
+    parts.append(
+        labels.place_label(view.to_pixels(body_points_w[-1]), "head", "halo soft", gaps=NAME_GAPS)
+    )
     return make_svg(view.width, view.height, description, *parts, draw_scales(view))
 
 
@@ -96,7 +106,9 @@ def _draw_route(record: RunRecord, view: MapViewport) -> str:
     return draw_polyline(points, "route")
 
 
-def _draw_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float, view: MapViewport, labels: LabelPlacer) -> str:
+def _draw_obstacle(
+    item: PlacedObstacle, normal_gravity_m_s2: float, view: MapViewport, labels: LabelPlacer
+) -> str:
     """Draw one obstacle as SVG, with a tooltip; empty if it is not in the window.
 
     Args:
@@ -121,7 +133,9 @@ def _draw_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float, view: MapVi
     if obstacle.shape == "box":
         corners = [view.to_pixels(corner) for corner in find_outline_w(obstacle)]
         return make_element("polygon", tooltip, points=format_points(corners), class_=class_)
-    return make_element("circle", tooltip, cx=x, cy=y, r=obstacle.radius_m * view.pixels_per_m, class_=class_)
+    return make_element(
+        "circle", tooltip, cx=x, cy=y, r=obstacle.radius_m * view.pixels_per_m, class_=class_
+    )
 
 
 def _describe_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float) -> str:
@@ -133,7 +147,9 @@ def _describe_obstacle(item: PlacedObstacle, normal_gravity_m_s2: float) -> str:
         words.append(f"springs back with {item.stiffness_n_per_m:g} N/m")
     sliding_force_n = item.compute_sliding_force_n(normal_gravity_m_s2)
     if sliding_force_n is not None:
-        words.append(f"slides from {sliding_force_n:.3g} N on, and is drawn where it stood at the start")
+        words.append(
+            f"slides from {sliding_force_n:.3g} N on, and is drawn where it stood at the start"
+        )
     return ", ".join(words)
 
 
@@ -150,7 +166,9 @@ def find_outline_w(obstacle: KnownObstacle) -> Floats:
     return center + corners @ np.array([(cos, sin), (-sin, cos)])
 
 
-def draw_body(record: RunRecord, view: MapViewport, body_points_w: Floats, labels: LabelPlacer) -> str:
+def draw_body(
+    record: RunRecord, view: MapViewport, body_points_w: Floats, labels: LabelPlacer
+) -> str:
     """Draw the snake's links as thick lines with round ends, then its joints as dots, as SVG.
 
     The links are drawn tail to head, so that every link shows its round end over the link behind it.
@@ -174,7 +192,13 @@ def draw_body(record: RunRecord, view: MapViewport, body_points_w: Floats, label
         for layer_class, layer_width in layers:
             stroke_width = max(layer_width, 1.0)
             line = make_element(
-                "line", x1=rear_x, y1=rear_y, x2=front_x, y2=front_y, class_=layer_class, stroke_width=stroke_width
+                "line",
+                x1=rear_x,
+                y1=rear_y,
+                x2=front_x,
+                y2=front_y,
+                class_=layer_class,
+                stroke_width=stroke_width,
             )
             parts.append(line)
         labels.reserve_line(points[i], points[i + 1], width / 2, 0.4)
@@ -186,8 +210,13 @@ def draw_body(record: RunRecord, view: MapViewport, body_points_w: Floats, label
 def _draw_measured_force(contact: WorldContact, view: MapViewport, labels: LabelPlacer) -> str:
     """Draw a measured force beside the desired one. An arrow that is too long is cut and labeled with its magnitude."""
     magnitude_n = math.hypot(*contact.force_w[:2])
-    cut = min(1.0, MAX_MEASURED_ARROW_RATIO * MAX_ARROW_LENGTH / max(magnitude_n * view.pixels_per_n, 1e-9))
-    start = view.offset_pixels(view.to_pixels(contact.position_w), contact.tangent_w, MEASURED_OFFSET)
+    cut = min(
+        1.0,
+        MAX_MEASURED_ARROW_RATIO * MAX_ARROW_LENGTH / max(magnitude_n * view.pixels_per_n, 1e-9),
+    )
+    start = view.offset_pixels(
+        view.to_pixels(contact.position_w), contact.tangent_w, MEASURED_OFFSET
+    )
     tip = view.offset_pixels(start, contact.force_w, cut * view.pixels_per_n)
     labels.reserve_line(start, tip, 3)
     drawn = draw_arrow(start, tip, "measured", head=8)
@@ -226,15 +255,21 @@ def _draw_solved_forces(snapshot: RunSnapshot, view: MapViewport, labels: LabelP
     return "".join(parts)
 
 
-def _label_push_point(index: int, balance: ForceBalance, view: MapViewport, labels: LabelPlacer) -> str:
+def _label_push_point(
+    index: int, balance: ForceBalance, view: MapViewport, labels: LabelPlacer
+) -> str:
     """Label a push-point: the magnitude of its force at the tip of the arrow, and its name behind the contact."""
     contact = balance.contacts[index]
     magnitude_n = balance.magnitudes_n[index]
     foot = view.to_pixels(contact.position_w)
     tip = view.offset_pixels(foot, contact.normal_w, magnitude_n * view.pixels_per_n)
     behind = view.offset_pixels(foot, contact.normal_w, -18.0)
-    force = labels.place_label(tip, f"{magnitude_n:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot)
-    name = labels.place_label(behind, format_subscript(f"o_{index + 1}"), "halo strong", away_from=foot)
+    force = labels.place_label(
+        tip, f"{magnitude_n:.0f} N", "halo solved-text", gaps=(6, 10, 16), away_from=foot
+    )
+    name = labels.place_label(
+        behind, format_subscript(f"o_{index + 1}"), "halo strong", away_from=foot
+    )
     return force + name
 
 
@@ -252,9 +287,15 @@ def draw_scales(view: MapViewport) -> str:
     parts = [draw_scale_bar(x, y, length_m * view.pixels_per_m, length_text)]
 
     if view.pixels_per_n > 0:
-        x += length_m * view.pixels_per_m + estimate_text_width(length_text, MAX_TEXT_SIZE) + SCALE_SPACING
+        x += (
+            length_m * view.pixels_per_m
+            + estimate_text_width(length_text, MAX_TEXT_SIZE)
+            + SCALE_SPACING
+        )
         force_n = round_down_to_1_2_5(0.8 * MAX_ARROW_LENGTH / view.pixels_per_n)
-        parts.append(draw_scale_bar(x, y, force_n * view.pixels_per_n, f"{force_n:g} N", "force-bar"))
+        parts.append(
+            draw_scale_bar(x, y, force_n * view.pixels_per_n, f"{force_n:g} N", "force-bar")
+        )
 
     origin = (view.width - 46, view.height - 8)
     for direction, name in (((1.0, 0.0), "x"), ((0.0, 1.0), "y")):

@@ -28,7 +28,8 @@ from snakesim_operator.results.summary import RunSummary, get_distance_m, get_es
 from snakesim_operator.results.time_axis import get_report_time_s, get_run_end_s
 
 MIN_STOP_S = 0.5  # a shorter stop at the end is not mentioned
-MAX_STANDING_FRACTION = 0.5  # a run that was stationary for a larger fraction, and at its end, is rated poor
+# A run that was stationary for a larger fraction, and at its end, is rated poor.
+MAX_STANDING_FRACTION = 0.5
 MIN_MOVED_RAD = 1e-3  # a joint whose target changed by less, such as by rounding, was not moved
 JUDGING_COMMANDS = {  # by controller that does not locomote, the command that judges its run
     START_CHECK_CONTROLLER: "snakesim robot check",
@@ -60,12 +61,16 @@ def make_verdict(record: RunRecord, summary: RunSummary) -> RunVerdict:
     estimates = "; ".join(get_estimates(summary).describe())
     if not estimates:
         return verdict
-    return RunVerdict(verdict.rating, f"{verdict.text} {end_with_full_stop(estimates.capitalize())}")
+    return RunVerdict(
+        verdict.rating, f"{verdict.text} {end_with_full_stop(estimates.capitalize())}"
+    )
 
 
 def _judge_run(record: RunRecord, summary: RunSummary) -> RunVerdict:
     if summary.ticks == 0 and len(record.time_s) == 0 and not summary.faults:
-        return RunVerdict("bad", f"Nothing was recorded: the robot was never armed ({summary.ended}).")
+        return RunVerdict(
+            "bad", f"Nothing was recorded: the robot was never armed ({summary.ended})."
+        )
     stopping_faults = [fault for fault in summary.faults if fault.reach == "robot"]
     if stopping_faults:
         return _judge_stopped_run(record, summary, stopping_faults[0])
@@ -85,10 +90,14 @@ def _judge_stopped_run(record: RunRecord, summary: RunSummary, fault: Fault) -> 
     start_s = float(record.time_s[0]) if len(record.time_s) else 0.0
     at_s = fault.tick / summary.rate_hz - start_s
     joint = f" at {fault.joint}" if fault.joint else ""
-    stopped = f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {end_with_full_stop(fault.cause)}"
+    stopped = (
+        f"Stopped by a fault after {max(at_s, 0.0):.1f} s{joint}: {end_with_full_stop(fault.cause)}"
+    )
     moved = describe_distance(record, summary)
     before = ", ".join([moved[0].lower() + moved[1:], *describe_refused_commands(summary)])
-    return RunVerdict("bad", f"{stopped}{describe_last_control_state(record, at_s)} Before that: {before}.")
+    return RunVerdict(
+        "bad", f"{stopped}{describe_last_control_state(record, at_s)} Before that: {before}."
+    )
 
 
 def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> RunVerdict:
@@ -108,8 +117,11 @@ def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> R
         deviation_rad = np.abs(record.target - np.nanmedian(record.target, axis=0))  # (n, joints)
         max_deviation_rad = np.nanmax(deviation_rad, axis=0)
         unmoved: list[str] = []
-        for joint, joint_deviation_rad in zip(record.description.joints, max_deviation_rad, strict=True):
-            was_moved = joint_deviation_rad > MIN_MOVED_RAD  # False for NaN, which is a joint without any target
+        for joint, joint_deviation_rad in zip(
+            record.description.joints, max_deviation_rad, strict=True
+        ):
+            # False for NaN, which is a joint without any target.
+            was_moved = joint_deviation_rad > MIN_MOVED_RAD
             if not was_moved:
                 unmoved.append(joint.name)
         all_joints_moved = not unmoved
@@ -123,7 +135,9 @@ def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> R
     return RunVerdict("good" if is_good else "poor", words)
 
 
-def _judge_motion(record: RunRecord, summary: RunSummary, stop_intervals: StopIntervals) -> RunVerdict:
+def _judge_motion(
+    record: RunRecord, summary: RunSummary, stop_intervals: StopIntervals
+) -> RunVerdict:
     """Judge a run that no fault stopped and whose pose is known, by the measured stop_intervals.
 
     The run is poor if it did not locomote, if it jammed or was stationary for long, or if it ended early or behind its
@@ -193,6 +207,10 @@ def find_final_stop(record: RunRecord, stop_intervals: StopIntervals) -> Locomot
     stop = stop_intervals.final_stop
     if stop is None or stop_intervals.run_end_s - stop.start_s < MIN_STOP_S:
         return None
-    reported = [state for state in record.control_states if get_report_time_s(record, state) >= stop.start_s]
+    reported = [
+        state for state in record.control_states if get_report_time_s(record, state) >= stop.start_s
+    ]
     is_intended = bool(reported) and reported[-1].state == "Idle"
-    return LocomotionStop(stop.start_s, end_with_full_stop(find_longest_reason(record, stop)), is_intended)
+    return LocomotionStop(
+        stop.start_s, end_with_full_stop(find_longest_reason(record, stop)), is_intended
+    )

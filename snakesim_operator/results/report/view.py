@@ -12,13 +12,13 @@ from snakesim_operator.results.report.snapshots import RunSnapshot
 from snakesim_operator.results.run_log import RunRecord
 
 MAX_ARROW_LENGTH = 72.0  # length of the arrow of the strongest force, in units of the drawing
-MAX_MEASURED_ARROW_RATIO = (
-    1.1  # over MAX_ARROW_LENGTH: a longer arrow is cut, so that one impact does not dwarf other forces
-)
+# Over MAX_ARROW_LENGTH: a longer arrow is cut, so that one impact does not dwarf other forces.
+MAX_MEASURED_ARROW_RATIO = 1.1
 MARGIN = 22.0
 ARROW_MARGIN = 80.0  # around the body, with room for arrows, in units of the drawing
 MAX_HEIGHT_RATIO = 1.1  # height over width
-MAX_WHOLE_OBSTACLE_FRACTION = 0.5  # of the window: a larger obstacle, such as a wall, is cut at the edge
+# Of the window: a larger obstacle, such as a wall, is cut at the edge.
+MAX_WHOLE_OBSTACLE_FRACTION = 0.5
 MAX_GROWTH_STEPS = 4  # to enlarge a window around the obstacles that it cuts
 FOOTER_HEIGHT = 30.0  # height of the area below the map with the scale bars
 
@@ -42,10 +42,14 @@ class MapViewport:
 
     def to_pixels(self, point_w: Floats | tuple[float, ...]) -> Point:
         """Convert a point of the ground, in m, to coordinates of the drawing."""
-        x, y = (self.rotate(np.asarray(point_w, dtype=np.float64)[:2]) - self.min_corner_w) * self.pixels_per_m
+        x, y = (
+            self.rotate(np.asarray(point_w, dtype=np.float64)[:2]) - self.min_corner_w
+        ) * self.pixels_per_m
         return float(x), float(self.height - FOOTER_HEIGHT - y)
 
-    def offset_pixels(self, start: Point, vector_w: Floats | tuple[float, ...], units: float) -> Point:
+    def offset_pixels(
+        self, start: Point, vector_w: Floats | tuple[float, ...], units: float
+    ) -> Point:
         """Offset a point of the drawing by a world vector times `units`."""
         x, y = self.rotate(np.asarray(vector_w, dtype=np.float64)[:2])
         return float(start[0] + units * x), float(start[1] - units * y)
@@ -57,8 +61,14 @@ class MapViewport:
         map_width = self.width
         map_height = self.height - FOOTER_HEIGHT
         if half_extent > MAX_WHOLE_OBSTACLE_FRACTION * min(map_width, map_height):
-            return -half_extent < x < map_width + half_extent and -half_extent < y < map_height + half_extent
-        return half_extent <= x <= map_width - half_extent and half_extent <= y <= map_height - half_extent
+            return (
+                -half_extent < x < map_width + half_extent
+                and -half_extent < y < map_height + half_extent
+            )
+        return (
+            half_extent <= x <= map_width - half_extent
+            and half_extent <= y <= map_height - half_extent
+        )
 
 
 def find_half_extent_m(obstacle: KnownObstacle) -> float:
@@ -66,7 +76,9 @@ def find_half_extent_m(obstacle: KnownObstacle) -> float:
     return max(obstacle.radius_m, math.hypot(*obstacle.half_size_m[:2]))
 
 
-def compute_viewports(record: RunRecord, snapshots: list[RunSnapshot], width: float) -> list[MapViewport]:
+def compute_viewports(
+    record: RunRecord, snapshots: list[RunSnapshot], width: float
+) -> list[MapViewport]:
     """Compute a viewport around the body for each snapshot, all of one size and one scale, with room for arrows."""
     if not snapshots:
         return []
@@ -104,7 +116,9 @@ def compute_map_viewport(
     return _fit_viewports(record, [np.vstack(body_points_w)], pixels_per_n, width)[0]
 
 
-def _fit_viewports(record: RunRecord, point_sets: list[Floats], pixels_per_n: float, width: float) -> list[MapViewport]:
+def _fit_viewports(
+    record: RunRecord, point_sets: list[Floats], pixels_per_n: float, width: float
+) -> list[MapViewport]:
     """Fit a viewport around each set of points, all of one size and one scale.
 
     If the first set is taller than wide, the ground is rotated by a quarter turn. A window grows so that it does not
@@ -137,7 +151,9 @@ def _fit_viewports(record: RunRecord, point_sets: list[Floats], pixels_per_n: fl
     viewports: list[MapViewport] = []
     for low, high in window_corners:
         corner = (low + high) / 2 - half_size_m
-        viewports.append(MapViewport(corner, scale, pixels_per_n, width, height + FOOTER_HEIGHT, upright))
+        viewports.append(
+            MapViewport(corner, scale, pixels_per_n, width, height + FOOTER_HEIGHT, upright)
+        )
     return viewports
 
 
@@ -150,7 +166,9 @@ def _grow_around_obstacles(
     for item in record.placed_obstacles:
         half_extent_m = find_half_extent_m(item.obstacle)
         if half_extent_m <= max_half_extent_m:
-            small.append((unscaled.rotate(np.array(item.obstacle.position_w[:2])), 1.1 * half_extent_m))
+            small.append(
+                (unscaled.rotate(np.array(item.obstacle.position_w[:2])), 1.1 * half_extent_m)
+            )
     for _ in range(MAX_GROWTH_STEPS):
         cut = [
             (at, half_extent)

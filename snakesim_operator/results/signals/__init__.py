@@ -7,7 +7,13 @@ from snakesim_operator.results.signals.signal_table import (
     make_signal_columns,
     select_columns,
 )
-from snakesim_operator.results.signals.units import CONTROLLER_SUFFIX, JOINT_SIGNALS, PARQUET_UNIT, UNITS, find_unit
+from snakesim_operator.results.signals.units import (
+    CONTROLLER_SUFFIX,
+    JOINT_SIGNALS,
+    PARQUET_UNIT,
+    UNITS,
+    find_unit,
+)
 
 __all__ = [
     "CONTROLLER_SUFFIX",

@@ -24,9 +24,15 @@ def compute_contact_signals(record: RunRecord) -> dict[str, Floats]:
     if not record.has_contact_sensors:
         return {}
     log = record.contact_log
-    newest = np.searchsorted(log.ticks, record.ticks, side="right") - 1  # (n,) sample of each row; -1: none yet
-    link_force_l_n = _repeat_newest_samples(_sum_by_link(log, len(record.description.links)), newest)
-    signals = {"link_force_n": np.linalg.norm(link_force_l_n, axis=2), "link_force_l_n": link_force_l_n}
+    # (n,) sample of each row; -1: none yet.
+    newest = np.searchsorted(log.ticks, record.ticks, side="right") - 1
+    link_force_l_n = _repeat_newest_samples(
+        _sum_by_link(log, len(record.description.links)), newest
+    )
+    signals = {
+        "link_force_n": np.linalg.norm(link_force_l_n, axis=2),
+        "link_force_l_n": link_force_l_n,
+    }
     if log.obstacles:
         force_w_n, is_in_world = _sum_by_obstacle(record, log)
         magnitude_n = _repeat_newest_samples(np.linalg.norm(force_w_n, axis=2), newest)
@@ -49,7 +55,9 @@ def _sum_by_link(log: ContactLog, link_count: int) -> Floats:
     sums_n = np.zeros((len(log.ticks), link_count, 3))
     is_on_known_link = log.link_index < link_count
     np.add.at(
-        sums_n, (log.sample_index[is_on_known_link], log.link_index[is_on_known_link]), log.force_l_n[is_on_known_link]
+        sums_n,
+        (log.sample_index[is_on_known_link], log.link_index[is_on_known_link]),
+        log.force_l_n[is_on_known_link],
     )
     return sums_n
 
@@ -81,10 +89,16 @@ def _sum_by_obstacle(record: RunRecord, log: ContactLog) -> tuple[Floats, NDArra
         base_rotation = np.eye(3)
         if is_in_world[sample]:
             base_rotation = rotation_from_quaternion(record.orientation_wxyz[row])
-        _, rotations = compute_link_frames(np.zeros(3), base_rotation, record.angle_rad[row], axes, lengths_m)
+        _, rotations = compute_link_frames(
+            np.zeros(3), base_rotation, record.angle_rad[row], axes, lengths_m
+        )
         contacts = slice(first_contact[sample], end_contact[sample])
         is_on_known_link = log.link_index[contacts] < len(lengths_m)
         links = log.link_index[contacts][is_on_known_link]
-        rotated_forces_n = np.einsum("cij,cj->ci", rotations[links], log.force_l_n[contacts][is_on_known_link])
-        np.add.at(forces_n[sample], log.obstacle_index[contacts][is_on_known_link], rotated_forces_n)
+        rotated_forces_n = np.einsum(
+            "cij,cj->ci", rotations[links], log.force_l_n[contacts][is_on_known_link]
+        )
+        np.add.at(
+            forces_n[sample], log.obstacle_index[contacts][is_on_known_link], rotated_forces_n
+        )
     return forces_n, is_in_world

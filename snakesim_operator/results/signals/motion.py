@@ -12,7 +12,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import ForwardKinematics
 from snakesim_operator.results.run_log import RunRecord
 
-VELOCITY_WINDOW_S = 0.1  # between the two positions of a velocity: poses may come at only 20 Hz, and are noisy
+# Between the two positions of a velocity: poses may come at only 20 Hz, and are noisy.
+VELOCITY_WINDOW_S = 0.1
 MIN_REACH_RATIO = 0.05  # horizontal distance from tail to head over body length; below it the heading is undefined
 
 

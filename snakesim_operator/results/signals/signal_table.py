@@ -47,7 +47,9 @@ def list_component_names(signal: str, record: RunRecord) -> Sequence[str]:
         case "obstacle_force_n":
             return record.contact_log.obstacles
         case "obstacle_force_w_n":
-            return [f"{obstacle}.{axis}" for obstacle in record.contact_log.obstacles for axis in XYZ]
+            return [
+                f"{obstacle}.{axis}" for obstacle in record.contact_log.obstacles for axis in XYZ
+            ]
         case "orientation_wxyz":
             return "wxyz"
         case _:

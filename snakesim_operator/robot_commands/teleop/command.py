@@ -15,12 +15,22 @@ from snakesim_hal.base.terminal import overwrite_lines, print_line
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
 from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, ControlState, LocomotionIntent, RobotStatus, WorldModel
+from snakesim_hal.wire.messages import (
+    Clock,
+    ControlState,
+    LocomotionIntent,
+    RobotStatus,
+    WorldModel,
+)
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_single_robot
 from snakesim_operator.robot_commands.prepared_stop import PreparedStop
 from snakesim_operator.robot_commands.teleop.joystick import STICK_AGE_S, Joystick, open_joystick
 from snakesim_operator.robot_commands.teleop.keyboard import KeyReader
-from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, TURN_RAD_S, SteeringState
+from snakesim_operator.robot_commands.teleop.steering import (
+    HEADING_STEP_RAD,
+    TURN_RAD_S,
+    SteeringState,
+)
 
 PERIOD_S = 0.05
 SCREEN_PERIOD_CYCLES = 4  # periods
@@ -31,7 +41,9 @@ STOP_TIMEOUT_S = 20.0  # at the end, for an emergency stop that is under way
 KEY_HELP = "up, down: speed   left, right: direction   s: stop   SPACE: EMERGENCY STOP   q: quit"
 
 
-def teleoperate_robot(selection: RobotSelection, max_speed_m_s: float, joystick: Path | None) -> int:
+def teleoperate_robot(
+    selection: RobotSelection, max_speed_m_s: float, joystick: Path | None
+) -> int:
     """Drive a robot until the operator presses q or Ctrl-C, or until the terminal or the joystick is gone.
 
     Args:
@@ -117,7 +129,8 @@ class TeleopLoop:
 
         # The emergency stop, which is prepared before it is needed.
         self._prepared_stop = PreparedStop(
-            RobotSelection(connection.endpoint, connection.namespace, connection.session), connection
+            RobotSelection(connection.endpoint, connection.namespace, connection.session),
+            connection,
         )
         self._prepared_stop.use_session(session)
         self._pending_stop: Future[str] | None = None
@@ -146,7 +159,9 @@ class TeleopLoop:
             time.sleep(max(PERIOD_S - elapsed_s, 0.0))
         self._stop_robot_at_end()
         with contextlib.suppress(OSError):  # the terminal may be gone
-            print_line(f"teleop ended: {self._end_reason}; {self._link.namespace} gets no more requests")
+            print_line(
+                f"teleop ended: {self._end_reason}; {self._link.namespace} gets no more requests"
+            )
         return 1 if self._is_input_lost() else 0
 
     def _stop_robot_at_end(self) -> None:
@@ -196,7 +211,9 @@ class TeleopLoop:
                     self._request_end("quit")
                 case "s":
                     self._steering.stop(now_s)
-                case "up" | "down" | "left" | "right" if self._stick is None and not keyboard.has_late_keys:
+                case "up" | "down" | "left" | "right" if (
+                    self._stick is None and not keyboard.has_late_keys
+                ):
                     self._steer_by_key(key, now_s)
                 case _:
                     pass
@@ -257,7 +274,9 @@ class TeleopLoop:
             self._control_state = states[-1]
             self._control_arrival_s = time.monotonic()
         if worlds := self._world_reader.drain():
-            self._body_heading_w_rad = yaw_from_rotation(rotation_from_quaternion(worlds[-1].base_orientation_wxyz))
+            self._body_heading_w_rad = yaw_from_rotation(
+                rotation_from_quaternion(worlds[-1].base_orientation_wxyz)
+            )
         for intent in self._intent_reader.drain():
             if intent.requester != self._user:
                 self._other_user = intent.requester
@@ -294,7 +313,9 @@ class TeleopLoop:
         if status is None:
             return f"{self._link.namespace}: no status yet"
         age = _describe_age_if_old(self._status_arrival_s)
-        return f"{self._link.namespace} ({status.backend}): {status.lifecycle}{age}: {status.reason}"
+        return (
+            f"{self._link.namespace} ({status.backend}): {status.lifecycle}{age}: {status.reason}"
+        )
 
     def _describe_control(self) -> str:
         control = self._control_state
@@ -317,7 +338,11 @@ class TeleopLoop:
             return f"no event of the joystick for {STICK_AGE_S:.0f} s: stopped; move it to continue"
         heading_w_rad = self._steering.heading_w_rad
         heading = "the mission's way" if heading_w_rad is None else _format_degrees(heading_w_rad)
-        body = "unknown" if self._body_heading_w_rad is None else _format_degrees(self._body_heading_w_rad)
+        body = (
+            "unknown"
+            if self._body_heading_w_rad is None
+            else _format_degrees(self._body_heading_w_rad)
+        )
         return f"requested: {self._steering.speed_m_s:+.2f} m/s, {heading}; body: {body}"
 
     def _describe_silence(self, silent_s: float) -> str:
@@ -327,7 +352,11 @@ class TeleopLoop:
             silent_s: Time since the last clock message.
         """
         status = self._status
-        if status is not None and status.held_up and not _describe_age_if_old(self._status_arrival_s):
+        if (
+            status is not None
+            and status.held_up
+            and not _describe_age_if_old(self._status_arrival_s)
+        ):
             return status.held_up
         return f"the robot has sent no clock for {silent_s:.0f} s"
 

@@ -71,7 +71,8 @@ class Joystick:
         self.right = 0.0  # from -1 to 1
         self.forward = 0.0  # from -1 to 1
         self.is_lost = False  # unplugged, or its driver is gone
-        self.last_event_s = -math.inf  # monotonic time at which the kernel received the newest event
+        # Monotonic time at which the kernel received the newest event.
+        self.last_event_s = -math.inf
 
     def read_events(self, timeout_s: float) -> bool:
         """Read all events that have arrived, and update the position of the stick.
@@ -99,7 +100,9 @@ class Joystick:
             return False
         event_count = len(data) // EVENT.size  # an incomplete event at the end is dropped
         is_button_pressed = False
-        for seconds, microseconds, event_type, code, value in EVENT.iter_unpack(data[: event_count * EVENT.size]):
+        for seconds, microseconds, event_type, code, value in EVENT.iter_unpack(
+            data[: event_count * EVENT.size]
+        ):
             self.last_event_s = seconds + 1e-6 * microseconds
             if event_type == EV_ABS and code == ABS_X:
                 self.right = self._x_axis.normalize(value)

@@ -18,13 +18,14 @@ from snakesim_hal.base.errors import ConfigError
 ESCAPE_PREFIXES = (b"\x1b[", b"\x1bO")  # the first two bytes of an arrow key
 ARROW_KEYS = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}  # by the third byte
 MAX_BYTES = 1024  # in one reading: a pasted text, or a key that repeats
-MAX_KEYS_PER_READ = (
-    8  # keys in one reading; teleop reads 20 times a second, and a keyboard repeats up to 50 times a second
-)
+# Keys in one reading; teleop reads 20 times a second, and a keyboard repeats up to 50 times a second.
+MAX_KEYS_PER_READ = 8
 RATE_WINDOW_S = 0.5
 MAX_KEY_RATE_HZ = 60.0  # more keys a second than any keyboard repeats
 MAX_UNREAD_DURATION_S = 0.5  # between two readings; keys may have waited for that long
-NO_TERMINAL_MESSAGE = "teleop reads keys, and stdin is no terminal; start it in one, or give --joystick"
+NO_TERMINAL_MESSAGE = (
+    "teleop reads keys, and stdin is no terminal; start it in one, or give --joystick"
+)
 INPUT_FLAGS, LOCAL_FLAGS, CONTROL_CHARACTERS = 0, 3, 6  # indices of what termios.tcgetattr returns
 
 
@@ -60,7 +61,10 @@ class KeyTiming:
         self._key_times_s.extend([now_s] * key_count)
         if key_count == 0:
             return False
-        has_too_many_keys = key_count > MAX_KEYS_PER_READ or len(self._key_times_s) > MAX_KEY_RATE_HZ * RATE_WINDOW_S
+        has_too_many_keys = (
+            key_count > MAX_KEYS_PER_READ
+            or len(self._key_times_s) > MAX_KEY_RATE_HZ * RATE_WINDOW_S
+        )
         return has_too_many_keys or time_since_last_read_s > MAX_UNREAD_DURATION_S
 
 
@@ -86,7 +90,8 @@ class KeyReader:
 
     def __enter__(self) -> Self:
         settings = termios.tcgetattr(self._file_descriptor)
-        settings[INPUT_FLAGS] &= ~termios.IXON  # Ctrl-S would pause output, and with it this program and its stop keys
+        # Ctrl-S would pause output, and with it this program and its stop keys.
+        settings[INPUT_FLAGS] &= ~termios.IXON
         settings[LOCAL_FLAGS] &= ~(termios.ICANON | termios.ECHO)
         characters = settings[CONTROL_CHARACTERS]
         characters[termios.VMIN] = 1

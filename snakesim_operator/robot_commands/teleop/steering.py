@@ -4,11 +4,13 @@ import math
 
 from snakesim_hal.wire.messages import LocomotionIntent
 
-INTENT_VALIDITY_NS = 500_000_000  # in robot time; ten times as long as the period in which intents are repeated
+# In robot time; ten times as long as the period in which intents are repeated.
+INTENT_VALIDITY_NS = 500_000_000
 SPEED_STEP_M_S = 0.05
 HEADING_STEP_RAD = math.radians(10)
 TURN_RAD_S = 0.8  # with the stick fully to one side
-MAX_HEADING_OFFSET_RAD = math.pi / 2  # the requested direction is ahead of the body's by at most this
+# The requested direction is ahead of the body's by at most this.
+MAX_HEADING_OFFSET_RAD = math.pi / 2
 
 
 class SteeringState:
@@ -19,7 +21,8 @@ class SteeringState:
         self._max_speed_m_s = max_speed_m_s
         self.speed_m_s = 0.0
         self.heading_w_rad: float | None = None  # None: the mission's own goal
-        self.last_input_s: float | None = None  # monotonic time of the operator's last input; None: no input yet
+        # Monotonic time of the operator's last input; None: no input yet.
+        self.last_input_s: float | None = None
 
     def change_speed(self, step_count: int, now_s: float) -> None:
         """Change the requested speed by steps of SPEED_STEP_M_S, within the maximum speed in both directions.
@@ -28,7 +31,9 @@ class SteeringState:
             step_count: Number of steps; negative steps decrease the speed.
             now_s: Monotonic time of the operator's input.
         """
-        self.set_speed_fraction((self.speed_m_s + step_count * SPEED_STEP_M_S) / self._max_speed_m_s, now_s)
+        self.set_speed_fraction(
+            (self.speed_m_s + step_count * SPEED_STEP_M_S) / self._max_speed_m_s, now_s
+        )
 
     def set_speed_fraction(self, fraction: float, now_s: float) -> None:
         """Request a fraction of the maximum speed.
@@ -41,7 +46,9 @@ class SteeringState:
         self.speed_m_s = round(limited * self._max_speed_m_s, 3) + 0.0  # + 0.0 turns -0.0 into 0.0
         self.last_input_s = now_s
 
-    def rotate_heading(self, rotation_rad: float, body_heading_w_rad: float | None, now_s: float) -> None:
+    def rotate_heading(
+        self, rotation_rad: float, body_heading_w_rad: float | None, now_s: float
+    ) -> None:
         """Rotate the requested heading. The first rotation starts at the heading of the body.
 
         Args:
@@ -76,7 +83,9 @@ class SteeringState:
         )
 
 
-def compute_limited_heading(heading_w_rad: float, rotation_rad: float, body_heading_w_rad: float | None) -> float:
+def compute_limited_heading(
+    heading_w_rad: float, rotation_rad: float, body_heading_w_rad: float | None
+) -> float:
     """Return a heading after a rotation, limited to MAX_HEADING_OFFSET_RAD to either side of the body's heading.
 
     Args:

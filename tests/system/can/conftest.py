@@ -39,7 +39,9 @@ def pytest_collection_modifyitems(session: pytest.Session, items: list[pytest.It
     if reason is None:
         return
     if asked_by := [name for name in NEEDED if os.environ.get(name, "") not in ("", "0", "false")]:
-        raise pytest.UsageError(f"{reason}, and {asked_by[0]} is set: tests/system/can may not be skipped. Run: {RUN}")
+        raise pytest.UsageError(
+            f"{reason}, and {asked_by[0]} is set: tests/system/can may not be skipped. Run: {RUN}"
+        )
     for item in ours:
         item.add_marker(pytest.mark.skip(reason=f"{reason}. Run: {RUN}"))
 

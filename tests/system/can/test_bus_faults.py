@@ -43,7 +43,9 @@ def test_can_interface_down_stops_joints_and_recovers(spare_channel: str) -> Non
         assert run.lifecycle == "fault"
         assert fault.tick - start <= 1
         assert run.true_states() == [ModuleState.FAULT] * 4, "the modules' own watchdogs"
-        stopped_ms = PERIOD_MS * next(n for n in range(1, 20) if run.true_state_at[start + n] == {ModuleState.FAULT})
+        stopped_ms = PERIOD_MS * next(
+            n for n in range(1, 20) if run.true_state_at[start + n] == {ModuleState.FAULT}
+        )
         assert stopped_ms <= WATCHDOG_MS + PERIOD_MS
         run.run(40)
         assert run.at_rest()
@@ -66,7 +68,8 @@ def test_can_adapter_unplugged_and_plugged_in_again_is_used(spare_channel: str) 
         assert fault.what == "interface_down"
         must(ip("link", "add", spare_channel, "type", "vcan"))
         must(ip("link", "set", spare_channel, "up"))
-        run.wire.server.wires[0].errors()  # the modules were never unplugged; only on this bus do they need this
+        # The modules were never unplugged; only on this bus do they need this.
+        run.wire.server.wires[0].errors()
         run.run(10)
         assert run.watch_seen("interface_up") == 1
         moves_again(run)
@@ -132,7 +135,8 @@ def test_can_queue_full_for_a_moment_is_counted_and_skipped(slow_channel: str) -
 def test_can_long_queue_with_socket_share_full_counts_as_full(slow_channel: str) -> None:
     must(ip("link", "set", slow_channel, "txqueuelen", "1000"))
     with open_shared_bus(slow_channel) as run:
-        run.wire._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the kernel makes it its minimum
+        # The kernel makes it its minimum.
+        run.wire._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
         clog(slow_channel, frames=1000)
         run.run(LEASE_MS // PERIOD_MS + 3, run.waving)
         assert "bus_stuck" in [fault.what for fault in run.faults]
@@ -145,7 +149,9 @@ def error_frame(kind: int) -> bytes:
     return frame(CAN_ERR_FLAG | kind, bytes([0, 0, 0, 0, 0, 0, 130, 7]))
 
 
-def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_socket: socket.socket) -> None:
+def test_error_frames_of_the_controller_are_faults_or_counted(
+    channel: str, raw_socket: socket.socket
+) -> None:
     """All kinds are told apart in tests/system/can_bus/test_wire.py."""
     with open_shared_bus(channel) as run:
         raw_socket.send(error_frame(ACK))
@@ -170,7 +176,9 @@ def test_error_frames_of_the_controller_are_faults_or_counted(channel: str, raw_
 # --- a reader that is too slow -------------------------------------------------------------------------------
 
 
-def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: socket.socket) -> None:
+def test_frames_that_the_kernel_dropped_are_counted(
+    channel: str, raw_socket: socket.socket
+) -> None:
     with open_shared_bus(channel) as run:
         ours = run.wire._socket
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # the kernel makes it its minimum
@@ -191,7 +199,9 @@ def test_frames_that_the_kernel_dropped_are_counted(channel: str, raw_socket: so
 
 
 @pytest.mark.slow
-def test_an_emergency_from_the_bus_stops_and_is_latched(channel: str, raw_socket: socket.socket) -> None:
+def test_an_emergency_from_the_bus_stops_and_is_latched(
+    channel: str, raw_socket: socket.socket
+) -> None:
     with open_shared_bus(channel) as run:
         raw_socket.send(frame(frame_id(Opcode.EMERGENCY, 0), b"\x01"))
         run.run(1, run.waving)
@@ -204,14 +214,21 @@ def test_an_emergency_from_the_bus_stops_and_is_latched(channel: str, raw_socket
         moves_again(run)
 
 
-def test_extended_and_remote_frames_stay_in_the_kernel(channel: str, raw_socket: socket.socket) -> None:
+def test_extended_and_remote_frames_stay_in_the_kernel(
+    channel: str, raw_socket: socket.socket
+) -> None:
     with open_shared_bus(channel) as run:
-        for number in (frame_id(Opcode.HEARTBEAT, 40), frame_id(Opcode.SYNC, 0), frame_id(Opcode.JOINT_STATE, 1)):
+        for number in (
+            frame_id(Opcode.HEARTBEAT, 40),
+            frame_id(Opcode.SYNC, 0),
+            frame_id(Opcode.JOINT_STATE, 1),
+        ):
             for _ in range(5):
                 raw_socket.send(frame(CAN_EFF_FLAG | number, bytes(8)))
                 raw_socket.send(frame(CAN_EFF_FLAG | 0x12340000 | number, bytes(8)))
                 raw_socket.send(frame(CAN_RTR_FLAG | number))
-        assert not [one for one in run.wire.receive() if one.data in (b"", bytes(8))]  # the modules' own are not zero
+        # The modules' own are not zero.
+        assert not [one for one in run.wire.receive() if one.data in (b"", bytes(8))]
         run.run(5, run.waving)
         assert not run.faults
         assert run.states() == [ModuleState.ARMED] * 4

@@ -24,7 +24,9 @@ from snakesim_testing.messages import raises_error
 UINPUT = Path("/dev/uinput")
 BTN_SOUTH, KEY_A, BUS_USB = 0x130, 30, 3
 CREATE, DESTROY = 0x5501, 0x5502
-pytestmark = pytest.mark.skipif(not UINPUT.exists(), reason="this kernel has no uinput: sudo modprobe uinput")
+pytestmark = pytest.mark.skipif(
+    not UINPUT.exists(), reason="this kernel has no uinput: sudo modprobe uinput"
+)
 
 
 def write_ioctl(number: int, size: int) -> int:
@@ -36,7 +38,13 @@ class Virtual:
 
     def __init__(self, button: int) -> None:
         self._handle = os.open(UINPUT, os.O_WRONLY | os.O_NONBLOCK)
-        for number, value in ((100, EV_KEY), (101, button), (100, EV_ABS), (103, ABS_X), (103, ABS_Y)):
+        for number, value in (
+            (100, EV_KEY),
+            (101, button),
+            (100, EV_ABS),
+            (103, ABS_X),
+            (103, ABS_Y),
+        ):
             fcntl.ioctl(self._handle, write_ioctl(number, 4), value)
         for axis, least, most in ((ABS_X, -100, 100), (ABS_Y, 0, 200)):
             setup = struct.pack("Hxx6i", axis, (least + most) // 2, least, most, 0, 0, 0)
@@ -63,7 +71,10 @@ def found() -> Joystick | None:
 def test_a_joystick_is_found_read_and_lost() -> None:
     device = Virtual(BTN_SOUTH)
     sticks: list[Joystick] = []
-    wait_until(lambda: sticks.append(stick) or True if (stick := found()) else False, "the device to be there")
+    wait_until(
+        lambda: sticks.append(stick) or True if (stick := found()) else False,
+        "the device to be there",
+    )
     stick = sticks[0]
     device.sends(EV_ABS, ABS_Y, 0)
     assert not stick.read_events(1.0)

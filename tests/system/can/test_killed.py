@@ -55,13 +55,21 @@ def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: RobotOnBus
     _, control = robot.arm()
     killed_ns = killed(control)
     passive = {ModuleState.DISARMED}
-    robot.until(lambda: len(first_in(robot.listener.listen(), passive, killed_ns)) == JOINTS, "modules stopped")
-    robot.until(lambda: "lease of control expired" in robot.tell("status").printed, "the fault in the status")
+    robot.until(
+        lambda: len(first_in(robot.listener.listen(), passive, killed_ns)) == JOINTS,
+        "modules stopped",
+    )
+    robot.until(
+        lambda: "lease of control expired" in robot.run_command("status").printed,
+        "the fault in the status",
+    )
     received = list(robot.listener.listen())
     last_ms = (max(h.at_ns for h in received if h.opcode == Opcode.SET_POINT) - killed_ns) / 1e6
     stop = next(h for h in stop_commands(received) if h.at_ns > killed_ns)
     stop_ms = (stop.at_ns - killed_ns) / 1e6
-    rest_ms = max((h.at_ns - stop.at_ns) / 1e6 for h in first_in(received, passive, killed_ns).values())
+    rest_ms = max(
+        (h.at_ns - stop.at_ns) / 1e6 for h in first_in(received, passive, killed_ns).values()
+    )
     lease_ms, period_ms = robot.config.lease_ns / 1e6, robot.config.period_ns / 1e6
     assert last_ms <= stop_ms <= lease_ms + 2 * period_ms + LATE_MS
     assert rest_ms <= 100 + period_ms + LATE_MS
@@ -72,32 +80,49 @@ def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: RobotOnBus
     )
 
 
-def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: RobotOnBus, channel: str) -> None:
+def test_a_killed_host_leaves_every_module_to_its_own_watchdog(
+    robot: RobotOnBus, channel: str
+) -> None:
     host, _ = robot.arm()
     armed = [ModuleState.ARMED] * JOINTS
     assert robot.listener.states() == armed, robot.read_log("host")
     killed_ns = killed(host)
     period_ms = robot.config.period_ns / 1e6
     fault = {ModuleState.FAULT}
-    robot.until(lambda: len(first_in(robot.listener.listen(), fault, killed_ns)) == JOINTS, "modules in fault")
+    robot.until(
+        lambda: len(first_in(robot.listener.listen(), fault, killed_ns)) == JOINTS,
+        "modules in fault",
+    )
     beats = {node: len(uptimes_ms(robot.listener.listen(), node)) for node in NODES}
     robot.until(
-        lambda: all(len(uptimes_ms(robot.listener.listen(), node)) > beats[node] + 1 for node in NODES),
+        lambda: all(
+            len(uptimes_ms(robot.listener.listen(), node)) > beats[node] + 1 for node in NODES
+        ),
         "heartbeats",
     )
     received = robot.listener.received
     stopped = first_in(received, fault, killed_ns)
-    assert all(h.opcode == Opcode.HEARTBEAT for h in stopped.values()), "told at once, without a Sync"
+    assert all(h.opcode == Opcode.HEARTBEAT for h in stopped.values()), (
+        "told at once, without a Sync"
+    )
     assert {h.decode()["last_stop"] for h in stopped.values()} == {LastStop.WATCHDOG}
     assert all(h.decode()["fault_watchdog"] and h.decode()["mode"] == 0 for h in stopped.values())
     last = {
-        node: max(h.at_ns for h in received if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node)
+        node: max(
+            h.at_ns
+            for h in received
+            if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node
+        )
         for node in NODES
     }
-    from_host = [h.at_ns for h in received if h.opcode in (Opcode.SET_POINT, Opcode.SYNC, Opcode.COMMAND)]
+    from_host = [
+        h.at_ns for h in received if h.opcode in (Opcode.SET_POINT, Opcode.SYNC, Opcode.COMMAND)
+    ]
     last_ms = (max(from_host) - killed_ns) / 1e6
     took_ms = [(stopped[node].at_ns - last[node]) / 1e6 for node in NODES]
-    own_ms = [passed_for_module_ms(received, node, last[node], stopped[node].at_ns) for node in NODES]
+    own_ms = [
+        passed_for_module_ms(received, node, last[node], stopped[node].at_ns) for node in NODES
+    ]
     assert last_ms < LATE_MS
     assert max(took_ms) <= 100 + period_ms + LATE_MS
     assert max(own_ms) <= 100 + period_ms
@@ -115,6 +140,10 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(robot: RobotOnBus
     assert scanned.code == 0 and lines[0].split() == list(COLUMNS), scanned.out + scanned.err
     rows = [dict(zip(COLUMNS, line.split(), strict=False)) for line in lines[1:]]
     assert [r["node"] for r in rows] == [str(node) for node in NODES]
-    assert all((r["emulated"], r["state"], r["faults"]) == ("yes", "fault", "watchdog") for r in rows)
+    assert all(
+        (r["emulated"], r["state"], r["faults"]) == ("yes", "fault", "watchdog") for r in rows
+    )
     assert len({r["serial"] for r in rows}) == JOINTS
-    print(f"| `snakesim drive scan can {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |")
+    print(
+        f"| `snakesim drive scan can {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |"
+    )

@@ -25,8 +25,18 @@ def test_triplet_over_socketcan_equals_virtual_bus_to_the_bit(tmp_path: Path, ch
     took_s: dict[str, float] = {}
     for name, sets in (("virtual", ()), (channel, over_the_bus)):
         began = time.monotonic()
-        arguments = ["triplet", "--backend", "can", "--duration", ROBOT_TIME_S, "--endpoint", find_free_endpoint()]
-        arguments += [argument for value in ("stall_limit_s=300", *sets) for argument in ("--set", value)]
+        arguments = [
+            "triplet",
+            "--backend",
+            "can",
+            "--duration",
+            ROBOT_TIME_S,
+            "--endpoint",
+            find_free_endpoint(),
+        ]
+        arguments += [
+            argument for value in ("stall_limit_s=300", *sets) for argument in ("--set", value)
+        ]
         ended = snakesim("run", *arguments, "--out", name, cwd=tmp_path, limit_s=LIMIT_S)
         took_s[name] = time.monotonic() - began
         assert ended.code == 0, ended.out + ended.err
@@ -36,7 +46,9 @@ def test_triplet_over_socketcan_equals_virtual_bus_to_the_bit(tmp_path: Path, ch
     assert real.host.armed_ticks == virtual.host.armed_ticks == round(float(ROBOT_TIME_S) * 100)
     for what in ("angle_rad", "mode", "target", "position_w_m"):
         assert np.array_equal(getattr(real, what), getattr(virtual, what)), what
-    assert np.isfinite(real.position_w_m).all(), "the base too: it comes by UDP, as from motion capture"
+    assert np.isfinite(real.position_w_m).all(), (
+        "the base too: it comes by UDP, as from motion capture"
+    )
     moved_rad = float(np.abs(real.angle_rad[-1] - real.angle_rad[0]).max())
     assert moved_rad > 0.01, "and it moved"
     print(

@@ -52,7 +52,9 @@ def test_frames_go_both_ways_and_foreign_ones_are_left_out(channel: str, other: 
     wire.close()
 
 
-def test_adapter_receives_only_requested_frames_and_leaves_nothing(channel: str, other: can.BusABC) -> None:
+def test_adapter_receives_only_requested_frames_and_leaves_nothing(
+    channel: str, other: can.BusABC
+) -> None:
     wire = open_wire(channel, [Opcode.SYNC])
     sync = CanFrame(frame_id(Opcode.SYNC, 0), bytes(6))
     for frame in (STATE, sync, STATE, sync):
@@ -82,7 +84,9 @@ def test_an_adapter_that_is_not_there_is_named() -> None:
 # Left out: those that are there without an adapter, and one that would connect to a network.
 @pytest.mark.parametrize("interface", sorted(can.VALID_INTERFACES - {"virtual", "udp_multicast"}))
 @pytest.mark.parametrize("data_bit_rate", [None, 5_000_000])
-def test_adapter_with_missing_library_or_device_explains_what_to_do(interface: str, data_bit_rate: int | None) -> None:
+def test_adapter_with_missing_library_or_device_explains_what_to_do(
+    interface: str, data_bit_rate: int | None
+) -> None:
     """Each of python-can's interfaces fails in its own way, one of them by a NameError."""
     with pytest.raises(SnakesimError) as raised:
         open_bus(f"{interface}:/dev/none", 1_000_000, data_bit_rate)
@@ -108,8 +112,12 @@ def test_modules_are_emulated_where_no_real_ones_can_be() -> None:
 
 def test_half_the_bit_rate_takes_twice_as_long() -> None:
     slow = ReportSchedule(100.0, bit_rate=500_000)
-    assert compute_bus_load(5, slow) == pytest.approx(2 * compute_bus_load(5, ReportSchedule(100.0)))
-    assert busiest_period_s(5, slow) == pytest.approx(2 * busiest_period_s(5, ReportSchedule(100.0)))
+    assert compute_bus_load(5, slow) == pytest.approx(
+        2 * compute_bus_load(5, ReportSchedule(100.0))
+    )
+    assert busiest_period_s(5, slow) == pytest.approx(
+        2 * busiest_period_s(5, ReportSchedule(100.0))
+    )
     bus, slow_bus = BusTime(), BusTime(500_000)
     for one in (bus, slow_bus):
         one.enqueue(1, STATE, 0.0)

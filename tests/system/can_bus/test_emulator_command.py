@@ -13,7 +13,12 @@ from snakesim_can_backend.emulator import command as program
 from snakesim_can_backend.emulator.command import main
 from snakesim_can_backend.emulator.faults import FAULT_DESCRIPTIONS
 from snakesim_can_backend.protocol.commands import make_command
-from snakesim_can_backend.protocol.definitions import CommandAction, Opcode, parse_node, parse_opcode
+from snakesim_can_backend.protocol.definitions import (
+    CommandAction,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
 from snakesim_hal.programs.commands import Command
 
 
@@ -24,14 +29,21 @@ def test_emulator_command_answers_for_every_module_and_reports_traffic(monkeypat
     with can.Bus(interface="virtual", channel=channel) as bus:
         asking = bus.send_periodic(to_python_can(make_command(CommandAction.IDENTIFY)), 0.1)
         where = ("--channel", f"virtual:{channel}", "--physics-model", "inertia", "--pose", "none")
-        assert main(["triplet", *where, "--duration", "2", "--stats", "--fault", "leak:joint_3@0"]) == 0
+        assert (
+            main(["triplet", *where, "--duration", "2", "--stats", "--fault", "leak:joint_3@0"])
+            == 0
+        )
         asking.stop()
         heard = defaultdict(set)
         while (message := bus.recv(0)) is not None:
-            heard[parse_opcode(message.arbitration_id), parse_node(message.arbitration_id)].add(bytes(message.data[:4]))
+            heard[parse_opcode(message.arbitration_id), parse_node(message.arbitration_id)].add(
+                bytes(message.data[:4])
+            )
     nodes = range(1, 14)
     assert all(heard[Opcode.HEARTBEAT, node] for node in nodes)
-    assert len(set.union(*(heard[Opcode.IDENTITY, node] for node in nodes))) == 13, "each has a serial of its own"
+    assert len(set.union(*(heard[Opcode.IDENTITY, node] for node in nodes))) == 13, (
+        "each has a serial of its own"
+    )
     said = capsys.readouterr().out
     assert said.startswith(f"modules ready: 13 on virtual:{channel}\n")
     for words in (
@@ -61,5 +73,7 @@ def test_wrong_input_is_told_and_nothing_starts(arguments, message, capsys):
 
 
 def test_help_explains_every_fault():
-    (command,) = (one for one in COMMANDS if isinstance(one, Command) and one.name == "drive emulate can")
+    (command,) = (
+        one for one in COMMANDS if isinstance(one, Command) and one.name == "drive emulate can"
+    )
     assert all(kind in command.details for kind in FAULT_DESCRIPTIONS)

@@ -49,7 +49,9 @@ def database(expanded: Path) -> Database:
 @pytest.mark.slow
 def test_every_message_of_every_node_is_there_and_no_other(database: Database) -> None:
     expected = {
-        opcode << NODE_BITS | node: layout.name if node == BROADCAST else f"{layout.name}_{node:02d}"
+        opcode << NODE_BITS | node: layout.name
+        if node == BROADCAST
+        else f"{layout.name}_{node:02d}"
         for opcode, layout in load_layouts().items()
         for node in list_nodes(opcode)
     }
@@ -69,7 +71,14 @@ def layout_of(message: Message) -> dict[str, tuple[object, ...]]:
     """Everything that a decoder needs of each signal."""
     return {
         s.name: (
-            *(s.start, s.length, s.is_signed, s.conversion.scale, s.conversion.offset, s.conversion.is_float),
+            *(
+                s.start,
+                s.length,
+                s.is_signed,
+                s.conversion.scale,
+                s.conversion.offset,
+                s.conversion.is_float,
+            ),
             *(s.unit, s.minimum, s.maximum, s.choices, s.multiplexer_ids),
         )
         for s in message.signals
@@ -79,17 +88,28 @@ def layout_of(message: Message) -> dict[str, tuple[object, ...]]:
 def sent() -> list[tuple[CanFrame, str]]:
     """Frames of every kind, and what stock cantools is to say of them."""
     layouts = load_layouts()
-    setpoint = layouts[Opcode.SET_POINT].encode(5, mode=JointMode.POSITION, count=3, position=-0.5, torque_limit=7.0)
+    setpoint = layouts[Opcode.SET_POINT].encode(
+        5, mode=JointMode.POSITION, count=3, position=-0.5, torque_limit=7.0
+    )
     state = layouts[Opcode.JOINT_STATE].encode(
         62, angle=1.0, velocity=-2.0, torque=0.5, count=3, state=ModuleState.ARMED, derated=1
     )
     return [
         (commands.make_emergency(), "Emergency(reason: host)"),
-        (commands.make_command(CommandAction.ARM), "Command(action: arm, key: 23214, checksum: 50)"),
+        (
+            commands.make_command(CommandAction.ARM),
+            "Command(action: arm, key: 23214, checksum: 50)",
+        ),
         (commands.make_command(CommandAction.STOP, 7), "Command_07(action: stop"),
         (commands.make_sync(200, 12345678), "Sync(count: 200, time: 12345678 us)"),
-        (setpoint, "SetPoint_05(mode: position, count: 3, position: -0.5 rad, torque_limit: 7.0 N.m"),
-        (state, "JointState_62(angle: 1.0 rad, velocity: -2.0 rad/s, torque: 0.5 N.m, count: 3, state: armed"),
+        (
+            setpoint,
+            "SetPoint_05(mode: position, count: 3, position: -0.5 rad, torque_limit: 7.0 N.m",
+        ),
+        (
+            state,
+            "JointState_62(angle: 1.0 rad, velocity: -2.0 rad/s, torque: 0.5 N.m, count: 3, state: armed",
+        ),
     ]
 
 

@@ -17,7 +17,13 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.fault_kinds import parse_injection
-from snakesim_testing.can.driver_loop import DriverLoop, armed, cleared_and_armed_again, config, loop
+from snakesim_testing.can.driver_loop import (
+    DriverLoop,
+    armed,
+    cleared_and_armed_again,
+    config,
+    loop,
+)
 from snakesim_testing.messages import raises_error
 
 
@@ -50,7 +56,9 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
         (CanSettings(channels=["vcan0"], emulators="process"), "full:bus_1@1"),
     ],
 )
-def test_what_cannot_be_had_is_refused_before_anything_is_opened(settings: CanSettings, text: str) -> None:
+def test_what_cannot_be_had_is_refused_before_anything_is_opened(
+    settings: CanSettings, text: str
+) -> None:
     with raises_error(ConfigError, code=("injection/not-supported", "injection/unknown-target")):
         CanBackend.check(config(faults=[text]), settings)
 
@@ -75,7 +83,9 @@ BUS_FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "after", "what", "then", "counted"), BUS_FAULTS, ids=[row[0] for row in BUS_FAULTS])
+@pytest.mark.parametrize(
+    ("kind", "after", "what", "then", "counted"), BUS_FAULTS, ids=[row[0] for row in BUS_FAULTS]
+)
 def test_a_bus_that_fails_stops_the_joints_and_comes_back(
     kind: str, after: int, what: list[str], then: list[str], counted: set[str]
 ) -> None:

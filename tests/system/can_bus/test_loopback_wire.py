@@ -27,7 +27,9 @@ def channel(tmp_path: Path) -> str:
 
 
 def test_frames_reach_every_other_end_in_order(tmp_path: Path):
-    first, second, third = (open_wire(channel(tmp_path), None, 1_000_000, 5_000_000) for _ in range(3))
+    first, second, third = (
+        open_wire(channel(tmp_path), None, 1_000_000, 5_000_000) for _ in range(3)
+    )
     frames = [CanFrame(0x8001, bytes(range(64))), CanFrame(0x101, b"")]
     for frame in frames:
         assert first.send(frame)

@@ -15,7 +15,11 @@ from snakesim_testing.messages import raises_error
 
 MS = 1_000_000
 TOLD: dict[str, Any] = {"velocity_w": [0.0, 0.0, 0.0], "angular_velocity_w": [0.1, 0.2, 0.3]}
-BARE: dict[str, Any] = {"timestamp_ns": 0, "position_w": [1.0, 2.0, 0.5], "orientation_wxyz": [1.0, 0.0, 0.0, 0.0]}
+BARE: dict[str, Any] = {
+    "timestamp_ns": 0,
+    "position_w": [1.0, 2.0, 0.5],
+    "orientation_wxyz": [1.0, 0.0, 0.0, 0.0],
+}
 GOOD = {**BARE, **TOLD}
 
 
@@ -33,7 +37,11 @@ class Mocap(MocapReceiver):
 
     def at(self, late_ms: float = 0.0, **more: Any) -> dict[str, Any]:
         """A datagram that was captured at the next tick, by a clock that is 5 s ahead."""
-        return {**GOOD, "timestamp_ns": self.now_ns + 10 * MS + 5000 * MS - round(late_ms * MS), **more}
+        return {
+            **GOOD,
+            "timestamp_ns": self.now_ns + 10 * MS + 5000 * MS - round(late_ms * MS),
+            **more,
+        }
 
 
 @contextmanager
@@ -116,7 +124,8 @@ def test_mocap_velocity_uses_capture_times_not_arrival_times(late_ms: float) -> 
 def test_a_turn_gives_the_angular_velocity() -> None:
     with receiver() as mocap:
         read(mocap, bare(mocap, 0.0))
-        turned = {**bare(mocap, 0.0), "orientation_wxyz": [0.99998750, 0.0, 0.0, 0.00499998]}  # 0.01 rad about z
+        # 0.01 rad about z.
+        turned = {**bare(mocap, 0.0), "orientation_wxyz": [0.99998750, 0.0, 0.0, 0.00499998]}
         pose = read(mocap, turned)
         assert pose is not None
         assert pose.angular_velocity_w == pytest.approx((0.0, 0.0, 1.0), abs=1e-4)
@@ -132,7 +141,9 @@ def test_mocap_velocity_after_gap_is_known_with_second_pose() -> None:
             jumped = {**bare(mocap, 0.1), "timestamp_ns": mocap.now_ns + 10 * MS + 6000 * MS}
             assert read(mocap, jumped) is None
         assert mocap.rejected_count_by_reason == {"future": 4}
-        pose = read(mocap, {**bare(mocap, 0.105), "timestamp_ns": mocap.now_ns + 10 * MS + 6000 * MS})
+        pose = read(
+            mocap, {**bare(mocap, 0.105), "timestamp_ns": mocap.now_ns + 10 * MS + 6000 * MS}
+        )
         assert pose is not None
         assert pose.velocity_w == pytest.approx((0.5, 0.0, 0.0))
         assert pose.timestamp_ns == mocap.now_ns

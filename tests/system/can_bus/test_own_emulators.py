@@ -41,7 +41,12 @@ VCAN = ["vcan0"]
 def test_twins_that_cannot_be_are_refused(settings: CanSettings) -> None:
     with raises_error(
         ConfigError,
-        code=("bus/not-virtual", "injection/not-supported", "injection/unknown-fault", "injection/unknown-target"),
+        code=(
+            "bus/not-virtual",
+            "injection/not-supported",
+            "injection/unknown-fault",
+            "injection/unknown-target",
+        ),
     ):
         validate_emulator_settings(RUN, settings)
 
@@ -62,7 +67,8 @@ class Child:
             f"#!{sys.executable}\n"
             "import json, os, pathlib, signal, sys, time\n"
             "config = json.loads(pathlib.Path(sys.argv[4]).read_text())\n"
-            f"pathlib.Path({str(self._noted)!r}).write_text(json.dumps({noting}))\n" + "\n".join(lines)
+            f"pathlib.Path({str(self._noted)!r}).write_text(json.dumps({noting}))\n"
+            + "\n".join(lines)
         )
         self._program.chmod(0o755)
         self._patch.setattr(sys, "executable", str(self._program))
@@ -87,18 +93,26 @@ READY, SERVE = "print('modules ready: 4 on vcan0', flush=True)", "time.sleep(60)
 ON_VCAN = CanSettings(channels=VCAN, emulators="process", physics_model="inertia")
 
 
-def test_a_child_is_told_everything_and_ends_when_asked(child: Child, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_child_is_told_everything_and_ends_when_asked(
+    child: Child, capsys: pytest.CaptureFixture[str]
+) -> None:
     end = "signal.signal(signal.SIGTERM, lambda *_: (print('last words', flush=True), sys.exit(0)))"
     child.does(end, "print('a warning')", READY, SERVE)
     settings = CanSettings(
-        channels=["vcan0", "vcan1"], emulators="process", physics_model="inertia", faults=["mute:joint_1@2"]
+        channels=["vcan0", "vcan1"],
+        emulators="process",
+        physics_model="inertia",
+        faults=["mute:joint_1@2"],
     )
     emulators = EmulatorProcess(RUN, settings, "127.0.0.1:5000", stepped=True)
     noted = child.noted()
     arguments = noted["arguments"]
     assert arguments[:3] == ["-P", "-m", "snakesim_can_backend.emulator.command"]
     assert "--stepped" in arguments
-    assert [arguments[i + 1] for i, word in enumerate(arguments) if word == "--channel"] == ["vcan0", "vcan1"]
+    assert [arguments[i + 1] for i, word in enumerate(arguments) if word == "--channel"] == [
+        "vcan0",
+        "vcan1",
+    ]
     assert arguments[arguments.index("--pose") + 1] == "127.0.0.1:5000"
     assert arguments[arguments.index("--parent") + 1] == str(os.getpid())
     assert noted["session"] == noted["pid"], "Ctrl-C is not for it"
@@ -136,7 +150,10 @@ def test_emulator_process_that_never_becomes_ready_is_reported_and_removed(
 def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixture[str]) -> None:
     with raises_error(BackendError, code="emulator/not-started"):
         EmulatorProcess(
-            RUN, CanSettings(channels=["vcan77"], emulators="process", physics_model="inertia"), None, stepped=False
+            RUN,
+            CanSettings(channels=["vcan77"], emulators="process", physics_model="inertia"),
+            None,
+            stepped=False,
         )
     assert "vcan77" in capsys.readouterr().err
 
@@ -153,7 +170,9 @@ def test_emulator_process_exit_is_noticed_without_its_log(child: Child) -> None:
 
 def test_emulator_process_error_is_reported_as_in_a_terminal(child: Child, tmp_path: Path) -> None:
     heard = tmp_path / "heard"
-    child.does(READY, "for line in sys.stdin:", f"    pathlib.Path({str(heard)!r}).open('a').write(line)")
+    child.does(
+        READY, "for line in sys.stdin:", f"    pathlib.Path({str(heard)!r}).open('a').write(line)"
+    )
     emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
     arguments = child.noted()["arguments"]
     assert "--interactive" in arguments
@@ -161,7 +180,9 @@ def test_emulator_process_error_is_reported_as_in_a_terminal(child: Child, tmp_p
     assert arguments[arguments.index("--pose") + 1] == "none"
     emulators.inject(FaultInjection("mute", "joint_3", 1.0, 2.0), begins=True)
     emulators.inject(FaultInjection("mute", "joint_3", 1.0, 2.0), begins=False)
-    wait_until(lambda: heard.exists() and heard.read_text().endswith("off\n"), "the end told to the child")
+    wait_until(
+        lambda: heard.exists() and heard.read_text().endswith("off\n"), "the end told to the child"
+    )
     assert heard.read_text() == "mute joint_3\nmute joint_3 off\n"
     emulators.stop()
     with raises_error(BackendError, code="injection/not-supported", field="joint_1"):
@@ -169,7 +190,9 @@ def test_emulator_process_error_is_reported_as_in_a_terminal(child: Child, tmp_p
             emulators.inject(FaultInjection("leak", "joint_1"), begins=True)
 
 
-def test_emulator_process_that_cannot_start_is_a_backend_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_emulator_process_that_cannot_start_is_a_backend_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sys, "executable", str(tmp_path / "no python"))
     with raises_error(BackendError, code="emulator/not-started"):
         EmulatorProcess(RUN, ON_VCAN, None, stepped=True)

@@ -60,7 +60,9 @@ def took_s(began: float) -> float:
     return time.monotonic() - began
 
 
-def test_virtual_bus_ends_receive_each_other_and_not_themselves(pair: tuple[VirtualWire, VirtualWire]) -> None:
+def test_virtual_bus_ends_receive_each_other_and_not_themselves(
+    pair: tuple[VirtualWire, VirtualWire],
+) -> None:
     near, far = pair
     frames = [CanFrame(0x105, b"\x01\x02"), CanFrame(0x7FF, b""), CanFrame(0, bytes(8))]
     assert all(near.send(frame) for frame in frames)

@@ -13,7 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_can_backend.bus import bus as wire_module
-from snakesim_can_backend.bus.bus import MAX_AT_ONCE, SocketCanWire, drain_socket, is_up, validate_interface
+from snakesim_can_backend.bus.bus import (
+    MAX_AT_ONCE,
+    SocketCanWire,
+    drain_socket,
+    is_up,
+    validate_interface,
+)
 from snakesim_can_backend.bus.bus_errors import BusError, Kind, decode_error_frame
 from snakesim_can_backend.protocol.definitions import FROM_HOST, CanFrame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError
@@ -48,7 +54,11 @@ def can_frame(identifier: int, data: bytes) -> bytes:
         (CAN_ERR_CRTL, RX_OVERFLOW, ["receive_overflow"]),
         (CAN_ERR_CRTL, TX_OVERFLOW, ["error_frames"]),
         (CAN_ERR_CRTL, ACTIVE, ["error_frames"]),
-        (CAN_ERR_CRTL | CAN_ERR_BUSOFF, TX_PASSIVE | RX_OVERFLOW, ["bus_off", "error_passive", "receive_overflow"]),
+        (
+            CAN_ERR_CRTL | CAN_ERR_BUSOFF,
+            TX_PASSIVE | RX_OVERFLOW,
+            ["bus_off", "error_passive", "receive_overflow"],
+        ),
         (CAN_ERR_PROT, RX_PASSIVE, ["error_frames"]),  # without the class, the byte means nothing
         (CAN_ERR_TX_TIMEOUT, 0, ["error_frames"]),
         (CAN_ERR_LOSTARB, 0, ["error_frames"]),
@@ -101,7 +111,9 @@ class CanLike(socket.socket):
 class Rig:
     """A SocketCanWire whose kernel is the other end of a pair of sockets."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, only: frozenset[Opcode] | None = None) -> None:
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, only: frozenset[Opcode] | None = None
+    ) -> None:
         near, self.kernel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.kernel.settimeout(2.0)
         self.socket = CanLike(fileno=near.detach())
@@ -140,7 +152,9 @@ def test_drain_takes_everything_in_its_order(frames: list[tuple[int, bytes]]) ->
         for identifier, data in frames:
             far.send(can_frame(identifier, data))
         far.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8))))
-        drain_socket(near, bytearray(16), taken, lambda identifier, data: errors.append((identifier, data)))
+        drain_socket(
+            near, bytearray(16), taken, lambda identifier, data: errors.append((identifier, data))
+        )
         assert taken == [CanFrame(*frame) for frame in frames]
         assert all(type(frame) is CanFrame for frame in taken)
         assert errors == [(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8)))]
@@ -198,7 +212,9 @@ def test_the_kernels_ways_to_say_full(rig: Rig, number: int) -> None:
     assert rig.wire.errors() == [BusError("queue_full", "can7", "the transmit queue is full")]
 
 
-@pytest.mark.parametrize(("number", "word"), [(errno.ENETDOWN, "down"), (errno.ENODEV, "gone"), (errno.ENXIO, "gone")])
+@pytest.mark.parametrize(
+    ("number", "word"), [(errno.ENETDOWN, "down"), (errno.ENODEV, "gone"), (errno.ENXIO, "gone")]
+)
 def test_wire_lost_interface_is_reported_once_per_loss(rig: Rig, number: int, word: str) -> None:
     rig.socket.fails, rig.up = OSError(number, ""), False
     for _ in range(3):
@@ -243,7 +259,9 @@ def test_anything_else_ends_the_run(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("only", [None, FROM_HOST])
-def test_the_kernel_filters(monkeypatch: pytest.MonkeyPatch, only: frozenset[Opcode] | None) -> None:
+def test_the_kernel_filters(
+    monkeypatch: pytest.MonkeyPatch, only: frozenset[Opcode] | None
+) -> None:
     rig = Rig(monkeypatch, only)
     pairs = list(struct.iter_unpack("=II", rig.socket.filters))
     rig.wire.close()
@@ -254,11 +272,15 @@ def test_the_kernel_filters(monkeypatch: pytest.MonkeyPatch, only: frozenset[Opc
 
     for identifier in range(0x800):
         assert passes(identifier) is (only is None or identifier >> 6 in only)
-        assert not passes(0x80000000 | identifier) and not passes(0x40000000 | identifier), "extended, remote"
+        assert not passes(0x80000000 | identifier) and not passes(0x40000000 | identifier), (
+            "extended, remote"
+        )
     assert rig.socket.fileno() == -1, "closed"
 
 
-def test_dropped_frames_are_told_with_their_number(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dropped_frames_are_told_with_their_number(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drops = iter([3, 3, 10])
 
     def meminfo(_level: int, option: int, length: int) -> bytes:
@@ -268,7 +290,11 @@ def test_dropped_frames_are_told_with_their_number(rig: Rig, monkeypatch: pytest
 
     monkeypatch.setattr(rig.socket, "getsockopt", meminfo)
     reported = [rig.wire.errors() for _ in range(3)]
-    assert [[t.kind for t in found] for found in reported] == [["receive_overflow"], [], ["receive_overflow"]]
+    assert [[t.kind for t in found] for found in reported] == [
+        ["receive_overflow"],
+        [],
+        ["receive_overflow"],
+    ]
     assert "dropped 3 frames" in reported[0][0].detail
     assert "dropped 7 frames" in reported[2][0].detail
 
@@ -290,7 +316,9 @@ def test_an_interface_must_be_there_and_up(monkeypatch: pytest.MonkeyPatch) -> N
     validate_interface("lo")
 
 
-def test_wire_absent_or_removed_interface_is_not_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wire_absent_or_removed_interface_is_not_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert not is_up("nocan7")
     (tmp_path / "flags").write_text("")
     monkeypatch.setattr(wire_module, "Path", lambda *parts: tmp_path / parts[-1])

@@ -28,17 +28,25 @@ from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
 pytestmark = pytest.mark.e2e
 
-CLIENT, STEER, STOP = (REPOSITORY / "examples" / name for name in ("client.py", "steer.py", "stop.py"))
+CLIENT, STEER, STOP = (
+    REPOSITORY / "examples" / name for name in ("client.py", "steer.py", "stop.py")
+)
 DEPTH = 8192
 LATENCY_TICKS = 2  # of control in this scenario: so many commands may be on their way
 ROBOT = ("triplet", "--set", "rate_hz=50", "--duration", "600", "--stay", "--clock-mode")
 EXTERNAL = ("--set", "services.control.external=true")
 
 
-@pytest.fixture(scope="module", params=["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)])
-def waiting(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
+@pytest.fixture(
+    scope="module", params=["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)]
+)
+def waiting(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[RunningCommand]:
     """A robot that waits for its controller."""
-    with running_snakesim(tmp_path_factory.mktemp("robot") / "run", *ROBOT, request.param, *EXTERNAL) as started:
+    with running_snakesim(
+        tmp_path_factory.mktemp("robot") / "run", *ROBOT, request.param, *EXTERNAL
+    ) as started:
         started.wait_for("a client that takes the lease")
         yield started
 
@@ -46,17 +54,22 @@ def waiting(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
     """A robot with a controller of its own."""
-    with running_armed_snakesim(tmp_path_factory.mktemp("driven") / "run", *ROBOT, "realtime") as started:
+    with running_armed_snakesim(
+        tmp_path_factory.mktemp("driven") / "run", *ROBOT, "realtime"
+    ) as started:
         yield started
 
 
 @pytest.mark.parametrize(
-    ("client", "known"), [(CLIENT, {"msgpack", "zenoh"}), (STEER, {"msgpack", "zenoh"}), (STOP, set[str]())]
+    ("client", "known"),
+    [(CLIENT, {"msgpack", "zenoh"}), (STEER, {"msgpack", "zenoh"}), (STOP, set[str]())],
 )
 def test_a_client_needs_nothing_of_ours(client: Path, known: set[str]) -> None:
     tree = ast.parse(client.read_text(encoding="utf-8"))
     assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    imported = {
+        name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names
+    }
     assert imported - sys.stdlib_module_names == known
 
 
@@ -80,12 +93,20 @@ def urgently() -> None:
 def test_a_client_leases_arms_moves_and_disarms(waiting: RunningCommand) -> None:
     """First of those who wait with the robot: what it has counted is of this client."""
     with open_session(ConnectionSettings(waiting.endpoint, "planar13")) as session:
-        wait_until(lambda: status(session).waiting_for == ["control"], "a run that waits for control alone")
+        wait_until(
+            lambda: status(session).waiting_for == ["control"], "a run that waits for control alone"
+        )
         joints = session.declare_reader(keys.JOINTS, JointState, depth=DEPTH)
-        ended = run_to_end([sys.executable, CLIENT, waiting.endpoint, "planar13"], waiting.home, child_setup=urgently)
+        ended = run_to_end(
+            [sys.executable, CLIENT, waiting.endpoint, "planar13"],
+            waiting.home,
+            child_setup=urgently,
+        )
         assert ended.code == 0, ended.out + ended.err
         angles = [state.angle_rad for state in joints.drain()]
-        furthest = [max(abs(angle - joint[0]) for angle in joint) for joint in zip(*angles, strict=True)]
+        furthest = [
+            max(abs(angle - joint[0]) for angle in joint) for joint in zip(*angles, strict=True)
+        ]
         assert 0.09 < furthest[2] < 0.11, furthest
         assert max(furthest[:2] + furthest[3:]) < 0.03, furthest
         now = status(session)
@@ -100,7 +121,9 @@ def test_a_client_leases_arms_moves_and_disarms(waiting: RunningCommand) -> None
 def test_a_stop_by_udp_stops_the_robot(waiting: RunningCommand) -> None:
     host, _, port = waiting.endpoint.removeprefix("tcp/").partition(":")
     ended = run_to_end([sys.executable, STOP, host, port], waiting.home)
-    assert ended.code == 0 and ended.out.startswith("planar13\n") and "anna" in ended.out, ended.out + ended.err
+    assert ended.code == 0 and ended.out.startswith("planar13\n") and "anna" in ended.out, (
+        ended.out + ended.err
+    )
     with open_session(ConnectionSettings(waiting.endpoint, "planar13")) as session:
         assert status(session).lifecycle == "estop"
     settled(waiting)
@@ -116,18 +139,27 @@ def script(text: str, run: RunningCommand, folder: Path) -> CompletedRun:
 
 def settled(run: RunningCommand) -> None:
     with snakesim.Robot.connect(run.endpoint) as robot:
-        wait_until(lambda: "control" in robot.status.waiting_for, "a run that waits for its controller")
+        wait_until(
+            lambda: "control" in robot.status.waiting_for, "a run that waits for its controller"
+        )
         if robot.status.lifecycle != "disarmed":
             robot.reset_fault()
 
 
-def test_the_script_of_the_documents_turns_a_joint_and_records(waiting: RunningCommand, tmp_path: Path) -> None:
-    nod = next(s for s in parse_sections(REPOSITORY / "docs" / "how-to" / "python.md") if "nod.py" in s.files).files[
-        "nod.py"
-    ]
+def test_the_script_of_the_documents_turns_a_joint_and_records(
+    waiting: RunningCommand, tmp_path: Path
+) -> None:
+    nod = next(
+        s
+        for s in parse_sections(REPOSITORY / "docs" / "how-to" / "python.md")
+        if "nod.py" in s.files
+    ).files["nod.py"]
     ended = script(nod, waiting, tmp_path)
     assert ended.code == 0, ended.err
-    assert "planar13, sim: disarmed\njoint_3 turned by +0.0" in ended.out or "turned by +0.1" in ended.out
+    assert (
+        "planar13, sim: disarmed\njoint_3 turned by +0.0" in ended.out
+        or "turned by +0.1" in ended.out
+    )
     assert ended.out.endswith("the robot is disarmed\n")
     with snakesim.Robot.connect(waiting.endpoint) as robot:
         assert robot.status.lifecycle == "disarmed"
@@ -178,7 +210,9 @@ def test_what_is_no_command_is_refused_before_it_is_sent(waiting: RunningCommand
 
 
 @pytest.mark.quiet
-def test_a_robot_with_a_controller_is_watched_tuned_and_recorded(driven: RunningCommand, tmp_path: Path) -> None:
+def test_a_robot_with_a_controller_is_watched_tuned_and_recorded(
+    driven: RunningCommand, tmp_path: Path
+) -> None:
     with snakesim.Robot.connect(driven.endpoint, name="planar13") as robot:
         before = robot.wait()
         assert robot.wait() > before

@@ -19,7 +19,12 @@ from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
-    for name, more in (("a", []), ("again", []), ("slow", ["--set", "rate_hz=50"]), ("hold", ["--controller", "hold"])):
+    for name, more in (
+        ("a", []),
+        ("again", []),
+        ("slow", ["--set", "rate_hz=50"]),
+        ("hold", ["--controller", "hold"]),
+    ):
         ended, _ = run_to_summary(folder / name, "triplet", "--duration", "1.5", *more)
         assert ended.code == 0, ended.out + ended.err
     return folder
@@ -35,14 +40,21 @@ def test_a_repeated_run_is_the_same(runs: Path) -> None:
 
 
 def test_runs_that_differ_are_told_apart(runs: Path, tmp_path: Path) -> None:
-    ended = snakesim("study", "compare", "a", "slow", "--out", str(tmp_path / "new" / "page.html"), cwd=runs)
+    ended = snakesim(
+        "study", "compare", "a", "slow", "--out", str(tmp_path / "new" / "page.html"), cwd=runs
+    )
     assert ended.code == 0, ended.out + ended.err
     assert re.search(r"rate_hz +100.0 -> 50.0", ended.out)
     assert "A is interpolated at the ticks of B" in ended.out
     assert re.search(r"angle +0\.\d+ rad +[+-]0\.\d+ rad +joint_\d+ at", ended.out)
     assert not re.search(r"\bnan\b", ended.out)
     page = (tmp_path / "new" / "page.html").read_text(encoding="utf-8")
-    for title in ("Advance of both runs", "s angle over time", "s torque over time", "Propulsion joints of both"):
+    for title in (
+        "Advance of both runs",
+        "s angle over time",
+        "s torque over time",
+        "Propulsion joints of both",
+    ):
         assert title in page
     ours = page.replace(LIBRARY.read_text(encoding="utf-8"), "")
     assert "src=" not in ours
@@ -52,7 +64,9 @@ def test_runs_that_differ_are_told_apart(runs: Path, tmp_path: Path) -> None:
 
 def test_within_decides_the_exit_code(runs: Path) -> None:
     ended = snakesim("study", "compare", "a", "hold", "--within", "20", cwd=runs)
-    assert ended.code == 1 and re.search(r"not within 20 %: B 1?\d\d\.\d % less", ended.out), ended.out + ended.err
+    assert ended.code == 1 and re.search(r"not within 20 %: B 1?\d\d\.\d % less", ended.out), (
+        ended.out + ended.err
+    )
 
 
 ODD: dict[str, Callable[[Path], object]] = {
@@ -71,7 +85,9 @@ ODD: dict[str, Callable[[Path], object]] = {
 @pytest.mark.parametrize("odd", ODD)
 def test_an_odd_record_is_one_clear_line(runs: Path, tmp_path: Path, odd: str) -> None:
     """Whatever stands in the place of one of its files; the record's own reader is not known here."""
-    every = [path.name for path in (runs / "a").iterdir() if not path.name.endswith((".log", ".html"))]
+    every = [
+        path.name for path in (runs / "a").iterdir() if not path.name.endswith((".log", ".html"))
+    ]
     assert {"config.json", "host.json"} < set(every)
     for name in every:
         folder = tmp_path / name
@@ -79,7 +95,8 @@ def test_an_odd_record_is_one_clear_line(runs: Path, tmp_path: Path, odd: str) -
         (folder / name).unlink()
         ODD[odd](folder / name)
         try:
-            done = compare_runs(folder, folder, tmp_path / "page.html")  # without a file that no comparison needs
+            # Without a file that no comparison needs.
+            done = compare_runs(folder, folder, tmp_path / "page.html")
             assert done == (EXIT_INCOMPLETE if name == RECORDING_FILENAME else 0)
         except ConfigError as error:
             assert len(error.lines) == 1 and len(str(error)) < 1000, error
@@ -90,7 +107,9 @@ def test_pages_are_written_to_files_only(runs: Path, tmp_path: Path) -> None:
     (tmp_path / "link.html").symlink_to(tmp_path / "elsewhere")
     os.mkfifo(tmp_path / "pipe.html")
     for name, words in (("link.html", "is a symbolic link"), ("pipe.html", "is a pipe")):
-        ended = snakesim("study", "compare", str(runs / "a"), str(runs / "a"), "--out", name, cwd=tmp_path)
+        ended = snakesim(
+            "study", "compare", str(runs / "a"), str(runs / "a"), "--out", name, cwd=tmp_path
+        )
         assert ended.code == 2 and words in ended.err and ended.err.count("\n") == 1, ended.err
     assert (tmp_path / "elsewhere").read_text() == "precious"
     for name in ("pipe.html", "/dev/zero", "nowhere"):

@@ -14,7 +14,10 @@ pytestmark = pytest.mark.e2e
 
 # What a shell does when TAB is pressed behind these words; zsh counts them from 1 where bash counts from 0.
 ASKED = 'COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _snakesim; printf "%s\\n" "${COMPREPLY[@]}"'
-ASK = {"bash": f'source "$1"; shift; {ASKED}', "zsh": f'source "$1"; shift; setopt ksharrays; {ASKED}'}
+ASK = {
+    "bash": f'source "$1"; shift; {ASKED}',
+    "zsh": f'source "$1"; shift; setopt ksharrays; {ASKED}',
+}
 TYPED: dict[str, tuple[list[str], set[str]]] = {
     "command": (["ru"], {"run"}),
     "all commands": ([""], {"run", "topic", "fault", "drive", "lab", "completion"}),
@@ -43,7 +46,9 @@ TYPED: dict[str, tuple[list[str], set[str]]] = {
 
 
 @pytest.fixture(scope="module", params=sorted(ASK))
-def script(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+def script(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, Path]:
     shell = request.param
     if shutil.which(shell) is None:
         pytest.skip(f"{shell} is not installed")
@@ -59,7 +64,12 @@ def test_what_can_follow(script: tuple[str, Path], typed: str) -> None:
     shell, path = script
     words, wanted = TYPED[typed]
     plain = ["--norc", "--noprofile"] if shell == "bash" else ["-f"]
-    done = run_to_end([shell, *plain, "-c", ASK[shell], shell, path, "snakesim", *words], path.parent)
+    done = run_to_end(
+        [shell, *plain, "-c", ASK[shell], shell, path, "snakesim", *words], path.parent
+    )
     assert done.code == 0, done.printed
-    found = {word for word in done.out.split() if word.startswith(words[-1])}  # which zsh leaves to its matcher
-    assert done.err == "" and (found >= wanted if typed == "all commands" else found == wanted), done.out
+    # Which zsh leaves to its matcher.
+    found = {word for word in done.out.split() if word.startswith(words[-1])}
+    assert done.err == "" and (found >= wanted if typed == "all commands" else found == wanted), (
+        done.out
+    )

@@ -15,11 +15,17 @@ from snakesim_operator.this_computer.network_findings import check_ports, check_
 from snakesim_testing.harness.endpoint import find_free_endpoint
 
 
-def test_it_checks_everything_and_leaves_this_process_as_it_was(capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_checks_everything_and_leaves_this_process_as_it_was(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     before = os.sched_getscheduler(0)
-    assert main(["doctor", "--json", "--endpoint", find_free_endpoint()]) == 1, "nobody answers there"
+    assert main(["doctor", "--json", "--endpoint", find_free_endpoint()]) == 1, (
+        "nobody answers there"
+    )
     reported = json.loads(capsys.readouterr().out)
-    assert {"Python", "OpenGL", "CAN", "disk", "kernel"} < {finding["what"] for finding in reported["findings"]}
+    assert {"Python", "OpenGL", "CAN", "disk", "kernel"} < {
+        finding["what"] for finding in reported["findings"]
+    }
     assert not reported["ok"]
     assert reported["findings"][-1]["state"] == "fail"
     for finding in reported["findings"]:

@@ -81,8 +81,12 @@ def lives(process: psutil.Process) -> bool:
 
 
 @pytest.mark.slow
-def test_a_part_of_it_pairs_with_the_card_of_another(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
-    ended = evaluate(home, "part", "--rows", "2", "--controller", "hold", "--against", str(undisturbed[1]))
+def test_a_part_of_it_pairs_with_the_card_of_another(
+    home: Path, undisturbed: tuple[CompletedRun, Path]
+) -> None:
+    ended = evaluate(
+        home, "part", "--rows", "2", "--controller", "hold", "--against", str(undisturbed[1])
+    )
     assert ended.code == 0, ended.out + ended.err
     assert sum(line.strip().startswith("cost of transport") for line in ended.out.splitlines()) == 1
     assert "code " in ended.out
@@ -122,14 +126,20 @@ def test_it_can_be_repeated(home: Path, undisturbed: tuple[CompletedRun, Path]) 
 
 
 @pytest.mark.slow
-def test_killed_it_leaves_nobody_behind_and_goes_on(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
+def test_killed_it_leaves_nobody_behind_and_goes_on(
+    home: Path, undisturbed: tuple[CompletedRun, Path]
+) -> None:
     out = home / "killed"
-    with run_in_background(home, "study", "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)) as process:
+    with run_in_background(
+        home, "study", "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)
+    ) as process:
         wait_until(lambda: done(out) >= 2, "two cases done")
         command_itself = psutil.Process(process.pid)
         left = command_itself.children()
         assert len(left) >= 2
-        sockets = [socket for one in (command_itself, *left) for socket in one.net_connections("tcp")]
+        sockets = [
+            socket for one in (command_itself, *left) for socket in one.net_connections("tcp")
+        ]
         assert not [socket for socket in sockets if socket.status == psutil.CONN_LISTEN]
         left[-1].suspend()  # it cannot see that its parent dies
     wait_until(lambda: not any(map(lives, left)), "no process left", 10)
@@ -153,7 +163,10 @@ STOPPED = {
         "cases are done; the same command continues with\n  --resume --out stopped",
     ),
     "optimize": ("keeps all trials", "the same command continues with\n  --storage stopped.db"),
-    "train": ("generation 1:", "stopped/policy.onnx is the best policy until then, .* goes on with --resume"),
+    "train": (
+        "generation 1:",
+        "stopped/policy.onnx is the best policy until then, .* goes on with --resume",
+    ),
 }
 TYPED = {
     "evaluate": ("study", "evaluate", "./quick.toml", "--fields", "400", "--out", "stopped"),
@@ -185,9 +198,12 @@ TYPED = {
 
 
 @pytest.mark.parametrize(
-    "command", ["evaluate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("optimize", "train"))]
+    "command",
+    ["evaluate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("optimize", "train"))],
 )
-def test_evaluate_interrupted_stops_at_once_and_keeps_only_results(command: str, tmp_path: Path) -> None:
+def test_evaluate_interrupted_stops_at_once_and_keeps_only_results(
+    command: str, tmp_path: Path
+) -> None:
     (tmp_path / "quick.toml").write_text(SUITE)
     (tmp_path / "tmp").mkdir()
     begun, kept = STOPPED[command]
@@ -217,26 +233,61 @@ def dask() -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     port = str(find_free_port())
     address = f"tcp://127.0.0.1:{port}"
     scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
-    worker = ("worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
+    worker = (
+        "worker",
+        address,
+        "--nthreads",
+        "1",
+        "--no-nanny",
+        "--no-dashboard",
+        "--host",
+        "127.0.0.1",
+    )
     return address, scheduler, worker
 
 
 @pytest.mark.slow
 def test_training_on_a_cluster_finds_the_same_policy(home: Path) -> None:
     address, scheduler, worker = dask()
-    small = ["--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.5"]
+    small = [
+        "--generations",
+        "2",
+        "--population",
+        "4",
+        "--fields",
+        "1",
+        "--check-fields",
+        "1",
+        "--duration",
+        "0.5",
+    ]
     train = ["policy", "train", "surveyed_clutter", *small]
-    with run_in_background(home, *scheduler, program=DASK), run_in_background(home, *worker, program=DASK):
+    with (
+        run_in_background(home, *scheduler, program=DASK),
+        run_in_background(home, *worker, program=DASK),
+    ):
         there = snakesim(
-            "policy", "train", "surveyed_clutter", *small, "--cluster", address, "--out", "there", cwd=home
+            "policy",
+            "train",
+            "surveyed_clutter",
+            *small,
+            "--cluster",
+            address,
+            "--out",
+            "there",
+            cwd=home,
         )
     here = snakesim(*train, "--workers", "1", "--out", "here", cwd=home)
     assert there.code == here.code == 0, there.out + there.err + here.err
-    assert (home / "there" / "policy.onnx").read_bytes() == (home / "here" / "policy.onnx").read_bytes()
+    assert (home / "there" / "policy.onnx").read_bytes() == (
+        home / "here" / "policy.onnx"
+    ).read_bytes()
 
 
 @pytest.mark.slow
-def test_a_cluster_that_loses_a_worker_gives_the_same_table(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
+def test_a_cluster_that_loses_a_worker_gives_the_same_table(
+    home: Path, undisturbed: tuple[CompletedRun, Path]
+) -> None:
     address, scheduler, worker = dask()
     out = home / "cluster"
     with (
@@ -282,9 +333,13 @@ class Deadly(HoldPose):
 
 
 @pytest.mark.slow
-def test_a_case_that_kills_its_workers_costs_no_other(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
+def test_a_case_that_kills_its_workers_costs_no_other(
+    home: Path, undisturbed: tuple[CompletedRun, Path]
+) -> None:
     (home / "deadly.py").write_text(DEADLY)
-    ended = evaluate(home, "deadly", "--controllers", "path_following,./deadly.py:Deadly", "--fields", "1")
+    ended = evaluate(
+        home, "deadly", "--controllers", "path_following,./deadly.py:Deadly", "--fields", "1"
+    )
     assert ended.code == 1 and "its worker process died" in ended.out, ended.out + ended.err
     rows = [line.split() for line in table_of(ended).splitlines()[1:5]]
     assert [row[3] for row in rows] == ["1/1", "0/1"] * 2
@@ -293,11 +348,29 @@ def test_a_case_that_kills_its_workers_costs_no_other(home: Path, undisturbed: t
 @pytest.mark.slow
 def test_a_sweep_runs_every_value(home: Path) -> None:
     span = "controllers.path_following.look_ahead_m=0.02:0.06:3"
-    given = ["--vary", span, "--set", "duration_s=0.5", "--seeds", "2", "--set", "controller=path_following"]
+    given = [
+        "--vary",
+        span,
+        "--set",
+        "duration_s=0.5",
+        "--seeds",
+        "2",
+        "--set",
+        "controller=path_following",
+    ]
     ended = snakesim("study", "sweep", "peg_row", *given, "--out", "sweep", cwd=home)
     assert ended.code == 0, ended.out + ended.err
-    assert [line.split()[1] for line in table_of(ended).splitlines()[1:4]] == ["0.02", "0.04", "0.06"]
-    page = re.sub(r"<(script|style).*?</\1>", "", (home / "sweep" / "evaluation.html").read_text(), flags=re.DOTALL)
+    assert [line.split()[1] for line in table_of(ended).splitlines()[1:4]] == [
+        "0.02",
+        "0.04",
+        "0.06",
+    ]
+    page = re.sub(
+        r"<(script|style).*?</\1>",
+        "",
+        (home / "sweep" / "evaluation.html").read_text(),
+        flags=re.DOTALL,
+    )
     assert not re.findall("goal|crossed", ended.out + page), "a scenario without a goal"
 
 
@@ -326,7 +399,9 @@ def test_evaluate_search_resumes_and_prints_a_runnable_command(home: Path) -> No
     assert command.pop(0) == "snakesim"
     assert "--until-goal" not in command, "`snakesim run` refuses it for a mission without a goal"
     again, summary = run_to_summary(home / "again", *command[1:])
-    assert again.code == 0 and f"{summary.path_distance_m:.4g}" == said.split(",")[0], again.out + again.err
+    assert again.code == 0 and f"{summary.path_distance_m:.4g}" == said.split(",")[0], (
+        again.out + again.err
+    )
 
 
 @pytest.mark.slow
@@ -342,16 +417,31 @@ def test_evaluate_search_on_a_suite_row_prints_an_evaluation(home: Path) -> None
         "--set",
         "duration_s=0.4",
     ]
-    given += ["--vary", "control.look_ahead_m=0.02:0.1", "--goal", "advance_m", "--trials", "1", "--seeds", "2"]
+    given += [
+        "--vary",
+        "control.look_ahead_m=0.02:0.1",
+        "--goal",
+        "advance_m",
+        "--trials",
+        "1",
+        "--seeds",
+        "2",
+    ]
     found = snakesim(*given, "--storage", "row.db", cwd=home)
     _, said = found.out.split("best advance_m: ")
     command = shlex.split(said.splitlines()[1])
-    assert command.pop(0) == "snakesim" and command[:5] == ["study", "evaluate", "./quick.toml", "--rows", "2"], (
-        found.out
-    )
+    assert command.pop(0) == "snakesim" and command[:5] == [
+        "study",
+        "evaluate",
+        "./quick.toml",
+        "--rows",
+        "2",
+    ], found.out
     ended = snakesim(*command, "--controllers", "path_following", "--out", "best", cwd=home)
     assert ended.code == 0, ended.out + ended.err
     lines = (home / "best" / "cases.jsonl").read_text().splitlines()
     cases = [json.loads(line)["outcome"]["numbers"] for line in lines]
-    assert len(cases) == 2 and {case["ticks"] for case in cases} == {40}, "what is set is set in a row, too"
+    assert len(cases) == 2 and {case["ticks"] for case in cases} == {40}, (
+        "what is set is set in a row, too"
+    )
     assert f"{sum(case['advance_m'] for case in cases) / 2:.4g}" == said.split(",")[0]

@@ -22,7 +22,10 @@ def test_scenarios_and_configurations(capsys: pytest.CaptureFixture[str]) -> Non
     assert reported["scenarios"]["triplet"]
     assert main(["config", "triplet", "--json", "--set", "robot.limits.torque_nm=3"]) == 0
     reported = json.loads(capsys.readouterr().out)
-    assert reported["robot.limits.torque_nm"] == {"value": 3, "origin": "--set robot.limits.torque_nm=3"}
+    assert reported["robot.limits.torque_nm"] == {
+        "value": 3,
+        "origin": "--set robot.limits.torque_nm=3",
+    }
 
 
 def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
@@ -30,10 +33,16 @@ def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixtu
     assert main(["status", "--json", "--endpoint", endpoint]) == 1
     assert json.loads(capsys.readouterr().out) == {"robots": [], "silent": []}
     with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as session:
-        session.declare_latched_publisher(keys.STATUS, RobotStatus).put(make_status(lifecycle="disarmed"))
+        session.declare_latched_publisher(keys.STATUS, RobotStatus).put(
+            make_status(lifecycle="disarmed")
+        )
         assert main(["status", "--json", "--endpoint", endpoint]) == 0
     (robot,) = json.loads(capsys.readouterr().out)["robots"]
-    assert (robot["namespace"], robot["impostor"], robot["status"]["lifecycle"]) == ("worm", False, "disarmed")
+    assert (robot["namespace"], robot["impostor"], robot["status"]["lifecycle"]) == (
+        "worm",
+        False,
+        "disarmed",
+    )
     assert robot["emulated"] is None  # its host has not described it
 
 
@@ -41,9 +50,15 @@ def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixtu
     ("described", "said"),
     [
         ({"emulated": True}, "  EMULATED: nothing real moves (backend lag)"),
-        ({"emulated": True, "hardware": "vcan0"}, "  EMULATED: nothing real moves (backend lag on vcan0)"),
+        (
+            {"emulated": True, "hardware": "vcan0"},
+            "  EMULATED: nothing real moves (backend lag on vcan0)",
+        ),
         ({"emulated": False, "hardware": "can0"}, "  REAL: motors move (backend lag on can0)"),
-        ({"emulated": True, "host": "another"}, "  UNKNOWN whether motors move: the host has not described the robot"),
+        (
+            {"emulated": True, "host": "another"},
+            "  UNKNOWN whether motors move: the host has not described the robot",
+        ),
         (None, "  UNKNOWN whether motors move: the host has not described the robot"),
     ],
 )
@@ -64,7 +79,9 @@ def test_status_and_top_say_whether_something_real_moves(
             assert capsys.readouterr().out.startswith(f"worm: {said.strip()}")
 
 
-def test_json_isolated_joint_is_reported_with_how_to_recover(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_isolated_joint_is_reported_with_how_to_recover(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     endpoint = find_free_endpoint()
     with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as session:
         lost = make_status(lifecycle="disarmed", isolated=["joint_3"], ready_to_arm=True)

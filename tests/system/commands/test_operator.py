@@ -10,7 +10,7 @@ import pytest
 from snakesim_hal.host.latch import ESTOP
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import RunningCommand, running_armed_snakesim
-from snakesim_testing.runs.in_process_command import snakesim, tell
+from snakesim_testing.runs.in_process_command import run_command_for_robot, snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -37,43 +37,54 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
 
 def until_armed(run: RunningCommand) -> None:
     """As a person does it: until the answer is yes."""
-    wait_until(lambda: tell(run, "robot", "arm", "planar13", "sim").code == 0, "armed", 30.0)
+    wait_until(
+        lambda: run_command_for_robot(run, "robot", "arm", "planar13", "sim").code == 0,
+        "armed",
+        30.0,
+    )
 
 
 def test_arming_is_for_what_is_named(run: RunningCommand) -> None:
-    assert tell(run, "robot", "disarm").code == 0
-    for robot, backend, word in (("mamba", "sim", "'planar13', not 'mamba'"), ("planar13", "can", "'sim', not 'can'")):
-        ended = tell(run, "robot", "arm", robot, backend)
+    assert run_command_for_robot(run, "robot", "disarm").code == 0
+    for robot, backend, word in (
+        ("mamba", "sim", "'planar13', not 'mamba'"),
+        ("planar13", "can", "'sim', not 'can'"),
+    ):
+        ended = run_command_for_robot(run, "robot", "arm", robot, backend)
         assert ended.code == 1
         assert word in ended.err
         assert "snakesim robot arm planar13 sim" in ended.err
     until_armed(run)
-    assert "planar13: armed" in tell(run, "status").out
-    again = tell(run, "robot", "arm", "planar13", "sim")
+    assert "planar13: armed" in run_command_for_robot(run, "status").out
+    again = run_command_for_robot(run, "robot", "arm", "planar13", "sim")
     assert again.code == 1
     assert "must be disarmed" in again.err
-    assert tell(run, "robot", "reset").code == 1
+    assert run_command_for_robot(run, "robot", "reset").code == 1
 
 
 def test_a_stop_is_latched_and_outlives_the_host(run: RunningCommand) -> None:
-    until_armed(run) if "planar13: armed" not in tell(run, "status").out else None
-    stopped = tell(run, "estop")
+    until_armed(run) if "planar13: armed" not in run_command_for_robot(run, "status").out else None
+    stopped = run_command_for_robot(run, "estop")
     assert stopped.code == 0
     assert "planar13: stopped" in stopped.out
     kept = run.out.parent / "snakesim" / "robots" / "planar13-sim" / ESTOP
     assert kept.is_file()
     first = run.part("host")
     os.kill(first, signal.SIGKILL)
-    wait_until(lambda: "planar13: estop" in tell(run, "status").out, "a new host in estop", 30.0)
+    wait_until(
+        lambda: "planar13: estop" in run_command_for_robot(run, "status").out,
+        "a new host in estop",
+        30.0,
+    )
     assert run.part("host") != first
-    status = tell(run, "status").out
+    status = run_command_for_robot(run, "status").out
     assert "before this host" in status
     assert "`snakesim robot reset" in status
     assert "then `snakesim robot arm planar13 sim" in status
-    refused = tell(run, "robot", "arm", "planar13", "sim")
+    refused = run_command_for_robot(run, "robot", "arm", "planar13", "sim")
     assert refused.code == 1
     assert "state is estop" in refused.err
-    assert tell(run, "robot", "reset").code == 0
+    assert run_command_for_robot(run, "robot", "reset").code == 0
     assert not kept.exists()
     until_armed(run)
     assert run.printed().count("; restart in") == 1

@@ -53,8 +53,16 @@ def test_one_is_read_and_set_and_read_again(param) -> None:
 @pytest.mark.parametrize(
     ("value", "code", "words"),
     [
-        ("control.propulsion=30", 2, "has no parameter 'control.propulsion'; did you mean `control.propulsion_n`?"),
-        ("control.gap_m=-1", 1, "`controllers.obstacle_triplet.gap_m` = -1 m is not allowed; expected a number >= 0"),
+        (
+            "control.propulsion=30",
+            2,
+            "has no parameter 'control.propulsion'; did you mean `control.propulsion_n`?",
+        ),
+        (
+            "control.gap_m=-1",
+            1,
+            "`controllers.obstacle_triplet.gap_m` = -1 m is not allowed; expected a number >= 0",
+        ),
         ("control.gap_m", 2, "give section.key=value"),
     ],
 )

@@ -25,20 +25,39 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def words(path: Path) -> list[str]:
-    return ["".join(text.itertext()) for text in ElementTree.parse(path).getroot().iter(f"{SVG}text")]
+    return [
+        "".join(text.itertext()) for text in ElementTree.parse(path).getroot().iter(f"{SVG}text")
+    ]
 
 
 @pytest.mark.slow
 def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
     given = ["angle_rad.joint_7,target.joint_7", "torque_nm", "contact_count"]
     out = run / "chosen.svg"
-    ended = snakesim("recording", "plot", str(run), *given, "--out", str(out), "--from", "1", "--to", "2.5", cwd=run)
+    ended = snakesim(
+        "recording",
+        "plot",
+        str(run),
+        *given,
+        "--out",
+        str(out),
+        "--from",
+        "1",
+        "--to",
+        "2.5",
+        cwd=run,
+    )
     assert ended.code == 0, ended.err
     written = words(out)
     assert {"[rad]", "torque_nm [N·m]", "contact_count", "time [s]"} <= set(written)
-    assert {"angle_rad.joint_7", "target.joint_7", "joint_1", "joint_13", "1.0", "2.4"} <= set(written)
+    assert {"angle_rad.joint_7", "target.joint_7", "joint_1", "joint_13", "1.0", "2.4"} <= set(
+        written
+    )
     light = out.read_text()
-    assert snakesim("recording", "plot", str(run), *given, "--out", str(out), "--dark", cwd=run).code == 0
+    assert (
+        snakesim("recording", "plot", str(run), *given, "--out", str(out), "--dark", cwd=run).code
+        == 0
+    )
     white = "fill: #ffffff"  # the ground, or all that is written on it
     assert 0 < light.count(white) < out.read_text().count(white)
 
@@ -47,8 +66,21 @@ def test_signals_have_their_names_and_units_on_the_axes(run: Path) -> None:
 def test_settings_of_another_environment_keep_no_figure_from_being_drawn(run: Path) -> None:
     """A notebook's window library, and TeX without a TeX."""
     (run / "matplotlibrc").write_text("text.usetex: True\n")
-    inherited = {"MPLBACKEND": "module://of_a_notebook", "MATPLOTLIBRC": str(run), "PATH": "/nowhere"}
-    ended = started("recording", "plot", str(run), "angle_rad", "--out", "inherited.svg", cwd=run, extra_env=inherited)
+    inherited = {
+        "MPLBACKEND": "module://of_a_notebook",
+        "MATPLOTLIBRC": str(run),
+        "PATH": "/nowhere",
+    }
+    ended = started(
+        "recording",
+        "plot",
+        str(run),
+        "angle_rad",
+        "--out",
+        "inherited.svg",
+        cwd=run,
+        extra_env=inherited,
+    )
     assert ended.code == 0, ended.err
     assert "joint_13" in words(run / "inherited.svg")
 
@@ -76,12 +108,26 @@ def test_runs_are_overlaid_and_their_mean_has_an_interval(run: Path, tmp_path: P
     overlaid = snakesim("recording", "plot", *runs, *signals, "--out", "overlaid.svg", cwd=tmp_path)
     assert overlaid.code == 0, overlaid.err
     written = words(tmp_path / "overlaid.svg")
-    assert {"run", "other", "longer", "other: velocity_b_m_s.y", "[m/s]", "link_force_n [N]"} <= set(written)
+    assert {
+        "run",
+        "other",
+        "longer",
+        "other: velocity_b_m_s.y",
+        "[m/s]",
+        "link_force_n [N]",
+    } <= set(written)
 
-    meant = snakesim("recording", "plot", *runs, *signals, "--mean", "--out", "mean.svg", cwd=tmp_path)
+    meant = snakesim(
+        "recording", "plot", *runs, *signals, "--mean", "--out", "mean.svg", cwd=tmp_path
+    )
     assert meant.code == 0, meant.err
-    assert "duration_s 3 (mean of 2 runs), with its 95 % interval by Student's t; until 2.99 s" in meant.out
-    assert {"duration_s 3 (mean of 2 runs)", "duration_s 2 (1 run)"} <= set(words(tmp_path / "mean.svg"))
+    assert (
+        "duration_s 3 (mean of 2 runs), with its 95 % interval by Student's t; until 2.99 s"
+        in meant.out
+    )
+    assert {"duration_s 3 (mean of 2 runs)", "duration_s 2 (1 run)"} <= set(
+        words(tmp_path / "mean.svg")
+    )
     assert (tmp_path / "mean.svg").read_text().count("FillBetweenPolyCollection") == 2 + 14
 
 
@@ -91,7 +137,9 @@ def test_no_legend_covers_the_axes(run: Path) -> None:
     from snakesim_operator.features.figures.signal_axes import draw_signals
 
     groups = make_single_run_groups([RunRecord.load(run)])
-    figure = draw_signals(groups, ["angle_rad", "angle_rad.joint_1,target.joint_1"], 3.5, (0.0, 3.0))
+    figure = draw_signals(
+        groups, ["angle_rad", "angle_rad.joint_1,target.joint_1"], 3.5, (0.0, 3.0)
+    )
     figure.draw_without_rendering()
     for axes in figure.axes:
         legend = axes.get_legend()
@@ -102,14 +150,18 @@ def test_no_legend_covers_the_axes(run: Path) -> None:
 
 @pytest.mark.slow
 def test_path_option_draws_head_and_tail_from_above(run: Path) -> None:
-    ended = snakesim("recording", "plot", str(run), "--path", "--out", str(run / "path.svg"), cwd=run)
+    ended = snakesim(
+        "recording", "plot", str(run), "--path", "--out", str(run / "path.svg"), cwd=run
+    )
     assert ended.code == 0, ended.err
     assert {"head", "tail", "x [m]", "y [m]"} <= set(words(run / "path.svg"))
 
 
 @pytest.mark.slow
 def test_the_papers_figures_come_from_one_command(run: Path) -> None:
-    ended = snakesim("recording", "plot", str(run), "--paper", "--out", str(run / "figures"), cwd=run)
+    ended = snakesim(
+        "recording", "plot", str(run), "--paper", "--out", str(run / "figures"), cwd=run
+    )
     assert ended.code == 0, ended.err
     made = sorted(run.glob("figures/*"), key=lambda path: int(path.stem.removeprefix("figure-")))
     assert [path.name for path in made] == [f"figure-{number}.pdf" for number in range(8, 14)]

@@ -66,7 +66,9 @@ class Bench:
         self.network_error: Exception | None = None
         self.searched = 0
         self.stop = PreparedStop(
-            RobotSelection("tcp/127.0.0.1:9", "worm"), ConnectionSettings("tcp/127.0.0.1:9", "worm"), self._note
+            RobotSelection("tcp/127.0.0.1:9", "worm"),
+            ConnectionSettings("tcp/127.0.0.1:9", "worm"),
+            self._note,
         )
 
     def _take(self, who: str, reply: Reply) -> None:
@@ -74,7 +76,9 @@ class Bench:
         self.go_on.wait(10.0)
         reply("emergency stop")
 
-    def _ask_session(self, _session: Any, _link: ConnectionSettings, _limit_s: float) -> list[StopResult]:
+    def _ask_session(
+        self, _session: Any, _link: ConnectionSettings, _limit_s: float
+    ) -> list[StopResult]:
         if self.network_error is not None:
             raise self.network_error
         return []
@@ -116,7 +120,9 @@ def test_prepared_stop_requested_during_a_stop_starts_another(bench: Bench) -> N
     bench.go_on.clear()
     first = bench.stop.request_stop("anna")
     wait_until(lambda: bench.asked, "the first stop", 5.0)
-    later: list[Future[str]] = [bench.stop.request_stop(f"viewer {number}") for number in range(100)]
+    later: list[Future[str]] = [
+        bench.stop.request_stop(f"viewer {number}") for number in range(100)
+    ]
     assert not first.done()
     assert len({id(future) for future in later}) == 1
     assert bench.stop.check_readiness().text.startswith("a stop has been under way")
@@ -127,7 +133,9 @@ def test_prepared_stop_requested_during_a_stop_starts_another(bench: Bench) -> N
     assert bench.log[1][0].startswith("viewer 0, viewer 1, ")
 
 
-def test_prepared_stop_of_unreachable_robot_explains_the_failure(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepared_stop_of_unreachable_robot_explains_the_failure(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.stop.use_session(Network())  # pyright: ignore[reportArgumentType]
     bench.network_error = ValueError("no session")
 
@@ -142,9 +150,13 @@ def test_prepared_stop_of_unreachable_robot_explains_the_failure(bench: Bench, m
     assert bench.stop.stop_and_wait("anna").startswith("worm: stopped"), "the next one is taken"
 
 
-def test_prepared_stop_ready_reflects_a_test_made_now(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepared_stop_ready_reflects_a_test_made_now(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(prepared_stop, "SELF_TEST_PERIOD_S", 0.02)
-    assert bench.stop.check_readiness() == prepared_stop.StopReadiness(is_ready=True, text=WAITING_FOR_ROBOT)
+    assert bench.stop.check_readiness() == prepared_stop.StopReadiness(
+        is_ready=True, text=WAITING_FOR_ROBOT
+    )
     network = Network()
     bench.stop.use_session(network)  # pyright: ignore[reportArgumentType]
 

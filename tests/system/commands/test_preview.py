@@ -29,7 +29,9 @@ CAMERA = {
 def depth(tick: int = 0) -> DepthImage:
     counts = np.arange(160 * 120, dtype="<u2").tobytes()
     limits = {"range_min_m": 0.05, "range_max_m": 4.0, "scale_m": 0.001}
-    return DepthImage(tick=tick, timestamp_ns=tick, width=160, height=120, depth=counts, **limits, **CAMERA)
+    return DepthImage(
+        tick=tick, timestamp_ns=tick, width=160, height=120, depth=counts, **limits, **CAMERA
+    )
 
 
 def test_depth_keeps_its_values() -> None:
@@ -43,7 +45,9 @@ def test_depth_keeps_its_values() -> None:
     assert np.array_equal(seen, np.arange(160 * 120).reshape(120, 160)[::2, ::2])
 
 
-@pytest.mark.parametrize(("width", "expected"), [(640, (160, 120)), (100, (80, 60)), (16, (16, 12))])
+@pytest.mark.parametrize(
+    ("width", "expected"), [(640, (160, 120)), (100, (80, 60)), (16, (16, 12))]
+)
 def test_colour_is_small_and_looks_alike(width: int, expected: tuple[int, int]) -> None:
     ramp = np.zeros((120, 160, 3), dtype=np.uint8)
     ramp[..., 0] = np.linspace(0, 255, 160)
@@ -73,10 +77,17 @@ def test_only_what_is_looked_at() -> None:
         assert not images.has_subscriber()
         with open_session(ConnectionSettings(endpoint, "worm")) as far:
             seen = far.declare_reader(keys.preview_key(keys.depth_key("head")), ImagePreview)
-            wait_until(lambda: camera.publish_preview() or images.has_subscriber(), "the image fetched")
+            wait_until(
+                lambda: camera.publish_preview() or images.has_subscriber(), "the image fetched"
+            )
             images.put(depth(3))
             found: list[ImagePreview] = []
-            wait_until(lambda: camera.publish_preview() or found.extend(seen.drain()) or found, "a preview")
+            wait_until(
+                lambda: camera.publish_preview() or found.extend(seen.drain()) or found, "a preview"
+            )
             assert found[0].tick == 3
             assert found[0].width == 80
-        wait_until(lambda: camera.publish_preview() or not images.has_subscriber(), "the image left alone again")
+        wait_until(
+            lambda: camera.publish_preview() or not images.has_subscriber(),
+            "the image left alone again",
+        )

@@ -61,14 +61,18 @@ def test_whole_numbers_flags_and_null_say_what_they_mean(path: str) -> None:
 
 
 def test_the_modes_are_told_with_their_numbers_and_units() -> None:
-    reported = json.loads(published_contract()["messages/JointCommand.json"])["$defs"]["JointMode"]["description"]
+    reported = json.loads(published_contract()["messages/JointCommand.json"])["$defs"]["JointMode"][
+        "description"
+    ]
     for mode, unit in (
         (JointMode.PASSIVE, "ignored"),
         (JointMode.POSITION, "rad"),
         (JointMode.VELOCITY, "rad/s"),
         (JointMode.TORQUE, "N·m"),
     ):
-        assert re.search(rf"^{mode.value} {mode.name.lower()}: .*\b{unit}$", reported, re.MULTILINE), mode
+        assert re.search(
+            rf"^{mode.value} {mode.name.lower()}: .*\b{unit}$", reported, re.MULTILINE
+        ), mode
 
 
 def test_every_refusal_is_told() -> None:
@@ -118,7 +122,10 @@ def test_streams_are_sent_with_the_priorities_of_the_table(name: str, lossless: 
     row = next(line for line in PROTOCOL.splitlines() if line.startswith(f"| {name} |"))
     priority, congestion, express = (cell.strip() for cell in row.strip("|").split("|")[1:])
     latched = key == keys.DESCRIPTION
-    with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal, plain(endpoint) as stranger:
+    with (
+        open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal,
+        plain(endpoint) as stranger,
+    ):
         arrived = stranger.declare_subscriber(key)
         publisher = (
             hal.declare_latched_publisher(key, message)
@@ -126,7 +133,12 @@ def test_streams_are_sent_with_the_priorities_of_the_table(name: str, lossless: 
             else hal.declare_publisher(key, message, lossless=lossless)
         )
         found: list[zenoh.Sample] = []
-        wait_until(lambda: publisher.send(b"") or found.extend(filter(None, [arrived.try_recv()])) or found, "a sample")
+        wait_until(
+            lambda: (
+                publisher.send(b"") or found.extend(filter(None, [arrived.try_recv()])) or found
+            ),
+            "a sample",
+        )
     assert str(found[0].priority).endswith(f".{priority}")
     assert found[0].express == (express == "yes")
     blocks = lossless and not latched
@@ -142,8 +154,14 @@ def test_a_plain_client_gets_the_latched_description_by_a_query() -> None:
         hal.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(robot)
         with plain(endpoint) as stranger:
             assert "`hal/description/@adv/**`" in PROTOCOL
-            replies = list(stranger.get("hal/description/@adv/**", accept_replies=zenoh.ReplyKeyExpr.ANY, timeout=5.0))
-    assert [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None] == [encode(robot)]
+            replies = list(
+                stranger.get(
+                    "hal/description/@adv/**", accept_replies=zenoh.ReplyKeyExpr.ANY, timeout=5.0
+                )
+            )
+    assert [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None] == [
+        encode(robot)
+    ]
 
 
 def plain(endpoint: str) -> zenoh.Session:

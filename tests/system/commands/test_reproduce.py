@@ -30,5 +30,7 @@ def test_the_list_is_printed_for_readers_and_for_scripts(tmp_path: Path) -> None
     listed = snakesim("reproduce", "--list", cwd=tmp_path)
     assert listed.code == 0, listed.err
     entries = json.loads(snakesim("reproduce", "--list", "--json", cwd=tmp_path).out)
-    assert [line.split()[0] for line in listed.out.splitlines()] == [entry["name"] for entry in entries]
+    assert [line.split()[0] for line in listed.out.splitlines()] == [
+        entry["name"] for entry in entries
+    ]
     assert "Alben" in listed.out

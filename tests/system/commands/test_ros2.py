@@ -28,13 +28,16 @@ from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ros2_rig import SERVICE_HASHES
 from snakesim_testing.runs.command import run_in_background, running_snakesim
-from snakesim_testing.runs.in_process_command import tell
+from snakesim_testing.runs.in_process_command import run_command_for_robot
 
 pytestmark = pytest.mark.e2e
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 DEFINED = {
-    "std_srvs/srv/Trigger": ("uint8 structure_needs_at_least_one_member", "bool success\nstring message"),
+    "std_srvs/srv/Trigger": (
+        "uint8 structure_needs_at_least_one_member",
+        "bool success\nstring message",
+    ),
     "rcl_interfaces/srv/ListParameters": (
         "string[] prefixes\nuint64 depth",
         "rcl_interfaces/msg/ListParametersResult result",
@@ -43,7 +46,10 @@ DEFINED = {
         "string[] names",
         "rcl_interfaces/msg/ParameterDescriptor[] descriptors",
     ),
-    "rcl_interfaces/srv/GetParameters": ("string[] names", "rcl_interfaces/msg/ParameterValue[] values"),
+    "rcl_interfaces/srv/GetParameters": (
+        "string[] names",
+        "rcl_interfaces/msg/ParameterValue[] values",
+    ),
     "rcl_interfaces/srv/SetParameters": (
         "rcl_interfaces/msg/Parameter[] parameters",
         "rcl_interfaces/msg/SetParametersResult[] results",
@@ -90,7 +96,12 @@ class RosSide:
         return f"0/{topic}/{package}::msg::dds_::{name}_/{STORE.hash_rihs01(kind)}"
 
     def first(
-        self, topic: str, kind: str, wanted: Callable[[Any], bool] = lambda _: True, *, latched: bool = False
+        self,
+        topic: str,
+        kind: str,
+        wanted: Callable[[Any], bool] = lambda _: True,
+        *,
+        latched: bool = False,
     ) -> Any:
         key, ring = self.key(topic, kind), handlers.RingChannel(20)
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
@@ -122,7 +133,10 @@ class RosSide:
         sent = struct.pack("<qqB16s", 7, time.time_ns(), 16, bytes(range(16)))
         payload = bytes(STORE.serialize_cdr(request, f"{kind}_Request"))
         complete = zenoh.QueryTarget.ALL_COMPLETE
-        (*_, reply) = [None, *self.session.get(key, payload=payload, attachment=sent, target=complete, timeout=20.0)]
+        (*_, reply) = [
+            None,
+            *self.session.get(key, payload=payload, attachment=sent, target=complete, timeout=20.0),
+        ]
         if reply is None:
             return None
         assert reply.ok is not None
@@ -134,7 +148,9 @@ class RosSide:
         return STORE.deserialize_cdr(reply.ok.payload.to_bytes(), f"{kind}_Response")
 
     def trigger(self, name: str) -> None:
-        answer = self.asked(name, "std_srvs/srv/Trigger", self.made("std_srvs/srv/Trigger_Request", 0))
+        answer = self.asked(
+            name, "std_srvs/srv/Trigger", self.made("std_srvs/srv/Trigger_Request", 0)
+        )
         assert answer is not None and answer.success, f"{name}: {answer}"
 
     def parameters(self, name: str, kind: str, *fields: Any) -> Any:
@@ -148,12 +164,22 @@ class RosSide:
 
     def command(self, names: list[str], **numbers: list[float]) -> None:
         stamp = self.made("builtin_interfaces/msg/Time", 0, 0)
-        fields = [np.array(numbers.get(word, []), dtype=np.float64) for word in ("position", "velocity", "effort")]
-        sent = self.made("sensor_msgs/msg/JointState", self.made("std_msgs/msg/Header", stamp, ""), names, *fields)
+        fields = [
+            np.array(numbers.get(word, []), dtype=np.float64)
+            for word in ("position", "velocity", "effort")
+        ]
+        sent = self.made(
+            "sensor_msgs/msg/JointState",
+            self.made("std_msgs/msg/Header", stamp, ""),
+            names,
+            *fields,
+        )
         kind = "sensor_msgs/msg/JointState"
         self.session.put(self.key("joint_commands", kind), bytes(STORE.serialize_cdr(sent, kind)))
 
-    def moved(self, act: Callable[[], None], there: Callable[[dict[str, float]], bool]) -> dict[str, float]:
+    def moved(
+        self, act: Callable[[], None], there: Callable[[dict[str, float]], bool]
+    ) -> dict[str, float]:
         """Repeat it until the joints are there; their angles in rad."""
 
         def wanted(state: Any) -> bool:
@@ -171,13 +197,24 @@ class RosSide:
 def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
     with running_snakesim(tmp_path / "run", *RUN) as run, ros_router(tmp_path) as (at, router):
         run.wait_for(" s  ")
-        refused = tell(run, "start", "ros2", "--ros-router", run.endpoint)
+        refused = run_command_for_robot(run, "start", "ros2", "--ros-router", run.endpoint)
         assert refused.code == 2
         assert "itself is on this endpoint" in refused.err
-        refused = tell(run, "start", "ros2", "--ros-router", at, "--joint-commands")
+        refused = run_command_for_robot(
+            run, "start", "ros2", "--ros-router", at, "--joint-commands"
+        )
         assert refused.code != 0
         assert "has a controller already, which holds the lease" in refused.err
-        bridge = ("start", "ros2", "--endpoint", run.endpoint, "--ros-router", at, "--cmd-vel", "--operate")
+        bridge = (
+            "start",
+            "ros2",
+            "--endpoint",
+            run.endpoint,
+            "--ros-router",
+            at,
+            "--cmd-vel",
+            "--operate",
+        )
         with session_at(at) as session, run_in_background(tmp_path, *bridge):
             _sees(RosSide(session))
             _steers(RosSide(session), run.endpoint)
@@ -186,25 +223,46 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
             with session_at(at) as anew:
                 RosSide(anew).first("joint_states", "sensor_msgs/msg/JointState")
         with session_at(at) as session:
-            wait_until(lambda: not RosSide(session).tokens(), "the node gone from the ROS graph", 10.0)
+            wait_until(
+                lambda: not RosSide(session).tokens(), "the node gone from the ROS graph", 10.0
+            )
 
 
 @pytest.mark.slow
 def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
     endpoint = find_free_endpoint()
-    late = ("run", "triplet", "--clock-mode", "lockstep", "--duration", "600", "--no-record", "--endpoint", endpoint)
+    late = (
+        "run",
+        "triplet",
+        "--clock-mode",
+        "lockstep",
+        "--duration",
+        "600",
+        "--no-record",
+        "--endpoint",
+        endpoint,
+    )
     with (
         ros_router(tmp_path) as (at, _),
         session_at(at) as session,
-        run_in_background(tmp_path, "start", "ros2", "--endpoint", endpoint, "--ros-router", at) as waiting,
+        run_in_background(
+            tmp_path, "start", "ros2", "--endpoint", endpoint, "--ros-router", at
+        ) as waiting,
     ):
         assert waiting.stdout is not None
         assert "Waiting for it up to 60 s" in waiting.stdout.readline()
         with run_in_background(tmp_path, *late):
             ros = RosSide(session)
             ros.first("joint_states", "sensor_msgs/msg/JointState")
-            assert ros.asked("arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)) is None
-            assert ros.asked("stop", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)).success
+            assert (
+                ros.asked(
+                    "arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)
+                )
+                is None
+            )
+            assert ros.asked(
+                "stop", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)
+            ).success
 
 
 @pytest.mark.slow
@@ -221,26 +279,51 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
         "services.control.external=true",
     )
     with running_snakesim(tmp_path / "run", *alone) as run, ros_router(tmp_path) as (at, _):
-        bridge = ("start", "ros2", "--endpoint", run.endpoint, "--ros-router", at, "--joint-commands", "--operate")
+        bridge = (
+            "start",
+            "ros2",
+            "--endpoint",
+            run.endpoint,
+            "--ros-router",
+            at,
+            "--joint-commands",
+            "--operate",
+        )
         with session_at(at) as session, run_in_background(tmp_path, *bridge):
             ros = RosSide(session)
             limp = ros.first("joint_states", "sensor_msgs/msg/JointState")
             ros.trigger("arm")
             ros.command(["joint_99"], position=[0.3])
             ros.command(["joint_7", "joint_8"], position=[0.3])
-            there = ros.moved(lambda: ros.command(["joint_7"], position=[0.3]), lambda now: now["joint_7"] > 0.28)
+            there = ros.moved(
+                lambda: ros.command(["joint_7"], position=[0.3]), lambda now: now["joint_7"] > 0.28
+            )
             # The others hold their angles between pegs, which give: a position loop is as stiff as its gains.
-            others = [abs(there[name] - was) for name, was in zip(limp.name, limp.position, strict=True)]
+            others = [
+                abs(there[name] - was) for name, was in zip(limp.name, limp.position, strict=True)
+            ]
             assert sorted(others)[-2] < 0.15
             assert there["joint_7"] == pytest.approx(0.3, abs=0.03)
-            ros.moved(lambda: ros.command(["joint_3"], velocity=[-0.5]), lambda now: now["joint_3"] < -0.2)
-            ros.first("joint_states", "sensor_msgs/msg/JointState", lambda now: max(abs(now.velocity)) < 0.05)
+            ros.moved(
+                lambda: ros.command(["joint_3"], velocity=[-0.5]), lambda now: now["joint_3"] < -0.2
+            )
+            ros.first(
+                "joint_states",
+                "sensor_msgs/msg/JointState",
+                lambda now: max(abs(now.velocity)) < 0.05,
+            )
             stood = ros.first("joint_states", "sensor_msgs/msg/JointState")
             later = stood.header.stamp.sec + 3
-            stands = ros.first("joint_states", "sensor_msgs/msg/JointState", lambda now: now.header.stamp.sec >= later)
+            stands = ros.first(
+                "joint_states",
+                "sensor_msgs/msg/JointState",
+                lambda now: now.header.stamp.sec >= later,
+            )
             assert max(abs(stands.position - stood.position)) < 0.02
             ros.trigger("stop")
-            refused = ros.asked("arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0))
+            refused = ros.asked(
+                "arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)
+            )
             assert not refused.success
             assert "stop" in refused.message
             ros.trigger("reset")
@@ -266,7 +349,9 @@ def _tunes(ros: RosSide) -> None:
     assert now.double_value == 0.3
     assert nothing.type == 0
     wanted = ros.parameter(name, -1.0)
-    refused = ros.parameters("set_parameters_atomically", "SetParametersAtomically", [wanted]).result
+    refused = ros.parameters(
+        "set_parameters_atomically", "SetParametersAtomically", [wanted]
+    ).result
     assert not refused.successful
     assert "speed_kp_s" in refused.reason
 
@@ -304,14 +389,20 @@ def _sees(ros: RosSide) -> None:
     ).transforms
     assert image.header.frame_id in {one.child_frame_id for one in static}
     parents = {one.child_frame_id: one.header.frame_id for one in static}
-    moving = ros.first("tf", "tf2_msgs/msg/TFMessage", lambda found: len(found.transforms) == 13).transforms
-    base = ros.first("tf", "tf2_msgs/msg/TFMessage", lambda found: len(found.transforms) == 1).transforms
+    moving = ros.first(
+        "tf", "tf2_msgs/msg/TFMessage", lambda found: len(found.transforms) == 13
+    ).transforms
+    base = ros.first(
+        "tf", "tf2_msgs/msg/TFMessage", lambda found: len(found.transforms) == 1
+    ).transforms
     parents |= {one.child_frame_id: one.header.frame_id for one in (*moving, *base)}
     frame, steps = image.header.frame_id, 0
     while frame != "map":
         frame, steps = parents[frame], steps + 1
     assert steps == 18  # optical, camera, 14 links, base, odom
-    drawn = ros.first("obstacles", "visualization_msgs/msg/MarkerArray", lambda found: len(found.markers) > 1)
+    drawn = ros.first(
+        "obstacles", "visualization_msgs/msg/MarkerArray", lambda found: len(found.markers) > 1
+    )
     assert {marker.header.frame_id for marker in drawn.markers} == {"odom"}
     kinds = [token.split("/")[5] for token in ros.tokens()]
     assert kinds.count("NN") == 1
@@ -340,7 +431,10 @@ def _steers(ros: RosSide, endpoint: str) -> None:
         assert newest.heading_w_rad is not None
         assert abs(newest.heading_w_rad) < 3.2
         wait_until(
-            lambda: plans.pop_newest(lambda plan: plan.speed_m_s == 0 and "has expired" in plan.reason) is not None,
+            lambda: (
+                plans.pop_newest(lambda plan: plan.speed_m_s == 0 and "has expired" in plan.reason)
+                is not None
+            ),
             "standing still without /cmd_vel",
             30.0,
         )
@@ -348,14 +442,20 @@ def _steers(ros: RosSide, endpoint: str) -> None:
         def sent(ago_s: float) -> bool:
             """Whether a Twist that its node sent so long ago becomes an intent."""
             timestamp_ns = time.time_ns() - round(ago_s * 1e9)
-            ros.session.put(key, payload, attachment=struct.pack("<qqB16s", 7, timestamp_ns, 16, bytes(range(16))))
+            ros.session.put(
+                key,
+                payload,
+                attachment=struct.pack("<qqB16s", 7, timestamp_ns, 16, bytes(range(16))),
+            )
             time.sleep(0.1)
             return bool(intents.drain())
 
         wait_until(lambda: sent(0.0), "a Twist of a moment ago", 10.0)
         time.sleep(0.5)
         intents.drain()
-        assert not any(sent(14.0 - 0.1 * number) for number in range(5)), "Twists that a network held back"
+        assert not any(sent(14.0 - 0.1 * number) for number in range(5)), (
+            "Twists that a network held back"
+        )
         wait_until(lambda: sent(0.0), "the next Twist", 10.0)
 
 

@@ -28,16 +28,22 @@ def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
             deaf.declare_alive("hal")
             said.clear()
             assert stop.stop_robots(RobotSelection(at), said.append) == 1
-            assert {line.split(": ")[1] for line in said if line.startswith("lab/worm")} == {"stopped"}
+            assert {line.split(": ")[1] for line in said if line.startswith("lab/worm")} == {
+                "stopped"
+            }
             assert any(line.startswith("lab/deaf: NOT STOPPED: NO ANSWER") for line in said)
             said.clear()
             assert stop.stop_robots(RobotSelection(at, "lab/nobody"), said.append) == 1
             assert said[0].startswith("lab/nobody: NOT STOPPED: NO ANSWER")
-            assert [line.split()[2] for line in said[1:]] == ["lab/deaf,", "lab/worm,"], "those that are there"
+            assert [line.split()[2] for line in said[1:]] == ["lab/deaf,", "lab/worm,"], (
+                "those that are there"
+            )
 
 
 def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
-    ended = snakesim("estop", "--namespace", "nobody", cwd=tmp_path, extra_env={"PYTHONPROFILEIMPORTTIME": "1"})
+    ended = snakesim(
+        "estop", "--namespace", "nobody", cwd=tmp_path, extra_env={"PYTHONPROFILEIMPORTTIME": "1"}
+    )
     imported = [line.rpartition("|")[2].strip() for line in ended.err.splitlines()]
     assert not {"numpy", "jinja2", "mujoco"} & set(imported)
     slow = min(imported.index("msgspec"), imported.index("zenoh"))
@@ -50,7 +56,10 @@ def test_stop_answer_without_matching_status_is_not_trusted() -> None:
         with open_session(ConnectionSettings(run.link.endpoint, "lab/other")) as impostor:
             impostor.declare_alive("hal")
             impostor.on_query(
-                keys.LIFECYCLE, lambda question: question.reply(Answer(ok=True, reason="done", lifecycle="disarmed"))
+                keys.LIFECYCLE,
+                lambda question: question.reply(
+                    Answer(ok=True, reason="done", lifecycle="disarmed")
+                ),
             )
             with raises_error(RefusedError, code="robot/not-confirmed"):
                 command.disarm_robot(RobotSelection(run.link.endpoint, "lab/other"))

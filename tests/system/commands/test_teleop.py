@@ -53,7 +53,10 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                 lost.type(2 * UP)
                 wait_until(lambda: way.is_at(0.1, "teleop"), "navigation to go at 0.1 m/s")
                 lost.type(LEFT)
-                wait_until(lambda: (intents.drain() or [NOTHING])[-1].heading_w_rad is not None, "a direction")
+                wait_until(
+                    lambda: (intents.drain() or [NOTHING])[-1].heading_w_rad is not None,
+                    "a direction",
+                )
                 lost.shows("requested: +0.10 m/s")
                 lost.process.send_signal(signal.SIGKILL)
                 wait_until(lambda: way.is_at(0.0, "expired"), "navigation to stop", 5.0)
@@ -64,12 +67,17 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                 assert left.process.wait(10) == 0
                 assert left.given_back
                 wait_until(
-                    lambda: way.speed_m_s == 0.0 or way.is_at(0.0, "wants it to stop"), "navigation to stop", 5.0
+                    lambda: way.speed_m_s == 0.0 or way.is_at(0.0, "wants it to stop"),
+                    "navigation to stop",
+                    5.0,
                 )
             with subprocess.Popen(
                 [sys.executable, str(STEER), run.endpoint, "planar13"], stderr=subprocess.PIPE
             ) as program:
-                wait_until(lambda: way.is_at(0.1, "as steer.py wants it"), "navigation to follow the documented client")
+                wait_until(
+                    lambda: way.is_at(0.1, "as steer.py wants it"),
+                    "navigation to follow the documented client",
+                )
                 program.terminate()
                 assert program.stderr is not None
                 assert program.stderr.read() == b""
@@ -100,7 +108,9 @@ def frozen(pid: int) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: RunningCommand, tmp_path: Path) -> None:
+def test_teleop_says_what_a_paused_clock_waits_for(
+    in_lockstep: RunningCommand, tmp_path: Path
+) -> None:
     """By the robot's own account; it has not gone."""
     why, run = " waits for navigation's answer to tick ", in_lockstep
     with (
@@ -109,7 +119,10 @@ def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: RunningCommand, 
     ):
         operator.type(UP)
         operator.shows("requested: +0.05 m/s")
-        states, found = session.declare_reader(keys.CONTROL_STATE, ControlState), list[ControlState]()
+        states, found = (
+            session.declare_reader(keys.CONTROL_STATE, ControlState),
+            list[ControlState](),
+        )
 
         def told() -> bool:
             found.extend(states.drain())
@@ -121,7 +134,9 @@ def test_teleop_says_what_a_paused_clock_waits_for(in_lockstep: RunningCommand, 
         assert "PowerOff" not in {one.state for one in found}
 
 
-def test_teleop_says_that_robot_stopped_sending(in_lockstep: RunningCommand, tmp_path: Path) -> None:
+def test_teleop_says_that_robot_stopped_sending(
+    in_lockstep: RunningCommand, tmp_path: Path
+) -> None:
     with at_the_keyboard(in_lockstep, tmp_path) as operator:
         operator.shows("armed: ")
         with frozen(in_lockstep.part("host")):

@@ -14,7 +14,13 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, LocomotionIntent
 from snakesim_operator.robot_commands.teleop import command, joystick
 from snakesim_operator.robot_commands.teleop.command import TeleopLoop
-from snakesim_operator.robot_commands.teleop.joystick import ABS_Y, EV_ABS, EVENT, Joystick, JoystickAxis
+from snakesim_operator.robot_commands.teleop.joystick import (
+    ABS_Y,
+    EV_ABS,
+    EVENT,
+    Joystick,
+    JoystickAxis,
+)
 from snakesim_testing.hal.small_robots import make_clock
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
@@ -32,14 +38,19 @@ def handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def test_a_stick_that_falls_silent_asks_for_nothing_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stick_that_falls_silent_asks_for_nothing_any_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Such as a receiver whose pad is switched off while it is pushed forward: its device stays, without events."""
     monkeypatch.setattr(joystick, "STICK_AGE_S", SILENT_S)
     monkeypatch.setattr(command, "STICK_AGE_S", SILENT_S)
     read, write = os.pipe()
     os.set_blocking(read, False)
     link = ConnectionSettings(find_free_endpoint(), "worm")
-    with open_session(ConnectionSettings(link.endpoint, "worm", listen=True)) as robot, open_session(link) as session:
+    with (
+        open_session(ConnectionSettings(link.endpoint, "worm", listen=True)) as robot,
+        open_session(link) as session,
+    ):
         heard, clocks = (
             robot.declare_reader(keys.INTENT, LocomotionIntent, depth=256),
             robot.declare_publisher(keys.CLOCK, Clock),
@@ -47,7 +58,8 @@ def test_a_stick_that_falls_silent_asks_for_nothing_any_more(monkeypatch: pytest
         stick = Joystick(read, JoystickAxis(0, 255), JoystickAxis(0, 255))
         teleop = TeleopLoop(session, link, 0.2, None, stick)
         loop = threading.Thread(target=teleop.run)
-        monkeypatch.setattr(command, "call_on_stop_signals", lambda _stop: None)  # of the main thread alone
+        # Of the main thread alone.
+        monkeypatch.setattr(command, "call_on_stop_signals", lambda _stop: None)
         monkeypatch.setattr(signal, "signal", lambda *_: None)
         loop.start()
         intents, ticks = list[LocomotionIntent](), itertools.count(1)
@@ -81,7 +93,10 @@ def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFix
     read, write = os.pipe()
     os.set_blocking(read, False)
     link = ConnectionSettings(find_free_endpoint(), "worm")
-    with open_session(ConnectionSettings(link.endpoint, "worm", listen=True)) as robot, open_session(link) as session:
+    with (
+        open_session(ConnectionSettings(link.endpoint, "worm", listen=True)) as robot,
+        open_session(link) as session,
+    ):
         heard, clocks = (
             robot.declare_reader(keys.INTENT, LocomotionIntent, depth=256),
             robot.declare_publisher(keys.CLOCK, Clock),
@@ -101,7 +116,10 @@ def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFix
         hand.join()
         stick.close()
         intents = heard.drain()
-        wait_until(lambda: intents.extend(heard.drain()) or not intents[-1].go, "the stop, which is asked for last")
+        wait_until(
+            lambda: intents.extend(heard.drain()) or not intents[-1].go,
+            "the stop, which is asked for last",
+        )
     assert len(intents) > 3
     assert {intent.speed_m_s for intent in intents[:-1]} == {0.2}
     assert all(a.timestamp_ns <= b.timestamp_ns for a, b in itertools.pairwise(intents))

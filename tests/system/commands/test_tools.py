@@ -33,7 +33,7 @@ TUTORIAL = Path("docs/tutorials/write-a-controller.md").resolve()
 
 def echoed(run: RunningCommand, key: str, count: int, *more: str) -> list[dict[str, Any]]:
     """What `snakesim topic echo` prints, each line read as JSON."""
-    ended = command.tell(run, "topic", "echo", key, "--count", str(count), *more)
+    ended = command.run_command_for_robot(run, "topic", "echo", key, "--count", str(count), *more)
     assert ended.code == 0 and ended.err == "", ended.err
     lines = [json.loads(line) for line in ended.out.splitlines()]
     assert len(lines) == count
@@ -54,7 +54,9 @@ def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith("snakesim: ")
     assert done.stderr.count("\n") == 1
-    seen = run_to_end(["sh", "-c", f"{' '.join(SNAKESIM_COMMAND)} config triplet | head -1"], tmp_path)
+    seen = run_to_end(
+        ["sh", "-c", f"{' '.join(SNAKESIM_COMMAND)} config triplet | head -1"], tmp_path
+    )
     assert seen.err == ""
     assert seen.out.count("\n") == 1
 
@@ -104,7 +106,10 @@ INTERRUPTED = (
 
 @pytest.mark.parametrize(
     "words",
-    [words if words[0] == "run" else pytest.param(words, marks=pytest.mark.slow) for words in INTERRUPTED],
+    [
+        words if words[0] == "run" else pytest.param(words, marks=pytest.mark.slow)
+        for words in INTERRUPTED
+    ],
     ids=lambda words: words[0],
 )
 def test_ctrl_c_at_any_moment_leaves_no_traceback(words: list[str], tmp_path: Path) -> None:
@@ -132,7 +137,9 @@ def test_ctrl_c_at_any_moment_leaves_no_traceback(words: list[str], tmp_path: Pa
 
 def first_line_ran(pid: int) -> bool:
     """Whether the interpreter's own handler of SIGINT is gone again, and the command's modules are being loaded."""
-    fields = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    fields = dict(
+        line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+    )
     maps = Path(f"/proc/{pid}/maps").read_text()
     caught = int(fields.get("SigCgt", "0"), 16) >> (signal.SIGINT - 1) & 1
     ended = fields["State"].strip().startswith("Z")
@@ -142,7 +149,7 @@ def first_line_ran(pid: int) -> bool:
 def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--clock-mode", "realtime"]
     with running_armed_snakesim(tmp_path / "run", *arguments) as run:
-        rate = command.tell(run, "topic", "rate", "sensor/joints", "--count", "2")
+        rate = command.run_command_for_robot(run, "topic", "rate", "sensor/joints", "--count", "2")
         found = re.findall(r"planar13/sensor/joints: ([\d.]+) Hz", rate.out)
         assert found and float(found[-1]) == pytest.approx(100, rel=0.1), rate.out + rate.err
         (reported,) = echoed(run, "hal/description", 1)
@@ -152,17 +159,21 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
         assert {"planar13/sensor/joints", "planar13/sensor/imu"} <= {line["key"] for line in found}
         assert all("tick" in line["message"] for line in found)
         everything = {line["key"] for line in echoed(run, "**", 200)}
-        assert {"planar13/hal/description", "planar13/hal/clock", "planar13/hal/done/guidance"} <= everything
+        assert {
+            "planar13/hal/description",
+            "planar13/hal/clock",
+            "planar13/hal/done/guidance",
+        } <= everything
         named = echoed(run, "*/joints", 3, "--namespace", "planar13")
         assert {line["key"] for line in named} <= {"sensor/joints", "actuator/joints"}
-        unknown = command.tell(run, "topic", "echo", "sensor/smell")
+        unknown = command.run_command_for_robot(run, "topic", "echo", "sensor/smell")
         assert unknown.code == 2
         assert "sensor/contacts" in unknown.err
-        wrong = command.tell(run, "topic", "echo", "sensor/***")
+        wrong = command.run_command_for_robot(run, "topic", "echo", "sensor/***")
         assert wrong.code == 2
         assert "is not a key" in wrong.err
         assert wrong.err.count("\n") == 1
-        status = command.tell(run, "status")
+        status = command.run_command_for_robot(run, "status")
         assert status.code == 0
         assert "planar13: armed" in status.out
         assert "control, guidance, navigation" in status.out
@@ -174,7 +185,17 @@ def test_echo_and_status_of_a_running_robot(tmp_path: Path) -> None:
 def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) -> None:
     """In a network namespace of its own, which has nothing but loopback."""
     run = "ip link set lo up && exec " + " ".join(
-        [*SNAKESIM_COMMAND, "run", "triplet", "--controller", "hold", "--duration", "1", "--out", "run"]
+        [
+            *SNAKESIM_COMMAND,
+            "run",
+            "triplet",
+            "--controller",
+            "hold",
+            "--duration",
+            "1",
+            "--out",
+            "run",
+        ]
     )
     for flags, code in (("", 2), (" --insecure", 0), (" --insecure --with-router", 0)):
         typed = ["unshare", "--net", "sh", "-c", f"{run} --endpoint tcp/0.0.0.0:7461{flags}"]
@@ -183,15 +204,21 @@ def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) ->
 
 
 def test_the_controller_of_the_tutorial(tmp_path: Path) -> None:
-    blocks = re.findall(r"```python wave\.py\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), re.DOTALL)
+    blocks = re.findall(
+        r"```python wave\.py\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), re.DOTALL
+    )
     example = next(block for block in blocks if "class Wave" in block)
     assert len([line for line in example.splitlines() if line.strip()]) <= 24
     (tmp_path / "wave.py").write_text(f"import shape, queue\n{example}", encoding="utf-8")
     (tmp_path / "shape.py").write_text("")  # a neighbor, which the file may import
     for name in ("random", "queue", "can", "calendar"):  # replace no module in any process of a run
-        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'a').write(__name__)")
+        (tmp_path / f"{name}.py").write_text(
+            f"open({str(tmp_path / 'executed')!r}, 'a').write(__name__)"
+        )
     flags = ("--duration", "2", "--in-process")
-    ended, summary = command.run_to_summary(tmp_path / "run", "triplet", "--controller", "./wave.py:Wave", *flags[:2])
+    ended, summary = command.run_to_summary(
+        tmp_path / "run", "triplet", "--controller", "./wave.py:Wave", *flags[:2]
+    )
     assert ended.code == 0, ended.out + ended.err
     assert summary.controller == "./wave.py:Wave"
     assert summary.energy_j is not None

@@ -14,7 +14,12 @@ from snakesim_hal.wire.messages import Clock, JointState, Message
 from snakesim_operator.base.targets import RobotSelection
 from snakesim_operator.monitoring.top import TrafficSnapshot, show_traffic
 from snakesim_operator.monitoring.traffic import MAX_ARRIVAL_TIMES, MAX_KEYS, NetworkTraffic
-from snakesim_testing.hal.small_robots import make_clock, make_description, make_joint_command, make_joint_state
+from snakesim_testing.hal.small_robots import (
+    make_clock,
+    make_description,
+    make_joint_command,
+    make_joint_state,
+)
 from snakesim_testing.harness.endpoint import find_free_endpoint
 
 MS = 1_000_000
@@ -29,7 +34,9 @@ def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
     for tick in range(100):
         traffic.add(
             arrival(
-                "lab/worm/sensor/joints", make_joint_state(robot, tick=tick, timestamp_ns=tick * 10 * MS), 10 * tick
+                "lab/worm/sensor/joints",
+                make_joint_state(robot, tick=tick, timestamp_ns=tick * 10 * MS),
+                10 * tick,
             )
         )
         traffic.add(arrival("lab/worm/hal/clock", make_clock(tick + 2), 10 * tick + 1))
@@ -44,7 +51,9 @@ def test_rates_ages_and_latencies_are_those_of_the_arrivals() -> None:
     assert joints.received_ago_s == pytest.approx(0.01)
     assert joints.age_ms == pytest.approx(20.0)
     (latency,) = traffic.measure_latencies()
-    assert (latency.arrival_median_ms, latency.arrival_p99_ms, latency.count) == pytest.approx((3.0, 3.0, 100))
+    assert (latency.arrival_median_ms, latency.arrival_p99_ms, latency.count) == pytest.approx(
+        (3.0, 3.0, 100)
+    )
 
 
 def test_top_foreign_keys_are_bounded_and_harmless_to_terminal() -> None:
@@ -79,7 +88,9 @@ def test_a_table_for_scripts_from_a_real_network() -> None:
         teller = threading.Thread(target=tell_time, args=(session,))
         teller.start()
         try:
-            assert show_traffic(RobotSelection(endpoint), lines.append, once=True, as_json=True) == 0
+            assert (
+                show_traffic(RobotSelection(endpoint), lines.append, once=True, as_json=True) == 0
+            )
         finally:
             over.set()
             teller.join()

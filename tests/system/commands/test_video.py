@@ -21,7 +21,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def film(run: Path, out: Path, *more: str) -> str:
     size = ("--width", "96", "--height", "64", "--fps", "10")
-    ended = snakesim("recording", "video", str(run), "--out", str(out), *size, *more, cwd=run.parent)
+    ended = snakesim(
+        "recording", "video", str(run), "--out", str(out), *size, *more, cwd=run.parent
+    )
     if "OpenGL" in ended.err:
         pytest.skip(f"no OpenGL here: {ended.err}")
     return ended.err

@@ -11,10 +11,17 @@ import pytest
 
 from snakesim_testing.runs.bench import host
 from snakesim_testing.runs.command import run_in_background, running_snakesim
-from snakesim_testing.runs.hand_turned_robot import BACKEND, JOINTS, make_hand_turned_folder, robot, seen
+from snakesim_testing.runs.hand_turned_robot import (
+    BACKEND,
+    JOINTS,
+    make_hand_turned_folder,
+    robot,
+    wait_for_published_angle,
+)
 from snakesim_testing.runs.in_process_command import snakesim
 
-SIGN, ZERO_RAD = np.array([1.0, -1.0, 1.0, 1.0]), np.array([0.3, -0.2, 0.0, 0.1])  # as it is really mounted
+# As it is really mounted.
+SIGN, ZERO_RAD = np.array([1.0, -1.0, 1.0, 1.0]), np.array([0.3, -0.2, 0.0, 0.1])
 
 
 @pytest.fixture
@@ -29,9 +36,13 @@ def set_joint_angles(home: Path, joints_rad: Sequence[float]) -> None:
     (home / "new.json").replace(home / "drives.json")
 
 
-def calibrating(home: Path, endpoint: str, *words: str) -> AbstractContextManager[subprocess.Popen[str]]:
+def calibrating(
+    home: Path, endpoint: str, *words: str
+) -> AbstractContextManager[subprocess.Popen[str]]:
     """A command that somebody answers by moving joints and pressing Enter."""
-    return run_in_background(home, "robot", "calibrate", *words, "--endpoint", endpoint, stdin=subprocess.PIPE)
+    return run_in_background(
+        home, "robot", "calibrate", *words, "--endpoint", endpoint, stdin=subprocess.PIPE
+    )
 
 
 def read_output_line(process: subprocess.Popen[str]) -> str:
@@ -54,13 +65,19 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
     with host(home, BACKEND) as endpoint:
         with calibrating(home, endpoint, "direction", "snake.toml") as process:
             for joint in range(JOINTS):
-                assert read_output_line(process).startswith(f"joint_{joint + 1}: turn what is ahead of it to the left")
+                assert read_output_line(process).startswith(
+                    f"joint_{joint + 1}: turn what is ahead of it to the left"
+                )
                 pose_rad[joint] += 0.3
                 set_joint_angles(home, pose_rad)
-                assert ("the other way round" if SIGN[joint] < 0 else "matches the file") in read_output_line(process)
+                assert (
+                    "the other way round" if SIGN[joint] < 0 else "matches the file"
+                ) in read_output_line(process)
             assert "1 joints changed" in read_output_line(process)
             assert process.wait(20) == 0
-        stale = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home)
+        stale = snakesim(
+            "robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home
+        )
         assert stale.code == 2
         assert "restart the host with this file" in stale.err
     set_joint_angles(home, [0.0] * JOINTS)
@@ -69,22 +86,40 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
             assert read_output_line(process).startswith("Move each joint")
             for angle_rad in (-0.9, 1.2):
                 set_joint_angles(home, [angle_rad, 0.0, 0.0, 0.0])
-                seen(home, endpoint, angle_rad + ZERO_RAD[0])
+                wait_for_published_angle(home, endpoint, angle_rad + ZERO_RAD[0])
             assert "1 joints changed" in enter(process)
         assert "joint_2 reports the turn" in swapped(home, endpoint)
-        with calibrating(home, endpoint, "gear", "snake.toml", "joint_3", "--degrees", "45") as process:
-            assert read_output_line(process).startswith("joint_3: turn what is ahead of it to the left by 45 degrees")
+        with calibrating(
+            home, endpoint, "gear", "snake.toml", "joint_3", "--degrees", "45"
+        ) as process:
+            assert read_output_line(process).startswith(
+                "joint_3: turn what is ahead of it to the left by 45 degrees"
+            )
             set_joint_angles(home, [1.2, 0.4, np.pi / 4, 0.0])
             assert "45 of 45 degrees: matches the file" in read_output_line(process)
             assert process.wait(20) == 0
         set_joint_angles(home, [0.0] * JOINTS)
-        seen(home, endpoint, ZERO_RAD[0])
-        assert snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=home).code == 0
+        wait_for_published_angle(home, endpoint, ZERO_RAD[0])
+        assert (
+            snakesim(
+                "robot",
+                "calibrate",
+                "zero",
+                "snake.toml",
+                "--now",
+                "--endpoint",
+                endpoint,
+                cwd=home,
+            ).code
+            == 0
+        )
     found = robot(home).joint_table
     assert [joint.drive.sign for joint in found] == SIGN.tolist()
     assert [joint.drive.zero_rad for joint in found] == pytest.approx(ZERO_RAD.tolist(), abs=1e-3)
     ends = found[0].limits
-    assert (ends.lower_rad, ends.upper_rad) == pytest.approx((-0.9 + 0.3 + 0.02, 1.2 + 0.3 - 0.02), abs=1e-3)
+    assert (ends.lower_rad, ends.upper_rad) == pytest.approx(
+        (-0.9 + 0.3 + 0.02, 1.2 + 0.3 - 0.02), abs=1e-3
+    )
     text = (home / "snake.toml").read_text()
     assert "# paper, section IV-A" in text
     assert "sign = -1 # turned by hand, " in text
@@ -103,7 +138,9 @@ def swapped(home: Path, endpoint: str) -> str:
 def test_by_hand_refuses_armed_robot_shipped_file_and_unknown_joint(home: Path) -> None:
     set_joint_angles(home, [0.0] * JOINTS)
     before = (home / "snake.toml").read_bytes()
-    with running_snakesim(home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600") as run:
+    with running_snakesim(
+        home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600"
+    ) as run:
         run.wait_for(" of 600 s")  # armed
         for words, code, why in (
             (("zero", "snake.toml", "--now"), 1, "snakesim robot disarm"),

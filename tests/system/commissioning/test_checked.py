@@ -33,7 +33,9 @@ def test_checked_robot_can_be_armed_until_file_or_drive_changes(home: Path) -> N
     checking = run(home, "check", "--controller", "joint_check", "--duration", "4")
     assert checking.code == 0, checking.out
     judged = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
-    assert judged.code == 0 and f"{JOINTS} of {JOINTS} joints match the robot file" in judged.out, judged.out
+    assert judged.code == 0 and f"{JOINTS} of {JOINTS} joints match the robot file" in judged.out, (
+        judged.out
+    )
     text = (home / "snake.toml").read_text()
     assert "[checked]" in text
     assert 'serials = ["A1", "B2", "C3"]' in text

@@ -28,7 +28,10 @@ def home(tmp_path: Path) -> Path:
 @contextmanager
 def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """The command, once it is armed, and the other end of its terminal."""
-    (ours, theirs), words = pty.openpty(), ("robot", "jog", "snake.toml", "joint_2", "--endpoint", endpoint)
+    (ours, theirs), words = (
+        pty.openpty(),
+        ("robot", "jog", "snake.toml", "joint_2", "--endpoint", endpoint),
+    )
     try:
         with run_in_background(home, *words, stdin=theirs) as process:
             assert process.stdout is not None
@@ -54,7 +57,10 @@ def moved_and_stood(home: Path, endpoint: str) -> bool:
         def ended() -> bool:
             return process.poll() is not None or stopped(home)
 
-        wait_until(lambda: ended() or read_setpoints(home)["mode"] == [0, 1, 0, 0], "one joint with current")
+        wait_until(
+            lambda: ended() or read_setpoints(home)["mode"] == [0, 1, 0, 0],
+            "one joint with current",
+        )
         before = read_setpoints(home)["target"][1]
         while not ended() and read_setpoints(home)["target"][1] < before + 0.04:
             os.write(terminal, UP)
@@ -72,7 +78,9 @@ def moved_and_stood(home: Path, endpoint: str) -> bool:
         wait_until(lambda: read_setpoints(home)["tick"] > held_back + 25, "half a second")
         if ended():
             return False
-        assert read_setpoints(home)["target"][1] == half["target"][1], "moved by keys that a network has held back"
+        assert read_setpoints(home)["target"][1] == half["target"][1], (
+            "moved by keys that a network has held back"
+        )
         os.write(terminal, b"q")
         return process.wait(20) == 0
 
@@ -80,9 +88,15 @@ def moved_and_stood(home: Path, endpoint: str) -> bool:
 def stopped_when_killed(home: Path, endpoint: str) -> bool:
     """Kill the command; False when it was not armed."""
     with jogging(home, endpoint) as (process, _terminal):
-        wait_until(lambda: process.poll() is not None or read_setpoints(home)["lifecycle"] != "disarmed", "armed again")
+        wait_until(
+            lambda: process.poll() is not None or read_setpoints(home)["lifecycle"] != "disarmed",
+            "armed again",
+        )
         if process.poll() is not None:
             return False
         process.kill()
-        wait_until(lambda: read_setpoints(home)["lifecycle"] == "fault", "a stop after the terminal is lost")
+        wait_until(
+            lambda: read_setpoints(home)["lifecycle"] == "fault",
+            "a stop after the terminal is lost",
+        )
         return True

@@ -35,7 +35,10 @@ def test_every_defect_is_named_and_no_sound_joint_is(tmp_path: Path) -> None:
     assert code == 1
     for defect, said in DEFECTS.items():
         assert any(re.match(said, line) for line in lines), f"{defect}: {lines}"
-    assert f"{JOINTS - len(DEFECTS)} of {JOINTS} joints match the robot file; {len(DEFECTS)} wrong" in lines
+    assert (
+        f"{JOINTS - len(DEFECTS)} of {JOINTS} joints match the robot file; {len(DEFECTS)} wrong"
+        in lines
+    )
 
 
 @pytest.mark.slow
@@ -46,7 +49,10 @@ def test_a_sound_robot_passes(tmp_path: Path) -> None:
 
 def test_a_run_of_another_scenario_is_neither_checked_nor_identified(tmp_path: Path) -> None:
     run_to_summary(tmp_path / "run", "triplet", "--duration", "0.1")
-    for typed, wanted in ((("robot", "check", "run"), "joint_check"), (("robot", "identify", "run"), "identify")):
+    for typed, wanted in (
+        (("robot", "check", "run"), "joint_check"),
+        (("robot", "identify", "run"), "identify"),
+    ):
         ended = snakesim(*typed, cwd=tmp_path)
         assert ended.code == 2
         assert f"snakesim run {wanted}" in ended.err

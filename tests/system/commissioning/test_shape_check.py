@@ -16,7 +16,10 @@ from snakesim_testing.runs.in_process_command import snakesim
 DRIVE_TYPES = [
     "feetech",
     "odrive",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("can", "cia402", "dynamixel", "moteus")),
+    *(
+        pytest.param(name, marks=pytest.mark.slow)
+        for name in ("can", "cia402", "dynamixel", "moteus")
+    ),
 ]
 MOUNTED = """
 [backends.{backend}.mounted.joint_1]
@@ -29,7 +32,9 @@ REAL = ("--backend", "./real.py:Real")
 
 
 @pytest.mark.parametrize("backend", DRIVE_TYPES)
-def test_faults_of_robot_without_imus_are_named_on_every_drive_type(tmp_path: Path, backend: str) -> None:
+def test_faults_of_robot_without_imus_are_named_on_every_drive_type(
+    tmp_path: Path, backend: str
+) -> None:
     home = make_bent_folder(tmp_path, backend)
     with (home / "bench.toml").open("a") as scenario:
         scenario.write(MOUNTED.format(backend=backend))
@@ -48,7 +53,15 @@ def test_faults_of_robot_without_imus_are_named_on_every_drive_type(tmp_path: Pa
 
 
 def start(home: Path, out: str, *words: str) -> CompletedRun:
-    flags = (*REAL, "--out", out, "--endpoint", find_free_endpoint(), "--set", "clock_mode=lockstep")
+    flags = (
+        *REAL,
+        "--out",
+        out,
+        "--endpoint",
+        find_free_endpoint(),
+        "--set",
+        "clock_mode=lockstep",
+    )
     return run_snakesim("run", "bench.toml", *flags, *words, cwd=home)
 
 
@@ -85,7 +98,10 @@ def test_drawing_of_shapes_is_printable_and_names_what_stays_unknown(tmp_path: P
     (tmp_path / "stiff.toml").write_text(stiff)
     drawn = snakesim("robot", "shape", "draw", "stiff.toml", "--out", "shapes.svg", cwd=tmp_path)
     assert drawn.code == 0, drawn.err
-    assert "joint_2: order, sign, gear, zero will stay unknown: its limits let the shapes bend it by" in drawn.out
+    assert (
+        "joint_2: order, sign, gear, zero will stay unknown: its limits let the shapes bend it by"
+        in drawn.out
+    )
     assert "joint_3: gear will stay unknown" in drawn.out
     refused = snakesim("robot", "shape", "draw", "planar13", "--out", "shapes.txt", cwd=tmp_path)
     assert refused.code == 2

@@ -28,20 +28,31 @@ from snakesim_testing.runs.command import RunningCommand, running_snakesim
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 
 RUN = (
-    *("triplet", "--controller", "lateral_undulation", "--clock-mode", "realtime", "--set", "rate_hz=50"),
+    *(
+        "triplet",
+        "--controller",
+        "lateral_undulation",
+        "--clock-mode",
+        "realtime",
+        "--set",
+        "rate_hz=50",
+    ),
     *("--duration", "600", "--stay", "--console"),
 )
 STOP_LIMIT_S = 10.0  # from the key to motors that are off: far above what it takes when no other tests run beside
 SILENT = "THE STOP DOES NOT ANSWER"
 COAST_LIMIT_S = 2.0  # of robot time, until joints without torque are at rest
-SMALL = 800, 400, 0.25  # width, height, pixels a dot: the browser draws without a graphics card here
+# Width, height, pixels a dot: the browser draws without a graphics card here.
+SMALL = 800, 400, 0.25
 LOOK = "document.documentElement.dataset.mantineColorScheme"
 STATE_TOP = "document.querySelector('[data-robot]').getBoundingClientRect().top"
 PANEL_WIDTHS = (
-    "(panel => [panel.scrollWidth, panel.clientWidth])(document.querySelector('[class*=ScrollArea-viewport]'))"
+    "(panel => [panel.scrollWidth, "
+    "panel.clientWidth])(document.querySelector('[class*=ScrollArea-viewport]'))"
 )
 HIDE = "Object.defineProperty(document, 'hidden', {value: true}); document.dispatchEvent(new Event('visibilitychange'))"
-GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}  # of the page: scene without notices
+# Of the page: scene without notices.
+GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}
 
 
 def fastest_rad_s(joints: JointState) -> float:
@@ -69,7 +80,9 @@ def test_console_page_shows_moving_snake_and_escape_stops_it(tmp_path: Path) -> 
             f"{live_after_s:.1f} s, motors off {stopped_after_s:.2f} s after the key"
         )
         page.wait_for("ESTOP")
-        page.value("document.querySelectorAll('[class*=ScrollArea-viewport]').forEach(e => { e.scrollTop = 300; })")
+        page.value(
+            "document.querySelectorAll('[class*=ScrollArea-viewport]').forEach(e => { e.scrollTop = 300; })"
+        )
         assert page.value(STATE_TOP) >= 0  # in sight all the same
         # On a busy computer the second stop may report for a moment that its self-test is late (503).
         assert not [error for error in page.errors if not error.endswith("/stop")], page.errors
@@ -86,7 +99,10 @@ def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
         ConsolePage(server, None, None, PageLog(), recorded="a run")
         page = browser.open("about:blank", *SMALL)
         for prefers in ("light", "dark"):
-            page.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": prefers}])
+            page.send(
+                "Emulation.setEmulatedMedia",
+                features=[{"name": "prefers-color-scheme", "value": prefers}],
+            )
             page.send("Page.navigate", url=address)
             page.wait_for("Dark page")
             wait_until(lambda prefers=prefers: page.value(LOOK) == prefers, f"a {prefers} page")
@@ -94,7 +110,9 @@ def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
         wait_until(lambda: page.value(LOOK) == "light", "the viewer's choice")
         page.value("window.ends = 0; addEventListener('pointercancel', () => { ends += 1; })")
         for count, leave in enumerate(("window.dispatchEvent(new Event('blur'))", HIDE), start=1):
-            page.value("document.body.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))")
+            page.value(
+                "document.body.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))"
+            )
             page.value(leave)
             assert page.value("ends") == count
 
@@ -105,17 +123,25 @@ def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
     config, log = load_scenario("triplet").config, PageLog()
     with running_console(ReadyStop()) as (server, address), open_chromium() as browser:
         ConsolePage(
-            server, None, RobotOperations(ConnectionSettings(find_free_endpoint(), "planar13"), log), log
+            server,
+            None,
+            RobotOperations(ConnectionSettings(find_free_endpoint(), "planar13"), log),
+            log,
         ).show_snapshot(make_expected_snapshot(config))
         page = browser.open(address, 400, 800, 0.5)
         page.wait_for("planar13")
         for tab in ("Joints", "State", "Signals", "Log"):
             page.click(tab)
-            wait_until(lambda: page.value(PANEL_WIDTHS) == [400, 400], f"a panel as wide as the phone in tab {tab}")
+            wait_until(
+                lambda: page.value(PANEL_WIDTHS) == [400, 400],
+                f"a panel as wide as the phone in tab {tab}",
+            )
         # On a busy computer the stop may report for a moment that it does not answer; then its box is higher.
         wait_until(lambda: page.value(f"{STOP_BOX}.bottom") < 100, "a second stop at the top")
         page.wait_for("Stops the robot even if EMERGENCY STOP does not react. Self-test: ready")
-        assert page.value(f"{NOTICE_BOX}.top > {STOP_BOX}.bottom"), "a notice, such as of missing WebGL, is not covered"
+        assert page.value(f"{NOTICE_BOX}.top > {STOP_BOX}.bottom"), (
+            "a notice, such as of missing WebGL, is not covered"
+        )
         page.size(1400, 860)
         wait_until(lambda: page.value(TAB_LINES) == 1, "tabs in one line")
 
@@ -130,14 +156,22 @@ def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -
         for wrong in (f"{origin}/", f"{origin}/signals", f"{origin}/{'x' * 22}/"):
             browser.open(wrong, *SMALL).wait_for("open the address that the console printed")
         evil = browser.open("data:text/html,<title>another site</title>", *SMALL)
-        evil.value(ANOTHER_SITE.format(page=address.replace("http", "ws").rstrip("/"), stop=f"{address}stop"))
-        wait_until(lambda: evil.value("[opened, posted]") == [False, True], "what another site may do")
+        evil.value(
+            ANOTHER_SITE.format(
+                page=address.replace("http", "ws").rstrip("/"), stop=f"{address}stop"
+            )
+        )
+        wait_until(
+            lambda: evil.value("[opened, posted]") == [False, True], "what another site may do"
+        )
         page = browser.open(f"http://localhost:{port}{urlsplit(address).path}signals", *SMALL)
         page.wait_for("Self-test: ready")
         assert SILENT not in page.text()
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             status = session.wait_for_latched(keys.STATUS, RobotStatus, 10.0)
-            assert status is not None and status.lifecycle != "estop", "another site has stopped the robot"
+            assert status is not None and status.lifecycle != "estop", (
+                "another site has stopped the robot"
+            )
             front = console_process(run, ".front")
             os.kill(front, signal.SIGSTOP)
             try:
@@ -153,7 +187,9 @@ def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -
             finally:
                 os.kill(pages, signal.SIGCONT)
             assert (
-                session.wait_for_latched(keys.STATUS, RobotStatus, 10.0, lambda one: one.lifecycle == "estop")
+                session.wait_for_latched(
+                    keys.STATUS, RobotStatus, 10.0, lambda one: one.lifecycle == "estop"
+                )
                 is not None
             )
 
@@ -194,7 +230,8 @@ def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
         change_settings(first, run)
         first.click("Resume")
         wait_until(lambda: "PAUSED" not in second.text(), "the end of the pause")
-        stop_in(second, run)  # no limit: two pages drawn without a graphics card take seconds for a key
+        # No limit: two pages drawn without a graphics card take seconds for a key.
+        stop_in(second, run)
         first.wait_for("ESTOP")
         first.click("Reset fault")
         first.wait_for("DISARMED")
@@ -214,7 +251,10 @@ def change_settings(tab: BrowserTab, run: RunningCommand) -> None:
     tab.click("Apply")
     with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
         in_force = session.wait_for_latched(
-            keys.PARAMETERS_IN_FORCE, ControlParameters, 10.0, lambda one: one.requester == "viewer 1"
+            keys.PARAMETERS_IN_FORCE,
+            ControlParameters,
+            10.0,
+            lambda one: one.requester == "viewer 1",
         )
     assert in_force is not None
     assert '"amplitude_rad":0.4' in in_force.parameters
@@ -227,17 +267,23 @@ def stop_in(tab: BrowserTab, run: RunningCommand) -> float:
             session.declare_reader(keys.JOINTS, JointState),
             session.declare_latched_reader(keys.STATUS, RobotStatus),
         )
-        wait_until(lambda: any(fastest_rad_s(one) > 0.05 for one in joints.drain()), "moving joints")
+        wait_until(
+            lambda: any(fastest_rad_s(one) > 0.05 for one in joints.drain()), "moving joints"
+        )
         pressed_s = time.monotonic()
         tab.press("Escape", 27)
-        wait_until(lambda: status.pop_newest(lambda one: one.lifecycle == "estop") is not None, "the stop")
+        wait_until(
+            lambda: status.pop_newest(lambda one: one.lifecycle == "estop") is not None, "the stop"
+        )
         stopped_after_s = time.monotonic() - pressed_s
         joints.drain()
         from_ns, recent = None, deque[float](maxlen=5)
         while len(recent) < 5 or max(recent) > 0.02:
             for one in joints.drain():
                 from_ns = one.timestamp_ns if from_ns is None else from_ns
-                assert one.timestamp_ns < from_ns + COAST_LIMIT_S * 1e9, f"joints still move: {list(recent)} rad/s"
+                assert one.timestamp_ns < from_ns + COAST_LIMIT_S * 1e9, (
+                    f"joints still move: {list(recent)} rad/s"
+                )
                 recent.append(fastest_rad_s(one))
             time.sleep(0.005)
     return stopped_after_s

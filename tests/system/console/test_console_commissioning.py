@@ -55,7 +55,9 @@ async def arm_unchecked(address: str) -> None:
         assert viewer.shows("its joints have not been checked against its file")
         assert viewer.shows(">DISARMED<")
         await viewer.click("Arm it unchecked")
-        await until(lambda: viewer.shows(", unchecked, commanded by control"), "a robot armed by the word")
+        await until(
+            lambda: viewer.shows(", unchecked, commanded by control"), "a robot armed by the word"
+        )
         await until(lambda: not viewer.visible("Arm it unchecked"), "the end of the offer")
         watching.cancel()
 
@@ -63,7 +65,9 @@ async def arm_unchecked(address: str) -> None:
 @contextmanager
 def console(home: Path, endpoint: str) -> Iterator[str]:
     """The address of one that may write into the robot file."""
-    with run_in_background(home, "console", "--endpoint", endpoint, "--commission", "snake.toml") as process:
+    with run_in_background(
+        home, "console", "--endpoint", endpoint, "--commission", "snake.toml"
+    ) as process:
         assert process.stdout is not None
         yield process.stdout.readline().split()[1]
 
@@ -84,7 +88,9 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         viewer = ConsoleViewer(socket)
         await viewer.come()
         watching = asyncio.create_task(viewer.watch())
-        await until(lambda: viewer.shows("not checked: its joints have not been checked"), "the table")
+        await until(
+            lambda: viewer.shows("not checked: its joints have not been checked"), "the table"
+        )
         await until(lambda: viewer.shows("id 2"), "the table")
         await until(lambda: viewer.has("Start step"), "the controls of the viewer")
         await viewer.click("Start step")  # of somebody who has no control
@@ -105,12 +111,18 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         assert await moved_and_stood(viewer, relay, home)
         await armed(viewer, home)
     await watching  # the page is closed
-    await until(lambda: read_setpoints(home)["lifecycle"] != "armed", "the end of a step whose viewer has left")
+    await until(
+        lambda: read_setpoints(home)["lifecycle"] != "armed",
+        "the end of a step whose viewer has left",
+    )
 
 
 async def armed(viewer: ConsoleViewer, home: Path) -> None:
     """Jog joint_2, which arms the robot."""
-    await until(lambda: viewer.shows("<div>done") or viewer.shows("<div>ended"), "the end of the step before")
+    await until(
+        lambda: viewer.shows("<div>done") or viewer.shows("<div>ended"),
+        "the end of the step before",
+    )
     await viewer.choose("Joint (0: all)", 2)
     await viewer.click("Start step")
     await until(lambda: viewer.shows("<div>joint_2: from -0.2"), "a joint that may be moved")
@@ -120,11 +132,18 @@ async def armed(viewer: ConsoleViewer, home: Path) -> None:
 async def moved_and_stood(viewer: ConsoleViewer, relay: StallingRelay, home: Path) -> bool:
     """Hold the button, let it go, also while the network stalls; False when the robot was stopped meanwhile."""
     await armed(viewer, home)
-    await until(lambda: stopped(home) or read_setpoints(home)["mode"] == [0, 1, 0, 0], "one joint with current")
+    await until(
+        lambda: stopped(home) or read_setpoints(home)["mode"] == [0, 1, 0, 0],
+        "one joint with current",
+    )
     before = read_setpoints(home)["target"][1]
-    held = {"type": "GuiButtonHoldMessage", "uuid": await viewer.wait_for_uuid(FORWARDS), "frequency": HOLD_HZ}
+    held = {
+        "type": "GuiButtonHoldMessage",
+        "uuid": await viewer.wait_for_uuid(FORWARDS),
+        "frequency": HOLD_HZ,
+    }
     while not stopped(home) and read_setpoints(home)["target"][1] < before + 0.04:
-        await viewer.say(held)
+        await viewer.send_message(held)
         await asyncio.sleep(1 / HOLD_HZ)
     await ticks(home, 25)
     half = read_setpoints(home)
@@ -134,14 +153,16 @@ async def moved_and_stood(viewer: ConsoleViewer, relay: StallingRelay, home: Pat
     assert read_setpoints(home)["target"][1] == half["target"][1]
     relay.stall()
     for _ in range(HELD_IN_STALL):
-        await viewer.say(held)
+        await viewer.send_message(held)
         await asyncio.sleep(1 / HOLD_HZ)
     await asyncio.sleep(LIFTED_S)  # the finger is lifted, and only then does the network recover
     relay.go_on()
     await ticks(home, 50)
     if stopped(home):
         return False
-    assert read_setpoints(home)["target"][1] == half["target"][1], "moved by what was held before the finger was lifted"
+    assert read_setpoints(home)["target"][1] == half["target"][1], (
+        "moved by what was held before the finger was lifted"
+    )
     await viewer.click("End step")
     await until(lambda: viewer.shows("<div>done"), "its end")
     await until(lambda: read_setpoints(home)["lifecycle"] == "disarmed", "a robot without current")

@@ -15,7 +15,16 @@ from snakesim_testing.runs.command import running_snakesim
 
 pytestmark = pytest.mark.e2e
 REPEAT_S = 0.04  # of a held key
-RUN = ("peg_row", "--clock-mode", "realtime", "--duration", "600", "--stay", "--console", "--no-record")
+RUN = (
+    "peg_row",
+    "--clock-mode",
+    "realtime",
+    "--duration",
+    "600",
+    "--stay",
+    "--console",
+    "--no-record",
+)
 
 
 def test_keys_drive_a_lost_page_stands_still_and_another_stops(tmp_path: Path) -> None:
@@ -43,19 +52,35 @@ async def drive_and_stop(address: str, endpoint: str) -> None:
                 await driver.trigger("Drive: ahead")  # of somebody who has no control
                 await driver.click("Take control")
                 await until(lambda: driver.has("Release control"), "control")
-                await hold(driver, "Drive: ahead", lambda: any(path.reason for path in paths.drain()), "who drives")
+                await hold(
+                    driver,
+                    "Drive: ahead",
+                    lambda: any(path.reason for path in paths.drain()),
+                    "who drives",
+                )
                 asked = intents.drain()
                 assert asked
-                assert all(intent.requester == "viewer 2" and (intent.speed_m_s or 0) > 0 for intent in asked)
+                assert all(
+                    intent.requester == "viewer 2" and (intent.speed_m_s or 0) > 0
+                    for intent in asked
+                )
                 before = asked[-1].heading_w_rad
                 assert before is not None
                 await driver.trigger("Drive: left")
                 await hold(
-                    driver, "Drive: ahead", lambda: any((i.heading_w_rad or 0) > before for i in intents.drain())
+                    driver,
+                    "Drive: ahead",
+                    lambda: any((i.heading_w_rad or 0) > before for i in intents.drain()),
                 )
-                await hold(driver, "Drive: backwards", lambda: any((i.speed_m_s or 0) < 0 for i in intents.drain()))
+                await hold(
+                    driver,
+                    "Drive: backwards",
+                    lambda: any((i.speed_m_s or 0) < 0 for i in intents.drain()),
+                )
             await driving  # the page is closed while its key is held
-            stopped = await until(lambda: paths.pop_newest(lambda path: path.speed_m_s == 0), "a robot told to stand")
+            stopped = await until(
+                lambda: paths.pop_newest(lambda path: path.speed_m_s == 0), "a robot told to stand"
+            )
             assert "viewer 2" in stopped.reason
             await until(lambda: other.shows("no viewer has control"), "the return of control")
             await other.trigger("Emergency stop")
@@ -64,7 +89,9 @@ async def drive_and_stop(address: str, endpoint: str) -> None:
         watching.cancel()
 
 
-async def hold(viewer: ConsoleViewer, key: str, done: Callable[[], bool], what: str = "an effect") -> None:
+async def hold(
+    viewer: ConsoleViewer, key: str, done: Callable[[], bool], what: str = "an effect"
+) -> None:
     """Hold a key, as its keyboard repeats it."""
     deadline = asyncio.get_running_loop().time() + LIMIT_S
     while not done():

@@ -16,7 +16,13 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, BrowserTab, ChromiumBrowser, open_chromium
+from snakesim_testing.operator.browser import (
+    CHROMIUM,
+    MISSING,
+    BrowserTab,
+    ChromiumBrowser,
+    open_chromium,
+)
 from verification.screenshots import recording
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
@@ -61,24 +67,34 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
         wait_until(lambda: cells(tab).get(measured, ["–"])[0] != "–", "values")
         said = cells(tab)
         assert [float(value) for value in said[measured]] == pytest.approx(
-            [angle[record.find_nearest_row(1.0)], angle.min(), angle.mean(), angle.max()], rel=1e-3, abs=1e-3
+            [angle[record.find_nearest_row(1.0)], angle.min(), angle.mean(), angle.max()],
+            rel=1e-3,
+            abs=1e-3,
         )
         assert said[wanted][0] != "–"
 
         point(tab, 0.25)  # in the first plot: the cursor of both follows
         wait_until(lambda: cells(tab)[measured] != said[measured], "another instant")
-        cursors = tab.value("[...document.querySelectorAll('.cursor')].map(one => one.getBoundingClientRect().left)")
+        cursors = tab.value(
+            "[...document.querySelectorAll('.cursor')].map(one => one.getBoundingClientRect().left)"
+        )
         assert len(cursors) == 2
         assert cursors[0] == pytest.approx(cursors[1], abs=2)
         point(tab, 0.25, press=True)  # and the snake in the console is there
-        wait_until(lambda: now_s(address) == pytest.approx(0.5, abs=0.05), "the time that was pressed")
+        wait_until(
+            lambda: now_s(address) == pytest.approx(0.5, abs=0.05), "the time that was pressed"
+        )
 
         tab.value(
             "(() => { const [low, high] = document.querySelectorAll('.ranges input');"
             "low.value = '-1'; high.value = '1'; high.onchange(); })()"
         )
         wait_until(lambda: tab.value(AXIS) == [-1, 1], "the range that was typed")
-        for label, file in (("Save CSV", "signals.csv"), ("Save SVG", "signals.svg"), ("Save PNG", "signals.png")):
+        for label, file in (
+            ("Save CSV", "signals.csv"),
+            ("Save SVG", "signals.svg"),
+            ("Save PNG", "signals.png"),
+        ):
             tab.click(label)
             wait_until(lambda file=file: (tmp_path / file).is_file(), file)
         assert not tab.errors, tab.errors
@@ -87,7 +103,9 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
         labels_of_the_report_are_read_on_a_phone(browser, record, tmp_path)
     with (tmp_path / "signals.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    column = [float(row["angle_rad.joint_5 [rad]"]) for row in rows if row["angle_rad.joint_5 [rad]"]]
+    column = [
+        float(row["angle_rad.joint_5 [rad]"]) for row in rows if row["angle_rad.joint_5 [rad]"]
+    ]
     assert np.array_equal(column, angle)
     drawing = ET.fromstring((tmp_path / "signals.svg").read_text(encoding="utf-8"))
     words = "".join(drawing.itertext())
@@ -96,9 +114,13 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
     assert (tmp_path / "signals.png").read_bytes().startswith(b"\x89PNG")
 
 
-def labels_of_the_report_are_read_on_a_phone(browser: ChromiumBrowser, record: RunRecord, folder: Path) -> None:
+def labels_of_the_report_are_read_on_a_phone(
+    browser: ChromiumBrowser, record: RunRecord, folder: Path
+) -> None:
     """Those of the scales in its drawings; a browser is there, and so is a run."""
-    (folder / "report.html").write_text(render_report(record, summarize_run(record, "complete")), encoding="utf-8")
+    (folder / "report.html").write_text(
+        render_report(record, summarize_run(record, "complete")), encoding="utf-8"
+    )
     phone = browser.open((folder / "report.html").as_uri(), 400, 900)
     phone.size(400, 900, mobile=True)
     phone.wait_for("Playback")

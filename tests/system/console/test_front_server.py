@@ -13,7 +13,11 @@ import pytest
 from snakesim_operator.base.console_port import ConsolePorts, open_console_ports
 from snakesim_operator.features.console.front import front_server
 from snakesim_operator.features.console.front.front_server import REQUESTER, FrontServer
-from snakesim_operator.features.console.front.requests import BadRequest, FrontRequest, parse_and_authorize_head
+from snakesim_operator.features.console.front.requests import (
+    BadRequest,
+    FrontRequest,
+    parse_and_authorize_head,
+)
 from snakesim_operator.robot_commands.prepared_stop import StopReadiness
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ready_stop import ReadyStop
@@ -75,17 +79,27 @@ def test_of_too_many_incomplete_requests_the_oldest_is_closed_and_a_stop_is_answ
 ) -> None:
     monkeypatch.setattr(front_server, "MAX_WAITING", FEW)
     stop = ReadyStop()
-    with front(stop) as client, contextlib.ExitStack() as stack, contextlib.closing(client.connect()) as kept:
+    with (
+        front(stop) as client,
+        contextlib.ExitStack() as stack,
+        contextlib.closing(client.connect()) as kept,
+    ):
         assert client.ask_over(kept, "GET") == (200, "ready")
-        opened = [stack.enter_context(client.send(HALF[number % len(HALF)])) for number in range(3 * FEW)]
+        opened = [
+            stack.enter_context(client.send(HALF[number % len(HALF)])) for number in range(3 * FEW)
+        ]
         wait_until(lambda: sum(map(is_closed, opened)) == 2 * FEW, "the oldest ones closed", 5.0)
         assert not is_closed(opened[-1])
         assert client.ask("POST") == (200, "stopped") and stop.requesters == [REQUESTER]
         used = kept.sock
-        assert client.ask_over(kept, "POST") == (200, "stopped") and kept.sock is used, "a page's connection is kept"
+        assert client.ask_over(kept, "POST") == (200, "stopped") and kept.sock is used, (
+            "a page's connection is kept"
+        )
 
 
-def test_of_too_many_stops_all_are_carried_out_and_some_are_not_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_too_many_stops_all_are_carried_out_and_some_are_not_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(front_server, "MAX_AT_STOP", 1)
     stop = ReadyStop()
     with front(stop) as client, contextlib.closing(client.connect()) as kept:
@@ -95,10 +109,14 @@ def test_of_too_many_stops_all_are_carried_out_and_some_are_not_reported(monkeyp
         assert client.ask("GET") == (200, "ready")
 
 
-def test_pages_are_limited_and_get_the_request_without_the_token(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pages_are_limited_and_get_the_request_without_the_token(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(front_server, "MAX_PAGES", 1)
     with front(None) as client:
-        request = f"GET /{client.ports.token}/signals?a=/b HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+        request = (
+            f"GET /{client.ports.token}/signals?a=/b HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+        )
         with client.send(request) as first:
             pages, _ = client.ports.pages.accept()
             with pages:
@@ -116,7 +134,9 @@ def test_pages_are_limited_and_get_the_request_without_the_token(monkeypatch: py
 def test_without_pages_there_is_an_answer() -> None:
     with front(ReadyStop()) as client:
         client.ports.pages.close()
-        with client.send(f"GET /{client.ports.token}/ HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()) as page:
+        with client.send(
+            f"GET /{client.ports.token}/ HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+        ) as page:
             assert b"503" in page.recv(1000)
         assert client.ask("POST") == (200, "stopped")
 
@@ -126,7 +146,10 @@ class BrokenStop(ReadyStop):
 
     def __init__(self) -> None:
         super().__init__()
-        self.errors: list[Exception] = [OSError(errno.EMFILE, "Too many open files"), KeyError("uid")]
+        self.errors: list[Exception] = [
+            OSError(errno.EMFILE, "Too many open files"),
+            KeyError("uid"),
+        ]
 
     def request_stop(self, requester: str) -> "Future[str]":
         if not self.errors:
@@ -176,17 +199,32 @@ def check(first_line: str, *headers: str) -> FrontRequest | BadRequest:
 def test_the_token_is_removed(target: str, path: str, passed_on: str) -> None:
     request = check(f"GET {target} HTTP/1.1", "Host: localhost:8080", "upgrade: websocket")
     assert isinstance(request, FrontRequest) and request.path == path and request.is_websocket
-    assert request.head == f"GET {passed_on} HTTP/1.1\r\nHost: localhost:8080\r\nupgrade: websocket\r\n\r\n".encode()
+    assert (
+        request.head
+        == f"GET {passed_on} HTTP/1.1\r\nHost: localhost:8080\r\nupgrade: websocket\r\n\r\n".encode()
+    )
 
 
-@pytest.mark.parametrize("target", ["/", "/secre/", "/secrets/", "secret", "//secret/", "/%73ecret/", "/?secret", "*"])
+@pytest.mark.parametrize(
+    "target", ["/", "/secre/", "/secrets/", "secret", "//secret/", "/%73ecret/", "/?secret", "*"]
+)
 def test_another_token_is_refused(target: str) -> None:
     request = check(f"GET {target} HTTP/1.1", "Host: localhost:8080")
-    assert isinstance(request, BadRequest) and (request.status, request.kind) == (403, "wrong token")
+    assert isinstance(request, BadRequest) and (request.status, request.kind) == (
+        403,
+        "wrong token",
+    )
 
 
 def test_another_origin_is_refused_with_the_token_too() -> None:
-    for headers in (("Host: evil.example",), ("Host: localhost:1", "Origin: http://localhost:2"), ()):
+    for headers in (
+        ("Host: evil.example",),
+        ("Host: localhost:1", "Origin: http://localhost:2"),
+        (),
+    ):
         request = check("GET /secret/ HTTP/1.1", *headers)
-        assert isinstance(request, BadRequest) and (request.status, request.kind) == (403, "another origin")
+        assert isinstance(request, BadRequest) and (request.status, request.kind) == (
+            403,
+            "another origin",
+        )
     assert isinstance(check("nonsense", "Host: localhost"), BadRequest)

@@ -8,8 +8,16 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, ControlAdmission
-from snakesim_operator.features.console.web.message_age import MAX_UNANSWERED, MessageAge, PageAction
+from snakesim_operator.features.console.web.admission import (
+    MAX_HOLD_AGE_S,
+    MAX_PRESS_AGE_S,
+    ControlAdmission,
+)
+from snakesim_operator.features.console.web.message_age import (
+    MAX_UNANSWERED,
+    MessageAge,
+    PageAction,
+)
 from snakesim_testing.harness.page import ViewerPage
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ready_stop import ReadyStop
@@ -54,7 +62,9 @@ class Link:
 
 @pytest.mark.parametrize(("down_stalls", "up_stalls"), [(True, True), (False, True), (True, False)])
 @pytest.mark.parametrize("stall_s", [1.0, 14.0, 30.0])
-def test_console_message_delayed_by_a_stall_is_too_old(*, down_stalls: bool, up_stalls: bool, stall_s: float) -> None:
+def test_console_message_delayed_by_a_stall_is_too_old(
+    *, down_stalls: bool, up_stalls: bool, stall_s: float
+) -> None:
     link, now_s = Link(), 0.0
     fresh: list[float] = []
     for _ in range(20):
@@ -62,17 +72,22 @@ def test_console_message_delayed_by_a_stall_is_too_old(*, down_stalls: bool, up_
         now_s += 1 / HZ
     assert len(fresh) == 20
     assert max(fresh) <= MAX_HOLD_AGE_S
-    lifted_s = now_s + stall_s - MAX_HOLD_AGE_S - 0.2  # the finger is lifted before the network recovers
+    # The finger is lifted before the network recovers.
+    lifted_s = now_s + stall_s - MAX_HOLD_AGE_S - 0.2
     late: list[float] = []
     for _ in range(round(stall_s * HZ)):
-        late += link.turn(now_s, down_stalls=down_stalls, up_stalls=up_stalls, held=now_s < lifted_s)
+        late += link.turn(
+            now_s, down_stalls=down_stalls, up_stalls=up_stalls, held=now_s < lifted_s
+        )
         now_s += 1 / HZ
     if up_stalls:
         late = link.turn(now_s, down_stalls=False, up_stalls=False, held=False)
         assert len(late) >= (stall_s - 1.0) * HZ
         assert min(late) > MAX_HOLD_AGE_S
     else:
-        assert all(age_s > MAX_HOLD_AGE_S for age_s in late[round(HZ) :]), "no question reaches the page"
+        assert all(age_s > MAX_HOLD_AGE_S for age_s in late[round(HZ) :]), (
+            "no question reaches the page"
+        )
     for _ in range(3):
         link.turn(now_s, down_stalls=False, up_stalls=False, held=False)
         now_s += 1 / HZ
@@ -108,9 +123,16 @@ def test_console_late_motion_is_ignored_and_late_stop_obeyed() -> None:
             return lambda viewer, _action: done.append(f"{what} {viewer}")
 
         admission.admit_control(
-            group, VIEWER, handler=note("group"), max_age_s=MAX_PRESS_AGE_S, at_any_age=("Disarm",), on_late=late.append
+            group,
+            VIEWER,
+            handler=note("group"),
+            max_age_s=MAX_PRESS_AGE_S,
+            at_any_age=("Disarm",),
+            on_late=late.append,
         )
-        admission.admit_control(hold, VIEWER, hold_hz=HZ, handler=note("hold"), max_age_s=MAX_HOLD_AGE_S)
+        admission.admit_control(
+            hold, VIEWER, hold_hz=HZ, handler=note("hold"), max_age_s=MAX_HOLD_AGE_S
+        )
         admission.admit_control(stop, handler=note("stop"))
         messages = {
             "arm": _update(group, "Arm"),
@@ -123,7 +145,9 @@ def test_console_late_motion_is_ignored_and_late_stop_obeyed() -> None:
         for age, asked_s in ((old, time.monotonic() - 14.0), (fresh, time.monotonic())):
             age.note_question("question", asked_s, 0)
             answer = {"type": "LocalStorageGetItemResponseMessage", "request_uuid": "question"}
-            admission.filter_message(VIEWER, msgspec.msgpack.encode(answer | {"value": None, "error": None}), age)
+            admission.filter_message(
+                VIEWER, msgspec.msgpack.encode(answer | {"value": None, "error": None}), age
+            )
         for name in raw:
             assert admission.filter_message(VIEWER, raw[name], old) is None
         assert done == [f"group {VIEWER}", f"stop {VIEWER}"], "to disarm and to stop"
@@ -144,7 +168,9 @@ def test_console_page_without_scene_may_view_and_stop() -> None:
     stopped: list[int] = []
     with running_console(ReadyStop()) as (server, address):
         button = server.gui.add_button("EMERGENCY STOP  (Esc)")
-        server.admission.admit_control(button, handler=lambda viewer, _action: stopped.append(viewer))
+        server.admission.admit_control(
+            button, handler=lambda viewer, _action: stopped.append(viewer)
+        )
         with ViewerPage(address, draws=False) as page:
             page.click("EMERGENCY STOP  (Esc)")
             wait_until(lambda: stopped == [0], "the stop", 10.0)

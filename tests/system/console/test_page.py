@@ -14,7 +14,10 @@ from snakesim_operator.base.console_port import open_console_ports, open_port
 from snakesim_operator.base.page_origin import explain_refusal
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.page import page_html
-from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot, make_expected_snapshot
+from snakesim_operator.features.console.robot_data.snapshot import (
+    RobotSnapshot,
+    make_expected_snapshot,
+)
 from snakesim_operator.features.console.scene.drawing import draw
 from snakesim_operator.features.console.scene.scene_colors import LEGEND
 from snakesim_operator.features.console.web.serve import serve_pages
@@ -26,17 +29,27 @@ from snakesim_testing.operator.viewer import watch
 
 
 def test_page_request_from_other_host_or_port_is_refused():
-    for host in ("127.0.0.1:8080", "localhost:9000", "[::1]:8080", "localhost"):  # a tunnel has another port
+    for host in (
+        "127.0.0.1:8080",
+        "localhost:9000",
+        "[::1]:8080",
+        "localhost",
+    ):  # a tunnel has another port
         assert explain_refusal(host, f"http://{host}") is None
         assert explain_refusal(host, None) is None
         assert explain_refusal(host, "http://evil.example")
         assert explain_refusal(host, "null")
         assert explain_refusal(host, "")
-    assert "http://localhost:8081" in (explain_refusal("localhost:8080", "http://localhost:8081") or "")
+    assert "http://localhost:8081" in (
+        explain_refusal("localhost:8080", "http://localhost:8081") or ""
+    )
     assert "has to be a name of this computer" in (
         explain_refusal("evil.example:8080", "http://evil.example:8080") or ""
     )
-    assert explain_refusal("localhost:8080", "https://mine.example", also=["https://mine.example"]) is None
+    assert (
+        explain_refusal("localhost:8080", "https://mine.example", also=["https://mine.example"])
+        is None
+    )
 
 
 def test_page_port_in_use_is_an_error_without_fallback():
@@ -53,9 +66,14 @@ def test_a_browser_that_comes_before_the_page_gets_it():
             viewers = [threading.Thread(target=come, args=(ports.address,)) for _ in range(3)]
             for viewer in viewers:
                 viewer.start()
-            with running_front_server(ports, None), serve_pages(ports.pages, has_stop=False) as server:
+            with (
+                running_front_server(ports, None),
+                serve_pages(ports.pages, has_stop=False) as server,
+            ):
                 assert early.recv(15) == b"HTTP/1.1 200 OK"
-                wait_until(lambda: len(server.get_clients()) == len(viewers), "the viewers that came early")
+                wait_until(
+                    lambda: len(server.get_clients()) == len(viewers), "the viewers that came early"
+                )
         for viewer in viewers:
             viewer.join(10.0)
 
@@ -87,19 +105,29 @@ def test_text_from_the_network_is_no_markup():
     evil = "<img src=x onerror=alert(1)>\x1b[2J"
     robot = make_description()
     named = {"lease_holder": evil[:40], "alive": [evil[:40]], "waiting_for": [evil[:40]]}
-    reported = make_status(lifecycle="fault", reason=evil, commands_rejected={evil[:40]: 1}, **named)
+    reported = make_status(
+        lifecycle="fault", reason=evil, commands_rejected={evil[:40]: 1}, **named
+    )
     snapshot = RobotSnapshot(robot=robot, status=reported)
-    shown = page_html.format_header(snapshot) + page_html.format_state_table(snapshot) + page_html.format_log([evil])
+    shown = (
+        page_html.format_header(snapshot)
+        + page_html.format_state_table(snapshot)
+        + page_html.format_log([evil])
+    )
     assert "<img" not in shown
     assert "&lt;img" in shown
     assert "\x1b" not in shown
 
 
 def test_page_says_that_simulator_is_paused_and_by_whom():
-    shown = page_html.format_header(RobotSnapshot(robot=make_description(), status=make_status(paused_by="<b>ada")))
+    shown = page_html.format_header(
+        RobotSnapshot(robot=make_description(), status=make_status(paused_by="<b>ada"))
+    )
     assert ">PAUSED<" in shown
     assert "by &lt;b&gt;ada" in shown
-    assert "PAUSED" not in page_html.format_header(RobotSnapshot(robot=make_description(), status=make_status()))
+    assert "PAUSED" not in page_html.format_header(
+        RobotSnapshot(robot=make_description(), status=make_status())
+    )
 
 
 def test_page_draws_an_expected_robot_at_its_start():

@@ -17,10 +17,12 @@ def test_scene_force_without_contact_is_dashed_until_contact():
     with running_console() as (server, _):
         scene = RobotScene(server.scene, make_description(), None)
         for felt in ([], [point], []):
-            snapshot = RobotSnapshot(robot=make_description(), body=joints(), world=world(felt, []), control=control)
+            snapshot = RobotSnapshot(
+                robot=make_description(), body=joints(), world=world(felt, []), control=control
+            )
             drawing = draw(snapshot, None)
             assert drawing is not None
-            scene.show(drawing)
+            scene.update_nodes(drawing)
             desired = scene._arrows.get("forces/desired")
             assert scene._dashed_forces.visible is not bool(felt)
             assert (desired is not None and desired.visible) is bool(felt)
@@ -31,16 +33,38 @@ def test_scene_force_without_contact_is_dashed_until_contact():
 
 def test_scene_perceived_shapes_are_drawn_until_forgotten():
     found = [
-        KnownObstacle(name="a", shape="sphere", position_w=(1.0, 0.0, 0.0), radius_m=0.1, touched=True),
-        KnownObstacle(name="b", shape="cylinder", position_w=(2.0, 0.0, 0.0), radius_m=0.1, height_m=0.2, touched=True),
-        KnownObstacle(name="c", shape="box", position_w=(3.0, 0.0, 0.0), half_size_m=(0.1, 0.2, 0.3), touched=True),
+        KnownObstacle(
+            name="a", shape="sphere", position_w=(1.0, 0.0, 0.0), radius_m=0.1, touched=True
+        ),
+        KnownObstacle(
+            name="b",
+            shape="cylinder",
+            position_w=(2.0, 0.0, 0.0),
+            radius_m=0.1,
+            height_m=0.2,
+            touched=True,
+        ),
+        KnownObstacle(
+            name="c",
+            shape="box",
+            position_w=(3.0, 0.0, 0.0),
+            half_size_m=(0.1, 0.2, 0.3),
+            touched=True,
+        ),
     ]
     with running_console() as (server, _):
         scene = RobotScene(server.scene, make_description(), None)
         for obstacles in (found, []):
-            drawing = draw(RobotSnapshot(robot=make_description(), body=joints(), world=world([], obstacles)), None)
+            drawing = draw(
+                RobotSnapshot(robot=make_description(), body=joints(), world=world([], obstacles)),
+                None,
+            )
             assert drawing is not None
-            scene.show(drawing)
+            scene.update_nodes(drawing)
             shown = list(scene._perceived_obstacles.meshes.batches.values())
             assert [batch.visible for batch in shown] == [bool(obstacles)] * 3
-            assert sorted(float(batch.batched_positions[0, 0]) for batch in shown) == [1.0, 2.0, 3.0]
+            assert sorted(float(batch.batched_positions[0, 0]) for batch in shown) == [
+                1.0,
+                2.0,
+                3.0,
+            ]

@@ -36,7 +36,9 @@ def test_help_needs_no_rights() -> None:
         (("can0", "1M"), 1, "1M"),
     ],
 )
-def test_what_is_no_can_interface_or_bit_rate_is_refused(arguments: tuple[str, ...], code: int, words: str) -> None:
+def test_what_is_no_can_interface_or_bit_rate_is_refused(
+    arguments: tuple[str, ...], code: int, words: str
+) -> None:
     done = up(*arguments)
     assert done.returncode == code
     assert words in done.stderr
@@ -47,7 +49,9 @@ def test_bus_off_stays_off_wherever_an_interface_is_configured() -> None:
     assert setting("40-can0.network", "CAN", "RestartSec") == "0"
     commands: dict[str, str] = {}
     for page in (*(ROOT / "docs").rglob("*.md"), *(ROOT / "deploy").rglob("*.md")):
-        commands[page.name] = "".join(re.findall(r"^```\w*\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL))
+        commands[page.name] = "".join(
+            re.findall(r"^```\w*\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+        )
     for file in (UP, ROOT / "snakesim_operator" / "features" / "lab" / "templates" / "can.j2"):
         commands[file.name] = file.read_text()
     found = {name: set(re.findall(r"restart-ms\W+(\d+)", text)) for name, text in commands.items()}

@@ -29,14 +29,17 @@ KERNEL = kernel.Kernel(
     },
     built_in=["virtio_net"],
 )
-REQUEST = machine.Request(command=["printf", "%s", "it's"], folder=Path("/a folder"), writable=[Path("/re,po")])
+REQUEST = machine.Request(
+    command=["printf", "%s", "it's"], folder=Path("/a folder"), writable=[Path("/re,po")]
+)
 
 
 def test_every_entry_of_an_archive_is_aligned() -> None:
     for length in range(5):
         entry = cpio.file("n" * length + "x", b"c" * length)
         assert len(entry) % 4 == 0
-        assert int(entry[54:62], 16) == length  # the size, seventh of the eight-digit fields after the magic
+        # The size, seventh of the eight-digit fields after the magic.
+        assert int(entry[54:62], 16) == length
 
 
 def test_vm_modules_are_ordered_by_dependency_without_builtin_ones() -> None:
@@ -84,8 +87,12 @@ def test_a_kernel_that_qemu_could_not_start_directly_stays_packed() -> None:
 
 
 def test_the_command_keeps_its_words_folder_and_environment(tmp_path: Path) -> None:
-    request = machine.Request(command=["sh", "-c", 'echo "$0 $GREETING $SNAKESIM_VCAN" > out', "it's"], folder=tmp_path)
-    script = machine.command_script(request, {"GREETING": "two\nlines", "DISPLAY": ":0", "BASH_FUNC_x%%": "() { :; }"})
+    request = machine.Request(
+        command=["sh", "-c", 'echo "$0 $GREETING $SNAKESIM_VCAN" > out', "it's"], folder=tmp_path
+    )
+    script = machine.command_script(
+        request, {"GREETING": "two\nlines", "DISPLAY": ":0", "BASH_FUNC_x%%": "() { :; }"}
+    )
     subprocess.run(["sh", "-c", script], check=True, timeout=30, env={"PATH": "/usr/bin:/bin"})
     assert (tmp_path / "out").read_text() == "it's two\nlines guest\n"
     assert "DISPLAY" not in script
@@ -93,7 +100,9 @@ def test_the_command_keeps_its_words_folder_and_environment(tmp_path: Path) -> N
 
 
 def test_interfaces_are_brought_up_as_asked() -> None:
-    request = machine.Request([], Path("/"), channels=["vcan0", "vcan1"], controllers=True, forward=[(17447, 7447)])
+    request = machine.Request(
+        [], Path("/"), channels=["vcan0", "vcan1"], controllers=True, forward=[(17447, 7447)]
+    )
     script = machine.interface_script(request)
     assert "ip link add vcan1 type vcan\nip link set vcan1 up\n" in script
     assert "ip link set can1 type can bitrate 1000000" in script
@@ -115,7 +124,9 @@ def test_the_host_is_read_only_but_for_the_given_folders(monkeypatch: pytest.Mon
     assert "accel kvm" in qemu(REQUEST, monkeypatch, kvm=True)
 
 
-def test_vm_guest_has_network_only_for_forwarded_loopback_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_vm_guest_has_network_only_for_forwarded_loopback_ports(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert "-netdev" not in qemu(REQUEST, monkeypatch)
     line = qemu(machine.Request([], Path("/"), forward=[(17447, 7447)]), monkeypatch)
     assert "restrict=on,hostfwd=tcp:127.0.0.1:17447-:7447" in line
@@ -132,10 +143,15 @@ def test_controllers_share_one_bus(monkeypatch: pytest.MonkeyPatch) -> None:
     ("parse", "text"),
     [
         *((with_vcan.ports, text) for text in ("", "17447", "0:7447", "17447:70000", "a:b")),
-        *((with_vcan.names, text) for text in ("", "vcan0,", "vcan0;reboot", "a-name-of-more-than-fifteen")),
+        *(
+            (with_vcan.names, text)
+            for text in ("", "vcan0,", "vcan0;reboot", "a-name-of-more-than-fifteen")
+        ),
     ],
 )
-def test_vm_invalid_port_forward_and_channel_name_are_refused(parse: Callable[[str], object], text: str) -> None:
+def test_vm_invalid_port_forward_and_channel_name_are_refused(
+    parse: Callable[[str], object], text: str
+) -> None:
     with pytest.raises(argparse.ArgumentTypeError):
         parse(text)
 

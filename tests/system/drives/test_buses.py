@@ -18,7 +18,10 @@ from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
 AXES, SERVOS = [0, 1], [2, 3]  # joints
-HEAD = {"driver": "odrive"}, {"joint_3": {"driver": "dynamixel"}, "joint_4": {"driver": "dynamixel"}}
+HEAD = (
+    {"driver": "odrive"},
+    {"joint_3": {"driver": "dynamixel"}, "joint_4": {"driver": "dynamixel"}},
+)
 LONG_S = 1.0  # a watchdog that a busy computer does not reach
 SHORT_S = 0.2
 
@@ -26,8 +29,13 @@ SHORT_S = 0.2
 class Robot(DriveRig):
     """Drives of one driver type, by default ODrive axes, and two servos at the head."""
 
-    def __init__(self, clock_mode: ClockMode = "lockstep", body: str = "odrive", **driver_types: Any) -> None:
-        fixed = {name: {"bring_up_limit_s": 2.0} | driver_types.get(name, {}) for name in (body, "dynamixel")}
+    def __init__(
+        self, clock_mode: ClockMode = "lockstep", body: str = "odrive", **driver_types: Any
+    ) -> None:
+        fixed = {
+            name: {"bring_up_limit_s": 2.0} | driver_types.get(name, {})
+            for name in (body, "dynamixel")
+        }
         config = make_run_config(
             backend="mixed",
             robot__chain__modules=4,
@@ -131,14 +139,18 @@ def test_bus_drive_fault_is_injected_and_reported_by_joint_number(opened: Opens)
     robot = opened()
     robot.run(20, "armed")
     robot.go_wrong("overheat:joint_4@0-9")
-    assert [(fault.what, fault.joint) for fault in robot.run(20, "armed")] == [("drive_fault", "joint_4")]
+    assert [(fault.what, fault.joint) for fault in robot.run(20, "armed")] == [
+        ("drive_fault", "joint_4")
+    ]
     with raises_error(ConfigError, code="injection/unknown-target", field="bus_3"):
         robot.go_wrong("cut:bus_3@0")
 
 
 def test_bus_at_half_rate_is_polled_every_second_tick(opened: Opens) -> None:
     robot = opened(dynamixel={"decimation": 2})
-    assert robot.backend.describe().sensors[0].delay_s == 0.01, "so old may a joint state be by itself"
+    assert robot.backend.describe().sensors[0].delay_s == 0.01, (
+        "so old may a joint state be by itself"
+    )
     ages: list[list[float]] = []
     for _ in range(6):
         assert robot.run(1, "armed") == []
@@ -146,7 +158,9 @@ def test_bus_at_half_rate_is_polled_every_second_tick(opened: Opens) -> None:
     assert ages == [[0.0, 0.0], [0.0, 10.0]] * 3
     assert robot.run(1, "armed") == []
     assert robot.run(1, "disarmed") == []
-    assert robot.axes_follow() == robot.servos_follow() == {False}, "in a tick in which the servos' turn is not"
+    assert robot.axes_follow() == robot.servos_follow() == {False}, (
+        "in a tick in which the servos' turn is not"
+    )
 
 
 class Held:
@@ -191,7 +205,11 @@ def test_bus_that_blocks_ages_alone_while_others_stop(opened: Opens) -> None:
     assert robot.servos_follow() == {True}, "nobody can reach them: their own watchdog stops them"
     held.go.set()
     wait_until(lambda: robot.servos_follow() == {False}, "servos that are let go", 10.0)
-    wait_until(lambda: robot.run(1, "disarmed") == [] and max(robot.ages_ms(SERVOS)) < ages[-1], "news", 10.0)
+    wait_until(
+        lambda: robot.run(1, "disarmed") == [] and max(robot.ages_ms(SERVOS)) < ages[-1],
+        "news",
+        10.0,
+    )
 
 
 def test_bus_with_slow_readings_does_not_delay_ticks(opened: Opens) -> None:
@@ -208,7 +226,9 @@ def test_bus_with_slow_readings_does_not_delay_ticks(opened: Opens) -> None:
     while readings[0] <= 5:
         assert robot.run(1, "disarmed") == []
         assert robot.tick < 100_000
-    assert robot.tick - began > 3 * readings[0], "if ticks waited for it, they would be as many as its readings"
+    assert robot.tick - began > 3 * readings[0], (
+        "if ticks waited for it, they would be as many as its readings"
+    )
     robot.go_wrong("slow:bus_2@0=0.02", begins=False)
     assert readings[0] > 5
     assert max(robot.ages_ms(SERVOS)) > 0
@@ -217,7 +237,11 @@ def test_bus_with_slow_readings_does_not_delay_ticks(opened: Opens) -> None:
 def test_bus_without_fresh_setpoints_disables_drives_within_the_lease(opened: Opens) -> None:
     robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
     wait_until(
-        lambda: (robot.run(1, "armed") and False) or robot.axes_follow() == robot.servos_follow() == {True}, "arms"
+        lambda: (
+            (robot.run(1, "armed") and False)
+            or robot.axes_follow() == robot.servos_follow() == {True}
+        ),
+        "arms",
     )
     wait_until(lambda: robot.axes_follow() == robot.servos_follow() == {False}, "both", 10.0)
     assert not any(axis.errors for axis in robot.axes._emulator.axes), "not by their watchdogs"
@@ -230,13 +254,17 @@ def test_bus_without_fresh_setpoints_disables_drives_within_the_lease(opened: Op
     wait_until(both_are_reported, "a fault of each bus", 10.0)
     assert {fault.what for fault in found} == {"no_setpoints"}
     assert "one lease" in found[0].cause
-    assert robot.axes_follow() == robot.servos_follow() == {False}, "setpoints of an armed robot enabled them again"
+    assert robot.axes_follow() == robot.servos_follow() == {False}, (
+        "setpoints of an armed robot enabled them again"
+    )
 
 
 @pytest.mark.parametrize("body", ["odrive", "moteus"])
 def test_drives_that_stop_while_driver_is_frozen_stay_off(opened: Opens, body: str) -> None:
     """Without a look at them the bus would let its drives go, which clears what their watchdogs have latched."""
-    robot = opened("realtime", body, **{body: {"watchdog_s": SHORT_S}, "dynamixel": {"watchdog_s": SHORT_S}})
+    robot = opened(
+        "realtime", body, **{body: {"watchdog_s": SHORT_S}, "dynamixel": {"watchdog_s": SHORT_S}}
+    )
     robot.arm()
     robot.freeze_driver(3 * SHORT_S)
     assert robot.enabled() == [False] * 4
@@ -245,11 +273,19 @@ def test_drives_that_stop_while_driver_is_frozen_stay_off(opened: Opens, body: s
     def all_are_named() -> bool:
         found = robot.run(1, "fault")
         assert robot.enabled() == [False] * 4
-        named.update(fault.joint for fault in found if fault.what == "drive_fault" and "watchdog" in fault.cause)
+        named.update(
+            fault.joint
+            for fault in found
+            if fault.what == "drive_fault" and "watchdog" in fault.cause
+        )
         return named == {f"joint_{i + 1}" for i in range(4)}
 
     wait_until(all_are_named, "a fault of every drive", 10.0)
-    wait_until(lambda: (robot.run(1, "disarmed") and False) or not robot.backend._driven_joints, "cleared", 10.0)
+    wait_until(
+        lambda: (robot.run(1, "disarmed") and False) or not robot.backend._driven_joints,
+        "cleared",
+        10.0,
+    )
     robot.arm()
 
 
@@ -282,7 +318,9 @@ def test_bus_thread_error_ends_run_and_disables_all_drives(opened: Opens) -> Non
 )
 def test_mixed_robot_errors_name_joint_family_and_section(changes: dict[str, Any]) -> None:
     fixed: dict[str, Any] = {"robot__drive": HEAD[0], "robot__joints": HEAD[1]}
-    config = make_run_config(**{"backend": "mixed", "robot__chain__modules": 4, "rate_hz": 100, **fixed, **changes})
+    config = make_run_config(
+        **{"backend": "mixed", "robot__chain__modules": 4, "rate_hz": 100, **fixed, **changes}
+    )
     with raises_error(
         ConfigError,
         code=(
@@ -298,5 +336,7 @@ def test_mixed_robot_errors_name_joint_family_and_section(changes: dict[str, Any
 
 
 def test_ids_are_those_of_a_family_on_a_port() -> None:
-    config = make_run_config(robot__drive=HEAD[0], robot__joints={"joint_3": {"driver": "dynamixel", "id": 1}})
+    config = make_run_config(
+        robot__drive=HEAD[0], robot__joints={"joint_3": {"driver": "dynamixel", "id": 1}}
+    )
     assert [joint.id for joint in config.robot.joint_table][:3] == [1, 2, 1]

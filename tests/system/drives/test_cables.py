@@ -8,7 +8,14 @@ import pytest
 
 from snakesim_testing.benches.workbench import read_example_from_docs
 from snakesim_testing.runs.bench import host, lab_folder
-from snakesim_testing.runs.hand_turned_robot import BACKEND, HELD, JOINTS, SCENARIO, robot, seen
+from snakesim_testing.runs.hand_turned_robot import (
+    BACKEND,
+    HELD,
+    JOINTS,
+    SCENARIO,
+    robot,
+    wait_for_published_angle,
+)
 from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -28,19 +35,32 @@ def why(home: Path, endpoint: str) -> str:
 
 def test_cable_turn_forgotten_by_its_drive_is_not_repeated(tmp_path: Path) -> None:
     held = read_example_from_docs().replace("emulated=True", "emulated=False") + HELD
-    with (lab_folder(tmp_path, JOINTS, SCENARIO, {"held.py": held}) / "snake.toml").open("a") as file:
+    with (lab_folder(tmp_path, JOINTS, SCENARIO, {"held.py": held}) / "snake.toml").open(
+        "a"
+    ) as file:
         file.write(ENDLESS)
     drives(tmp_path, 0.0)
     with host(tmp_path, BACKEND) as endpoint:
         assert "joint_1: how far its cable is wound is not known" in why(tmp_path, endpoint)
-        declared = snakesim("robot", "calibrate", "zero", "snake.toml", "--now", "--endpoint", endpoint, cwd=tmp_path)
-        assert declared.code == 0 and "its cable counts as unwound here" in declared.out, declared.printed
+        declared = snakesim(
+            "robot",
+            "calibrate",
+            "zero",
+            "snake.toml",
+            "--now",
+            "--endpoint",
+            endpoint,
+            cwd=tmp_path,
+        )
+        assert declared.code == 0 and "its cable counts as unwound here" in declared.out, (
+            declared.printed
+        )
     assert robot(tmp_path).joint_table[0].limits.cable_unwound
     with host(tmp_path, BACKEND) as endpoint:
         assert "cable" not in why(tmp_path, endpoint)
         for angle_rad in (2.0, 4.0):  # somebody turns it through
             drives(tmp_path, angle_rad)
-            seen(tmp_path, endpoint, angle_rad)
+            wait_for_published_angle(tmp_path, endpoint, angle_rad)
     drives(tmp_path, 4.0 - TURN)  # it was switched off and on
     with host(tmp_path, BACKEND) as endpoint:
         shown = why(tmp_path, endpoint)

@@ -17,7 +17,9 @@ def over_can(*sets: str) -> InProcessResult:
 
 @pytest.mark.slow
 def test_clutter_run_over_can_continues_without_lost_joint() -> None:
-    reported = over_can("duration_s=6", "robot.safety.max_isolated_joints=1", f'faults=["mute:joint_7@{LOST_S}"]')
+    reported = over_can(
+        "duration_s=6", "robot.safety.max_isolated_joints=1", f'faults=["mute:joint_7@{LOST_S}"]'
+    )
     assert reported.summary.ended == "complete"
     assert list(reported.record.host.isolated) == ["joint_7"]
     advance = ForwardProgress.from_run(reported.record)

@@ -15,10 +15,20 @@ LINE = re.compile(
 
 @pytest.mark.slow  # each driver type alone is in tests/contract, several at once in test_mounted_drives.py
 def test_controller_advances_equally_on_every_drive_family() -> None:
-    ended = subprocess.run([sys.executable, str(SCRIPT), "2"], capture_output=True, text=True, check=False, timeout=110)
+    ended = subprocess.run(
+        [sys.executable, str(SCRIPT), "2"], capture_output=True, text=True, check=False, timeout=110
+    )
     assert ended.returncode == 0, ended.stderr
     rows = [match.groups() for line in ended.stdout.splitlines() if (match := LINE.match(line))]
-    assert [row[0] for row in rows] == ["sim", "can", "odrive", "moteus", "cia402", "dynamixel", "mixed"], ended.stdout
+    assert [row[0] for row in rows] == [
+        "sim",
+        "can",
+        "odrive",
+        "moteus",
+        "cia402",
+        "dynamixel",
+        "mixed",
+    ], ended.stdout
     moved_m = [float(row[1]) for row in rows]
     assert min(moved_m) > 0.8 * max(moved_m) > 0.1, ended.stdout
     assert len({row[2] for row in rows}) == 1

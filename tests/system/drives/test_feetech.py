@@ -10,7 +10,12 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.harness.command import SNAKESIM_COMMAND, CompletedRun, make_environment, snakesim
+from snakesim_testing.harness.command import (
+    SNAKESIM_COMMAND,
+    CompletedRun,
+    make_environment,
+    snakesim,
+)
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.lab.machines import HURRIED
@@ -30,7 +35,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     printed = folder / "servos.log"
     with printed.open("wb") as file:
         servos = subprocess.Popen(
-            [*first, *SNAKESIM_COMMAND, "drive", "emulate", "feetech", "row.toml", "--channel", "servos"],
+            [
+                *first,
+                *SNAKESIM_COMMAND,
+                "drive",
+                "emulate",
+                "feetech",
+                "row.toml",
+                "--channel",
+                "servos",
+            ],
             cwd=folder,
             env=make_environment(folder),
             stdout=file,
@@ -55,7 +69,14 @@ def scan_torques(folder: Path) -> list[str]:
 def run(folder: Path, *arguments: str) -> CompletedRun:
     """Run the scenario, which holds its pose."""
     return snakesim(
-        "run", "row.toml", "--backend", "feetech", "--endpoint", find_free_endpoint(), *arguments, cwd=folder
+        "run",
+        "row.toml",
+        "--backend",
+        "feetech",
+        "--endpoint",
+        find_free_endpoint(),
+        *arguments,
+        cwd=folder,
     )
 
 
@@ -69,7 +90,9 @@ def test_external_servos_are_detected_and_driven_and_off_afterwards(folder: Path
 
 def test_servos_hold_while_host_is_frozen_and_are_off_once_it_resumes(folder: Path) -> None:
     """The host's process gets SIGSTOP for 1.5 s, three times its longest pause."""
-    ended = run(folder, "--fault", "freeze:host@0.5-2", "--duration", "5", "--out", str(folder / "frozen"))
+    ended = run(
+        folder, "--fault", "freeze:host@0.5-2", "--duration", "5", "--out", str(folder / "frozen")
+    )
     record = RunRecord.load(folder / "frozen").host
     assert record.armed_ticks > 5, "it was armed when it was frozen"
     assert ended.code == 1 and record.lifecycle == "fault", ended.printed
@@ -78,7 +101,9 @@ def test_servos_hold_while_host_is_frozen_and_are_off_once_it_resumes(folder: Pa
     assert scan_torques(folder) == ["off"] * 4
 
 
-def test_servos_keep_their_torque_when_host_is_killed_and_the_next_start_switches_it_off(folder: Path) -> None:
+def test_servos_keep_their_torque_when_host_is_killed_and_the_next_start_switches_it_off(
+    folder: Path,
+) -> None:
     endpoint = find_free_endpoint()
     printed = folder / "host.log"
     programs: list[subprocess.Popen[bytes]] = []

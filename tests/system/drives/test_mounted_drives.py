@@ -14,7 +14,9 @@ MIXED = ["joint_3.zero_rad=0.5", "joint_4.sign=-1", "joint_5.gear=1.5", "joint_5
 
 def simulate_peg_row(*sets: str, backend: str = "can", duration_s: float = 1.2) -> RunSummary:
     fixed = (f"backend={backend}", f"duration_s={duration_s}")
-    return simulate(load_scenario("peg_row", [parse_set_option(text) for text in (*fixed, *sets)]).config).summary
+    return simulate(
+        load_scenario("peg_row", [parse_set_option(text) for text in (*fixed, *sets)]).config
+    ).summary
 
 
 @pytest.fixture(scope="module")
@@ -64,4 +66,6 @@ def test_every_second_module_reversed_and_declared_is_the_same_run(plain: RunSum
 def test_drives_with_zero_and_gear_change_only_quantization(plain: RunSummary) -> None:
     mixed = simulate_peg_row(*(f"robot.joints.{text}" for text in MIXED))
     assert mixed.path_distance_m == pytest.approx(plain.path_distance_m, rel=0.05)
-    assert mixed.command_digest != plain.command_digest, "angles behind a gear are rounded otherwise"
+    assert mixed.command_digest != plain.command_digest, (
+        "angles behind a gear are rounded otherwise"
+    )

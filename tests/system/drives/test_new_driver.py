@@ -16,7 +16,9 @@ def test_new_driver_passes_the_contract_suite_as_generated(tmp_path: Path) -> No
     written = snakesim("drive", "new", "acme_servo", cwd=tmp_path)
     assert written.code == 0, written.printed
     ended = run_to_end(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], tmp_path / "acme_servo", limit_s=SUITE_LIMIT_S
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"],
+        tmp_path / "acme_servo",
+        limit_s=SUITE_LIMIT_S,
     )
     assert ended.code == 0, ended.printed
     passed = re.search(r"(\d+) passed", ended.out)

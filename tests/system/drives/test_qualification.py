@@ -9,7 +9,13 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.terminal import discard_line
-from snakesim_operator.features.qualification.protocol.record import PROGRESS, RECORD, SUMMARY, Record, read_record
+from snakesim_operator.features.qualification.protocol.record import (
+    PROGRESS,
+    RECORD,
+    SUMMARY,
+    Record,
+    read_record,
+)
 from snakesim_operator.features.qualification.runner import Options, qualify_drive
 from snakesim_operator.features.qualification.setup import Request
 from snakesim_testing.harness.wait import wait_until
@@ -29,7 +35,9 @@ REFUTED_STEPS = {"dynamixel": ["watchdog"]}  # packets of the second program fee
 
 def options(tmp_path: Path, *only: str, mutant: str = "") -> Options:
     module = (MUTANT_PROGRAM, mutant) if mutant else ("snakesim_operator",)
-    return Options(operator="test", key=tmp_path / "key.pem", yes=True, only=only, emulator_module=module)
+    return Options(
+        operator="test", key=tmp_path / "key.pem", yes=True, only=only, emulator_module=module
+    )
 
 
 def list_steps(record: Record, verdict: str) -> list[str]:
@@ -77,15 +85,21 @@ def test_whole_qualification_completes_on_an_emulated_drive(driver_type: str, tm
 
 def test_drive_without_watchdog_is_refuted(tmp_path: Path):
     record = qualify_drive(
-        Request("moteus", tmp_path), options(tmp_path, "watchdog", mutant="no_watchdog"), discard_line
+        Request("moteus", tmp_path),
+        options(tmp_path, "watchdog", mutant="no_watchdog"),
+        discard_line,
     )
     assert list_steps(record, "refuted") == ["watchdog"]
-    assert {claim.id for claim in record.claims if claim.verdict == "refuted"} == {"stops-without-host"}
+    assert {claim.id for claim in record.claims if claim.verdict == "refuted"} == {
+        "stops-without-host"
+    }
 
 
 def test_drive_that_enables_itself_again_is_refuted(tmp_path: Path):
     record = qualify_drive(
-        Request("moteus", tmp_path), options(tmp_path, "freeze", mutant="enables_again"), discard_line
+        Request("moteus", tmp_path),
+        options(tmp_path, "freeze", mutant="enables_again"),
+        discard_line,
     )
     assert list_steps(record, "refuted") == ["freeze"]
     assert "stays-off" in {claim.id for claim in record.claims if claim.verdict == "refuted"}
@@ -102,7 +116,11 @@ def test_interrupted_qualification_leaves_the_motor_off_and_continues(tmp_path: 
     folder = tmp_path / "out"
     words = ("drive", "qualify", "odrive", "--yes", "--out", "out", "--key", "key.pem")
     with run_in_background(tmp_path, *words) as process:
-        wait_until(lambda: (folder / PROGRESS).exists() and b"motion" in (folder / PROGRESS).read_bytes(), "steps", 90)
+        wait_until(
+            lambda: (folder / PROGRESS).exists() and b"motion" in (folder / PROGRESS).read_bytes(),
+            "steps",
+            90,
+        )
         time.sleep(0.5)
         os.kill(process.pid, signal.SIGINT)
         assert process.wait(30) == 130
@@ -110,17 +128,24 @@ def test_interrupted_qualification_leaves_the_motor_off_and_continues(tmp_path: 
     assert last["enabled"] == [False]
     before = read_record(folder / PROGRESS)
     record = qualify_drive(
-        Request("odrive", folder), options(tmp_path, *(step.key for step in before.steps), "torque"), discard_line
+        Request("odrive", folder),
+        options(tmp_path, *(step.key for step in before.steps), "torque"),
+        discard_line,
     )
     assert record.steps[: len(before.steps)] == before.steps
     assert list_steps(record, "confirmed")[-1] == "torque"
 
 
-def test_qualification_is_refused_without_terminal_without_limits_and_for_several_joints(tmp_path: Path):
+def test_qualification_is_refused_without_terminal_without_limits_and_for_several_joints(
+    tmp_path: Path,
+):
     asked = snakesim("drive", "qualify", "odrive", cwd=tmp_path)
     assert asked.code == 2
     assert "stdin is no terminal" in asked.err
-    for setting, word in (("robot.limits.torque_nm=7", "at most 2 N·m"), ("robot.limits.angle_rad=1", "at most 0.35")):
+    for setting, word in (
+        ("robot.limits.torque_nm=7", "at most 2 N·m"),
+        ("robot.limits.angle_rad=1", "at most 0.35"),
+    ):
         ran = snakesim("drive", "qualify", "odrive", "--yes", "--set", setting, cwd=tmp_path)
         assert ran.code == 2
         assert word in ran.err

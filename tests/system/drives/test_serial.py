@@ -11,7 +11,12 @@ import pytest
 
 from snakesim_hal.network.free_ports import find_free_port
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.harness.command import SNAKESIM_COMMAND, CompletedRun, make_environment, snakesim
+from snakesim_testing.harness.command import (
+    SNAKESIM_COMMAND,
+    CompletedRun,
+    make_environment,
+    snakesim,
+)
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.lab.machines import HURRIED
@@ -20,7 +25,9 @@ from snakesim_testing.runs.servo_row import write_servo_row
 pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
 
 # A sync write of 1 to the register `torque enable` (64): instruction, address, size, and servos with what they get.
-ENABLES = re.compile(r" out .* 83 40 00 01 00( [0-9a-f]{2} 01)+ [0-9a-f]{2} [0-9a-f]{2}$", re.MULTILINE)
+ENABLES = re.compile(
+    r" out .* 83 40 00 01 00( [0-9a-f]{2} 01)+ [0-9a-f]{2} [0-9a-f]{2}$", re.MULTILINE
+)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +40,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def pose(folder: Path) -> Iterator[str]:
     """Servos on `./servos`; where they send the pose."""
     address = f"127.0.0.1:{find_free_port()}"
-    output, first = folder / "servos.log", HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
+    # Real servos wait for nobody.
+    output, first = folder / "servos.log", HURRIED if os.geteuid() == 0 else ()
     with output.open("wb") as file:
         servos = subprocess.Popen(
             [
@@ -76,7 +84,9 @@ def test_external_servos_are_detected_and_driven_in_real_time(pose: str, folder:
     ended = run(folder, pose, "--duration", "2")
     assert ended.code == 0, ended.printed
     again = snakesim("drive", "scan", "dynamixel", "servos", "--baud", "1000000", cwd=folder)
-    assert {line.split()[6] for line in again.out.splitlines()[1:]} == {"5"}, "current-based position is kept"
+    assert {line.split()[6] for line in again.out.splitlines()[1:]} == {"5"}, (
+        "current-based position is kept"
+    )
 
 
 def test_servos_that_stop_while_host_is_frozen_stay_off(pose: str, folder: Path) -> None:
@@ -86,9 +96,15 @@ def test_servos_that_stop_while_host_is_frozen_stay_off(pose: str, folder: Path)
     record = RunRecord.load(folder / "frozen").host
     assert record.armed_ticks > 10, "it was armed when it was frozen"
     assert ended.code == 1 and record.lifecycle == "fault", ended.printed
-    stopped = {fault.joint for fault in record.faults if fault.what == "drive_fault" and "watchdog" in fault.cause}
+    stopped = {
+        fault.joint
+        for fault in record.faults
+        if fault.what == "drive_fault" and "watchdog" in fault.cause
+    }
     assert len(stopped) == 13, record.faults
-    assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, "enabled once, by the arming"
+    assert len(ENABLES.findall((folder / "bytes.log").read_text())) == 1, (
+        "enabled once, by the arming"
+    )
 
 
 def test_a_host_and_a_service_of_one_scenario_arm_servos_of_another_program(tmp_path: Path) -> None:
@@ -101,7 +117,11 @@ def test_a_host_and_a_service_of_one_scenario_arm_servos_of_another_program(tmp_
         path = tmp_path / log
         file = stack.enter_context(path.open("wb"))
         program = subprocess.Popen(
-            [*SNAKESIM_COMMAND, *arguments], cwd=tmp_path, env=make_environment(tmp_path), stdout=file, stderr=file
+            [*SNAKESIM_COMMAND, *arguments],
+            cwd=tmp_path,
+            env=make_environment(tmp_path),
+            stdout=file,
+            stderr=file,
         )
         stack.callback(program.wait, 10)
         stack.callback(program.terminate)
@@ -111,7 +131,9 @@ def test_a_host_and_a_service_of_one_scenario_arm_servos_of_another_program(tmp_
         return snakesim("robot", "arm", "row", "dynamixel", *network, cwd=tmp_path)
 
     with contextlib.ExitStack() as stack:
-        servos = start(stack, "servos.log", "drive", "emulate", "dynamixel", "row.toml", "--channel", "row")
+        servos = start(
+            stack, "servos.log", "drive", "emulate", "dynamixel", "row.toml", "--channel", "row"
+        )
         wait_until(lambda: "servos ready: 4" in servos.read_text(), "the servos")
         start(stack, "host.log", "start", "host", "row.toml", "--backend", "dynamixel", *network)
         with contextlib.ExitStack() as other:
@@ -126,6 +148,8 @@ def test_a_host_and_a_service_of_one_scenario_arm_servos_of_another_program(tmp_
                 "mission.speed_m_s=0.3",
                 *network,
             )
-            wait_until(lambda: "`mission.speed_m_s` = 0.3 (here " in arm().printed, "a refusal", 30.0)
+            wait_until(
+                lambda: "`mission.speed_m_s` = 0.3 (here " in arm().printed, "a refusal", 30.0
+            )
         start(stack, "control.log", "start", "service", "control", "row.toml", *network)
         wait_until(lambda: arm().code == 0, "armed", 60.0)

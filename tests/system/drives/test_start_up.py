@@ -12,7 +12,9 @@ IN_REAL_TIME = ("--clock-mode", "realtime", "--duration", "0.5")
 
 def test_status_names_the_start_up_step_until_the_robot_is_armed(tmp_path: Path) -> None:
     homing = ("--set", "backend.homing_s=20", "--set", "backend.watchdog_s=0.5")
-    with running_snakesim(tmp_path / "run", "triplet", "--backend", BACKEND, *homing, *IN_REAL_TIME) as run:
+    with running_snakesim(
+        tmp_path / "run", "triplet", "--backend", BACKEND, *homing, *IN_REAL_TIME
+    ) as run:
         answer = wait_until(lambda: find_step(run), "status names the step")
         assert "joint_1 (drive 1): homing, " in answer
         assert " of 21.6 s" in answer

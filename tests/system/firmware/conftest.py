@@ -25,7 +25,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return
     for item in items:
         if HERE in item.path.parents:
-            item.add_marker(pytest.mark.skip(reason=f"the reference firmware is in C, and {NO_COMPILER}"))
+            item.add_marker(
+                pytest.mark.skip(reason=f"the reference firmware is in C, and {NO_COMPILER}")
+            )
 
 
 @pytest.fixture(scope="session", params=["plain", "sanitized"])

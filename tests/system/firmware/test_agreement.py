@@ -19,7 +19,12 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_hal.physics.motor import STEEPEST_ROLL_OFF
 from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.can.firmware_replay import Answer, find_difference, run_reference, shrink_difference
+from snakesim_testing.can.firmware_replay import (
+    Answer,
+    find_difference,
+    run_reference,
+    shrink_difference,
+)
 from snakesim_testing.can.firmware_traffic import NODE, Traffic
 from snakesim_testing.can.module_rig import parameter, setpoint
 
@@ -33,14 +38,14 @@ HEAT = HeatLimits(80.0, 105.0)
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_emulator_and_reference_agree_on_random_traffic(replay: Path, seed: int) -> None:
-    difference = find_difference(replay, Traffic(seed).make(EVENTS_PER_SEED))
+    difference = find_difference(replay, Traffic(seed).generate_events(EVENTS_PER_SEED))
     assert difference is None, str(shrink_difference(replay, difference))
 
 
 def test_random_traffic_reaches_every_state_and_every_reason_of_a_stop(replay: Path) -> None:
     answers: list[Answer] = []
     for seed in SEEDS:
-        answers += run_reference(replay, Traffic(seed).make(EVENTS_PER_SEED))
+        answers += run_reference(replay, Traffic(seed).generate_events(EVENTS_PER_SEED))
     assert {answer.state for answer in answers} == set(ModuleState)
     assert {answer.mode for answer in answers} == set(JointMode)
     assert {answer.last_stop for answer in answers} == set(LastStop)
@@ -50,13 +55,21 @@ def test_random_traffic_reaches_every_state_and_every_reason_of_a_stop(replay: P
 
 @pytest.mark.parametrize(
     ("constant", "wrong_value"),
-    [("MAX_LOST_SETPOINTS", 3), ("AT_REST_RAD_S", 0.049), ("HEARTBEAT_US", 100_001), ("MAX_WRONG_COUNTS", 6)],
+    [
+        ("MAX_LOST_SETPOINTS", 3),
+        ("AT_REST_RAD_S", 0.049),
+        ("HEARTBEAT_US", 100_001),
+        ("MAX_WRONG_COUNTS", 6),
+    ],
 )
 def test_a_difference_is_found_and_shrunk_to_the_events_that_matter(
     replay: Path, monkeypatch: pytest.MonkeyPatch, constant: str, wrong_value: float
 ) -> None:
     monkeypatch.setattr(emulated_firmware, constant, wrong_value)
-    found = (find_difference(replay, Traffic(seed).make(EVENTS_PER_SEED)) for seed in range(20))
+    found = (
+        find_difference(replay, Traffic(seed).generate_events(EVENTS_PER_SEED))
+        for seed in range(20)
+    )
     difference = next(difference for difference in found if difference is not None)
     shrunk = shrink_difference(replay, difference)
     assert len(shrunk.events) <= 20, str(shrunk)
@@ -69,8 +82,15 @@ def describe_event(frame: CanFrame, time_us: int) -> str:
 
 def arm_with(parameters: dict[ModuleParameter, float], sensors: str, target: CanFrame) -> list[str]:
     """The events after which a module with some parameters follows a setpoint."""
-    events = [f"init {NODE} 7 {RATED_NM} {RATED_RAD_S} 800 1050 18000 0", sensors, f"poll {BOOTED_US}"]
-    events += [describe_event(parameter(index, value, node_id=NODE), BOOTED_US) for index, value in parameters.items()]
+    events = [
+        f"init {NODE} 7 {RATED_NM} {RATED_RAD_S} 800 1050 18000 0",
+        sensors,
+        f"poll {BOOTED_US}",
+    ]
+    events += [
+        describe_event(parameter(index, value, node_id=NODE), BOOTED_US)
+        for index, value in parameters.items()
+    ]
     events.append(describe_event(make_command(CommandAction.ARM, NODE), BOOTED_US))
     events.append(describe_event(target, BOOTED_US))
     events.append(describe_event(make_sync(1, 0), BOOTED_US))
@@ -78,7 +98,12 @@ def arm_with(parameters: dict[ModuleParameter, float], sensors: str, target: Can
 
 
 def compute_expected_torque(
-    mode: JointMode, target: float, limit_nm: float, angle_rad: float, speed_rad_s: float, winding_c: float
+    mode: JointMode,
+    target: float,
+    limit_nm: float,
+    angle_rad: float,
+    speed_rad_s: float,
+    winding_c: float,
 ) -> float:
     """Return the torque that the specification of SetPoint demands, with the parameters of the test below."""
     match mode:
@@ -119,17 +144,27 @@ def test_the_control_law_is_that_of_the_specification(replay: Path) -> None:
         events += arm_with(parameters, sensors, setpoint(0, mode, target, limit_nm, NODE))
         events.append(f"torque {angle_rad} {speed_rad_s}")
         expected_nm.append(
-            compute_expected_torque(mode, target, limit_nm, angle_rad, speed_rad_s, winding_tenths_c / 10)
+            compute_expected_torque(
+                mode, target, limit_nm, angle_rad, speed_rad_s, winding_tenths_c / 10
+            )
         )
-    completed = subprocess.run([str(replay)], input="\n".join(events), capture_output=True, text=True, check=True)
-    torques_nm = [float(line.split()[0]) for line in completed.stdout.splitlines() if "|" not in line]
+    completed = subprocess.run(
+        [str(replay)], input="\n".join(events), capture_output=True, text=True, check=True
+    )
+    torques_nm = [
+        float(line.split()[0]) for line in completed.stdout.splitlines() if "|" not in line
+    ]
     assert torques_nm == pytest.approx(expected_nm, abs=1e-3)
 
 
 def test_a_module_that_is_not_driven_has_no_torque(replay: Path) -> None:
     sensors = "sensors 1 0 0 0 0 24000 0 200 200" + " 0" * 23
-    events = arm_with({ModuleParameter.STIFFNESS: 20.0}, sensors, setpoint(0, JointMode.POSITION, 1.0, 3.0, NODE))
+    events = arm_with(
+        {ModuleParameter.STIFFNESS: 20.0}, sensors, setpoint(0, JointMode.POSITION, 1.0, 3.0, NODE)
+    )
     events += ["torque 0 0", f"poll {BOOTED_US + 100_000}", "torque 0 0"]
-    completed = subprocess.run([str(replay)], input="\n".join(events), capture_output=True, text=True, check=True)
+    completed = subprocess.run(
+        [str(replay)], input="\n".join(events), capture_output=True, text=True, check=True
+    )
     torques = [line for line in completed.stdout.splitlines() if "|" not in line]
     assert torques == ["3.000000 0", "0.000000 0"]

@@ -64,9 +64,20 @@ def test_a_run_drives_the_modules_of_another_process(tmp_path: Path) -> None:
         (["--firmware"], "--channel unix:PATH"),
         (["--firmware", "--channel", "vcan0"], "--channel unix:PATH"),
         (["--firmware", "--channel", "unix:a.sock", "--fault", "mute:joint_1@1"], "planned faults"),
-        (["--firmware", "--channel", "unix:a.sock", "--set", "backend.mounted.joint_1.connected=false"], "joint_1"),
+        (
+            [
+                "--firmware",
+                "--channel",
+                "unix:a.sock",
+                "--set",
+                "backend.mounted.joint_1.connected=false",
+            ],
+            "joint_1",
+        ),
     ],
 )
-def test_wrong_input_starts_nothing(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_input_starts_nothing(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["triplet", *arguments]) == 2
     assert message in capsys.readouterr().err

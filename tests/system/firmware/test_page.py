@@ -37,12 +37,22 @@ def test_the_main_loop_of_the_page_compiles(tmp_path: Path) -> None:
     assert block.startswith(include)
     source = tmp_path / "main.c"
     source.write_text(block.replace(include, include + BOARD, 1))
-    command = [*list_compilers()[0], *STRICT_FLAGS, f"-I{HEADER.parent}", "-c", source, "-o", tmp_path / "main.o"]
+    command = [
+        *list_compilers()[0],
+        *STRICT_FLAGS,
+        f"-I{HEADER.parent}",
+        "-c",
+        source,
+        "-o",
+        tmp_path / "main.o",
+    ]
     completed = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert completed.returncode == 0, completed.stderr
 
 
-@pytest.mark.parametrize("name", ["jm_receive", "jm_poll", "jm_pop_frame", "jm_compute_torque", "jm_pop_flash_write"])
+@pytest.mark.parametrize(
+    "name", ["jm_receive", "jm_poll", "jm_pop_frame", "jm_compute_torque", "jm_pop_flash_write"]
+)
 def test_the_page_names_every_function_that_a_board_calls(name: str) -> None:
     assert f"{name}(" in HEADER.read_text()
     assert f"`{name}`" in PAGE

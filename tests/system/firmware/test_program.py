@@ -12,7 +12,13 @@ import pytest
 from snakesim_can_backend.bus.unix_wire import UnixWire
 from snakesim_can_backend.emulator.reference_firmware import describe_modules
 from snakesim_can_backend.protocol.commands import make_command, make_emergency
-from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, Opcode, parse_node, parse_opcode
+from snakesim_can_backend.protocol.definitions import (
+    CanFrame,
+    CommandAction,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_native.programs import JOINT_MODULES, get_program
@@ -32,7 +38,14 @@ def run_modules(
     modules_path = folder / "modules.txt"
     modules_path.write_text(describe_modules(config(), CanSettings()))
     process = subprocess.Popen(
-        [program or get_program(JOINT_MODULES), "--socket", path, "--modules", modules_path, *arguments],
+        [
+            program or get_program(JOINT_MODULES),
+            "--socket",
+            path,
+            "--modules",
+            modules_path,
+            *arguments,
+        ],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
     )
@@ -69,7 +82,9 @@ def make_garbage(seed: int) -> bytes:
     """Records of random bytes, most of them with an id that modules read, then an incomplete one."""
     choose = random.Random(seed)
     records = [
-        choose.randrange(0x900).to_bytes(4, "little") + bytes((choose.randrange(12),)) + choose.randbytes(11)
+        choose.randrange(0x900).to_bytes(4, "little")
+        + bytes((choose.randrange(12),))
+        + choose.randbytes(11)
         for _ in range(GARBAGE_RECORDS)
     ]
     return b"".join(records) + choose.randbytes(7)
@@ -111,17 +126,31 @@ def test_the_program_ends_with_the_process_that_started_it(tmp_path: Path) -> No
 
 def test_two_programs_cannot_share_a_socket(tmp_path: Path) -> None:
     with run_modules(tmp_path) as (path, _):
-        command = [get_program(JOINT_MODULES), "--socket", path, "--modules", tmp_path / "modules.txt"]
+        command = [
+            get_program(JOINT_MODULES),
+            "--socket",
+            path,
+            "--modules",
+            tmp_path / "modules.txt",
+        ]
         second = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
         assert second.returncode == 2
         assert "another process" in second.stderr
         assert path.is_socket()
 
 
-@pytest.mark.parametrize("text", ["", "joint_1 node 70\n", "joint_1 node 1 speed 3\n", "joint_1 node 1 serial\n"])
+@pytest.mark.parametrize(
+    "text", ["", "joint_1 node 70\n", "joint_1 node 1 speed 3\n", "joint_1 node 1 serial\n"]
+)
 def test_a_wrong_description_is_wrong_input(tmp_path: Path, text: str) -> None:
     (tmp_path / "modules.txt").write_text(text)
-    command = [get_program(JOINT_MODULES), "--socket", tmp_path / "bus.sock", "--modules", tmp_path / "modules.txt"]
+    command = [
+        get_program(JOINT_MODULES),
+        "--socket",
+        tmp_path / "bus.sock",
+        "--modules",
+        tmp_path / "modules.txt",
+    ]
     assert subprocess.run(command, capture_output=True, timeout=10, check=False).returncode == 2
 
 

@@ -25,7 +25,9 @@ from snakesim_testing.harness.wait import wait_until
         (OSError(19, "No such device"), "LagBackend.{} failed: OSError: [Errno 19] No such device"),
     ],
 )
-def test_backend_error_is_latched_and_joints_are_made_safe(where: str, error: Exception, cause: str) -> None:
+def test_backend_error_is_latched_and_joints_are_made_safe(
+    where: str, error: Exception, cause: str
+) -> None:
     with running_commanded_host(make_run_config()) as (run, _):
         run.backend.fails_in, run.backend.fails_with = where, error
         wait_until(run.has_ended, "the end of the host")
@@ -45,10 +47,15 @@ class Wrong(LagBackend):
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
         right = super().sample(tick, timestamp_ns)
         joints = msgspec.structs.replace(right.joints, **self.wrong.get(keys.JOINTS, {}))
-        return Samples(joints, {**right.by_key, **{key: one for key, one in self.wrong.items() if key != keys.JOINTS}})
+        return Samples(
+            joints,
+            {**right.by_key, **{key: one for key, one in self.wrong.items() if key != keys.JOINTS}},
+        )
 
 
-@pytest.mark.parametrize("clock_mode", [pytest.param("realtime", marks=pytest.mark.quiet), "lockstep"])
+@pytest.mark.parametrize(
+    "clock_mode", [pytest.param("realtime", marks=pytest.mark.quiet), "lockstep"]
+)
 @pytest.mark.parametrize(
     ("key", "sample", "why"),
     [
@@ -57,12 +64,28 @@ class Wrong(LagBackend):
             make_pose(position_w=np.zeros(3)),
             "Pose.position_w is array([0., 0., 0.]), must be plain Python",
         ),
-        (keys.POSE, make_pose(position_w=[0.0, math.nan, 0.0]), "Pose.position_w[1] is nan, must be `float` >= -"),
+        (
+            keys.POSE,
+            make_pose(position_w=[0.0, math.nan, 0.0]),
+            "Pose.position_w[1] is nan, must be `float` >= -",
+        ),
         (keys.POSE, {"position_w": [0.0, 0.0, 0.0]}, "a dict, must be a Pose"),
         (keys.POSE, make_power(), "a Power, must be a Pose"),
-        (keys.POWER, make_power(), f"not a sensor of its description, which has {keys.JOINTS}, {keys.POSE}"),
-        ("sensor/pose2", make_pose(), f"not a sensor of its description, which has {keys.JOINTS}, {keys.POSE}"),
-        (keys.JOINTS, {"angle_rad": np.zeros(3)}, "JointState.angle_rad is array([0., 0., 0.]), must be plain Python"),
+        (
+            keys.POWER,
+            make_power(),
+            f"not a sensor of its description, which has {keys.JOINTS}, {keys.POSE}",
+        ),
+        (
+            "sensor/pose2",
+            make_pose(),
+            f"not a sensor of its description, which has {keys.JOINTS}, {keys.POSE}",
+        ),
+        (
+            keys.JOINTS,
+            {"angle_rad": np.zeros(3)},
+            "JointState.angle_rad is array([0., 0., 0.]), must be plain Python",
+        ),
     ],
 )
 def test_backend_sample_out_of_bounds_is_a_named_latched_fault(
@@ -76,6 +99,8 @@ def test_backend_sample_out_of_bounds_is_a_named_latched_fault(
         assert run.host.ending_status == "failed"
         assert run.host.authority.state == "fault"
         cause = next(
-            fault.cause for fault in run.host.authority.faults_since_start.faults if fault.what == "backend_failed"
+            fault.cause
+            for fault in run.host.authority.faults_since_start.faults
+            if fault.what == "backend_failed"
         )
         assert cause.startswith(f"Wrong.sample: {key} cannot be published: {why}"), cause

@@ -21,7 +21,12 @@ from snakesim_testing.hal.local_network import (
     running_commanded_host,
     running_host,
 )
-from snakesim_testing.hal.small_robots import make_clock, make_description, make_joint_state, make_run_config
+from snakesim_testing.hal.small_robots import (
+    make_clock,
+    make_description,
+    make_joint_state,
+    make_run_config,
+)
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
@@ -37,11 +42,27 @@ def test_injected_fault_lasts_until_ended_and_impossible_one_is_refused() -> Non
     with running_commanded_host(make_run_config(**ALLOWED)) as (run, _):
         for asked, refusal, words in (
             (FaultRequest(kind="mote", target="joint_1"), "cannot", "knows no 'mote'"),
-            (FaultRequest(kind="mute", target="joint_9"), "cannot", "no joint_9; this robot has joint_1 to joint_3"),
-            (FaultRequest(kind="leak", target="joint_1"), "cannot", "backend 'lag' cannot do leak to joint_1"),
+            (
+                FaultRequest(kind="mute", target="joint_9"),
+                "cannot",
+                "no joint_9; this robot has joint_1 to joint_3",
+            ),
+            (
+                FaultRequest(kind="leak", target="joint_1"),
+                "cannot",
+                "backend 'lag' cannot do leak to joint_1",
+            ),
             (FaultRequest(kind="kill", target="control"), "wrong_part", "is carried out by run"),
-            (FaultRequest(kind="drop", target="actuator/joints"), "wrong_part", "is carried out by control"),
-            (FaultRequest(kind="mute", target="joint_1", end=True), "wrong_state", "is not active; active: nothing"),
+            (
+                FaultRequest(kind="drop", target="actuator/joints"),
+                "wrong_part",
+                "is carried out by control",
+            ),
+            (
+                FaultRequest(kind="mute", target="joint_1", end=True),
+                "wrong_state",
+                "is not active; active: nothing",
+            ),
         ):
             answer = run.request(keys.fault_key("hal"), asked)
             assert not answer.ok and answer.refusal == refusal and words in answer.reason, asked
@@ -80,7 +101,10 @@ def test_where_something_real_moves_nothing_goes_wrong_on_request() -> None:
 def test_injected_plan_that_fails_is_a_fault_of_the_run() -> None:
     with running_commanded_host(make_run_config(faults=["leak:joint_1@0"], **ALLOWED)) as (run, _):
         told = run.host.authority.faults_since_start
-        wait_until(lambda: any(fault.what == "injection_refused" for fault in told.faults), "a word about it")
+        wait_until(
+            lambda: any(fault.what == "injection_refused" for fault in told.faults),
+            "a word about it",
+        )
         assert "is refused: backend 'lag' cannot do leak" in run.host.faults.notes[0]
 
 
@@ -90,7 +114,9 @@ def test_a_hanging_host_does_nothing_and_goes_on_afterwards() -> None:
         before = run.backend.advanced
         time.sleep(0.3)
         assert run.backend.advanced - before <= 2
-        assert ask(run, "hang", "host", end=True).ok, "a hanging host still takes the request to end it"
+        assert ask(run, "hang", "host", end=True).ok, (
+            "a hanging host still takes the request to end it"
+        )
         wait_until(lambda: run.backend.advanced > before + 5, "the host going on")
         assert ask(run, "hang", "host", for_s=0.1).ok
         before = run.backend.advanced
@@ -107,7 +133,10 @@ def test_sensors_that_are_dropped_do_not_arrive_and_come_back() -> None:
         wait_until(lambda: len(run.host.faults.notes) == 2, "its end")
         begin, end = (int(text.split()[1].rstrip(":")) for text in run.host.faults.notes)
         ticks: list[int] = []
-        wait_until(lambda: ticks.extend(j.tick for j in reader.drain()) or (ticks and ticks[-1] > end), "new samples")
+        wait_until(
+            lambda: ticks.extend(j.tick for j in reader.drain()) or (ticks and ticks[-1] > end),
+            "new samples",
+        )
         assert not set(ticks) & set(range(begin, end))
 
 
@@ -122,7 +151,9 @@ def test_injected_plan_is_not_repeated_for_restarted_service() -> None:
     config = make_run_config(faults=["drop:actuator/joints@0.1"], allow_fault_injection=True)
     with connected_sessions("worm") as (session,):
         for first_arming, expected in ((0, ["drop:actuator/joints@0.1=1"]), (1, [])):
-            injector = FaultInjector("control", config, session, report_event=lambda _text, _now_s: None)
+            injector = FaultInjector(
+                "control", config, session, report_event=lambda _text, _now_s: None
+            )
             turn(injector, 0, first_arming)
             for tick in range(1, 15):
                 turn(injector, tick, 1)
@@ -131,11 +162,16 @@ def test_injected_plan_is_not_repeated_for_restarted_service() -> None:
 
 
 def test_injected_newer_fault_replaces_one_of_its_kind() -> None:
-    config = make_run_config(faults=["drop:actuator/joints@0.1-0.3=0.5", "drop:actuator/joints@0.2-0.4"])
+    config = make_run_config(
+        faults=["drop:actuator/joints@0.1-0.3=0.5", "drop:actuator/joints@0.2-0.4"]
+    )
     notes: list[str] = []
     with connected_sessions("worm") as (session,):
         injector = FaultInjector(
-            "control", config, session, report_event=lambda text, now_s: notes.append(f"{now_s:g} {text}")
+            "control",
+            config,
+            session,
+            report_event=lambda text, now_s: notes.append(f"{now_s:g} {text}"),
         )
         for tick in range(50):
             turn(injector, tick, int(tick > 0))
@@ -167,9 +203,13 @@ def test_injected_delay_ends_with_its_sending_thread() -> None:
         assert any(thread.name == "late messages" for thread in threading.enumerate())
         faults.end(delay)
         wait_until(lambda: len(arrived) == 5, "all of them")
-        assert all(0.1 <= there_s - here_s < 1.0 for here_s, there_s in zip(sent_at, arrived, strict=True))
+        assert all(
+            0.1 <= there_s - here_s < 1.0 for here_s, there_s in zip(sent_at, arrived, strict=True)
+        )
         wait_until(lambda: publisher._put == straight, "the straight way again")
-        wait_until(lambda: all(t.name != "late messages" for t in threading.enumerate()), "the thread gone")
+        wait_until(
+            lambda: all(t.name != "late messages" for t in threading.enumerate()), "the thread gone"
+        )
         faults.close()
 
 

@@ -100,7 +100,9 @@ def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Eve
     latch.close()
     assert time.monotonic() - began < 2.0
     hanging.set()
-    wait_until(lambda: EstopLatch(tmp_path).left_by_earlier_host is not None, "the stop kept after all")
+    wait_until(
+        lambda: EstopLatch(tmp_path).left_by_earlier_host is not None, "the stop kept after all"
+    )
     assert answers.empty()  # once each
 
 

@@ -33,8 +33,11 @@ def test_host_does_not_await_an_answer_to_a_tick_that_a_service_has_not_received
             wait_until(lambda: run.status.waiting_for == ["navigation"], "control")
             slow.report_done(0)
             run.arm()
-            assert run.request_lifecycle("disarm").ok  # an armed robot that loses its controller goes to fault
-            wait_until(lambda: slow.newest_clock is not None and slow.newest_clock.tick == 1, "tick 1")
+            # An armed robot that loses its controller goes to fault.
+            assert run.request_lifecycle("disarm").ok
+            wait_until(
+                lambda: slow.newest_clock is not None and slow.newest_clock.tick == 1, "tick 1"
+            )
         wait_until(lambda: not run.host.participants["control"].is_connected, "control has left")
         late = SineFollower()
         with running_follower(run.link, late):

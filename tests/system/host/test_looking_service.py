@@ -26,14 +26,18 @@ def config_of(*sets: str) -> RunConfig:
     quiet = [f"robot.sensors.depth.0.{text}" for text in QUIET]
     schedule = ["services.sensor.decimation=5", "services.sensor.latency_ticks=3", "duration_s=0.4"]
     return load_scenario(
-        "peg_row", [parse_set_option(text) for text in ("robot=planar13_camera", *quiet, *schedule, *sets)]
+        "peg_row",
+        [parse_set_option(text) for text in ("robot=planar13_camera", *quiet, *schedule, *sets)],
     ).config
 
 
 def images_of(config: RunConfig) -> list[DepthImage]:
     """What somebody who acts every tick reads, as the clock names it."""
     found: dict[int, DepthImage] = {}
-    with register_plugin_temporarily(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
+    with (
+        register_plugin_temporarily(SERVICES, "sensor", SensorService),
+        InProcessRun(config) as run,
+    ):
         onlooker = HostClient(run.network.create_session(), "onlooker")
         images, ticks = onlooker.subscribe(HEAD, DepthImage), onlooker.iterate_ticks(0.0)
         for _ in run.iterate_ticks():
@@ -65,7 +69,10 @@ def test_looking_service_on_can_sees_what_simulator_sees() -> None:
 
 def test_what_the_backend_has_itself_is_left_to_it() -> None:
     config = config_of()
-    with register_plugin_temporarily(SERVICES, "sensor", SensorService), InProcessRun(config) as run:
+    with (
+        register_plugin_temporarily(SERVICES, "sensor", SensorService),
+        InProcessRun(config) as run,
+    ):
         service = run._loop_by_service["sensor"].service  # pyright: ignore[reportPrivateUsage]
         assert isinstance(service, SensorService)
         assert service._readers == []  # pyright: ignore[reportPrivateUsage]
@@ -73,8 +80,12 @@ def test_what_the_backend_has_itself_is_left_to_it() -> None:
 
 def recording(path, images) -> str:
     """As `snakesim topic echo` prints it."""
-    plain = [{**msgspec.to_builtins(image), "depth": b64encode(image.depth).decode()} for image in images]
-    path.write_text("".join(json.dumps({"key": f"planar13/{HEAD}", "message": image}) + "\n" for image in plain))
+    plain = [
+        {**msgspec.to_builtins(image), "depth": b64encode(image.depth).decode()} for image in images
+    ]
+    path.write_text(
+        "".join(json.dumps({"key": f"planar13/{HEAD}", "message": image}) + "\n" for image in plain)
+    )
     return str(path)
 
 
@@ -83,7 +94,9 @@ def test_looking_service_replays_recording_with_times_of_this_run(tmp_path) -> N
     file = recording(tmp_path / "head.jsonl", recorded[2:5])
     played = images_of(
         config_of(
-            "backend=can", "robot.sensors.depth.0.model=recorded", f'robot.sensors.depth.0.settings.file="{file}"'
+            "backend=can",
+            "robot.sensors.depth.0.model=recorded",
+            f'robot.sensors.depth.0.settings.file="{file}"',
         )
     )
     wanted = [recorded[2 + i % 3].depth for i in range(len(played))]
@@ -95,6 +108,8 @@ def test_a_recording_that_is_none_is_told(tmp_path) -> None:
     file = tmp_path / "head.jsonl"
     for text in ("{", ""):
         file.write_text(text)
-        config = config_of("robot.sensors.depth.0.model=recorded", f'robot.sensors.depth.0.settings.file="{file}"')
+        config = config_of(
+            "robot.sensors.depth.0.model=recorded", f'robot.sensors.depth.0.settings.file="{file}"'
+        )
         with raises_error(ConfigError, code="recording/not-readable"):
             SimulatorRig(config)

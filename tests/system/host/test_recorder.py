@@ -37,7 +37,9 @@ class Numbers(msgspec.Struct):
 
 def fill(box: BlackBox, *ticks: int) -> None:
     for tick in ticks:
-        box.record_tick(tick, tick * 10_000_000, Samples(make_joint_state(ROBOT, 0.001 * tick)), TOLD)
+        box.record_tick(
+            tick, tick * 10_000_000, Samples(make_joint_state(ROBOT, 0.001 * tick)), TOLD
+        )
 
 
 def recorder(box: BlackBox, folder: Path | None, memory: int | None = None) -> HostRecordWriter:
@@ -52,7 +54,11 @@ def reported(folder: Path) -> Numbers:
 
 
 def ticks_on_disk(folder: Path) -> list[int]:
-    return read_black_box(folder / BLACK_BOX)[1]["tick"].tolist() if (folder / BLACK_BOX).exists() else []
+    return (
+        read_black_box(folder / BLACK_BOX)[1]["tick"].tolist()
+        if (folder / BLACK_BOX).exists()
+        else []
+    )
 
 
 @pytest.fixture
@@ -75,12 +81,18 @@ def test_recorder_writes_rows_within_a_second_and_all_at_end(tmp_path: Path, mem
         began = time.monotonic()
         wait_until(lambda: ticks_on_disk(tmp_path) == list(range(40)), "the rows", 5.0)
         assert time.monotonic() - began < 1.0
-        wait_until(lambda: (tmp_path / HOST_RECORD).exists() and reported(tmp_path).ticks == 40, "the numbers", 1.0)
+        wait_until(
+            lambda: (tmp_path / HOST_RECORD).exists() and reported(tmp_path).ticks == 40,
+            "the numbers",
+            1.0,
+        )
         fill(box, *range(40, 45))
     assert ticks_on_disk(tmp_path) == list(range(45))
     assert reported(tmp_path) == remembered(memory) == Numbers(45, 0, "")
     assert compute_digest(read_black_box(tmp_path / BLACK_BOX)[1]) == box.command_digest
-    assert msgspec.json.decode((tmp_path / DESCRIPTION).read_bytes(), type=RobotDescription) == ROBOT
+    assert (
+        msgspec.json.decode((tmp_path / DESCRIPTION).read_bytes(), type=RobotDescription) == ROBOT
+    )
     assert {path.name for path in tmp_path.iterdir()} == {BLACK_BOX, HOST_RECORD, DESCRIPTION}
 
 
@@ -130,7 +142,9 @@ def test_recorder_writes_what_full_disk_refused_when_space_returns(
     disk.space = len(box.layout.encode_header()) + 7 * ROW + 11  # the eighth row is torn
     with recorder(box, tmp_path, memory):
         fill(box, *range(20))
-        wait_until(lambda: len(os.pread(memory, 9, 0)) and remembered(memory).failure, "a word about it")
+        wait_until(
+            lambda: len(os.pread(memory, 9, 0)) and remembered(memory).failure, "a word about it"
+        )
         assert ticks_on_disk(tmp_path) == list(range(7))
         assert remembered(memory).lost_ticks == 0
         disk.space = 2**30
@@ -140,7 +154,9 @@ def test_recorder_writes_what_full_disk_refused_when_space_returns(
     assert capfd.readouterr().err == f"record: {tmp_path}: No space left on device\n"  # once
 
 
-def test_recorder_counts_unwritten_rows_and_gaps_show_in_ticks(tmp_path: Path, memory: int, disk: Disk) -> None:
+def test_recorder_counts_unwritten_rows_and_gaps_show_in_ticks(
+    tmp_path: Path, memory: int, disk: Disk
+) -> None:
     box = BlackBox(ROBOT, memory_bytes=10 * ROW)
     begins = len(box.layout.encode_header())
     disk.space = begins + 3 * ROW
@@ -175,14 +191,19 @@ def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
         running_follower(run.link, SineFollower()),
     ):
         with HostRecordWriter(
-            run.host.black_box, run.host.description, partial(create_host_record, run.host), tmp_path, memory
+            run.host.black_box,
+            run.host.description,
+            partial(create_host_record, run.host),
+            tmp_path,
+            memory,
         ):
             layout = run.host.black_box.layout
             disk.space, disk.hangs = len(layout.encode_header()) + 6 * layout.row_bytes, True
             run.arm()
             wait_until(run.has_ended, "the end of the run")
             assert disk.is_hanging.wait(5.0)
-        assert not disk.should_continue.is_set()  # neither the run nor its recorder's end waited for it
+        # Neither the run nor its recorder's end waited for it.
+        assert not disk.should_continue.is_set()
         assert run.host.ending_status == "complete"
         assert not run.host.authority.faults
     last = msgspec.json.decode(os.pread(memory, 2**20, 0), type=HostRecord)
@@ -214,4 +235,8 @@ def test_numbers_are_written_although_the_disk_never_catches_up(
     monkeypatch.setattr(under_test.os, "pwrite", slow)
     with recorder(box, tmp_path, memory):
         fill(box, 0)
-        wait_until(lambda: (tmp_path / HOST_RECORD).exists() and reported(tmp_path).ticks > 3, "numbers", 5.0)
+        wait_until(
+            lambda: (tmp_path / HOST_RECORD).exists() and reported(tmp_path).ticks > 3,
+            "numbers",
+            5.0,
+        )

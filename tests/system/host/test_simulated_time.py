@@ -32,7 +32,10 @@ def stands_at(run: RunningHost) -> int:
 
 @pytest.mark.parametrize("clock_mode", ["realtime", "lockstep"])
 def test_nothing_expires_in_a_pause_and_steps_are_exact(clock_mode: ClockMode) -> None:
-    with running_commanded_host(make_run_config(clock_mode=clock_mode, **PATIENT)) as (run, control):
+    with running_commanded_host(make_run_config(clock_mode=clock_mode, **PATIENT)) as (
+        run,
+        control,
+    ):
         assert "paused by ada" in ask(run, "pause")
         tick = stands_at(run)
         time.sleep(MANY_LEASES_S)
@@ -45,14 +48,19 @@ def test_nothing_expires_in_a_pause_and_steps_are_exact(clock_mode: ClockMode) -
             assert stands_at(run) == tick
         ask(run, "resume")
         wait_until(lambda: run.backend.advanced > tick + 5, "ticks after the pause")
-        assert run.host.authority.state == "armed" and not run.host.authority.faults, run.host.authority.faults
+        assert run.host.authority.state == "armed" and not run.host.authority.faults, (
+            run.host.authority.faults
+        )
         assert control.ticks_seen == sorted(control.ticks_seen)
         assert "step by 'ada', done" in run.host.request_log[-2]
 
 
 def test_pause_controller_death_stops_the_robot_afterwards() -> None:
     """The lease counts robot time: it is as long after a pause as it was before."""
-    with running_commanded_host(make_run_config(clock_mode="realtime", **PATIENT)) as (run, control):
+    with running_commanded_host(make_run_config(clock_mode="realtime", **PATIENT)) as (
+        run,
+        control,
+    ):
         ask(run, "pause")
         stands_at(run)
         control.silent.set()

@@ -42,7 +42,9 @@ class Plain:
 
 
 def run_with(camera=None, **top):
-    return SimulatorRig(make_config({"sensors": {"depth": [{**CAMERA, **(camera or {})}]}}, WALL, **top))
+    return SimulatorRig(
+        make_config({"sensors": {"depth": [{**CAMERA, **(camera or {})}]}}, WALL, **top)
+    )
 
 
 def arrivals(run, ticks):
@@ -66,7 +68,9 @@ def test_snapshot_shows_past_scene_and_arrives_after_delay(delay_s, ticks):
     assert sensor.rate_hz == 20.0
     assert sensor.delay_s == pytest.approx(ticks * 0.01)
     found = arrivals(run, 30)
-    assert [tick for tick, _ in found] == [tick + ticks for tick in range(0, 30, 5) if tick + ticks < 30]
+    assert [tick for tick, _ in found] == [
+        tick + ticks for tick in range(0, 30, 5) if tick + ticks < 30
+    ]
     for tick, image in found:
         assert isinstance(image, DepthImage)
         taken = tick - ticks
@@ -84,7 +88,9 @@ def bytes_of_a_run(robot, seed=3):
         samples = run.sample()
         for key, message in (("joints", samples.joints), *samples.by_key.items()):
             reported[key] = reported.get(key, b"") + encode(message)
-        run.command([JointMode.POSITION] * 13, [0.5 * np.sin(0.1 * tick + 0.6 * i) for i in range(13)])
+        run.command(
+            [JointMode.POSITION] * 13, [0.5 * np.sin(0.1 * tick + 0.6 * i) for i in range(13)]
+        )
         run.advance()
     run.sim.close()
     return reported
@@ -102,7 +108,9 @@ def test_snapshot_depends_only_on_seed_and_changes_nothing_else():
 
 def test_snapshot_thread_is_absent_without_cameras():
     def looking():
-        return [thread.name for thread in threading.enumerate() if thread.name.startswith("sensors")]
+        return [
+            thread.name for thread in threading.enumerate() if thread.name.startswith("sensors")
+        ]
 
     before = looking()
     plain = SimulatorRig(make_config())
@@ -121,7 +129,9 @@ def slow(tmp_path, sleep_s, name="Slow"):
 
 
 def test_snapshot_late_in_real_time_is_dropped_and_reported_rarely(tmp_path):
-    run = run_with({**slow(tmp_path, 1.0), "delay_s": 0.01, "rate_hz": 100.0}, clock_mode="realtime")
+    run = run_with(
+        {**slow(tmp_path, 1.0), "delay_s": 0.01, "rate_hz": 100.0}, clock_mode="realtime"
+    )
     reported = []
     for _ in range(40):
         assert HEAD not in run.sample().by_key
@@ -155,7 +165,9 @@ def test_a_model_that_breaks_is_an_error_of_the_backend(tmp_path):
 )
 def test_snapshot_impossible_model_is_refused_before_opening_anything(camera):
     config = make_config({"sensors": {"depth": [{**CAMERA, **camera}]}})
-    with raises_error(ConfigError, code=("config/unknown-key", "plugin/not-found", "plugin/not-loadable")):
+    with raises_error(
+        ConfigError, code=("config/unknown-key", "plugin/not-found", "plugin/not-loadable")
+    ):
         SimBackend.check(config, SimSettings())
 
 

@@ -25,7 +25,9 @@ ROBOTS = {
 }
 MAX_EXPOSED = 2.5  # of 10, as systemd-analyze rates it; below is "OK"
 MACHINE = re.compile(r"^\[machines\.\w+\]$", re.MULTILINE)
-needs_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze here")
+needs_systemd = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="no systemd-analyze here"
+)
 
 
 @pytest.fixture(scope="module")
@@ -61,18 +63,26 @@ def test_systemd_accepts_every_unit_and_finds_it_closed(rendered: Path) -> None:
     assert done.code == 0
     assert done.err == ""
     for unit in units:
-        rated = run_to_end(["systemd-analyze", "security", "--offline=true", "--no-pager", unit], rendered)
+        rated = run_to_end(
+            ["systemd-analyze", "security", "--offline=true", "--no-pager", unit], rendered
+        )
         score = re.search(r"exposure level for \S+: ([\d.]+)", rated.out)
-        assert score is not None and float(score[1]) <= MAX_EXPOSED, f"{unit.name}: {rated.printed[-200:]}"
+        assert score is not None and float(score[1]) <= MAX_EXPOSED, (
+            f"{unit.name}: {rated.printed[-200:]}"
+        )
 
 
 def test_containers_run_what_the_units_run(rendered: Path) -> None:
     for compose in rendered.rglob("compose.yaml"):
         services = yaml.safe_load(compose.read_text())["services"]
-        units = [unit.read_text() for unit in (compose.parent / "systemd").glob("snakesim-[gr]*.service")]
+        units = [
+            unit.read_text() for unit in (compose.parent / "systemd").glob("snakesim-[gr]*.service")
+        ]
         ours = sorted(service["command"][1:] for service in services.values())
         commands = [re.search(r"^ExecStart=\S+ (.*)$", unit, re.MULTILINE) for unit in units]
-        assert ours == sorted(shlex.split(command[1]) for command in commands if command is not None)
+        assert ours == sorted(
+            shlex.split(command[1]) for command in commands if command is not None
+        )
 
 
 def test_lab_files_of_removed_roles_are_deleted_others_kept(tmp_path: Path) -> None:
@@ -83,4 +93,9 @@ def test_lab_files_of_removed_roles_are_deleted_others_kept(tmp_path: Path) -> N
     lab.write_text(EXAMPLE_PATH.read_text().replace('role = "viewer"', 'role = "administrator"'))
     assert main(["lab", "render", str(lab), "--out", str(tmp_path)]) == 0
     left = {path.name for path in (tmp_path / "laptop").iterdir()}
-    assert left == {"notes.txt", "rendered.txt", "operator.planar13.json5", "administrator.planar13.json5"}
+    assert left == {
+        "notes.txt",
+        "rendered.txt",
+        "operator.planar13.json5",
+        "administrator.planar13.json5",
+    }

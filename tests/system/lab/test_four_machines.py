@@ -35,32 +35,61 @@ class Lab:
         scenario = (*SCENARIO, "--backend", backend)
         self.start("hub", "router", "start", "router", str(folder / "hub" / "router.main.json5"))
         out = ("--end-after-duration", "--out", str(folder / "record"))
-        self.start("robot1", "host", "start", "host", *scenario, *self.session("robot1", "robot.planar13"), *out)
+        self.start(
+            "robot1",
+            "host",
+            "start",
+            "host",
+            *scenario,
+            *self.session("robot1", "robot.planar13"),
+            *out,
+        )
         for name in ("guidance", "navigation", "control"):
-            self.start("ws1", name, "start", "service", name, *scenario, *self.session("ws1", "gnc.planar13"))
+            self.start(
+                "ws1",
+                name,
+                "start",
+                "service",
+                name,
+                *scenario,
+                *self.session("ws1", "gnc.planar13"),
+            )
 
     def at(self, machine: str, *arguments: str, check: bool = True) -> str:
         """A `snakesim` command on one machine; what it says."""
         state = {"XDG_STATE_HOME": str(self.folder / "state" / machine)}
-        return self.machines[machine].run(*SNAKESIM_COMMAND, *arguments, check=check, cwd=self.folder, env=state)
+        return self.machines[machine].run(
+            *SNAKESIM_COMMAND, *arguments, check=check, cwd=self.folder, env=state
+        )
 
     def start(self, machine: str, name: str, *arguments: str) -> None:
         """A program of ours on one machine."""
         state = {"XDG_STATE_HOME": str(self.folder / "state" / machine), "OMP_NUM_THREADS": "1"}
-        self.machines[machine].start(*SNAKESIM_COMMAND, *arguments, log=self.folder / f"{name}.log", env=state)
+        self.machines[machine].start(
+            *SNAKESIM_COMMAND, *arguments, log=self.folder / f"{name}.log", env=state
+        )
 
     def session(self, machine: str, label: str) -> tuple[str, str]:
         return "--session", str(self.folder / machine / f"{label}.json5")
 
     def logs(self) -> str:
-        return "\n".join(f"{path.name}: {path.read_text()[-800:]}" for path in self.folder.glob("*.log"))
+        return "\n".join(
+            f"{path.name}: {path.read_text()[-800:]}" for path in self.folder.glob("*.log")
+        )
 
 
 def example(folder: Path, backend: str) -> str:
     """The example with its folders here, without the recorder."""
-    text = re.sub(r"^\[machines\.(\w+)\]$", rf'\g<0>\nfolder = "{folder}/\1"', EXAMPLE_PATH.read_text(), flags=re.M)
+    text = re.sub(
+        r"^\[machines\.(\w+)\]$",
+        rf'\g<0>\nfolder = "{folder}/\1"',
+        EXAMPLE_PATH.read_text(),
+        flags=re.M,
+    )
     text = text.replace("10.0.0.1", f"{NET}.1").replace('backend = "sim"', f'backend = "{backend}"')
-    return re.sub(r'\[\[roles\]\]\nmachine = "ws1"\nrole = "recorder"\nrobot = "planar13"\n', "", text)
+    return re.sub(
+        r'\[\[roles\]\]\nmachine = "ws1"\nrole = "recorder"\nrobot = "planar13"\n', "", text
+    )
 
 
 def until(lab: Lab, words: str, *arguments: str) -> None:
@@ -80,17 +109,23 @@ def test_lockstep_across_four_machines_has_digest_of_one(tmp_path: Path, backend
     """
     with ExitStack() as stack:
         lab = Lab(tmp_path, backend, stack)
-        operator, viewer = lab.session("laptop", "operator.planar13"), lab.session("laptop", "viewer.planar13")
+        operator, viewer = (
+            lab.session("laptop", "operator.planar13"),
+            lab.session("laptop", "viewer.planar13"),
+        )
         until(lab, "next: `snakesim robot arm planar13", "status", *viewer)
         checked = lab.at("hub", "lab", "check", "lab.toml", "--out", ".")
         assert "all is as it should be" in checked, checked
-        lab.machines["laptop"].start_module("snakesim_testing.lab.intruder", viewer[1], log=tmp_path / "intruder.log")
+        lab.machines["laptop"].start_module(
+            "snakesim_testing.lab.intruder", viewer[1], log=tmp_path / "intruder.log"
+        )
         refused = lab.at("laptop", "robot", "arm", "planar13", backend, *viewer, check=False)
         assert "exit code 1" in refused, refused
         until(lab, "planar13: armed", "robot", "arm", "planar13", backend, *operator)
         record = finished(lab)
         more = ("--in-process",) if backend == "sim" else ()
-        lab.at("robot1", "run", *SCENARIO, "--backend", backend, "--out", "alone", *more)  # by this machine alone
+        # By this machine alone.
+        lab.at("robot1", "run", *SCENARIO, "--backend", backend, "--out", "alone", *more)
     assert record.command_digest == read_summary(tmp_path / "alone").command_digest, lab.logs()
     did = (tmp_path / "intruder.log").read_text().splitlines()[-1]
     assert re.fullmatch(r"\{'repeated': \d{3,}, 'commanded': \d{2,}\}", did), did

@@ -32,7 +32,10 @@ def test_the_largest_image_arrives_and_a_viewer_can_send_none(lab: RunningLab) -
     viewer_link, robot_link = link(lab, Role.VIEWER), link(lab, Role.ROBOT)
     with open_session(viewer_link) as viewer, open_session(robot_link) as robot:
         reader, found = viewer.declare_reader(KEY, DepthImage), list[DepthImage]()
-        robots, viewers = robot.declare_publisher(KEY, DepthImage), viewer.declare_publisher(KEY, DepthImage)
+        robots, viewers = (
+            robot.declare_publisher(KEY, DepthImage),
+            viewer.declare_publisher(KEY, DepthImage),
+        )
         wait_until(robots.has_subscriber, "the viewer subscribes")
         viewers.put(msgspec.structs.replace(IMAGE, tick=2))
 

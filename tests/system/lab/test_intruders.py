@@ -19,7 +19,11 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from snakesim_hal.network.free_ports import find_free_port
 from snakesim_hal.wire.roles import Role
-from snakesim_operator.features.lab.certificates import CertificateIssuer, issue_certificate, load_or_create_authority
+from snakesim_operator.features.lab.certificates import (
+    CertificateIssuer,
+    issue_certificate,
+    load_or_create_authority,
+)
 from snakesim_operator.features.lab.identities import CertificateIdentity
 from snakesim_testing.lab.router_waits import eventually, settle
 from snakesim_testing.lab.small_lab import OTHER_ROBOT, OWN_ROBOT, RunningLab, open_zenoh_session
@@ -28,7 +32,11 @@ COMMAND = f"{OWN_ROBOT}/actuator/joints"
 
 
 def with_certificate(
-    lab: RunningLab, folder: Path, who: CertificateIdentity, issuer: CertificateIssuer, life: timedelta
+    lab: RunningLab,
+    folder: Path,
+    who: CertificateIdentity,
+    issuer: CertificateIssuer,
+    life: timedelta,
 ) -> dict[str, Any]:
     """Settings of a session with a certificate that the lab did not make."""
     certificate, key = issue_certificate(issuer, who, lab.lab, life)
@@ -51,11 +59,15 @@ REASONS = {  # in the words of the router's log
 
 
 @pytest.mark.parametrize("flaw", REASONS)
-def test_without_a_valid_certificate_nobody_is_let_in(lab: RunningLab, tmp_path: Path, flaw: str) -> None:
+def test_without_a_valid_certificate_nobody_is_let_in(
+    lab: RunningLab, tmp_path: Path, flaw: str
+) -> None:
     who, day = lab.find_identity_by_role(Role.GNC, OWN_ROBOT), timedelta(days=1)
     own = load_or_create_authority(lab.folder / "authority", lab.lab)
     if flaw == "another authority":
-        settings = with_certificate(lab, tmp_path, who, load_or_create_authority(tmp_path / "foreign", lab.lab), day)
+        settings = with_certificate(
+            lab, tmp_path, who, load_or_create_authority(tmp_path / "foreign", lab.lab), day
+        )
     elif flaw == "signed by a role":
         settings = with_certificate(lab, tmp_path, who, role_as_issuer(lab, own), day)
     elif flaw == "expired":
@@ -75,7 +87,9 @@ def test_without_a_valid_certificate_nobody_is_let_in(lab: RunningLab, tmp_path:
 
 def role_as_issuer(lab: RunningLab, own: CertificateIssuer) -> CertificateIssuer:
     """Somebody who signs with the certificate of a role."""
-    certificate, key = issue_certificate(own, lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT), lab.lab)
+    certificate, key = issue_certificate(
+        own, lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT), lab.lab
+    )
     private: Any = load_pem_private_key(key, None)
     return CertificateIssuer(x509.load_pem_x509_certificate(certificate), private)
 
@@ -92,11 +106,17 @@ def test_who_was_taken_out_of_the_lab_file_is_nobody(lab: RunningLab, tmp_path: 
 @pytest.mark.parametrize("mode", ["peer", "router"])
 def test_intruder_peer_or_router_has_rights_of_its_certificate(lab: RunningLab, mode: str) -> None:
     assert (
-        passed(lab, lab.make_session_settings(lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT), mode=mode), "command")
+        passed(
+            lab,
+            lab.make_session_settings(lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT), mode=mode),
+            "command",
+        )
         == []
     )
     assert passed(
-        lab, lab.make_session_settings(lab.find_identity_by_role(Role.GNC, OWN_ROBOT), mode=mode), "command"
+        lab,
+        lab.make_session_settings(lab.find_identity_by_role(Role.GNC, OWN_ROBOT), mode=mode),
+        "command",
     ) == ["command"]
 
 
@@ -125,7 +145,9 @@ def test_bytes_that_are_sent_again_command_nothing(lab: RunningLab) -> None:
     assert len(sent) > 1000
     with lab.open_session(lab.find_identity_by_name("router.spare.hub")) as witness:
         heard: list[str] = []
-        _kept = witness.declare_subscriber("**", lambda sample: heard.append(sample.payload.to_string()))
+        _kept = witness.declare_subscriber(
+            "**", lambda sample: heard.append(sample.payload.to_string())
+        )
         settle(witness)
         with socket.create_connection((host, int(port))) as again:
             again.sendall(sent)
@@ -138,13 +160,18 @@ def test_bytes_that_are_sent_again_command_nothing(lab: RunningLab) -> None:
 
 def test_a_role_cannot_pose_as_the_router(lab: RunningLab) -> None:
     """A viewer's certificate at the router's address: nobody gives it a command."""
-    viewer, gnc = lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT), lab.find_identity_by_role(Role.GNC, OWN_ROBOT)
+    viewer, gnc = (
+        lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT),
+        lab.find_identity_by_role(Role.GNC, OWN_ROBOT),
+    )
     endpoint = f"tls/127.0.0.1:{find_free_port()}"
     settings = lab.make_session_settings(
         viewer, mode="router", listen={"endpoints": [endpoint]}, connect={"endpoints": []}
     )
     tls = settings["transport"]["link"]["tls"]
-    tls.update(listen_certificate=tls["connect_certificate"], listen_private_key=tls["connect_private_key"])
+    tls.update(
+        listen_certificate=tls["connect_certificate"], listen_private_key=tls["connect_private_key"]
+    )
     with open_zenoh_session(settings), pytest.raises(zenoh.ZError):
         lab.open_session(gnc, connect={"endpoints": [endpoint], "timeout_ms": 400}).close()
 
@@ -160,7 +187,11 @@ def test_router_log_states_only_who_joined_and_what_was_refused(lab: RunningLab)
     assert_told(lab, f"let in: {who.common_name} from 127.0.0.1")
     for what in (f"Put (ingress) on {COMMAND}", f"Query (ingress) on {OWN_ROBOT}/hal/lifecycle"):
         assert_told(lab, f"refused: {who.common_name}: {what}")
-    own = [line for line in lab.read_router_log() if who.common_name in line and " on unused/key" not in line]
+    own = [
+        line
+        for line in lab.read_router_log()
+        if who.common_name in line and " on unused/key" not in line
+    ]
     assert len([line for line in own if "Put (ingress)" in line]) < 5
     assert not [line for line in own if "Reply" in line or "Delete" in line]
 
@@ -174,7 +205,9 @@ def passed(lab: RunningLab, settings: dict[str, Any], command: str) -> list[str]
     """What the robot hears when a session with these settings puts a command."""
     heard: list[str] = []
     with lab.open_session(lab.find_identity_by_role(Role.ROBOT, OWN_ROBOT)) as robot:
-        _kept = robot.declare_subscriber(COMMAND, lambda sample: heard.append(sample.payload.to_string()))
+        _kept = robot.declare_subscriber(
+            COMMAND, lambda sample: heard.append(sample.payload.to_string())
+        )
         settle(robot)
         with open_zenoh_session(settings) as session:
             settle(session)
@@ -199,7 +232,8 @@ def relay(tap: socket.socket, router: tuple[str, int], sent: bytearray) -> None:
             while piece := onward.recv(65536):
                 client.sendall(piece)
         with contextlib.suppress(OSError):  # The client is gone, too.
-            client.shutdown(socket.SHUT_RDWR)  # This ends the receive below. Closing would take its descriptor away.
+            # This ends the receive below. Closing would take its descriptor away.
+            client.shutdown(socket.SHUT_RDWR)
 
     answers = threading.Thread(target=relay_answers, daemon=True)
     with client, onward:
@@ -213,7 +247,9 @@ def relay(tap: socket.socket, router: tuple[str, int], sent: bytearray) -> None:
         answers.join()
 
 
-def test_renewed_certificate_continues_and_expired_one_is_excluded(lab: RunningLab, tmp_path: Path) -> None:
+def test_renewed_certificate_continues_and_expired_one_is_excluded(
+    lab: RunningLab, tmp_path: Path
+) -> None:
     """A session with a short certificate connects again by itself when it is renewed on the disk; otherwise it ends."""
     own, life = load_or_create_authority(lab.folder / "authority", lab.lab), timedelta(seconds=2)
     heard: dict[str, list[float]] = {"renewed": [], "ended": []}
@@ -221,7 +257,10 @@ def test_renewed_certificate_continues_and_expired_one_is_excluded(lab: RunningL
         (tmp_path / name).mkdir()
     who = lab.find_identity_by_role(Role.GNC, OWN_ROBOT)
     settings = {name: with_certificate(lab, tmp_path / name, who, own, life) for name in heard}
-    with lab.open_session(lab.find_identity_by_role(Role.ROBOT, OWN_ROBOT)) as robot, ExitStack() as held:
+    with (
+        lab.open_session(lab.find_identity_by_role(Role.ROBOT, OWN_ROBOT)) as robot,
+        ExitStack() as held,
+    ):
         sessions = {name: held.enter_context(open_zenoh_session(settings[name])) for name in heard}
         with_certificate(lab, tmp_path / "renewed", who, own, timedelta(days=1))
 

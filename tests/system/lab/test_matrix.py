@@ -18,7 +18,9 @@ from snakesim_testing.lab.router_waits import eventually, settle
 from snakesim_testing.lab.small_lab import OTHER_ROBOT, OWN_ROBOT, RunningLab
 
 # One key of each line; a gnc has only its own services' names, and `hal` is none of them.
-KEYS = {line.key: line.key.replace("*", "control") for line in ACCESS_RULES} | {"process/*": "process/control-1a2b"}
+KEYS = {line.key: line.key.replace("*", "control") for line in ACCESS_RULES} | {
+    "process/*": "process/control-1a2b"
+}
 FORGED_PLACES = {
     "alive/hal": "alive/*",
     "hal/done/hal": "hal/done/*",
@@ -56,12 +58,16 @@ def expected(role: Role, robot: str) -> Seen:
         for act in line.list_actions(role):
             own_name = "*" in line.key and act in OWN_NAME_ONLY
             if not (own_name and role is Role.RECORDER):
-                granted[act] |= {KEYS[line.key]} | (set() if own_name and role is Role.GNC else forged)
+                granted[act] |= {KEYS[line.key]} | (
+                    set() if own_name and role is Role.GNC else forged
+                )
     return granted
 
 
 QUICK = [*((role, OWN_ROBOT) for role in Role), (Role.GNC, OTHER_ROBOT)]
-SLOW = [pytest.param(role, OTHER_ROBOT, marks=pytest.mark.slow) for role in Role if role is not Role.GNC]
+SLOW = [
+    pytest.param(role, OTHER_ROBOT, marks=pytest.mark.slow) for role in Role if role is not Role.GNC
+]
 
 
 @pytest.mark.parametrize(("role", "robot"), [*QUICK, *SLOW])
@@ -94,7 +100,9 @@ def seen_by(lab: RunningLab, name: str) -> Seen:
 
 
 @pytest.mark.parametrize("role", [Role.VIEWER, Role.OPERATOR, Role.GNC])
-def test_a_wildcard_covers_no_more_than_its_keys(lab: RunningLab, witness: zenoh.Session, role: Role) -> None:
+def test_a_wildcard_covers_no_more_than_its_keys(
+    lab: RunningLab, witness: zenoh.Session, role: Role
+) -> None:
     """Neither a put at `actuator/*` passes for who may not put at `actuator/joints`, nor a query at `hal/*`."""
     wide = [
         f"{start}/{rest}"
@@ -103,8 +111,12 @@ def test_a_wildcard_covers_no_more_than_its_keys(lab: RunningLab, witness: zenoh
     ]
     passed: set[str] = set()
     with lab.open_session(lab.find_identity_by_role(role, OWN_ROBOT)) as session:
-        subscriber = witness.declare_subscriber("**", lambda sample: passed.add(f"put {sample.key_expr}"))
-        queryable = witness.declare_queryable("**", lambda query: passed.add(f"query {query.key_expr}"))
+        subscriber = witness.declare_subscriber(
+            "**", lambda sample: passed.add(f"put {sample.key_expr}")
+        )
+        queryable = witness.declare_queryable(
+            "**", lambda query: passed.add(f"query {query.key_expr}")
+        )
         settle(session, witness)
         for key in wide:
             session.put(key, "x")
@@ -121,18 +133,30 @@ def test_who_has_all_robots_addresses_them_at_once(lab: RunningLab) -> None:
     tokens: list[zenoh.LivelinessToken] = []  # each lasts as long as somebody has it
     with ExitStack() as held:
         for robot in (OWN_ROBOT, OTHER_ROBOT):
-            session = held.enter_context(lab.open_session(lab.find_identity_by_role(Role.ROBOT, robot)))
-            session.declare_queryable(f"{robot}/hal/estop", lambda query, robot=robot: stopped.append(robot))
+            session = held.enter_context(
+                lab.open_session(lab.find_identity_by_role(Role.ROBOT, robot))
+            )
+            session.declare_queryable(
+                f"{robot}/hal/estop", lambda query, robot=robot: stopped.append(robot)
+            )
             tokens.append(session.liveliness().declare_token(f"{robot}/alive/hal"))
-        anyone = held.enter_context(lab.open_session(lab.find_identity_by_name("operator.all.laptop")))
-        one = held.enter_context(lab.open_session(lab.find_identity_by_role(Role.OPERATOR, OTHER_ROBOT)))
+        anyone = held.enter_context(
+            lab.open_session(lab.find_identity_by_name("operator.all.laptop"))
+        )
+        one = held.enter_context(
+            lab.open_session(lab.find_identity_by_role(Role.OPERATOR, OTHER_ROBOT))
+        )
         settle(anyone)
         for session, reached in ((one, []), (anyone, [OTHER_ROBOT, OWN_ROBOT])):
             stopped.clear()
             session.get("**/hal/estop", target=zenoh.QueryTarget.ALL, timeout=0.5)
             settle(anyone)
             assert sorted(stopped) == sorted(reached)
-        found = {str(reply.ok.key_expr) for reply in anyone.liveliness().get("**/alive/hal") if reply.ok is not None}
+        found = {
+            str(reply.ok.key_expr)
+            for reply in anyone.liveliness().get("**/alive/hal")
+            if reply.ok is not None
+        }
         assert found == {f"{OWN_ROBOT}/alive/hal", f"{OTHER_ROBOT}/alive/hal"}
 
 
@@ -140,7 +164,9 @@ def test_router_state_is_read_by_administrator_and_changed_by_nobody(lab: Runnin
     """The admin space of Zenoh names every session and address."""
     for role in Role:
         with lab.open_session(lab.find_identity_by_role(role, OWN_ROBOT)) as session:
-            replies = [reply for reply in session.get("@/*/router", timeout=0.5) if reply.ok is not None]
+            replies = [
+                reply for reply in session.get("@/*/router", timeout=0.5) if reply.ok is not None
+            ]
             assert bool(replies) == (role is Role.ADMINISTRATOR), role
             session.put("@/*/router/config/access_control/enabled", "false")
 
@@ -160,9 +186,12 @@ def samples(session: zenoh.Session, witness: zenoh.Session) -> Seen:
             seen["read"].add(relative(sample.key_expr))
 
     subscribers = [witness.declare_subscriber(f"{OWN_ROBOT}/**", at_witness)]
-    subscribers += [session.declare_subscriber(f"{OWN_ROBOT}/{place}", at_session) for place in PLACES]
+    subscribers += [
+        session.declare_subscriber(f"{OWN_ROBOT}/{place}", at_session) for place in PLACES
+    ]
     settle(session, witness)
-    wait = zenoh.CongestionControl.BLOCK  # by default Zenoh drops what finds its queue full for 0.1 ms
+    # By default Zenoh drops what finds its queue full for 0.1 ms.
+    wait = zenoh.CongestionControl.BLOCK
     for place in PLACES:
         witness.put(f"{OWN_ROBOT}/{place}", TO_ALL, congestion_control=wait)
         session.put(f"{OWN_ROBOT}/{place}", "from the session", congestion_control=wait)
@@ -177,8 +206,12 @@ def queries(session: zenoh.Session, witness: zenoh.Session) -> Seen:
     """A query, and a liveliness token of one that the other looks for, in both directions, at every key."""
     own, other = session.liveliness(), witness.liveliness()
     return {
-        "ask": passing(session, witness, lambda key: session.get(key, timeout=1.0), witness.declare_queryable),
-        "answer": passing(session, witness, lambda key: witness.get(key, timeout=1.0), session.declare_queryable),
+        "ask": passing(
+            session, witness, lambda key: session.get(key, timeout=1.0), witness.declare_queryable
+        ),
+        "answer": passing(
+            session, witness, lambda key: witness.get(key, timeout=1.0), session.declare_queryable
+        ),
         "watch": passing(session, witness, own.get, lambda key, _: other.declare_token(key)),
         "declare": passing(session, witness, other.get, lambda key, _: own.declare_token(key)),
     }
@@ -194,7 +227,11 @@ def passing(
     offers = [declare(f"{OWN_ROBOT}/{place}", answer) for place in PLACES]
     settle(session, witness)
     replies = {place: get(f"{OWN_ROBOT}/{place}") for place in PLACES}
-    found = {place for place, channel in replies.items() if any(reply.ok is not None for reply in channel)}
+    found = {
+        place
+        for place, channel in replies.items()
+        if any(reply.ok is not None for reply in channel)
+    }
     for offer in offers:
         offer.undeclare()
     settle(session, witness)

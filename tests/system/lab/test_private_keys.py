@@ -22,7 +22,9 @@ def certs(out: Path, *more: str) -> int:
     return main(["lab", "certs", str(EXAMPLE_PATH), "--out", str(out), *more])
 
 
-def test_a_folder_that_is_there_keeps_its_mode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_that_is_there_keeps_its_mode(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     shared = tmp_path / "shared"
     shared.mkdir()
     shared.chmod(0o755)
@@ -39,18 +41,25 @@ def test_a_folder_that_is_there_keeps_its_mode(tmp_path: Path, capsys: pytest.Ca
     assert mode(tmp_path / "a" / "new") == 0o700
 
 
-def test_an_authority_that_everybody_may_read_signs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_authority_that_everybody_may_read_signs_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert certs(tmp_path) == 0
     key = tmp_path / "authority" / "authority.key"
     key.chmod(0o644)
     assert certs(tmp_path, "--rotate") == 2
     said = capsys.readouterr().err
-    assert f"{key}: every user of this computer may read this private key (mode 644); chmod 600 {key}" in said
+    assert (
+        f"{key}: every user of this computer may read this private key (mode 644); chmod 600 {key}"
+        in said
+    )
     key.chmod(0o600)
     assert certs(tmp_path, "--rotate") == 0
 
 
-def test_private_key_readable_by_all_is_named_in_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_private_key_readable_by_all_is_named_in_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     key = tmp_path / "viewer.key"
     key.touch(0o600)
     path = tmp_path / "session.json5"
@@ -86,7 +95,9 @@ def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
 def test_too_little_memory_is_one_line(tmp_path: Path, max_mb: int) -> None:
     typed = [*SNAKESIM_COMMAND, "lab", "certs", str(EXAMPLE_PATH), "--out", str(tmp_path / "lab")]
     limited = ["sh", "-c", f'ulimit -v {max_mb * 1024}; exec "$@"', "sh", *typed]
-    ended = run_to_end(limited, tmp_path, make_environment(tmp_path, PYTHONDONTWRITEBYTECODE="1"), 60.0)
+    ended = run_to_end(
+        limited, tmp_path, make_environment(tmp_path, PYTHONDONTWRITEBYTECODE="1"), 60.0
+    )
     assert ended.code in (0, 1) and "Traceback" not in ended.err, ended.err
     if ended.code == 1:
         assert len(ended.err.splitlines()) == 1

@@ -35,7 +35,8 @@ env.reset(seed=1)
 env.step(env.action_space.sample())
 """
 needs_sb3 = pytest.mark.skipif(
-    importlib.util.find_spec("stable_baselines3") is None, reason="stable-baselines3 is not installed: it brings torch"
+    importlib.util.find_spec("stable_baselines3") is None,
+    reason="stable-baselines3 is not installed: it brings torch",
 )
 
 
@@ -60,7 +61,9 @@ def episode(env: SnakeEnv, seed: int | None = 1, action=wave) -> dict[str, Any]:
     return info
 
 
-@pytest.mark.parametrize("name", [IDS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in IDS[1:])])
+@pytest.mark.parametrize(
+    "name", [IDS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in IDS[1:])]
+)
 def test_the_checker_of_gymnasium_has_nothing_to_say(name: str) -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -112,7 +115,9 @@ def test_every_number_has_a_name_a_unit_and_bounds() -> None:
 def test_an_episode_is_the_run_of_its_actions(more: dict[str, Any]) -> None:
     """To the bit, behind the same limiter and with the same latency."""
     info = episode(made(frame_skip=1, **more), action=lambda time_s: 8.0 * wave(time_s))
-    run = snakesim.run("triplet", controller=lambda time_s, _: 8.0 * wave(time_s), duration=1, seed=1, **more)
+    run = snakesim.run(
+        "triplet", controller=lambda time_s, _: 8.0 * wave(time_s), duration=1, seed=1, **more
+    )
     assert "limited" in info
     assert info["ended"] == "time"
     assert info["digest"] == run.digest
@@ -176,8 +181,12 @@ def test_the_gate_is_inside_and_says_so() -> None:
 
 
 @pytest.mark.parametrize("action", ["position", "residual:hold"])
-@pytest.mark.parametrize(("fault", "why"), [("nan:joint_3@0.2", "joint_3"), ("diverge:simulator@0.2", "diverged")])
-def test_environment_episode_of_stopped_robot_ends_with_reason(action: str, fault: str, why: str) -> None:
+@pytest.mark.parametrize(
+    ("fault", "why"), [("nan:joint_3@0.2", "joint_3"), ("diverge:simulator@0.2", "diverged")]
+)
+def test_environment_episode_of_stopped_robot_ends_with_reason(
+    action: str, fault: str, why: str
+) -> None:
     env = made(set={"faults": [fault]}, action=action)
     info = episode(env, action=lambda time_s: 0.1 * wave(time_s))
     assert info["ended"] == "stopped"
@@ -215,7 +224,9 @@ def test_the_goal_ends_the_episode() -> None:
 
 
 def test_waypoints_lead_to_a_goal() -> None:
-    goal = {"mission.goal": {"kind": "waypoints", "points_m": [[1.2, 0.0], [3.0, 0.0]], "within_m": 0.5}}
+    goal = {
+        "mission.goal": {"kind": "waypoints", "points_m": [[1.2, 0.0], [3.0, 0.0]], "within_m": 0.5}
+    }
     env = made("surveyed_clutter", set=goal, new_field=False, observe=["goal_m", "goal_bearing"])
     seen, _ = env.reset(seed=1)
     info = episode(env)
@@ -228,7 +239,11 @@ def test_waypoints_lead_to_a_goal() -> None:
 @pytest.mark.parametrize("mode", [None, "async"], ids=["ours", "that of Gymnasium"])
 def test_many_at_once_are_what_each_is_alone(mode: str | None) -> None:
     envs = gymnasium.make_vec(
-        "SnakeSIM/Scenario-v0", num_envs=3, vectorization_mode=mode, scenario="triplet", duration=0.1
+        "SnakeSIM/Scenario-v0",
+        num_envs=3,
+        vectorization_mode=mode,
+        scenario="triplet",
+        duration=0.1,
     )
     envs.reset(seed=1)
     envs.step(np.zeros((3, 13)))
@@ -240,7 +255,10 @@ def test_many_at_once_are_what_each_is_alone(mode: str | None) -> None:
     assert rewards.shape == (3,)
     assert rewards.all()
     assert truncated.all()
-    alone = [episode(made(duration=0.1), seed=seed, action=lambda _: np.zeros(13))["digest"] for seed in (1, 2, 3)]
+    alone = [
+        episode(made(duration=0.1), seed=seed, action=lambda _: np.zeros(13))["digest"]
+        for seed in (1, 2, 3)
+    ]
     assert list(infos["digest"]) == alone
     assert len({*alone}) == 3
     assert not truncated_again.any()
@@ -414,7 +432,10 @@ def test_an_episode_that_is_over_wants_a_reset() -> None:
 
 def test_the_extra_brings_all_that_it_needs() -> None:
     others = {
-        package for extra, packages in PACKAGES_BY_EXTRA.items() if extra not in ("gym", "sim") for package in packages
+        package
+        for extra, packages in PACKAGES_BY_EXTRA.items()
+        if extra not in ("gym", "sim")
+        for package in packages
     }
     code = f"import sys\nsys.modules |= dict.fromkeys({others})\n" + STEP
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -430,6 +451,8 @@ def test_without_the_extra_the_import_says_how_to_get_it() -> None:
 def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     found = next(
-        of for of in parse_sections(REPOSITORY / "docs" / "how-to" / "environments.md") if "search.py" in of.files
+        of
+        for of in parse_sections(REPOSITORY / "docs" / "how-to" / "environments.md")
+        if "search.py" in of.files
     )
     exec(compile(found.files["search.py"], "search.py", "exec"), {"__name__": "__main__"})

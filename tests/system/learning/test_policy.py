@@ -22,7 +22,8 @@ from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 from snakesim_testing.runs.in_process_command import snakesim as command_line
 
 JOINTS, FRAME_SKIP = 13, 5
-SHIFT_S = np.arange(JOINTS, dtype=np.float32) / np.float32(8)  # dyadic, so that no order of sums rounds differently
+# Dyadic, so that no order of sums rounds differently.
+SHIFT_S = np.arange(JOINTS, dtype=np.float32) / np.float32(8)
 METADATA = {
     "snakesim.observations": "angle_rad,velocity_rad_s,time_s",
     "snakesim.action": "position",
@@ -32,14 +33,23 @@ METADATA = {
 
 
 def saved(
-    file: Path, kind: int = TensorProto.FLOAT, rows: int | str = 1, width: int = 2 * JOINTS + 1, **changes
+    file: Path,
+    kind: int = TensorProto.FLOAT,
+    rows: int | str = 1,
+    width: int = 2 * JOINTS + 1,
+    **changes,
 ) -> Path:
     """A model that bends the joints one after the other: |t - shift| / 4 + angle / 2, with other metadata if asked."""
     weights = np.zeros((2 * JOINTS + 1, JOINTS), dtype=np.float32)
     weights[-1] = 1.0
     feedback = np.zeros_like(weights)
     feedback[:JOINTS] = np.eye(JOINTS) / 2
-    constants = {"W": weights, "F": feedback, "shift": SHIFT_S, "gain": np.array([0.25], np.float32)}
+    constants = {
+        "W": weights,
+        "F": feedback,
+        "shift": SHIFT_S,
+        "gain": np.array([0.25], np.float32),
+    }
     steps = [
         ("MatMul", ["x", "W"], "t"),
         ("Sub", ["t", "shift"], "since"),
@@ -58,7 +68,9 @@ def saved(
         [onnx.numpy_helper.from_array(value, name) for name, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10)
-    helper.set_model_props(model, {key: value for key, value in (METADATA | changes).items() if value is not None})
+    helper.set_model_props(
+        model, {key: value for key, value in (METADATA | changes).items() if value is not None}
+    )
     onnx.save(model, file)
     return file
 
@@ -75,17 +87,23 @@ class Same(snakesim.Controller):
     def update(self, observation):
         if self.ticks % FRAME_SKIP == 0:
             bend = np.abs(np.float32(observation.time_s) - SHIFT_S) * np.float32(0.25)
-            self.target = (bend + np.array(observation.joints.angle_rad, np.float32) * np.float32(0.5)).tolist()
+            self.target = (
+                bend + np.array(observation.joints.angle_rad, np.float32) * np.float32(0.5)
+            ).tolist()
         self.ticks += 1
         return snakesim.ControllerCommand(snakesim.make_position_setpoints(self.robot, self.target))
 
 
 def driven(model: Path, scenario: str = "triplet", duration: float = 0.1) -> snakesim.Result:
-    return snakesim.run(scenario, controller="policy", duration=duration, set={"control.model": str(model)})
+    return snakesim.run(
+        scenario, controller="policy", duration=duration, set={"control.model": str(model)}
+    )
 
 
 @pytest.mark.parametrize("rows", [1, "batch"])
-def test_a_policy_commands_what_the_same_arithmetic_in_python_does(tmp_path: Path, rows: int | str) -> None:
+def test_a_policy_commands_what_the_same_arithmetic_in_python_does(
+    tmp_path: Path, rows: int | str
+) -> None:
     found = driven(saved(tmp_path / "model.onnx", rows=rows), duration=2)
     same = snakesim.run("triplet", controller=Same, duration=2)
     assert found.complete
@@ -100,16 +118,24 @@ EVERYTHING = (
 EPISODES = {
     "simulator": {},
     "emulated modules": {"backend": "can"},
-    "waypoints": {"mission.goal": {"kind": "waypoints", "points_m": [[1.2, 0.1], [3.0, 0.0]], "within_m": 0.5}},
+    "waypoints": {
+        "mission.goal": {"kind": "waypoints", "points_m": [[1.2, 0.1], [3.0, 0.0]], "within_m": 0.5}
+    },
     "a slow sensor": {"robot.sensors.pose.rate_hz": 20},
 }
 
 
-@pytest.mark.parametrize("case", ["simulator", *(pytest.param(n, marks=pytest.mark.slow) for n in list(EPISODES)[1:])])
+@pytest.mark.parametrize(
+    "case", ["simulator", *(pytest.param(n, marks=pytest.mark.slow) for n in list(EPISODES)[1:])]
+)
 def test_policy_controller_gets_observations_of_its_environment(tmp_path: Path, case: str) -> None:
     """To the bit: targets that depend on every number of the observation have one digest."""
     env: Any = SnakeEnv(
-        "surveyed_clutter", observe=EVERYTHING.split(","), duration=2, new_field=False, set=EPISODES[case]
+        "surveyed_clutter",
+        observe=EVERYTHING.split(","),
+        duration=2,
+        new_field=False,
+        set=EPISODES[case],
     )
     width = len(env.observation_names)
     file = linear(tmp_path / "model.onnx", width)
@@ -132,9 +158,14 @@ def test_policy_controller_gets_observations_of_its_environment(tmp_path: Path, 
 
 def linear(file: Path, width: int) -> Path:
     """A model that moves every joint by small shares of everything that it sees."""
-    weights = np.random.default_rng(1).normal(size=(width, JOINTS)).astype(np.float32) * np.float32(0.01)
+    weights = np.random.default_rng(1).normal(size=(width, JOINTS)).astype(np.float32) * np.float32(
+        0.01
+    )
     graph = helper.make_graph(
-        [helper.make_node("MatMul", ["x", "W"], ["mixed"]), helper.make_node("Sin", ["mixed"], ["y"])],
+        [
+            helper.make_node("MatMul", ["x", "W"], ["mixed"]),
+            helper.make_node("Sin", ["mixed"], ["y"]),
+        ],
         "policy",
         [helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, width])],
         [helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, JOINTS])],
@@ -159,13 +190,19 @@ def test_policy_with_silent_sensor_holds_robot_and_says_why(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("command", [("run", "--out", "run"), ("config",)])
-def test_a_robot_without_the_sensor_is_refused_before_anything_starts(tmp_path: Path, command: Sequence[str]) -> None:
+def test_a_robot_without_the_sensor_is_refused_before_anything_starts(
+    tmp_path: Path, command: Sequence[str]
+) -> None:
     width = len(SnakeEnv("surveyed_clutter", observe=EVERYTHING.split(",")).observation_names)
     linear(tmp_path / "model.onnx", width)
     shipped = Path(str(files("snakesim_hal") / "shipped"))
-    touchless = re.sub(r"\[sensors\.contacts\][^\[]*", "", (shipped / "robots/planar13.toml").read_text())
+    touchless = re.sub(
+        r"\[sensors\.contacts\][^\[]*", "", (shipped / "robots/planar13.toml").read_text()
+    )
     (tmp_path / "touchless.toml").write_text(touchless)
-    scenario = (shipped / "scenarios/triplet.toml").read_text().replace('"planar13"', '"./touchless.toml"')
+    scenario = (
+        (shipped / "scenarios/triplet.toml").read_text().replace('"planar13"', '"./touchless.toml"')
+    )
     (tmp_path / "blind.toml").write_text(scenario)
     given = ("--controller", "policy", "--set", "control.model=model.onnx")
     done = command_line(command[0], "./blind.toml", *command[1:], *given, cwd=tmp_path)
@@ -196,7 +233,11 @@ def test_policy_model_mismatch_names_file_field_and_expectation(tmp_path: Path, 
 def test_the_snippet_of_the_documentation_makes_a_model_that_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    blocks = [code for one in parse_sections(REPOSITORY / "docs" / "how-to" / "policies.md") for _, code in one.blocks]
+    blocks = [
+        code
+        for one in parse_sections(REPOSITORY / "docs" / "how-to" / "policies.md")
+        for _, code in one.blocks
+    ]
     (tmp_path / "named.py").write_text(next(code for code in blocks if "set_model_props" in code))
     monkeypatch.chdir(tmp_path)
     linear(Path("trained.onnx"), 3 * JOINTS)
@@ -210,13 +251,25 @@ def test_what_is_no_model_is_refused(tmp_path: Path) -> None:
         driven(tmp_path / "text.onnx")
     with raises_error(snakesim.ConfigError, code="file/not-found", field="none.onnx"):
         driven(tmp_path / "none.onnx")
-    with raises_error(snakesim.ConfigError, code="config/missing-key", field="controllers.policy.model"):
+    with raises_error(
+        snakesim.ConfigError, code="config/missing-key", field="controllers.policy.model"
+    ):
         snakesim.run("triplet", controller="policy")
 
 
 def test_without_its_extra_it_says_what_to_install(tmp_path: Path) -> None:
     lacking = "import sys; sys.modules['onnxruntime'] = None; from snakesim_operator.cli import main; sys.exit(main())"
     words = ("run", "triplet", "--in-process", "--controller", "policy", "--duration", "0.1")
-    given = ("--set", f"control.model={saved(tmp_path / 'model.onnx')}", "--out", str(tmp_path / "run"))
-    done = subprocess.run([sys.executable, "-c", lacking, *words, *given], capture_output=True, text=True, check=False)
-    assert "policy needs onnxruntime: " in done.stderr and "pip install 'snakesim[policy]'" in done.stderr, done
+    given = (
+        "--set",
+        f"control.model={saved(tmp_path / 'model.onnx')}",
+        "--out",
+        str(tmp_path / "run"),
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", lacking, *words, *given], capture_output=True, text=True, check=False
+    )
+    assert (
+        "policy needs onnxruntime: " in done.stderr
+        and "pip install 'snakesim[policy]'" in done.stderr
+    ), done

@@ -25,11 +25,15 @@ from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
-needs_pandas = pytest.mark.skipif(importlib.util.find_spec("pandas") is None, reason="pandas is not installed")
+needs_pandas = pytest.mark.skipif(
+    importlib.util.find_spec("pandas") is None, reason="pandas is not installed"
+)
 
 
 def wave(time_s, joints):
-    return [0.2 * min(time_s, 1.0) * np.sin(3 * time_s - 0.9 * i) for i in range(len(joints.angle_rad))]
+    return [
+        0.2 * min(time_s, 1.0) * np.sin(3 * time_s - 0.9 * i) for i in range(len(joints.angle_rad))
+    ]
 
 
 class Nod(snakesim.Controller):
@@ -69,7 +73,9 @@ def test_a_run_is_that_of_the_command(result: snakesim.Result) -> None:
 def test_signals_have_names_units_and_time(result: snakesim.Result) -> None:
     assert result["angle_rad"].shape == (100, 13)
     assert result.time_s.shape == (100,)
-    assert np.array_equal(result["angle_rad.joint_3"], result["angle_rad"][:, result.joints.index("joint_3")])
+    assert np.array_equal(
+        result["angle_rad.joint_3"], result["angle_rad"][:, result.joints.index("joint_3")]
+    )
     assert result.units["torque_nm.joint_1"] == "N·m"
     assert result.units["position_w_m.x"] == "m"
     assert set(result.arrays) <= set(UNITS)
@@ -78,7 +84,9 @@ def test_signals_have_names_units_and_time(result: snakesim.Result) -> None:
         result["angle_rd"]
 
 
-def test_a_function_is_a_controller() -> None:  # a lambda, too: tests/system/learning/test_environments.py
+def test_a_function_is_a_controller() -> (
+    None
+):  # a lambda, too: tests/system/learning/test_environments.py
     found = snakesim.run("triplet", controller=wave, duration=1)
     assert found.complete
     assert found.summary.controller.startswith("program:")
@@ -86,7 +94,9 @@ def test_a_function_is_a_controller() -> None:  # a lambda, too: tests/system/le
 
 
 def test_a_class_is_a_controller_and_takes_parameters() -> None:
-    found = snakesim.run("triplet", controller=Nod, duration=1, set={"control.by_rad": np.float64(0.3)})
+    found = snakesim.run(
+        "triplet", controller=Nod, duration=1, set={"control.by_rad": np.float64(0.3)}
+    )
     assert found["target.joint_5"][-1] == 0.3
     with raises_error(snakesim.ConfigError, code="config/unknown-key", field="control.by_rd"):
         snakesim.run("triplet", controller=Nod, set={"control.by_rd": 1})
@@ -111,7 +121,8 @@ def test_custom_telemetry_of_a_controller_is_a_signal() -> None:
     amplitude_rad = found["amplitude_rad.controller"]
     assert found.units["amplitude_rad.controller"] == "rad"
     assert np.all(np.diff(amplitude_rad[np.isfinite(amplitude_rad)]) >= 0)
-    assert amplitude_rad[-1] == pytest.approx(found.time_s[-1] - found.time_s[0], abs=0.06)  # sent 20 times a second
+    # Sent 20 times a second.
+    assert amplitude_rad[-1] == pytest.approx(found.time_s[-1] - found.time_s[0], abs=0.06)
 
 
 def test_custom_telemetry_beyond_its_bound_is_an_error_of_the_controller() -> None:
@@ -130,7 +141,10 @@ def test_load_returns_the_run_of_a_folder(tmp_path: Path) -> None:
 
 def test_compute_body_points_w_ends_at_the_head(result: snakesim.Result) -> None:
     nodes_w = snakesim.compute_body_points_w(
-        result.record.description, result["position_w_m"][0], result["orientation_wxyz"][0], result["angle_rad"][0]
+        result.record.description,
+        result["position_w_m"][0],
+        result["orientation_wxyz"][0],
+        result["angle_rad"][0],
     )
     assert nodes_w.shape == (len(result.joints) + 2, 3)
     assert np.allclose(nodes_w[0], result["position_w_m"][0])
@@ -195,7 +209,9 @@ def test_python_controller_failure_in_child_process_is_a_cause(tmp_path: Path) -
     """As when NumPy was imported first."""
     (tmp_path / "failing.py").write_text(FAILING)
     code = "import numpy, snakesim\nsnakesim.run('triplet', controller='./failing.py:Failing', duration=0.1)"
-    done = run_to_end([sys.executable, "-c", code], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
+    done = run_to_end(
+        [sys.executable, "-c", code], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""}
+    )
     assert "raised LinAlgError: Singular matrix (failing.py line 7)" in done.err.splitlines()[-1]
     assert "np.linalg.solve(np.zeros((2, 2)), np.ones(2))" in done.err
 
@@ -207,7 +223,9 @@ def test_python_controller_too_slow_for_real_time_is_reported() -> None:
 
     run = snakesim.run("triplet", controller=slow, duration=0.03)
     assert run.complete
-    assert re.match(r"control: update\(\) took \d\d\d ms of 10 ms; 3 of 3 updates", run.summary.too_slow[0])
+    assert re.match(
+        r"control: update\(\) took \d\d\d ms of 10 ms; 3 of 3 updates", run.summary.too_slow[0]
+    )
     assert "update() took" in repr(run)
 
 
@@ -225,7 +243,9 @@ def test_pages_plots_and_films_need_no_folder(result: snakesim.Result, tmp_path:
     assert film.read_bytes().startswith(b"GIF8")
 
 
-def test_without_pandas_it_says_what_to_install(result: snakesim.Result, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pandas_it_says_what_to_install(
+    result: snakesim.Result, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with raises_error(snakesim.ConfigError, code="extra/not-installed"):
         result.to_pandas()
@@ -255,13 +275,19 @@ def test_an_unknown_name_lists_what_there_is() -> None:
 
 def test_importing_it_loads_neither_numpy_nor_a_simulator() -> None:
     code = "import sys, snakesim; print(sorted({'numpy', 'mujoco', 'zenoh'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY
+    )
     assert done.stdout == "[]\n"
 
 
 def test_importing_it_changes_no_environment_variable() -> None:
-    code = "import os; before = dict(os.environ); import snakesim; print(before == dict(os.environ))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    code = (
+        "import os; before = dict(os.environ); import snakesim; print(before == dict(os.environ))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY
+    )
     assert done.stdout == "True\n"
 
 
@@ -272,13 +298,17 @@ def test_python_process_computes_like_snakesim_run_after_one_call() -> None:
         "import os, numpy; print(make_common_arithmetic_env().items() <= os.environ.items(), is_pinned())\n"
         "snakesim.use_common_arithmetic()"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY
+    )
     assert done.stdout == "True True\n"
 
 
 def test_a_call_that_comes_too_late_is_an_error() -> None:
     code = "import numpy, snakesim\nsnakesim.is_pinned = lambda: False\nsnakesim.use_common_arithmetic()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY
+    )
     assert done.returncode == 1
     assert "before NumPy is imported" in done.stderr
 
@@ -293,7 +323,11 @@ FIRST_EXAMPLES = [
 
 @pytest.mark.parametrize(("page", "name"), FIRST_EXAMPLES, ids=lambda one: one)
 def test_a_first_example_starts_gently_from_the_measured_pose(page: str, name: str) -> None:
-    blocks = [content for section in parse_sections(REPOSITORY / "docs" / page) for _, content in section.blocks]
+    blocks = [
+        content
+        for section in parse_sections(REPOSITORY / "docs" / page)
+        for _, content in section.blocks
+    ]
     defined = next(block for block in blocks if f"class {name}" in block or f"def {name}" in block)
     names: dict[str, Any] = {"__name__": "example", "snakesim": snakesim}
     exec(re.split(r"first = |snakesim.run\(", defined)[0], names)
@@ -350,9 +384,13 @@ def test_no_reference_cycle_keeps_a_run_in_memory(use: Callable[[], None]) -> No
 def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
     """Run, plot, sweep a gain, take the best, run it on emulated modules, compare."""
     page = REPOSITORY / "docs" / "how-to" / "python.md"
-    study = next(section for section in parse_sections(page) if "study.py" in section.files).files["study.py"]
+    study = next(section for section in parse_sections(page) if "study.py" in section.files).files[
+        "study.py"
+    ]
     (tmp_path / "study.py").write_text(study)
-    done = run_to_end([sys.executable, "study.py"], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""})
+    done = run_to_end(
+        [sys.executable, "study.py"], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""}
+    )
     assert done.code == 0, done.err
     assert (tmp_path / "first.html").is_file()
     assert "incomplete" not in done.out

@@ -27,7 +27,10 @@ SMALL = (*FEW, "--duration", "0.5", *RANDOMIZE)
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a search with two processes."""
     out = tmp_path_factory.mktemp("train") / "two"
-    assert main(["policy", "train", "surveyed_clutter", *SMALL, "--workers", "2", "--out", str(out)]) == 0
+    assert (
+        main(["policy", "train", "surveyed_clutter", *SMALL, "--workers", "2", "--out", str(out)])
+        == 0
+    )
     return out
 
 
@@ -52,7 +55,9 @@ def test_training_search_resumed_reaches_the_same_policy(trained: Path, tmp_path
     first, second, *_ = (trained / "search.jsonl").read_bytes().splitlines(keepends=True)
     (out / "search.jsonl").write_bytes(first + second + b'{"rewards": [0.')  # killed while it wrote
     typed = ["policy", "train", "surveyed_clutter", *SMALL, "--workers", "2", "--out", str(out)]
-    assert main(typed) == main([*typed, "--resume", "--seed", "2"]) == 2, "another search is in that folder"
+    assert main(typed) == main([*typed, "--resume", "--seed", "2"]) == 2, (
+        "another search is in that folder"
+    )
     assert main([*typed, "--resume"]) == 0
     for name in ("policy.onnx", "curve.csv", "search.jsonl"):
         assert (out / name).read_bytes() == (trained / name).read_bytes(), name
@@ -61,7 +66,18 @@ def test_training_search_resumed_reaches_the_same_policy(trained: Path, tmp_path
 @pytest.mark.slow
 def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) -> None:
     began = read_learned_parameters(str(trained / "policy.onnx"))
-    nothing = ("--generations", "1", "--population", "4", "--fields", "1", "--check-fields", "1", "--duration", "0.1")
+    nothing = (
+        "--generations",
+        "1",
+        "--population",
+        "4",
+        "--fields",
+        "1",
+        "--check-fields",
+        "1",
+        "--duration",
+        "0.1",
+    )
     typed = [
         "policy",
         "train",
@@ -84,7 +100,18 @@ def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) 
 
 @pytest.mark.slow
 def test_the_number_of_processes_changes_nothing(trained: Path, tmp_path: Path) -> None:
-    main(["policy", "train", "surveyed_clutter", *SMALL, "--workers", "1", "--out", str(tmp_path / "one")])
+    main(
+        [
+            "policy",
+            "train",
+            "surveyed_clutter",
+            *SMALL,
+            "--workers",
+            "1",
+            "--out",
+            str(tmp_path / "one"),
+        ]
+    )
     for name in ("policy.onnx", "curve.csv"):
         assert (tmp_path / "one" / name).read_bytes() == (trained / name).read_bytes(), name
 
@@ -93,7 +120,9 @@ def test_the_file_computes_what_was_searched_with(tmp_path: Path) -> None:
     env = SnakeEnv("surveyed_clutter", observe=OBSERVE, duration=1)
     values = {name: one.start + one.sigma for name, one in FORMS["feeling"].items()}
     sizes = {name: len(part.names) for name, part in env.parts.items()}
-    policy = PolicyArrays.make_from_parameters(values, [joint.axis for joint in env.description.joints], sizes)
+    policy = PolicyArrays.make_from_parameters(
+        values, [joint.axis for joint in env.description.joints], sizes
+    )
     write_onnx_file(tmp_path / "policy.onnx", policy, values, 5, ["snakesim", "policy", "train"])
     model = PolicyModel(env.description, str(tmp_path / "policy.onnx"))
     random = np.random.default_rng(1)
@@ -103,23 +132,36 @@ def test_the_file_computes_what_was_searched_with(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("backend", ["sim", pytest.param("can", marks=pytest.mark.slow)])
-def test_what_was_trained_drives_simulator_and_emulated_modules(trained: Path, backend: str) -> None:
+def test_what_was_trained_drives_simulator_and_emulated_modules(
+    trained: Path, backend: str
+) -> None:
     name = f"policy:{trained / 'policy.onnx'}"
     run = snakesim.run("surveyed_clutter", controller=name, duration=1, backend=backend)
     assert run.complete
     assert np.ptp(run["target.joint_5"]) > 0.05
 
 
-@pytest.mark.parametrize(("name", "out"), [("clutter", "trained"), ("free", "free"), ("lab", "lab")])
+@pytest.mark.parametrize(
+    ("name", "out"), [("clutter", "trained"), ("free", "free"), ("lab", "lab")]
+)
 def test_training_shipped_policy_names_its_documented_command(name: str, out: str) -> None:
     told = {one.key: one.value for one in onnx.load(POLICY_FOLDER / f"{name}.onnx").metadata_props}
-    page = (REPOSITORY / "docs" / "development" / "shipped-policies.md").read_text().replace("\\\n", " ")
+    page = (
+        (REPOSITORY / "docs" / "development" / "shipped-policies.md")
+        .read_text()
+        .replace("\\\n", " ")
+    )
     (given,) = [
-        line for line in page.splitlines() if line.startswith("snakesim policy train") and line.endswith(f"--out {out}")
+        line
+        for line in page.splitlines()
+        if line.startswith("snakesim policy train") and line.endswith(f"--out {out}")
     ]
     ours, documented = (
         vars(make_parser().parse_args(words))
-        for words in ([*told["snakesim.trained_by"].split()[1:], "--out", out], shlex.split(given)[1:])
+        for words in (
+            [*told["snakesim.trained_by"].split()[1:], "--out", out],
+            shlex.split(given)[1:],
+        )
     )
     assert ours == documented
 
@@ -127,7 +169,9 @@ def test_training_shipped_policy_names_its_documented_command(name: str, out: st
 @pytest.mark.slow
 def test_training_shipped_policy_crosses_an_unseen_field() -> None:
     given = {"scene.random_field.0.seed": 5400}
-    run = snakesim.run("surveyed_clutter", controller="policy:clutter", duration=4, seed=5400, set=given)
+    run = snakesim.run(
+        "surveyed_clutter", controller="policy:clutter", duration=4, seed=5400, set=given
+    )
     assert run.complete
     assert (run.metrics["advance_m"] or 0.0) > 2.95
 

@@ -37,7 +37,11 @@ DELAYS = {
     "robot.sensors.power.delay_s": 0.02,
     "robot.sensors.power.rate_hz": 30,
 }
-HOT = {"robot.heat.time_constant_s": 0.03, "robot.heat.rise_at_rated_k": 900.0, "robot.sensors.power.rate_hz": 20}
+HOT = {
+    "robot.heat.time_constant_s": 0.03,
+    "robot.heat.rise_at_rated_k": 900.0,
+    "robot.sensors.power.rate_hz": 20,
+}
 Case = tuple[str, dict[str, Any]]
 CASES: dict[str, Case] = {
     "positions among obstacles": ("surveyed_clutter", {"observe": ALL_PARTS}),
@@ -60,8 +64,16 @@ CASES: dict[str, Case] = {
     "angles that jump": ("triplet", {"set": {"robot.sensors.joints.angle_noise_rad": 0.06}}),
     "motors of random strength": ("triplet", {"randomize": {"robot.limits.torque_nm": (2.0, 7.0)}}),
 }
-QUICK = ("positions among obstacles", "torques", "delayed sensors", "hot motors that are isolated", "angles that jump")
-EVERY_CASE = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES]
+QUICK = (
+    "positions among obstacles",
+    "torques",
+    "delayed sensors",
+    "hot motors that are isolated",
+    "angles that jump",
+)
+EVERY_CASE = [
+    name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CASES
+]
 
 
 def make(case: Case, **more: Any) -> SnakeEnv:
@@ -143,7 +155,12 @@ QUICK_RESETS = (
     ("delayed sensors", AutoresetMode.NEXT_STEP),
 )
 EVERY_RESET = [
-    pytest.param(name, mode, id=f"{name}-{mode.name}", marks=() if (name, mode) in QUICK_RESETS else pytest.mark.slow)
+    pytest.param(
+        name,
+        mode,
+        id=f"{name}-{mode.name}",
+        marks=() if (name, mode) in QUICK_RESETS else pytest.mark.slow,
+    )
     for name in CASES
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
 ]
@@ -245,7 +262,9 @@ def test_a_simulation_that_diverges_stops_only_its_environment() -> None:
         if isinstance(envs, SnakeEnv):
             reasons.append(infos["reason"])
         else:
-            assert np.array_equal(terminated, [True, False, False]) and infos["_reason"].tolist() == [
+            assert np.array_equal(terminated, [True, False, False]) and infos[
+                "_reason"
+            ].tolist() == [
                 True,
                 False,
                 False,
@@ -258,7 +277,10 @@ def test_a_simulation_that_diverges_stops_only_its_environment() -> None:
 
 
 def test_scenes_of_different_sizes_are_stepped_side_by_side() -> None:
-    case: Case = ("surveyed_clutter", {"randomize": {"scene.random_field.0.density_per_m2": (5.0, 12.0)}})
+    case: Case = (
+        "surveyed_clutter",
+        {"randomize": {"scene.random_field.0.density_per_m2": (5.0, 12.0)}},
+    )
     envs = make_many(case, 4, duration=0.1)
     envs.reset(seed=1)
     still = np.zeros((4, 13))
@@ -293,8 +315,17 @@ def test_slopes_of_different_angles_are_stepped_side_by_side() -> None:
 @pytest.mark.parametrize(
     ("scenario", "randomized"),
     [
-        ("swimming", {"scene.fluid.density_kg_m3": (500.0, 1500.0), "scene.fluid.viscosity_pa_s": (0.0, 5.0)}),
-        ("pipe", {"scene.pipe.0.inner_radius_m": (0.07, 0.105), "scene.pipe.0.friction": (0.1, 0.9)}),
+        (
+            "swimming",
+            {
+                "scene.fluid.density_kg_m3": (500.0, 1500.0),
+                "scene.fluid.viscosity_pa_s": (0.0, 5.0),
+            },
+        ),
+        (
+            "pipe",
+            {"scene.pipe.0.inner_radius_m": (0.07, 0.105), "scene.pipe.0.friction": (0.1, 0.9)},
+        ),
     ],
 )
 def test_fluids_and_pipes_of_several_kinds_are_stepped_side_by_side(
@@ -326,7 +357,13 @@ def test_wrappers_of_gymnasium_accept_it() -> None:
     assert [info["ended"] for info in infos] == ["time", "time"] and infos[0]["episode"]["l"] == 2
 
 
-WRONG = [{"num_envs": 0}, {"num_envs": 2.0}, {"thread_count": 0}, {"thread_count": 1.5}, {"autoreset_mode": "sometimes"}]
+WRONG = [
+    {"num_envs": 0},
+    {"num_envs": 2.0},
+    {"thread_count": 0},
+    {"thread_count": 1.5},
+    {"autoreset_mode": "sometimes"},
+]
 
 
 @pytest.mark.parametrize("given", WRONG)

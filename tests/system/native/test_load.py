@@ -52,7 +52,9 @@ def test_a_library_is_compiled_when_it_is_first_needed(small_package: Path) -> N
 
 
 @pytest.mark.usefixtures("compiler")
-def test_a_changed_source_is_compiled_again_and_the_older_build_removed(small_package: Path) -> None:
+def test_a_changed_source_is_compiled_again_and_the_older_build_removed(
+    small_package: Path,
+) -> None:
     old = load_again()
     (small_package / "numbers" / "three.c").write_text(SOURCE % 4)
     new = load_again()
@@ -75,7 +77,9 @@ def test_a_file_of_other_sources_under_the_expected_name_is_not_used(small_packa
 
 
 @pytest.mark.usefixtures("compiler")
-def test_a_read_only_package_uses_the_cache_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_only_package_uses_the_cache_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(load, "_is_writable", lambda _folder: False)
     loaded = load_again()
     assert loaded.library is not None, loaded.problem

@@ -31,9 +31,15 @@ def test_client_in_lockstep_answers_repeated_tick_once(
     ticks = shown(
         sessions,
         [make_clock(0)] * 50
-        + [make_clock(0, arm_session=1), make_clock(1, arm_session=1), make_clock(2, arm_session=1)],
+        + [
+            make_clock(0, arm_session=1),
+            make_clock(1, arm_session=1),
+            make_clock(2, arm_session=1),
+        ],
     )
-    assert [(c.tick, c.arm_session) if c is not None else None for c in (next(ticks) for _ in range(4))] == [
+    assert [
+        (c.tick, c.arm_session) if c is not None else None for c in (next(ticks) for _ in range(4))
+    ] == [
         *((0, 1), (1, 1), (2, 1)),
         None,
     ]
@@ -47,9 +53,12 @@ def test_client_in_lockstep_ignores_sample_of_a_later_tick(
     client = HostClient(service, "guidance")
     feed, ticks = client.subscribe(keys.POSE, Pose), client.iterate_ticks(5.0)
     poses, clocks = (
-        host.declare_publisher(key, kind, lossless=True) for key, kind in ((keys.POSE, Pose), (keys.CLOCK, Clock))
+        host.declare_publisher(key, kind, lossless=True)
+        for key, kind in ((keys.POSE, Pose), (keys.CLOCK, Clock))
     )
-    wait_until(lambda: poses.has_subscriber() and clocks.has_subscriber(), "the service listens", 5.0)
+    wait_until(
+        lambda: poses.has_subscriber() and clocks.has_subscriber(), "the service listens", 5.0
+    )
     poses.put(make_pose(3))
     seen: list[int | None] = []
     for at in (

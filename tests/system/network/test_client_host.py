@@ -38,13 +38,16 @@ from snakesim_testing.hal.local_network import (
     running_host,
     wait_for_messages,
 )
-from snakesim_testing.hal.small_robots import make_description, make_joint_command, make_joint_state, make_run_config
+from snakesim_testing.hal.small_robots import (
+    make_description,
+    make_joint_command,
+    make_joint_state,
+    make_run_config,
+)
 from snakesim_testing.harness.wait import wait_until
 
-pytestmark = [
-    pytest.mark.usefixtures("quick_threads"),
-    pytest.mark.quiet,  # a follower that a busy computer delays loses its lease, and does not command again
-]
+# A follower that a busy computer delays loses its lease, and does not command again.
+pytestmark = [pytest.mark.usefixtures("quick_threads"), pytest.mark.quiet]
 
 
 def passive(points: SafeSetpoints) -> bool:
@@ -62,9 +65,18 @@ def lockstep_run(amplitude_rad: float, ticks: int) -> tuple[str, dict[str, Any]]
         run.arm()
         wait_until(run.has_ended, "the end of the run")
         statistics, box = run.host.statistics, run.host.black_box
-        assert (statistics.ticks, statistics.answered_ticks, box.row_count, run.backend.advanced) == (ticks,) * 4
-        assert control.armed_ticks == list(range(ticks)) or control.armed_ticks == list(range(1, ticks))
-        assert set(itertools.pairwise(control.ticks_seen)) <= {(0, 0)} | {(t, t + 1) for t in range(ticks)}
+        assert (
+            statistics.ticks,
+            statistics.answered_ticks,
+            box.row_count,
+            run.backend.advanced,
+        ) == (ticks,) * 4
+        assert control.armed_ticks == list(range(ticks)) or control.armed_ticks == list(
+            range(1, ticks)
+        )
+        assert set(itertools.pairwise(control.ticks_seen)) <= {(0, 0)} | {
+            (t, t + 1) for t in range(ticks)
+        }
         assert not run.host.authority.faults
         assert not run.host.authority.rejected_counts
         assert run.host.authority.state == "disarmed"
@@ -79,14 +91,19 @@ def test_lockstep_answers_every_tick_and_repeats_itself() -> None:
     assert first == again != other
     assert columns["time_s"] == pytest.approx(0.01 * np.arange(150))
     asked = 0.2 * np.sin(2 * np.pi * columns["time_s"])
-    assert np.abs(columns["target"][1:, 0] - asked[1:]).max() < 1e-9  # the answer to a tick counts in that tick
+    # The answer to a tick counts in that tick.
+    assert np.abs(columns["target"][1:, 0] - asked[1:]).max() < 1e-9
     followed = columns["angle_rad"][1:, 0] - columns["angle_rad"][:-1, 0]
-    assert followed == pytest.approx(0.5 * (columns["target"][:-1, 0] - columns["angle_rad"][:-1, 0]))
+    assert followed == pytest.approx(
+        0.5 * (columns["target"][:-1, 0] - columns["angle_rad"][:-1, 0])
+    )
 
 
 def test_a_slow_participant_is_waited_for() -> None:
     """Guidance owes tick t only at the end of tick t + lag - 1, and no tick passes without it."""
-    config = make_run_config(services={"control": {}, "guidance": {"decimation": 5, "latency_ticks": 5}})
+    config = make_run_config(
+        services={"control": {}, "guidance": {"decimation": 5, "latency_ticks": 5}}
+    )
     with (
         running_host(config, max_ticks=40) as run,
         running_follower(run.link, SineFollower()),
@@ -184,16 +201,20 @@ def test_client_second_holder_needs_higher_priority() -> None:
         assert answer.lifecycle == "armed"
         assert answer.host == run.host.description.host
         wait_until(lambda: len(control.armed_ticks) > 5, "the robot going on undisturbed")
-        answer = run.request(keys.LEASE, LeaseRequest(action="acquire", holder="teleop", priority=200))
+        answer = run.request(
+            keys.LEASE, LeaseRequest(action="acquire", holder="teleop", priority=200)
+        )
         assert answer.ok
         assert answer.lifecycle == "disarmed"
         at = len(run.backend.enacted)
-        late = make_joint_command(
-            run.host.description, 0.2, lease_epoch=held, sequence=10**6
-        )  # the old holder has not heard yet
+        # The old holder has not heard yet.
+        late = make_joint_command(run.host.description, 0.2, lease_epoch=held, sequence=10**6)
         run.session.declare_publisher(keys.JOINT_COMMAND, JointCommand, lossless=True).put(late)
         refused = run.host.authority.rejected_counts
-        wait_until(lambda: refused["wrong_epoch"] + refused["no_lease"] > 0, "the old holder's command refused")
+        wait_until(
+            lambda: refused["wrong_epoch"] + refused["no_lease"] > 0,
+            "the old holder's command refused",
+        )
         wait_until(lambda: len(run.backend.enacted) > at + 3, "three ticks")
         assert all(passive(points) for points in run.backend.enacted[at + 1 :])
 
@@ -241,9 +262,13 @@ def test_host_counts_and_survives_everything_sent_to_it() -> None:
         "hal/done/*",
         "**",
     ]
-    with running_host(make_run_config()) as run, running_follower(run.link, SineFollower()) as control:
+    with (
+        running_host(make_run_config()) as run,
+        running_follower(run.link, SineFollower()) as control,
+    ):
         run.arm()
-        put, get = run.session._zenoh.put, run.session._zenoh.get  # a stranger does not keep to our session
+        # A stranger does not keep to our session.
+        put, get = run.session._zenoh.put, run.session._zenoh.get
         for key, payload, encoding in itertools.product(samples, garbage, own + foreign):
             put(key, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
         counted = run.host.authority.rejected_counts
@@ -254,7 +279,9 @@ def test_host_counts_and_survives_everything_sent_to_it() -> None:
             for payload, encoding in itertools.product(garbage, own[2:] + foreign[:2]):
                 (reply,) = get(key, payload=payload, encoding=encoding, timeout=5.0)
                 assert reply.ok is not None
-                answer = MessageDecoder(Answer).decode(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+                answer = MessageDecoder(Answer).decode(
+                    reply.ok.payload.to_bytes(), str(reply.ok.encoding)
+                )
                 assert not answer.ok
                 assert answer.lifecycle == "armed"
         for pattern in ("hal/*", "**"):  # a tool that looks what is there
@@ -263,7 +290,9 @@ def test_host_counts_and_survives_everything_sent_to_it() -> None:
         wait_until(lambda: len(control.armed_ticks) > seen + 5, "the robot going on undisturbed")
         assert run.host.authority.state == "armed"
         assert not run.host.authority.faults
-        wait_until(lambda: run.status.commands_rejected == dict(counted), "the counts in the status")
+        wait_until(
+            lambda: run.status.commands_rejected == dict(counted), "the counts in the status"
+        )
 
 
 def test_host_ignores_commands_and_answers_of_a_stranger() -> None:
@@ -294,7 +323,9 @@ def test_a_flood_of_commands_does_not_keep_an_estop_out() -> None:
         wait_until(lambda: host._inbox.dropped >= 400, "a full inbox")
         answers: list[Any] = []
         request = EstopRequest(requester="a person")
-        asking = threading.Thread(target=lambda: answers.append(stranger.send_request(keys.ESTOP, request, 10.0)))
+        asking = threading.Thread(
+            target=lambda: answers.append(stranger.send_request(keys.ESTOP, request, 10.0))
+        )
         asking.start()
         wait_until(lambda: host._inbox.waiting() > limit, "the estop in the inbox")
         thread = threading.Thread(target=host.run)
@@ -332,7 +363,9 @@ def test_host_names_backend_too_slow_and_a_rate_that_holds() -> None:
     with running_host(make_run_config(clock_mode="realtime", rate_hz=50.0)) as run:
         run.backend.read_s = 0.03
         slow = "backend 'lag' takes 3"
-        wait_until(lambda: any(slow in warning for warning in run.status.realtime_warnings), "a warning")
+        wait_until(
+            lambda: any(slow in warning for warning in run.status.realtime_warnings), "a warning"
+        )
         assert "ms to read" in run.status.reason
         assert "of a tick of 20 ms; it would hold 2" in run.status.reason
         run.backend.read_s = 0.0
@@ -353,7 +386,10 @@ def test_client_that_joins_late_receives_description_status_and_setpoints() -> N
     with running_commanded_host(make_run_config()) as (run, _), open_session(run.link) as late:
         descriptions = late.declare_latched_reader(keys.DESCRIPTION, RobotDescription)
         assert wait_for_messages(descriptions, "the description") == [run.host.description]
-        applied, poses = late.declare_reader(keys.APPLIED, AppliedCommand), late.declare_reader(keys.POSE, Pose)
+        applied, poses = (
+            late.declare_reader(keys.APPLIED, AppliedCommand),
+            late.declare_reader(keys.POSE, Pose),
+        )
         commands = wait_for_messages(applied, "applied commands", 4)
         assert all(c.sequence is not None and c.mode == [JointMode.POSITION] * 3 for c in commands)
         assert all(pose.tick % 5 == 0 for pose in wait_for_messages(poses, "a pose"))

@@ -11,7 +11,12 @@ from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, JointState, LeaseRequest
 from snakesim_testing.hal.local_network import connected_sessions, running_host
-from snakesim_testing.hal.small_robots import make_clock, make_description, make_joint_state, make_run_config
+from snakesim_testing.hal.small_robots import (
+    make_clock,
+    make_description,
+    make_joint_state,
+    make_run_config,
+)
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
@@ -53,7 +58,10 @@ def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
         feed = client.subscribe(keys.JOINTS, JointState)
         clocks = hal.declare_publisher(keys.CLOCK, Clock, lossless=True)
         joints = hal.declare_publisher(keys.JOINTS, JointState, lossless=True)
-        wait_until(lambda: clocks.has_subscriber() and joints.has_subscriber(), "the client's subscriptions")
+        wait_until(
+            lambda: clocks.has_subscriber() and joints.has_subscriber(),
+            "the client's subscriptions",
+        )
         ticks = iter(client.iterate_ticks(silence_timeout_s=5.0))
         for tick in (3, 4):
             joints.put(make_joint_state(robot, tick=tick))
@@ -86,12 +94,17 @@ def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
 
 
 def test_commander_requests_free_lease_and_releases_passed_one() -> None:
-    with running_host(make_run_config(clock_mode="realtime", services={})) as run, open_session(run.link) as session:
+    with (
+        running_host(make_run_config(clock_mode="realtime", services={})) as run,
+        open_session(run.link) as session,
+    ):
         client = HostClient(session, "pilot")
         commander = Commander(client, client.wait_for_description())
         other = LeaseRequest(action="acquire", holder="teleop", priority=200)
         assert run.request(keys.LEASE, other).ok
-        ticks = (found for found in client.iterate_ticks(silence_timeout_s=1.0) if found is not None)
+        ticks = (
+            found for found in client.iterate_ticks(silence_timeout_s=1.0) if found is not None
+        )
         held = [commander.ensure_lease(next(ticks)) for _ in range(2)]
         assert held[0] is False
         assert commander.lease_refusal is not None
@@ -100,4 +113,6 @@ def test_commander_requests_free_lease_and_releases_passed_one() -> None:
         assert commander.lease_refusal is None
         assert run.host.authority.lease.holder == "pilot"
         assert run.request(keys.LEASE, other).ok
-        wait_until(lambda: not commander.ensure_lease(next(ticks)), "the lease seen to have passed on")
+        wait_until(
+            lambda: not commander.ensure_lease(next(ticks)), "the lease seen to have passed on"
+        )

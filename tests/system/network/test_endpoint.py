@@ -44,7 +44,9 @@ def test_an_endpoint_is_taken_as_it_is(text: str) -> None:
 
 @pytest.mark.parametrize("text", WRONG)
 def test_a_wrong_endpoint_says_what_a_valid_one_looks_like(text: str) -> None:
-    with raises_error(ConfigError, code="network/invalid-address", field=("--router", "tcp/127.0.0.1:7447")) as caught:
+    with raises_error(
+        ConfigError, code="network/invalid-address", field=("--router", "tcp/127.0.0.1:7447")
+    ) as caught:
         check_endpoint(text, "--router")
     assert len(str(caught.value)) < 400
 
@@ -63,7 +65,9 @@ def test_a_wrong_endpoint_says_what_a_valid_one_looks_like(text: str) -> None:
         ("udp/robot.lab:7447", True),
     ],
 )
-def test_endpoint_for_other_machines_needs_access_control_or_a_request(endpoint: str, exposed: bool) -> None:
+def test_endpoint_for_other_machines_needs_access_control_or_a_request(
+    endpoint: str, exposed: bool
+) -> None:
     require_safe_listening_endpoint(endpoint, "--endpoint", insecure=True)
     require_safe_listening_endpoint(endpoint, "--endpoint", access_control=True)
     if exposed:
@@ -80,20 +84,31 @@ def test_namespaces() -> None:
             check_namespace(text, "--namespace")
 
 
-APART = ["unshare", "--net", "--map-root-user"]  # a network namespace of its own, whose loopback interface is down
+# A network namespace of its own, whose loopback interface is down.
+APART = ["unshare", "--net", "--map-root-user"]
 LOOKS = "from snakesim_operator.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
 
 
 def test_endpoint_on_loopback_that_is_down_is_named(tmp_path: Path) -> None:
-    if shutil.which("unshare") is None or subprocess.run([*APART, "true"], check=False, capture_output=True).returncode:
+    if (
+        shutil.which("unshare") is None
+        or subprocess.run([*APART, "true"], check=False, capture_output=True).returncode
+    ):
         pytest.skip("no network namespace can be made here")
     command = [*APART, *make_python_command("-c", LOOKS), "run", "triplet", "--out", "run"]
     ended = subprocess.run(
-        command, cwd=tmp_path, env=make_child_environment(), capture_output=True, text=True, timeout=60, check=False
+        command,
+        cwd=tmp_path,
+        env=make_child_environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert ended.returncode == 1
     assert "loopback interface" in ended.stderr
     assert "ip link set lo up" in ended.stderr
     assert not (tmp_path / "run").exists()
     require_loopback_up("tcp/127.0.0.1:7447")
-    require_loopback_up("tcp/192.0.2.1:7447")  # not on loopback: whether it answers is another question
+    # Not on loopback: whether it answers is another question.
+    require_loopback_up("tcp/192.0.2.1:7447")

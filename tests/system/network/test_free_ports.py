@@ -57,7 +57,9 @@ def test_port_that_another_program_uses_is_left_out(kind: socket.SocketKind) -> 
         assert find_free_port() not in (before, before + 1)
 
 
-def test_forked_process_does_not_get_the_ports_of_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forked_process_does_not_get_the_ports_of_its_parent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     before = find_free_port()
     monkeypatch.setattr(os, "getpid", lambda: 1)
     assert (find_free_port() - FIRST_PORT) // BLOCK_PORTS != (before - FIRST_PORT) // BLOCK_PORTS

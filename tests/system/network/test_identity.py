@@ -13,7 +13,12 @@ import pytest
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.client import HostClient
-from snakesim_hal.network.local_registry import LocalRobot, get_robot_state_folder, list_local_robots, register_robot
+from snakesim_hal.network.local_registry import (
+    LocalRobot,
+    get_robot_state_folder,
+    list_local_robots,
+    register_robot,
+)
 from snakesim_hal.network.private_channel import HostEnd, HostMessage, StarterEnd, socket_pair
 from snakesim_hal.network.run_key import RUN_KEY, add_proof, has_valid_proof, new_run_key
 from snakesim_hal.network.session import open_session
@@ -35,9 +40,15 @@ def test_a_description_is_proven_by_the_runs_key_alone() -> None:
     assert not has_valid_proof(msgspec.structs.replace(ours, emulated=not ours.emulated), key)
 
 
-def test_identity_service_of_a_run_ignores_forged_description(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identity_service_of_a_run_ignores_forged_description(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv(RUN_KEY, new_run_key())
-    with running_host(make_run_config()) as run, open_session(run.link) as stranger, open_session(run.link) as own:
+    with (
+        running_host(make_run_config()) as run,
+        open_session(run.link) as stranger,
+        open_session(run.link) as own,
+    ):
         forged = msgspec.structs.replace(run.host.description, emulated=True, lease_ns=10**9)
         stranger.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(forged)
         assert HostClient(own, "control").wait_for_description() == run.host.description
@@ -73,7 +84,9 @@ def test_a_run_is_armed_over_its_private_channel() -> None:
         assert starter.answers.pop().ok
         run.wait_for_lifecycle("armed")
         assert run.status.reason.startswith("armed by the run")
-        assert [text.split(": ", 1)[1] for text in run.host.request_log][-1] == "arm by 'the run', done"
+        assert [text.split(": ", 1)[1] for text in run.host.request_log][
+            -1
+        ] == "arm by 'the run', done"
     starter.close()
 
 
@@ -101,7 +114,9 @@ def test_identity_robots_of_this_computer_are_listed_while_alive(
     assert list_local_robots() == []
 
 
-def test_a_run_that_was_killed_is_not_found_any_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_was_killed_is_not_found_any_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     script = """
         import os, time
@@ -111,7 +126,9 @@ def test_a_run_that_was_killed_is_not_found_any_more(tmp_path: Path, monkeypatch
             print("there", flush=True)
             time.sleep(60)
     """
-    with subprocess.Popen([sys.executable, "-c", textwrap.dedent(script)], stdout=subprocess.PIPE) as run:
+    with subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(script)], stdout=subprocess.PIPE
+    ) as run:
         assert run.stdout is not None
         assert run.stdout.readline()
         assert [robot.pid for robot in list_local_robots()] == [run.pid]
@@ -121,7 +138,9 @@ def test_a_run_that_was_killed_is_not_found_any_more(tmp_path: Path, monkeypatch
         assert not list((tmp_path / "snakesim" / "live").iterdir())
 
 
-def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_cannot_be_written_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "snakesim").write_text("a file where the folder belongs")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     with register_robot(a_robot()) as failure:
@@ -130,7 +149,9 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: py
     assert list_local_robots() == []
 
 
-def test_one_robot_is_one_folder_whatever_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_robot_is_one_folder_whatever_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     robots = tmp_path / "snakesim" / "robots"
     assert get_robot_state_folder("mamba", "can", "can0+can1") == robots / "mamba-can-can0+can1"

@@ -65,8 +65,14 @@ def test_who_is_asked_answers_before_the_question_returns() -> None:
 
 def test_readers_of_one_process_share_the_message_that_the_first_has_decoded() -> None:
     network = LocalNetwork()
-    sender, one, other = network.create_session(), network.create_session(), network.create_session()
-    readers = [session.declare_reader(keys.done_key("control"), TickDone) for session in (one, other)]
+    sender, one, other = (
+        network.create_session(),
+        network.create_session(),
+        network.create_session(),
+    )
+    readers = [
+        session.declare_reader(keys.done_key("control"), TickDone) for session in (one, other)
+    ]
     sent = TickDone(tick=4)
     sender.declare_publisher(keys.done_key("control"), TickDone).put(sent)
     (first,), (second,) = (reader.drain() for reader in readers)
@@ -75,9 +81,15 @@ def test_readers_of_one_process_share_the_message_that_the_first_has_decoded() -
     assert first is not sent  # the sender's own message is encoded, and never handed to a reader
 
 
-def test_readers_of_one_process_share_the_message_that_the_check_of_the_sender_has_decoded() -> None:
+def test_readers_of_one_process_share_the_message_that_the_check_of_the_sender_has_decoded() -> (
+    None
+):
     network = LocalNetwork()
-    sender, one, other = network.create_session(), network.create_session(), network.create_session()
+    sender, one, other = (
+        network.create_session(),
+        network.create_session(),
+        network.create_session(),
+    )
     key = keys.done_key("control")
     readers = [
         one.declare_reader(key, TickDone),
@@ -109,7 +121,11 @@ def test_reader_decodes_the_bytes_of_a_message_that_a_fault_has_changed() -> Non
 
 def test_each_reader_checks_what_no_reader_could_decode() -> None:
     network = LocalNetwork()
-    sender, one, other = network.create_session(), network.create_session(), network.create_session()
+    sender, one, other = (
+        network.create_session(),
+        network.create_session(),
+        network.create_session(),
+    )
     key = keys.done_key("control")
     readers = [
         one.declare_reader(key, TickDone),
@@ -125,7 +141,11 @@ def test_each_reader_checks_what_no_reader_could_decode() -> None:
 
 def test_host_shares_no_command_with_the_readers_of_its_process() -> None:
     network = LocalNetwork()
-    sender, reading, host = network.create_session(), network.create_session(), network.create_session()
+    sender, reading, host = (
+        network.create_session(),
+        network.create_session(),
+        network.create_session(),
+    )
     reader = reading.declare_reader(keys.JOINT_COMMAND, JointCommand)
     receiver = mock.Mock()
     inbox = HostInbox(host, receiver, [], lambda _query, _answer: None)

@@ -16,7 +16,11 @@ from snakesim_hal.network.streams import IncomingQuery, Publisher, ReceivedSampl
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import ENCODING_PREFIX, encode
 from snakesim_hal.wire.messages import Answer, EstopRequest, JointState, LeaseRequest, TickDone
-from snakesim_testing.hal.local_network import connected_sessions, fast_thread_switching, wait_for_messages
+from snakesim_testing.hal.local_network import (
+    connected_sessions,
+    fast_thread_switching,
+    wait_for_messages,
+)
 from snakesim_testing.hal.small_robots import make_description, make_joint_state
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
@@ -32,7 +36,10 @@ def test_session_latched_value_reaches_later_readers_once() -> None:
         for tick in range(3):
             publisher.put(make_joint_state(ROBOT, tick=tick))
         with open_session(ConnectionSettings(endpoint, "worm")) as late:
-            reader, arrived = late.declare_latched_reader(keys.JOINTS, JointState), list[ReceivedSample]()
+            reader, arrived = (
+                late.declare_latched_reader(keys.JOINTS, JointState),
+                list[ReceivedSample](),
+            )
             late.on_latched_arrival(keys.JOINTS, arrived.append)
             found = wait_for_messages(reader, "the latched value")
             wait_until(lambda: arrived, "the latched arrival")
@@ -81,7 +88,12 @@ def test_session_reader_keeps_newest_and_counts_dropped_samples() -> None:
             (good[:-3], ENCODING_PREFIX + "JointState/1"),
         ]
         for payload, encoding in [*bad, (good, ENCODING_PREFIX + "JointState/1")]:
-            hal._zenoh.put(keys.JOINTS, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
+            hal._zenoh.put(
+                keys.JOINTS,
+                payload,
+                encoding=encoding,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
         assert [joints.tick for joints in wait_for_messages(reader, "the good one")] == [20]
         assert session.rejected == {"unknown_version": 1, "unknown_message": 1, "malformed": 1}
 
@@ -115,15 +127,19 @@ def test_session_namespaces_are_separate_except_for_a_tool() -> None:
         b.on_arrival(keys.DONE_ALL, heard["b"].append)
         tool.on_arrival(f"**/{keys.DONE_ALL}", heard["tool"].append)
         publishers = [
-            session.declare_publisher(keys.done_key(name), TickDone) for session, name in ((a, "a"), (b, "b"))
+            session.declare_publisher(keys.done_key(name), TickDone)
+            for session, name in ((a, "a"), (b, "b"))
         ]
 
         def heard_everywhere() -> bool:
             for publisher in publishers:
                 publisher.put(TickDone(tick=1))
-            return len({arrival.key for arrival in heard["tool"]}) == 2 and bool(heard["a"] and heard["b"])
+            return len({arrival.key for arrival in heard["tool"]}) == 2 and bool(
+                heard["a"] and heard["b"]
+            )
 
-        wait_until(heard_everywhere, "everybody's sample")  # put again until every subscription has been made
+        # Put again until every subscription has been made.
+        wait_until(heard_everywhere, "everybody's sample")
         assert {arrival.key for arrival in heard["a"]} == {"hal/done/a"}
         assert {arrival.key for arrival in heard["b"]} == {"hal/done/b"}
         split = {keys.split_namespace(arrival.key) for arrival in heard["tool"]}
@@ -150,7 +166,10 @@ def test_an_answer_to_somebody_who_has_gone_hurts_nobody() -> None:
     questions: list[IncomingQuery] = []
     with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal:
         hal.on_query(keys.ESTOP, questions.append)
-        with open_session(ConnectionSettings(endpoint, "worm")) as session, pytest.raises(NotConnectedError):
+        with (
+            open_session(ConnectionSettings(endpoint, "worm")) as session,
+            pytest.raises(NotConnectedError),
+        ):
             session.send_request(keys.ESTOP, EstopRequest(requester="a person"), timeout_s=0.1)
         wait_until(lambda: questions, "the question")
         questions[0].reply(Answer(ok=True, reason=""))
@@ -169,7 +188,9 @@ def test_nobody_there_is_told_soon() -> None:
         open_session(ConnectionSettings(endpoint, "worm")) as session,
         raises_error(NotConnectedError, code="network/no-answer"),
     ):
-        session.send_request(keys.LEASE, LeaseRequest(action="acquire", holder="control"), timeout_s=0.2)
+        session.send_request(
+            keys.LEASE, LeaseRequest(action="acquire", holder="control"), timeout_s=0.2
+        )
     assert time.monotonic() - began < 5.0
     with pytest.raises(ConnectionError):
         raise NotConnectedError("it is the matching builtin, too")
@@ -195,7 +216,9 @@ def test_liveliness_shows_who_comes_who_was_there_and_who_goes() -> None:
             first.declare_alive("guidance")
             with open_session(ConnectionSettings(endpoint, "worm")) as second:
                 second.declare_alive("control")
-                hal.on_token_change(lambda key, present: seen.append((keys.parse_service(key), present)))
+                hal.on_token_change(
+                    lambda key, present: seen.append((keys.parse_service(key), present))
+                )
                 wait_until(lambda: len(seen) >= 2, "both tokens")
                 assert set(seen) == {("guidance", True), ("control", True)}
             wait_until(lambda: ("control", False) in seen, "control's going")
@@ -242,7 +265,10 @@ def test_session_may_be_opened_by_threads_without_changing_environment() -> None
             failed.append(error)
             start.abort()
 
-    with fast_thread_switching(1e-6), open_session(ConnectionSettings(endpoint, "worm", listen=True)):
+    with (
+        fast_thread_switching(1e-6),
+        open_session(ConnectionSettings(endpoint, "worm", listen=True)),
+    ):
         together = threading.Barrier(8)
         threads = [threading.Thread(target=open_often, args=(together,)) for _ in range(8)]
         for thread in threads:

@@ -36,14 +36,24 @@ def test_session_file_connects_sessions_and_stock_zenoh_at_router(tmp_path: Path
         open_session(link, connect_timeout_s=0.1),
     ):
         pass
-    with open_router(router), open_session(link) as ours, zenoh.open(zenoh.Config.from_file(path)) as stock:
+    with (
+        open_router(router),
+        open_session(link) as ours,
+        zenoh.open(zenoh.Config.from_file(path)) as stock,
+    ):
         ours.declare_alive("control")
-        wait_until(lambda: tokens(stock) == ["worm/alive/control"], "the token of the one with the other", 20.0)
+        wait_until(
+            lambda: tokens(stock) == ["worm/alive/control"],
+            "the token of the one with the other",
+            20.0,
+        )
 
 
 def tokens(session: zenoh.Session) -> list[str]:
     """The liveliness tokens that a session sees."""
-    return [str(reply.ok.key_expr) for reply in session.liveliness().get("**") if reply.ok is not None]
+    return [
+        str(reply.ok.key_expr) for reply in session.liveliness().get("**") if reply.ok is not None
+    ]
 
 
 @pytest.mark.parametrize(
@@ -60,13 +70,21 @@ def tokens(session: zenoh.Session) -> list[str]:
         "{mode: ",
     ],
 )
-def test_session_file_that_contradicts_requirements_is_refused_by_name(text: str, tmp_path: Path) -> None:
-    with raises_error(ConfigError, code=("network/invalid-address", "network/session-file"), field="lab.json5"):
+def test_session_file_that_contradicts_requirements_is_refused_by_name(
+    text: str, tmp_path: Path
+) -> None:
+    with raises_error(
+        ConfigError, code=("network/invalid-address", "network/session-file"), field="lab.json5"
+    ):
         read_session(written(tmp_path, text))
 
 
 def test_a_file_for_one_robot_is_no_way_to_another(tmp_path: Path) -> None:
-    settings = {"mode": "client", "connect": {"endpoints": ["tcp/10.0.0.1:7447"]}, "namespace": "worm"}
+    settings = {
+        "mode": "client",
+        "connect": {"endpoints": ["tcp/10.0.0.1:7447"]},
+        "namespace": "worm",
+    }
     session = read_session(written(tmp_path, json.dumps(settings)))
     assert (
         ConnectionSettings.from_session_file(session).namespace

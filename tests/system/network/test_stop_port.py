@@ -47,7 +47,15 @@ def test_a_stop_is_taken_and_answered_in_the_robots_name() -> None:
 
 @pytest.mark.parametrize(
     "datagram",
-    [b"", b"x", REQUEST_HEADER[:4], REQUEST_HEADER, REQUEST_HEADER + b"short", b"SNAKSTOQ" + bytes(16), bytes(60_000)],
+    [
+        b"",
+        b"x",
+        REQUEST_HEADER[:4],
+        REQUEST_HEADER,
+        REQUEST_HEADER + b"short",
+        b"SNAKSTOQ" + bytes(16),
+        bytes(60_000),
+    ],
 )
 def test_what_is_no_stop_is_not_taken(datagram: bytes) -> None:
     with served() as (port, asked), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
@@ -65,10 +73,15 @@ def test_a_stop_that_is_too_long_is_a_stop() -> None:
 
 
 def test_stop_port_ignores_answers_from_elsewhere() -> None:
-    with open_stop_port(LOOPBACK, 0) as silent, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as liar:
+    with (
+        open_stop_port(LOOPBACK, 0) as silent,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as liar,
+    ):
         port = silent.getsockname()[1]
         answers: list[object] = []
-        asking = threading.Thread(target=lambda: answers.append(request_stop(LOOPBACK, port, "anna", 0.5)))
+        asking = threading.Thread(
+            target=lambda: answers.append(request_stop(LOOPBACK, port, "anna", 0.5))
+        )
         asking.start()
         request, sender = silent.recvfrom(200)
         liar.sendto(ANSWER_HEADER + request[8:24] + b"lab/worm\ndone", sender)

@@ -61,12 +61,24 @@ def world(link: int = 0, orientation: tuple[float, float, float, float] = UPRIGH
 
 
 def imu(link: list[int], rates: int) -> Imu:
-    return Imu(tick=0, timestamp_ns=0, link=link, angular_velocity_rad_s=[X] * rates, acceleration_m_s2=[X] * len(link))
+    return Imu(
+        tick=0,
+        timestamp_ns=0,
+        link=link,
+        angular_velocity_rad_s=[X] * rates,
+        acceleration_m_s2=[X] * len(link),
+    )
 
 
 def trajectory(*path: tuple[float, float]) -> Trajectory:
     return Trajectory(
-        tick=0, timestamp_ns=0, path_id=1, path_w=list(path), speed_m_s=0.1, push_points=[], finished=False
+        tick=0,
+        timestamp_ns=0,
+        path_id=1,
+        path_w=list(path),
+        speed_m_s=0.1,
+        push_points=[],
+        finished=False,
     )
 
 
@@ -79,7 +91,10 @@ def image(depth: bytes, link: int = 3, turned: Quaternion = UPRIGHT) -> DepthIma
     ("message", "why"),
     [
         (make_joint_state(ROBOT, 0.1), None),
-        (msgspec.structs.replace(make_joint_state(ROBOT, 0.1), angle_rad=[0.0] * 13), "wrong_length"),
+        (
+            msgspec.structs.replace(make_joint_state(ROBOT, 0.1), angle_rad=[0.0] * 13),
+            "wrong_length",
+        ),
         (msgspec.structs.replace(make_joint_state(ROBOT, 0.1), valid=[]), "wrong_length"),
         (make_power(), None),
         (make_power(joint_count=4), "wrong_length"),
@@ -119,8 +134,12 @@ def test_what_passes_as_a_path_makes_a_route() -> None:
 def test_check_of_a_trajectory_is_not_repeated_for_other_readers_of_the_same_message() -> None:
     path = trajectory((0.0, 0.0), (1.0, 0.0))
     no_path = trajectory((0.0, 0.0), (0.0, 0.0))
-    with mock.patch.object(robot_mismatch, "is_polyline", wraps=robot_mismatch.is_polyline) as is_polyline:
-        errors = [find_mismatch(message, ROBOT) for message in (no_path, no_path, path, path, no_path)]
+    with mock.patch.object(
+        robot_mismatch, "is_polyline", wraps=robot_mismatch.is_polyline
+    ) as is_polyline:
+        errors = [
+            find_mismatch(message, ROBOT) for message in (no_path, no_path, path, path, no_path)
+        ]
     assert [error is None for error in errors] == [False, False, True, True, False]
     assert is_polyline.call_count == 3  # once for each message that differs from the one before
 
@@ -134,20 +153,27 @@ def test_stranger_invalid_intent_is_counted_and_ignored() -> None:
     with connected_sessions("worm", "worm") as (hal, session):
         served(hal)
         client = HostClient(session, "navigation")
-        intents, joints = client.subscribe(keys.INTENT, LocomotionIntent), client.subscribe(keys.JOINTS, JointState)
-        assert client.wait_for_description() == client.wait_for_description() == ROBOT  # asked again, it is remembered
+        intents, joints = (
+            client.subscribe(keys.INTENT, LocomotionIntent),
+            client.subscribe(keys.JOINTS, JointState),
+        )
+        # Asked again, it is remembered.
+        assert client.wait_for_description() == client.wait_for_description() == ROBOT
         clocks = hal.declare_publisher(keys.CLOCK, Clock)
         asked, felt = (
             hal.declare_publisher(keys.INTENT, LocomotionIntent),
             hal.declare_publisher(keys.JOINTS, JointState),
         )
         wait_until(
-            lambda: clocks.has_subscriber() and asked.has_subscriber() and felt.has_subscriber(), "everybody heard"
+            lambda: clocks.has_subscriber() and asked.has_subscriber() and felt.has_subscriber(),
+            "everybody heard",
         )
         for speed in (0.1, 0.2):
             asked.put(LocomotionIntent(timestamp_ns=5, requester="operator", speed_m_s=speed))
         felt.put(make_joint_state(ROBOT, 0.1, tick=3))
-        felt.put(msgspec.structs.replace(make_joint_state(ROBOT, 0.1, tick=4), angle_rad=[0.0] * 13))
+        felt.put(
+            msgspec.structs.replace(make_joint_state(ROBOT, 0.1, tick=4), angle_rad=[0.0] * 13)
+        )
         ticks = client.iterate_ticks()
 
         def all_there() -> bool:
@@ -203,7 +229,9 @@ def test_large_images_arrive_where_they_are_expected() -> None:
         open_session(ConnectionSettings(endpoint, "worm", max_bytes=largest)) as session,
         open_session(ConnectionSettings(endpoint, "worm")) as small,
     ):
-        readers = [each.declare_reader(keys.depth_key("head"), DepthImage) for each in (session, small)]
+        readers = [
+            each.declare_reader(keys.depth_key("head"), DepthImage) for each in (session, small)
+        ]
         publisher = hal.declare_publisher(keys.depth_key("head"), DepthImage, lossless=True)
         wait_until(publisher.has_subscriber, "somebody listening")
         sent = msgspec.structs.replace(image(bytes(largest)), width=1280, height=960)

@@ -30,7 +30,8 @@ Push = tuple[float, int, float]  # place along the body in m, side (1: left), fo
 class Score:
     """Errors over a run, for true pushes of at least MIN_FORCE_N."""
 
-    share: list[float] = field(default_factory=list[float])  # error / true force; 1 where nothing was found
+    # Error / true force; 1 where nothing was found.
+    share: list[float] = field(default_factory=list[float])
     place_m: list[float] = field(default_factory=list[float])  # of those found
     ghosts: int = 0  # found, at least MIN_FORCE_N, and nothing there
 
@@ -54,20 +55,34 @@ def score(scenario: str, *settings: str, with_pose: bool = True) -> Score:
     result, (robot, seen) = Score(), watched(scenario, *settings)
     nothing = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
     for samples, true in seen:
-        imu, pose, reported = samples.by_key.get(keys.IMU, nothing), samples.by_key.get(keys.POSE), samples.joints
+        imu, pose, reported = (
+            samples.by_key.get(keys.IMU, nothing),
+            samples.by_key.get(keys.POSE),
+            samples.joints,
+        )
         assert isinstance(imu, Imu)
         assert isinstance(pose, Pose | None)
         felt = estimate_pushes(
-            robot, reported.angle_rad, reported.velocity_rad_s, reported.torque_nm, imu, pose if with_pose else None
+            robot,
+            reported.angle_rad,
+            reported.velocity_rad_s,
+            reported.torque_nm,
+            imu,
+            pose if with_pose else None,
         )
         result.add(true, pushes(robot, felt))
     return result
 
 
 @lru_cache(maxsize=1)
-def watched(scenario: str, *settings: str) -> tuple[RobotDescription, list[tuple[Samples, list[Push]]]]:
+def watched(
+    scenario: str, *settings: str
+) -> tuple[RobotDescription, list[tuple[Samples, list[Push]]]]:
     """A run's robot, and its samples with what was true; the last run is kept, to be judged in another way."""
-    sets = (KeyOverride(text[1:], None, text) if text.startswith("-") else parse_set_option(text) for text in settings)
+    sets = (
+        KeyOverride(text[1:], None, text) if text.startswith("-") else parse_set_option(text)
+        for text in settings
+    )
     config = load_scenario(scenario, [parse_set_option("duration_s=3"), *sets]).config
     seen: list[tuple[Samples, list[Push]]] = []
 
@@ -89,7 +104,10 @@ def watched(scenario: str, *settings: str) -> tuple[RobotDescription, list[tuple
 def pushes(robot: RobotDescription, felt: list[EstimatedPush]) -> list[Push]:
     """Where along the body."""
     starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
-    return [(starts[c.link] + c.distance_from_rear_joint_m, -int(np.sign(c.normal_l[1])), c.force_n) for c in felt]
+    return [
+        (starts[c.link] + c.distance_from_rear_joint_m, -int(np.sign(c.normal_l[1])), c.force_n)
+        for c in felt
+    ]
 
 
 def true_pushes(robot: RobotDescription, truth: TrueState) -> list[Push]:
@@ -98,7 +116,9 @@ def true_pushes(robot: RobotDescription, truth: TrueState) -> list[Push]:
     starts = np.append(0.0, np.cumsum(lengths))
     base = rotation_from_quaternion(truth.base_orientation_wxyz)
     axes = [joint.axis for joint in robot.joints]
-    rear_w, frames = compute_link_frames(truth.base_position_w, base, truth.angles_rad, axes, lengths)
+    rear_w, frames = compute_link_frames(
+        truth.base_position_w, base, truth.angles_rad, axes, lengths
+    )
     found: list[Push] = []
     for contact in truth.contacts:
         force_n = float(np.linalg.norm(contact.force_w))

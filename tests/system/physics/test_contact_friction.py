@@ -20,9 +20,16 @@ class Pressed:
     """A straight snake on ground without friction, pressed at a long wall beside it."""
 
     def __init__(self, *, step_s: float = 0.002, **wall: Any) -> None:
-        wall = {"position_m": [1.0, -0.09], "size_m": [8.0, 0.1, 0.2], "friction": MU, "name": "it"} | wall
+        wall = {
+            "position_m": [1.0, -0.09],
+            "size_m": [8.0, 0.1, 0.2],
+            "friction": MU,
+            "name": "it",
+        } | wall
         config = make_config(scene={"ground": {"friction": 0.0}, "box": [wall]})
-        self.sim, self.data, self.physics = make_resting_body(config, SimSettings(timestep_s=step_s))
+        self.sim, self.data, self.physics = make_resting_body(
+            config, SimSettings(timestep_s=step_s)
+        )
         self.model = self.sim.model
         self._touches = ObstacleContactReader(self.sim, self.data, self.physics.contacts)
         self.links = len(self.sim.link_geoms)
@@ -117,7 +124,9 @@ def test_friction_of_body_moved_after_restore_is_zero() -> None:
 
 @pytest.mark.parametrize("friction", [0.3, 1.0])
 def test_rolled_up_a_snake_whose_links_rub_comes_to_rest(friction: float) -> None:
-    config = make_config({"chain": {"modules": 8}, "limits": {"angle_rad": 1.5}}, {"ground": {"friction": 0.0}})
+    config = make_config(
+        {"chain": {"modules": 8}, "limits": {"angle_rad": 1.5}}, {"ground": {"friction": 0.0}}
+    )
     _, data, physics = make_resting_body(config, SimSettings(self_friction=friction), 0.75)
     data.qfrc_applied[6:] = 1.0
     physics.step(3000)

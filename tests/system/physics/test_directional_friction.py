@@ -19,14 +19,26 @@ from snakesim_testing.sim.waves import JointWave, integrate_momentum_balance, si
 HU = DirectionalFriction(0.11, 0.14, 0.19)
 SCALES = {"skin": {"forward": 0.11, "backward": 0.14, "sideways": 0.19}}
 TURNED_SCALES = {"skin": {"forward": 0.14, "backward": 0.11, "sideways": 0.19}}
-WHEELS = {"wheels": {"radius_m": 0.03, "bearing_radius_m": 0.003, "bearing_friction": 0.1, "tire_friction": 0.6}}
+WHEELS = {
+    "wheels": {
+        "radius_m": 0.03,
+        "bearing_radius_m": 0.003,
+        "bearing_friction": 0.1,
+        "tire_friction": 0.6,
+    }
+}
 CLOTH = {"friction": 0.19}
 MUD = {"friction": 0.0, "viscous": {"along_s_per_m": 0.5, "across_s_per_m": 3.0}}
 WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
 WAVE = JointWave(0.3, 0.7, 4.0)
 GHOST_MM_S = 1.0
 # Of the drag. On hills MuJoCo shares the weight among contacts that come and go.
-DRAG_TOLERANCE = {"flat ground": 0.01, "level hills": 0.015, "step": 0.01, "top of an obstacle": 0.01}
+DRAG_TOLERANCE = {
+    "flat ground": 0.01,
+    "level hills": 0.015,
+    "step": 0.01,
+    "top of an obstacle": 0.01,
+}
 # In a second. On hills the contacts of MuJoCo come and go, with friction of any kind.
 CREEP_M = {"flat ground": 1e-6, "level hills": 1e-4, "step": 1e-6, "top of an obstacle": 1e-6}
 
@@ -34,7 +46,12 @@ CREEP_M = {"flat ground": 1e-6, "level hills": 1e-4, "step": 1e-6, "top of an ob
 @pytest.mark.parametrize("surface", list(SURFACES))
 @pytest.mark.parametrize(
     ("direction", "expected"),
-    [((1.0, 0.0), (0.11, 0.0)), ((-1.0, 0.0), (0.14, 0.0)), ((0.0, 1.0), (0.0, 0.19)), ((0.6, -0.8), (0.066, 0.152))],
+    [
+        ((1.0, 0.0), (0.11, 0.0)),
+        ((-1.0, 0.0), (0.14, 0.0)),
+        ((0.0, 1.0), (0.0, 0.19)),
+        ((0.6, -0.8), (0.066, 0.152)),
+    ],
 )
 def test_dragging_takes_the_coefficient_of_the_direction(
     surface: str, direction: tuple[float, float], expected: tuple[float, float]
@@ -49,7 +66,9 @@ def test_dragging_takes_the_coefficient_of_the_direction(
 
 @pytest.mark.parametrize("surface", list(SURFACES))
 @pytest.mark.parametrize("angle_rad", [0.0, np.pi, 0.9, 4.0])
-def test_it_stands_within_the_half_ellipses_and_slides_beyond(surface: str, angle_rad: float) -> None:
+def test_it_stands_within_the_half_ellipses_and_slides_beyond(
+    surface: str, angle_rad: float
+) -> None:
     direction = np.array([np.cos(angle_rad), np.sin(angle_rad)])
     along = HU.forward if direction[0] > 0 else HU.backward
     limit = 1.0 / np.hypot(direction[0] / along, direction[1] / HU.sideways)
@@ -75,20 +94,29 @@ def test_gliding_body_comes_to_rest_where_an_independent_integrator_says(
     glider.go(1.5)
     expected_m = glide_without_mujoco(np.array(velocity), HU, 1.5)
     print(f"{surface}: {glider.position_w - start} m, without MuJoCo {expected_m} m")
-    assert glider.position_w - start == pytest.approx(expected_m, abs=0.01 * float(np.linalg.norm(expected_m)))
+    assert glider.position_w - start == pytest.approx(
+        expected_m, abs=0.01 * float(np.linalg.norm(expected_m))
+    )
 
 
 @pytest.mark.parametrize(
     ("robot", "ground", "coefficients", "viscous"),
     [
         (SCALES, CLOTH, HU, 0j),
-        pytest.param(WHEELS, CLOTH, DirectionalFriction(0.01, 0.01, 0.6), 0j, marks=pytest.mark.slow),
-        pytest.param({}, MUD, DirectionalFriction(0.0, 0.0, 0.0), 0.5 + 3.0j, marks=pytest.mark.slow),
+        pytest.param(
+            WHEELS, CLOTH, DirectionalFriction(0.01, 0.01, 0.6), 0j, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {}, MUD, DirectionalFriction(0.0, 0.0, 0.0), 0.5 + 3.0j, marks=pytest.mark.slow
+        ),
     ],
     ids=["scales", "wheels", "mud"],
 )
 def test_wave_drifts_as_a_momentum_balance_says(
-    robot: dict[str, Any], ground: dict[str, Any], coefficients: DirectionalFriction, viscous: complex
+    robot: dict[str, Any],
+    ground: dict[str, Any],
+    coefficients: DirectionalFriction,
+    viscous: complex,
 ) -> None:
     ours = simulate_wave(WAVE, ground, robot).drift_mm_s
     balance = integrate_momentum_balance(WAVE, coefficients, viscous).drift_mm_s
@@ -102,7 +130,9 @@ def test_mirrored_snake_moves_mirrored() -> None:
     mirrored = JointWave(-0.3, 0.7, 4.0, bend=-0.04)
     plain = simulate_wave(wave, CLOTH, SCALES).center[-1]
     assert np.linalg.norm(plain) > 0.02
-    assert simulate_wave(mirrored, CLOTH, SCALES).center[-1] == pytest.approx(plain * [1.0, -1.0], abs=1e-6)
+    assert simulate_wave(mirrored, CLOTH, SCALES).center[-1] == pytest.approx(
+        plain * [1.0, -1.0], abs=1e-6
+    )
 
 
 def test_reversed_wave_of_turned_scales_drifts_the_other_way_by_as_much() -> None:
@@ -113,7 +143,9 @@ def test_reversed_wave_of_turned_scales_drifts_the_other_way_by_as_much() -> Non
 
 
 @pytest.mark.parametrize(("robot", "ground"), [(SCALES, CLOTH), (WHEELS, CLOTH), ({}, MUD)])
-def test_ground_takes_all_the_energy_that_a_writhing_snake_loses(robot: dict[str, Any], ground: dict[str, Any]) -> None:
+def test_ground_takes_all_the_energy_that_a_writhing_snake_loses(
+    robot: dict[str, Any], ground: dict[str, Any]
+) -> None:
     """What the feet lose by the law of sliding, from their velocities, is what the body loses, within 3 %."""
     config = make_config(robot, {"ground": ground})
     sim, data, physics = make_resting_body(config, SimSettings(timestep_s=0.0005), 0.05)
@@ -140,7 +172,12 @@ def test_ground_takes_all_the_energy_that_a_writhing_snake_loses(robot: dict[str
 
 
 def loss_j(
-    slip: Floats, feet_w: Floats, robot: dict[str, Any], ground: dict[str, Any], physics: PhysicsStepper, step_s: float
+    slip: Floats,
+    feet_w: Floats,
+    robot: dict[str, Any],
+    ground: dict[str, Any],
+    physics: PhysicsStepper,
+    step_s: float,
 ) -> float:
     """Return the energy that feet lose in a step, by the law of sliding."""
     links = np.diff(feet_w, axis=0)
@@ -157,7 +194,9 @@ def loss_j(
         coefficients = DirectionalFriction(0.0, 0.0, 0.0)
         viscous = (0.5 / step_s, 3.0 / step_s)
     of_along = np.where(along > 0, coefficients.forward, coefficients.backward)
-    dry = (of_along * along**2 + coefficients.sideways * across**2) / np.maximum(np.hypot(along, across), 1e-15)
+    dry = (of_along * along**2 + coefficients.sideways * across**2) / np.maximum(
+        np.hypot(along, across), 1e-15
+    )
     normal_n = physics.laws.foot_forces_n
     assert normal_n is not None
     return float(normal_n @ (dry + viscous[0] * along**2 + viscous[1] * across**2))
@@ -184,7 +223,12 @@ def test_restored_state_continues_to_the_bit(surface: str) -> None:
 
 
 def test_side_of_a_link_rubs_on_a_wall_equally_in_both_directions() -> None:
-    wall = {"position_m": [1.0, -0.09], "size_m": [8.0, 0.1, 0.2], "friction": 0.3, "backward_friction": 0.9}
+    wall = {
+        "position_m": [1.0, -0.09],
+        "size_m": [8.0, 0.1, 0.2],
+        "friction": 0.3,
+        "backward_friction": 0.9,
+    }
     config = make_config(SCALES, {"ground": {"friction": 0.0}, "box": [wall]})
     decelerations = []
     for speed_m_s in (1.0, -1.0):
@@ -204,9 +248,13 @@ def test_side_of_a_link_rubs_on_a_wall_equally_in_both_directions() -> None:
 
 def test_undulation_moves_forward_on_scales_without_obstacles() -> None:
     """The example of the documentation moves forward, along the first heading of its body."""
-    with_scales = simulate(load_scenario("scales", [parse_set_option("duration_s=5")]).config).summary
+    with_scales = simulate(
+        load_scenario("scales", [parse_set_option("duration_s=5")]).config
+    ).summary
     equal = simulate(
-        load_scenario("scales", [parse_set_option("duration_s=5"), parse_set_option("robot=planar13")]).config
+        load_scenario(
+            "scales", [parse_set_option("duration_s=5"), parse_set_option("robot=planar13")]
+        ).config
     ).summary
     assert (with_scales.heading_advance_m or 0.0) > 0.25
     assert (with_scales.heading_advance_m or 0.0) > 2.0 * (equal.heading_advance_m or 0.0)

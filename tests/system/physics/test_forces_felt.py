@@ -49,6 +49,8 @@ def test_drives_without_torque_mode_push_by_their_shape():
 @pytest.mark.slow
 def test_body_without_push_points_moves_towards_goal():
     alone = {"scene.random_field": [], "scene.pegs_along_route": [], "start.on_route": False}
-    found = snakesim.run("surveyed_clutter", controller="obstacle_aided", duration=6, set=alone).summary
+    found = snakesim.run(
+        "surveyed_clutter", controller="obstacle_aided", duration=6, set=alone
+    ).summary
     assert "in search of contacts" in (found.reported_reason or "")
     assert (found.advance_m or 0.0) > 0.2  # 0.00 with a wave that travels to the tail

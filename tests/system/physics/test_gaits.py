@@ -38,7 +38,9 @@ def find_displacement_m(record: RunRecord) -> tuple[float, float]:
         pytest.param("cpg", "peg_row", ON_PEGS, 0.8, marks=pytest.mark.slow),
     ],
 )
-def test_gait_moves_forward(gait: str, scenario: str, sets: tuple[str, ...], min_forward_m: float) -> None:
+def test_gait_moves_forward(
+    gait: str, scenario: str, sets: tuple[str, ...], min_forward_m: float
+) -> None:
     record, _ = run_gait(gait, scenario, 4, *sets)
     forward_m, sideways_m = find_displacement_m(record)
     assert forward_m > min_forward_m
@@ -48,10 +50,17 @@ def test_gait_moves_forward(gait: str, scenario: str, sets: tuple[str, ...], min
 @pytest.mark.parametrize(
     ("gait", "side"),
     [("serpenoid", 1.0)]
-    + [pytest.param(*row, marks=pytest.mark.slow) for row in (("serpenoid", -1.0), ("cpg", 1.0), ("cpg", -1.0))],
+    + [
+        pytest.param(*row, marks=pytest.mark.slow)
+        for row in (("serpenoid", -1.0), ("cpg", 1.0), ("cpg", -1.0))
+    ],
 )
 def test_directional_control_turns_the_body_towards_its_goal(gait: str, side: float) -> None:
-    goal = ("mission.goal.kind=heading", f"mission.goal.heading_rad={side * 0.8}", "mission.goal.distance_m=5")
+    goal = (
+        "mission.goal.kind=heading",
+        f"mission.goal.heading_rad={side * 0.8}",
+        "mission.goal.distance_m=5",
+    )
     record, summary = run_gait(gait, "scales", 10, *goal)
     forward_m, sideways_m = find_displacement_m(record)
     assert forward_m > 0.3
@@ -59,7 +68,9 @@ def test_directional_control_turns_the_body_towards_its_goal(gait: str, side: fl
     assert not summary.limited_commands  # planned paths do not jerk the joints
 
 
-@pytest.mark.parametrize(("height", "side"), [(0.015, 1.0), pytest.param(-0.015, -1.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("height", "side"), [(0.015, 1.0), pytest.param(-0.015, -1.0, marks=pytest.mark.slow)]
+)
 def test_sidewinding_by_a_helix_travels_to_the_requested_side(height: float, side: float) -> None:
     record, _ = run_gait("backbone_sidewinding", "mamba_flat", 4, f"control.half_height={height}")
     forward_m, sideways_m = find_displacement_m(record)

@@ -12,7 +12,8 @@ DENSE = parse_set_option("scene.random_field.0.density_per_m2=12")
 
 def _moved_to_the_left_m(heading_w_rad: float, seconds: int, seed: int) -> float:
     config = load_scenario(
-        "surveyed_clutter", [DENSE, parse_set_option(f"duration_s={seconds}"), parse_set_option(f"seed={seed}")]
+        "surveyed_clutter",
+        [DENSE, parse_set_option(f"duration_s={seconds}"), parse_set_option(f"seed={seed}")],
     ).config
     with InProcessRun(config) as run:
         session = run.network.create_session()
@@ -25,7 +26,9 @@ def _moved_to_the_left_m(heading_w_rad: float, seconds: int, seed: int) -> float
             if turn % 20 == 0:
                 intents.put(
                     LocomotionIntent(
-                        timestamp_ns=run.host.build_status().timestamp_ns, requester="ann", heading_w_rad=heading_w_rad
+                        timestamp_ns=run.host.build_status().timestamp_ns,
+                        requester="ann",
+                        heading_w_rad=heading_w_rad,
                     )
                 )
             places += [world.center_w[1] for world in worlds.drain() if world.center_w is not None]

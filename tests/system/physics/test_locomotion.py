@@ -45,7 +45,11 @@ def test_triplet_with_35_newtons_moves_half_a_meter(noise: tuple[str, ...]):
 
 def test_it_ends_when_the_obstacle_at_the_tail_is_lost():
     whole = triplet()
-    assert [state for state, _ in groupby(whole.states)] == ["NotLocomoting", "Locomoting", "NotLocomoting"]
+    assert [state for state, _ in groupby(whole.states)] == [
+        "NotLocomoting",
+        "Locomoting",
+        "NotLocomoting",
+    ]
     assert whole.reasons[0].startswith("standing still")
     assert whole.states[50] == "Locomoting"
     assert "2 usable push-points, 3 are needed" in whole.reasons[-1]
@@ -56,7 +60,10 @@ def test_locomotion_without_world_or_trajectory_stops_then_continues(what: str):
     gap = range(200, 400)
     blind, lost = (gap, ()) if what == "blind" else ((), gap)
     whole = run_controller(
-        load_run_config("triplet"), duration_s=8.0, ticks_without_world=blind, ticks_without_trajectory=lost
+        load_run_config("triplet"),
+        duration_s=8.0,
+        ticks_without_world=blind,
+        ticks_without_trajectory=lost,
     )
     where, pushes = whole.path_s_m, (whole.record.mode == JointMode.TORQUE).any(axis=1)
     assert pushes[150:200].all()
@@ -67,9 +74,9 @@ def test_locomotion_without_world_or_trajectory_stops_then_continues(what: str):
     held = np.abs(whole.record.torque_nm[280:400]).max(axis=1)
     assert held.max() < 0.5 * np.abs(whole.record.torque_nm[150:200]).max()
     steps = np.abs(np.diff(whole.record.target, axis=0))[190:460]
-    angles = (whole.record.mode[1:] == JointMode.POSITION)[190:460] & (whole.record.mode[:-1] == JointMode.POSITION)[
-        190:460
-    ]
+    angles = (whole.record.mode[1:] == JointMode.POSITION)[190:460] & (
+        whole.record.mode[:-1] == JointMode.POSITION
+    )[190:460]
     assert steps[angles].max() < 0.03  # rad; the limiter would allow 0.075
     assert set(whole.states[gap.start + 2 : gap.stop]) <= {"NotLocomoting", "Idle"}
 
@@ -78,7 +85,8 @@ def test_triplet_has_one_torque_joint_and_others_in_position():
     whole = triplet()
     pushing = np.array([report.propulsion_joint is not None for report in whole.reports])
     torque_joints = (whole.record.mode == JointMode.TORQUE).sum(axis=1)
-    lag = whole.record.config.services["control"].latency_ticks - 1  # periods from a controller's word to its deed
+    # Periods from a controller's word to its deed.
+    lag = whole.record.config.services["control"].latency_ticks - 1
     assert (torque_joints[lag + 1 :] == pushing[1 : len(pushing) - lag]).all()
     assert np.isin(whole.record.mode, [JointMode.TORQUE, JointMode.POSITION]).all()
 
@@ -86,11 +94,16 @@ def test_triplet_has_one_torque_joint_and_others_in_position():
 def test_triplet_only_propulsion_joint_leaves_its_reference():
     """As in the paper's Figure 12."""
     whole = triplet()
-    off = np.abs(whole.record.angle_rad - np.array([report.reference_rad for report in whole.reports]))
+    off = np.abs(
+        whole.record.angle_rad - np.array([report.reference_rad for report in whole.reports])
+    )
     torque = whole.record.mode == JointMode.TORQUE
     assert 0.1 < off[torque].max() < 0.7
     settled = np.array(
-        [whole.record.mode[max(i - 40, 0) : i + 1].max(axis=0) == JointMode.POSITION for i in range(len(off))]
+        [
+            whole.record.mode[max(i - 40, 0) : i + 1].max(axis=0) == JointMode.POSITION
+            for i in range(len(off))
+        ]
     )
     assert np.median(off[settled]) < 0.02
 
@@ -105,8 +118,14 @@ def test_triplet_case_study_commands_are_smooth_and_never_limited():
     steps = np.abs(np.diff(whole.record.target, axis=0))
     same = np.diff(whole.record.mode, axis=0) == 0
     limits = whole.record.config.robot.limits
-    assert steps[same & (whole.record.mode[1:] == JointMode.TORQUE)].max() < limits.torque_rate_nm_s * 0.01
-    assert steps[same & (whole.record.mode[1:] == JointMode.POSITION)].max() < 0.6 * limits.speed_rad_s * 0.01
+    assert (
+        steps[same & (whole.record.mode[1:] == JointMode.TORQUE)].max()
+        < limits.torque_rate_nm_s * 0.01
+    )
+    assert (
+        steps[same & (whole.record.mode[1:] == JointMode.POSITION)].max()
+        < 0.6 * limits.speed_rad_s * 0.01
+    )
 
 
 def test_no_command_jumps_at_a_hand_over():
@@ -115,13 +134,17 @@ def test_no_command_jumps_at_a_hand_over():
     switches = 0
     for i, j in zip(*np.nonzero(np.diff(record.mode, axis=0)), strict=True):
         tick, mode = i + 1, JointMode(int(record.mode[i + 1, j]))
-        angle, speed, torque = (float(x[tick, j]) for x in (record.angle_rad, record.velocity_rad_s, record.torque_nm))
+        angle, speed, torque = (
+            float(x[tick, j]) for x in (record.angle_rad, record.velocity_rad_s, record.torque_nm)
+        )
         steady = compute_bumpless_target(record.description.joints[j], mode, angle, speed, torque)
         report = whole.reports[tick]
         if mode == JointMode.POSITION:
             way = abs(steady - report.reference_rad[j])
         else:
-            full_nm = record.description.joints[j].torque_limit_nm - require_value(report.torque_headroom_nm)
+            full_nm = record.description.joints[j].torque_limit_nm - require_value(
+                report.torque_headroom_nm
+            )
             way = full_nm + 0.5 * abs(speed) + abs(torque)
         assert abs(record.target[tick, j] - steady) <= FADE_MAX * way + 1e-9
         switches += 1
@@ -142,16 +165,24 @@ def test_braking_obstacles_between_push_points_do_not_stop_pushing(clearance_m: 
     pegs: list[Cylinder] = []
     for s, side in zip(places, (1, 1, -1), strict=True):
         (x, y), (along_x, along_y) = route.compute_point(s), route.tangent_w(s).tolist()
-        pegs.append(Cylinder(position_m=(x - side * along_y * way_m, y + side * along_x * way_m), radius_m=0.05))
+        pegs.append(
+            Cylinder(
+                position_m=(x - side * along_y * way_m, y + side * along_x * way_m), radius_m=0.05
+            )
+        )
     scene = msgspec.structs.replace(config.scene, cylinder=pegs)
     whole = run_controller(msgspec.structs.replace(config, scene=scene), duration_s=8.0)
     assert whole.moved_m > 0.5
-    assert ["peg_0_1", "peg_0_2", "peg_0_3"] in [[p.obstacle for p in report.push_points] for report in whole.reports]
+    assert ["peg_0_1", "peg_0_2", "peg_0_3"] in [
+        [p.obstacle for p in report.push_points] for report in whole.reports
+    ]
 
 
 @pytest.mark.slow
 def test_steep_wave_pushes_with_contacts_further_apart():
-    whole = run_controller(load_run_config("peg_row", "scene.route.amplitude_m=0.05"), duration_s=8.0)  # 34.9 degrees
+    whole = run_controller(
+        load_run_config("peg_row", "scene.route.amplitude_m=0.05"), duration_s=8.0
+    )  # 34.9 degrees
     assert whole.moved_m > 1.0
     assert set(whole.states[STARTED:]) == {"Locomoting"}
     assert not any(report.jammed for report in whole.reports)
@@ -185,7 +216,8 @@ def test_push_report_contains_measured_not_requested_forces():
 
 def test_body_clear_of_every_peg_is_not_jammed():
     thin = ("robot.chain.modules=10", "robot.module.length_m=0.09", "robot.module.radius_m=0.025")
-    row = "scene.reference_robot={spacing_m = 0.09, radius_m = 0.025}"  # as it is, not in proportion
+    # As it is, not in proportion.
+    row = "scene.reference_robot={spacing_m = 0.09, radius_m = 0.025}"
     whole = run_controller(load_run_config("peg_row", *thin, row), duration_s=4.0)
     assert not any(report.jammed for report in whole.reports)
     assert whole.states[-1] == "NotLocomoting"
@@ -212,9 +244,13 @@ def test_triplet_travels_three_body_lengths_with_backward_hand_overs():
     assert backward > 1.5 * forward
 
 
-@pytest.mark.parametrize(("modules", "min_advance_m"), [(8, 0.8), pytest.param(30, 0.5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("modules", "min_advance_m"), [(8, 0.8), pytest.param(30, 0.5, marks=pytest.mark.slow)]
+)
 def test_any_number_of_modules_moves_with_the_same_code(modules, min_advance_m):
-    whole = run_controller(load_run_config("peg_row", f"robot.chain.modules={modules}"), duration_s=6.0)
+    whole = run_controller(
+        load_run_config("peg_row", f"robot.chain.modules={modules}"), duration_s=6.0
+    )
     assert whole.moved_m >= min_advance_m
     assert set(whole.states[STARTED:]) == {"Locomoting"}
     assert not any(report.jammed for report in whole.reports)
@@ -249,7 +285,9 @@ def test_a_jam_is_reported_as_one():
 
 
 def test_pegs_that_grip_are_a_jam_too():
-    whole = run_controller(load_run_config("triplet", "scene.pegs_along_route.0.friction=1.0"), duration_s=4.0)
+    whole = run_controller(
+        load_run_config("triplet", "scene.pegs_along_route.0.friction=1.0"), duration_s=4.0
+    )
     assert whole.moved_m < 0.15
     assert whole.reports[-1].jammed
 

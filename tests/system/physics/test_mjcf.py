@@ -42,8 +42,15 @@ def library() -> Path:
     return loaded.path
 
 
-def test_a_snake_slides_to_a_stop_in_a_program_that_knows_mujoco_alone(tmp_path: Path, library: Path) -> None:
-    obstacle = {"name": "post", "position_m": [5.0, 5.0], "size_m": [0.1, 0.1, 0.2], "stiffness_n_per_m": 300.0}
+def test_a_snake_slides_to_a_stop_in_a_program_that_knows_mujoco_alone(
+    tmp_path: Path, library: Path
+) -> None:
+    obstacle = {
+        "name": "post",
+        "position_m": [5.0, 5.0],
+        "size_m": [0.1, 0.1, 0.2],
+        "stiffness_n_per_m": 300.0,
+    }
     config = make_config(scene={"ground": {"friction": MU}, "box": [obstacle]})
     file = tmp_path / "snake.xml"
     file.write_text(export_mjcf(config, SimSettings()))
@@ -51,10 +58,14 @@ def test_a_snake_slides_to_a_stop_in_a_program_that_knows_mujoco_alone(tmp_path:
     assert "snakesim.yielding" in file.read_text()
 
     command = [sys.executable, "-c", PROGRAM, str(file), str(library), str(SPEED_M_S), str(SLIDE_S)]
-    finished = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60)
+    finished = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
+    )
     result = json.loads(finished.stdout)
     assert not [name for name in result["modules"] if name.startswith("snakesim")]
-    assert result["height"] == pytest.approx(config.robot.module.radius_m, abs=1e-3), "the ground does not carry it"
+    assert result["height"] == pytest.approx(config.robot.module.radius_m, abs=1e-3), (
+        "the ground does not carry it"
+    )
     lost_m_s = SPEED_M_S - result["speed"]
     assert lost_m_s == pytest.approx(MU * result["gravity"] * SLIDE_S, rel=0.05)
 
@@ -64,5 +75,7 @@ def test_a_model_without_the_library_is_refused_by_name(tmp_path: Path, library:
     file = tmp_path / "snake.xml"
     file.write_text(export_mjcf(make_config(scene={"ground": {"friction": MU}}), SimSettings()))
     program = f"import mujoco; mujoco.MjModel.from_xml_path({str(file)!r})"
-    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
+    finished = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
+    )
     assert "snakesim.dry_friction" in finished.stderr

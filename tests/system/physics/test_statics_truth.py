@@ -13,7 +13,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.obstacle_triplet import TripletSolution, compute_bending_torque_nm, solve_triplet
+from snakesim_gnc.control.obstacle_triplet import (
+    TripletSolution,
+    compute_bending_torque_nm,
+    solve_triplet,
+)
 from snakesim_gnc.control.obstacle_triplet.statics import add_tether_force
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
@@ -57,7 +61,9 @@ def make_bench(seed: int) -> Bench | None:
     lay = place_chain_on_route(route, tail_s, lengths.tolist())
     headings = lay.heading_rad + np.concatenate(([0.0], np.cumsum(lay.angles_rad)))
     along = np.column_stack([np.cos(headings), np.sin(headings)])
-    nodes = np.array(lay.tail_w) + np.concatenate(([[0.0, 0.0]], np.cumsum(lengths[:, None] * along, axis=0)))
+    nodes = np.array(lay.tail_w) + np.concatenate(
+        ([[0.0, 0.0]], np.cumsum(lengths[:, None] * along, axis=0))
+    )
     first = next(k for k, s in enumerate(inflections) if s > tail_s)
     touched, normals, tangents, places, links = [], [], [], [], []
     for k in range(3):
@@ -66,7 +72,10 @@ def make_bench(seed: int) -> Bench | None:
         ) * wavelength * np.array([1, 0])
         link = int(np.argmin(np.abs(nodes[:-1, 0] + along[:, 0] * lengths / 2 - wished[0])))
         on_link = float((wished - nodes[link]) @ along[link])
-        if not 0.015 < on_link < lengths[link] - 0.015 or starts[link] + on_link > starts[-1] - 0.03:
+        if (
+            not 0.015 < on_link < lengths[link] - 0.015
+            or starts[link] + on_link > starts[-1] - 0.03
+        ):
             return None
         left = np.array([-along[link][1], along[link][0]])
         normals.append(left if left[0] > 0 else -left)
@@ -109,7 +118,13 @@ def make_config(points: np.ndarray, pegs: list[Cylinder], tail_s_m: float) -> Ru
         armature_kg_m2=0.01,
         viscous_nm_s_per_rad=0.02,
     )
-    limits = MotionLimits(angle_rad=1.5, speed_rad_s=100, acceleration_rad_s2=1e4, torque_nm=1000, torque_rate_nm_s=1e5)
+    limits = MotionLimits(
+        angle_rad=1.5,
+        speed_rad_s=100,
+        acceleration_rad_s2=1e4,
+        torque_nm=1000,
+        torque_rate_nm_s=1e5,
+    )
     waypoints = WaypointRoute(points_m=[(x, y) for x, y in points.tolist()])
     return msgspec.structs.replace(
         base,
@@ -119,7 +134,9 @@ def make_config(points: np.ndarray, pegs: list[Cylinder], tail_s_m: float) -> Ru
     )
 
 
-def settle(bench: Bench, share: float = 1.0, ahead_rad: float | Floats = 0.0) -> tuple[float, Floats]:
+def settle(
+    bench: Bench, share: float = 1.0, ahead_rad: float | Floats = 0.0
+) -> tuple[float, Floats]:
     """Tension and contact forces, for this share of the propulsion, at rest. ahead_rad: how far targets are ahead."""
     backend = SimBackend(bench.config, SimSettings(timestep_s=0.001, tether=bench.tether))
     count, torque_nm = bench.config.robot.chain.modules, bench.config.robot.limits.torque_nm
@@ -140,20 +157,26 @@ def settle(bench: Bench, share: float = 1.0, ahead_rad: float | Floats = 0.0) ->
         forces.append(list(pushed.values()))
     tension, force = float(np.mean(tensions[-20:])), np.mean(forces[-20:], axis=0)
     solved = share * bench.solved.forces_n
-    print(f"{share:.2f}: tension {tension:.2f} N; contacts {force.round(1)} N, solved {solved.round(1)} N")
+    print(
+        f"{share:.2f}: tension {tension:.2f} N; contacts {force.round(1)} N, solved {solved.round(1)} N"
+    )
     assert np.ptp(tensions[-20:]) < 0.02 * PROPULSION_N  # at rest
     return tension, force
 
 
 def with_shipped(bench: Bench, **more: object) -> Bench:
     """The bench with the motors of the shipped robot, and more of it."""
-    robot = msgspec.structs.replace(bench.config.robot, motor=load_run_config("triplet").robot.motor, **more)
+    robot = msgspec.structs.replace(
+        bench.config.robot, motor=load_run_config("triplet").robot.motor, **more
+    )
     return dataclasses.replace(bench, config=msgspec.structs.replace(bench.config, robot=robot))
 
 
 FEASIBLE = ((seed, bench) for seed in itertools.count(1) if (bench := make_bench(seed)) is not None)
 BENCHES = list(itertools.islice(FEASIBLE, WANTED))
-each_bench = pytest.mark.parametrize("bench", [pytest.param(bench, id=f"seed{seed}") for seed, bench in BENCHES])
+each_bench = pytest.mark.parametrize(
+    "bench", [pytest.param(bench, id=f"seed{seed}") for seed, bench in BENCHES]
+)
 a_few_benches = pytest.mark.parametrize(
     "bench",
     [
@@ -174,10 +197,13 @@ def test_tension_and_contact_forces_are_those_solved_for(bench: Bench):
 def test_statics_holds_with_servo_targets_that_lead_by_load(bench: Bench):
     shipped = with_shipped(bench)
     gives_way, _ = settle(shipped)
-    tension, force = settle(shipped, ahead_rad=bench.loads_nm / shipped.config.robot.motor.stiffness_nm_per_rad)
+    tension, force = settle(
+        shipped, ahead_rad=bench.loads_nm / shipped.config.robot.motor.stiffness_nm_per_rad
+    )
     assert tension == pytest.approx(PROPULSION_N, rel=0.005)
     assert abs(gives_way - PROPULSION_N) > 10 * abs(tension - PROPULSION_N)  # 33.2 to 42.8 N
-    assert force == pytest.approx(bench.solved.forces_n, rel=0.01)  # 0.43 to 1.09 of them without the lead
+    # 0.43 to 1.09 of them without the lead.
+    assert force == pytest.approx(bench.solved.forces_n, rel=0.01)
 
 
 @pytest.mark.slow  # a share of the push above

@@ -37,4 +37,6 @@ def test_undulation_swims_forward_at_its_depth(controller: str, min_forward_m: f
 def test_wave_in_water_drifts_as_the_momentum_balance_says(wave: JointWave) -> None:
     drift_mm_s = swim_wave(wave, WATER).drift_mm_s
     assert abs(drift_mm_s) > 150.0
-    assert drift_mm_s == pytest.approx(swim_without_mujoco(wave, WATER, 0.002).drift_mm_s, abs=TOLERANCE_MM_S)
+    assert drift_mm_s == pytest.approx(
+        swim_without_mujoco(wave, WATER, 0.002).drift_mm_s, abs=TOLERANCE_MM_S
+    )

@@ -24,7 +24,12 @@ def swim(wave: JointWave, step_s: float = 0.002, *, yaw_rad: float = 0.0) -> Bod
 def random_waves(count: int) -> list[JointWave]:
     rng = np.random.default_rng(SEED)
     return [
-        JointWave(rng.uniform(0.2, 0.6), rng.uniform(0.5, 1.2), rng.uniform(2.0, 5.0), rng.uniform(-0.05, 0.05))
+        JointWave(
+            rng.uniform(0.2, 0.6),
+            rng.uniform(0.5, 1.2),
+            rng.uniform(2.0, 5.0),
+            rng.uniform(-0.05, 0.05),
+        )
         for _ in range(count)
     ]
 
@@ -32,7 +37,9 @@ def random_waves(count: int) -> list[JointWave]:
 FIRST, *OTHERS = random_waves(4)
 
 
-@pytest.mark.parametrize("wave", [FIRST, *(pytest.param(wave, marks=pytest.mark.slow) for wave in OTHERS)])
+@pytest.mark.parametrize(
+    "wave", [FIRST, *(pytest.param(wave, marks=pytest.mark.slow) for wave in OTHERS)]
+)
 def test_a_reversed_wave_drifts_the_other_way_by_as_much(wave: JointWave) -> None:
     there, back = swim(wave).drift_mm_s, swim(wave.reversed).drift_mm_s
     assert abs(there + back) < GHOST_MM_S
@@ -64,7 +71,9 @@ def test_reflected_or_rotated_snake_moves_reflected_or_rotated() -> None:
     assert np.linalg.norm(plain) > 0.02
     assert swim(reflected).center[-1] == pytest.approx(plain * [1.0, -1.0], abs=1e-6)
     turned = complex(*plain) * np.exp(1j * yaw_rad)
-    assert swim(wave, yaw_rad=yaw_rad).center[-1] == pytest.approx([turned.real, turned.imag], abs=1e-6)
+    assert swim(wave, yaw_rad=yaw_rad).center[-1] == pytest.approx(
+        [turned.real, turned.imag], abs=1e-6
+    )
 
 
 @pytest.mark.slow
@@ -78,6 +87,9 @@ def test_reflected_or_rotated_snake_moves_reflected_or_rotated() -> None:
     ],
 )
 def test_it_drifts_as_a_momentum_balance_with_coulomb_friction_says(wave: JointWave) -> None:
-    ours, balance = swim(wave).drift_mm_s, integrate_momentum_balance(wave, DirectionalFriction(MU, MU, MU)).drift_mm_s
+    ours, balance = (
+        swim(wave).drift_mm_s,
+        integrate_momentum_balance(wave, DirectionalFriction(MU, MU, MU)).drift_mm_s,
+    )
     print(f"{wave}: {ours:+.2f} mm/s, momentum balance {balance:+.2f} mm/s")
     assert ours == pytest.approx(balance, abs=GHOST_MM_S)

@@ -37,13 +37,19 @@ def test_body_glides_on_a_slope_as_an_independent_integrator_says(
     surface: str, slope_rad: float, towards_rad: float
 ) -> None:
     """Friction holds the body on the slopes of 0.1 rad, and not on the third one."""
-    glider = GlidingSnake(surface, SCALES, slope={"slope_rad": slope_rad, "slope_towards_rad": towards_rad})
+    glider = GlidingSnake(
+        surface, SCALES, slope={"slope_rad": slope_rad, "slope_towards_rad": towards_rad}
+    )
     velocity_m_s = np.array([1.0, 0.6])
     glider.throw(velocity_m_s)
     start = glider.position_w
     glider.go(1.0)
-    expected_m = glide_without_mujoco(velocity_m_s, HU, 1.0, gravity_w=make_tilted_gravity(slope_rad, towards_rad))
-    assert glider.position_w - start == pytest.approx(expected_m, abs=0.01 * float(np.linalg.norm(expected_m)))
+    expected_m = glide_without_mujoco(
+        velocity_m_s, HU, 1.0, gravity_w=make_tilted_gravity(slope_rad, towards_rad)
+    )
+    assert glider.position_w - start == pytest.approx(
+        expected_m, abs=0.01 * float(np.linalg.norm(expected_m))
+    )
 
 
 @pytest.mark.parametrize("scenario", ["pipe", "over_pipe", "stairs", "gaps"])
@@ -79,7 +85,8 @@ def test_rectilinear_motion_advances_in_a_pipe() -> None:
 
 def test_arc_rolls_over_a_pipe() -> None:
     first, last = find_nodes_w(run_scenario("over_pipe", 10))
-    assert first[:, 1].min() > -0.35 + 0.035  # before the pipe, which is 0.16 m wide at the height of the ground
+    # Before the pipe, which is 0.16 m wide at the height of the ground.
+    assert first[:, 1].min() > -0.35 + 0.035
     assert last[:, 1].max() < -0.53 - 0.035  # and behind it
 
 

@@ -10,7 +10,12 @@ from snakesim_testing.sim.waves import JointWave, integrate_momentum_balance, si
 
 ROLLING_FRICTION = 0.01
 TIRE_FRICTION = 0.6
-SECTION = {"radius_m": 0.03, "bearing_radius_m": 0.003, "bearing_friction": 0.1, "tire_friction": TIRE_FRICTION}
+SECTION = {
+    "radius_m": 0.03,
+    "bearing_radius_m": 0.003,
+    "bearing_friction": 0.1,
+    "tire_friction": TIRE_FRICTION,
+}
 TURNING = {"wheels": {**SECTION, "separate_limits": True}}
 COEFFICIENTS = DirectionalFriction(ROLLING_FRICTION, ROLLING_FRICTION, TIRE_FRICTION)
 SLOW = JointWave(0.3, 0.7, 4.0)
@@ -19,7 +24,9 @@ SLOW = JointWave(0.3, 0.7, 4.0)
 def test_wheels_that_roll_and_slip_have_the_whole_friction_sideways() -> None:
     glider = GlidingSnake("flat ground", TURNING)
     force_n = glider.drag(np.array([0.5, 0.1]), 0.4)
-    assert np.abs(force_n) / (glider.mass_kg * G) == pytest.approx((ROLLING_FRICTION, TIRE_FRICTION), rel=0.01)
+    assert np.abs(force_n) / (glider.mass_kg * G) == pytest.approx(
+        (ROLLING_FRICTION, TIRE_FRICTION), rel=0.01
+    )
     slipping = GlidingSnake("flat ground", {"wheels": SECTION})
     force_n = slipping.drag(np.array([0.5, 0.1]), 0.4)
     assert abs(force_n[1]) / (slipping.mass_kg * G) < 0.2  # by the law of scales
@@ -29,7 +36,9 @@ def test_wheels_that_roll_and_slip_have_the_whole_friction_sideways() -> None:
 def test_wheels_roll_easily_and_hold_sideways(surface: str) -> None:
     glider = GlidingSnake(surface, TURNING)
     force_n = glider.drag(np.array([0.5, 0.0]), 0.4)
-    assert np.linalg.norm(force_n) / (glider.mass_kg * G) == pytest.approx(ROLLING_FRICTION, rel=0.02)
+    assert np.linalg.norm(force_n) / (glider.mass_kg * G) == pytest.approx(
+        ROLLING_FRICTION, rel=0.02
+    )
     held = GlidingSnake(surface, TURNING)
     held.push(np.array([0.0, 0.95 * TIRE_FRICTION]))
     held.go(0.5)

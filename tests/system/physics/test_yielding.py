@@ -33,7 +33,9 @@ class Pushed:
         sim, self._data, self._physics = make_resting_body(config, SimSettings(timestep_s=step_s))
         self._body, self._step_s = sim.model.body("obstacle:it").id, sim.model.opt.timestep
 
-    def for_s(self, time_s: float, force_w: tuple[float, float] = (0.0, 0.0), moment_nm: float = 0.0) -> Floats:
+    def for_s(
+        self, time_s: float, force_w: tuple[float, float] = (0.0, 0.0), moment_nm: float = 0.0
+    ) -> Floats:
         """How far it is from where it stood: x, y in m and a turn in rad, (3,)."""
         self._data.xfrc_applied[self._body] = (*force_w, 0.0, 0.0, 0.0, moment_nm)
         self._physics.step(round(time_s / self._step_s))
@@ -58,7 +60,10 @@ def test_spring_post_yields_by_force_over_stiffness_and_returns(direction: float
     [
         *((direction, 0.002) for direction in DIRECTIONS),
         (DIRECTIONS[1], 0.0005),
-        *(pytest.param(direction, 0.0005, marks=pytest.mark.slow) for direction in (DIRECTIONS[0], *DIRECTIONS[2:])),
+        *(
+            pytest.param(direction, 0.0005, marks=pytest.mark.slow)
+            for direction in (DIRECTIONS[0], *DIRECTIONS[2:])
+        ),
     ],
 )
 def test_block_slides_only_above_friction_of_its_foot(direction: float, step_s: float) -> None:
@@ -66,7 +71,8 @@ def test_block_slides_only_above_friction_of_its_foot(direction: float, step_s: 
     block = Pushed("box", BLOCK, step_s)
     held = block.for_s(1.0, tuple(0.9 * HOLDS_N * towards))
     assert np.linalg.norm(held) < 2e-4
-    assert block.for_s(5.0, tuple(0.9 * HOLDS_N * towards)) == pytest.approx(held, abs=1e-9)  # it does not creep
+    # It does not creep.
+    assert block.for_s(5.0, tuple(0.9 * HOLDS_N * towards)) == pytest.approx(held, abs=1e-9)
     block.for_s(1.0)
     block.for_s(0.1, tuple(2.0 * HOLDS_N * towards))
     before = block.speed
@@ -89,7 +95,10 @@ def test_a_block_turns_above_the_moment_of_its_foot() -> None:
 def test_a_block_that_turns_is_moved_sideways_by_any_force() -> None:
     """Dry friction opposes the whole motion: a foot that slips already holds nothing across its slip."""
     gentle = (0.3 * HOLDS_N, 0.0)
-    turned, alone = Pushed("box", BLOCK).for_s(1.0, gentle, moment_nm=2.0), Pushed("box", BLOCK).for_s(1.0, gentle)
+    turned, alone = (
+        Pushed("box", BLOCK).for_s(1.0, gentle, moment_nm=2.0),
+        Pushed("box", BLOCK).for_s(1.0, gentle),
+    )
     assert turned[0] > 0.01 > 1e-4 > alone[0]
 
 
@@ -100,8 +109,12 @@ def test_spring_too_stiff_for_time_step_is_refused_with_advice() -> None:
 
 
 def test_yielding_obstacles_under_emulated_modules_are_no_joints() -> None:
-    loose = {"cylinder": [PEG | {"position_m": [0.5, 0.1], "mass_kg": 1.0, "stiffness_n_per_m": 5e5}]}
-    physics_model = MujocoPhysicsModel(make_config(scene=loose), PhysicsModelSettings(timestep_s=0.0005))
+    loose = {
+        "cylinder": [PEG | {"position_m": [0.5, 0.1], "mass_kg": 1.0, "stiffness_n_per_m": 5e5}]
+    }
+    physics_model = MujocoPhysicsModel(
+        make_config(scene=loose), PhysicsModelSettings(timestep_s=0.0005)
+    )
     bent = np.full(13, 3.0)
     for _ in range(400):
         physics_model.advance(bent)
@@ -112,7 +125,9 @@ def test_yielding_obstacles_under_emulated_modules_are_no_joints() -> None:
         == (13,)
     )
     assert np.abs(physics_model.data.qpos[-3:-1]).max() > 1e-3  # it was pushed away
-    assert [load.link for load in physics_model.loads()] == sorted({load.link for load in physics_model.loads()})
+    assert [load.link for load in physics_model.loads()] == sorted(
+        {load.link for load in physics_model.loads()}
+    )
 
 
 def test_leaning_peg_has_its_foot_position_and_angle() -> None:
@@ -120,7 +135,10 @@ def test_leaning_peg_has_its_foot_position_and_angle() -> None:
     sim = build_sim_model(config, SimSettings(), motors=False)
     data, found = mujoco.MjData(sim.model), np.zeros(1, dtype=np.int32)
     mujoco.mj_kinematics(sim.model, data)
-    towards, across = np.array([math.cos(2.0), math.sin(2.0)]), np.array([-math.sin(2.0), math.cos(2.0)])
+    towards, across = (
+        np.array([math.cos(2.0), math.sin(2.0)]),
+        np.array([-math.sin(2.0), math.cos(2.0)]),
+    )
     for height_m in (0.001, 0.04, 0.12):
         middle = np.array(AT) + height_m * math.tan(0.3) * towards
         for aim, radius_m in ((across, 0.05), (towards, 0.05 / math.cos(0.3))):
@@ -133,7 +151,9 @@ def test_leaning_peg_has_its_foot_position_and_angle() -> None:
 def test_snake_advances_at_fixed_obstacles_and_displaces_loose_ones() -> None:
     peg = "scene.pegs_along_route.0."
     fixed, held, pushed = (
-        run_controller(load_run_config("peg_row", *(peg + text for text in made)), duration_s=6.0).moved_m
+        run_controller(
+            load_run_config("peg_row", *(peg + text for text in made)), duration_s=6.0
+        ).moved_m
         for made in ((), ("mass_kg=20", "base_friction=1.0"), ("mass_kg=0.5",))
     )
     assert held == pytest.approx(fixed, rel=0.1)

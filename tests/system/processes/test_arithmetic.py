@@ -50,11 +50,19 @@ def test_arithmetic_of_unknown_processor_is_not_pinned(computer: Path, flags: st
 
 def measured_with(code: str, **more: str) -> dict[str, str]:
     show = (
-        "import json; from snakesim_hal.base import arithmetic; {}; print(json.dumps(arithmetic.measure_arithmetic()))"
+        "import json; from snakesim_hal.base import arithmetic; {}; "
+        "print(json.dumps(arithmetic.measure_arithmetic()))"
     )
-    unset = {name: value for name, value in os.environ.items() if name not in arithmetic.make_common_arithmetic_env()}
+    unset = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in arithmetic.make_common_arithmetic_env()
+    }
     done = subprocess.run(
-        [sys.executable, "-c", show.format(code)], env={**unset, **more}, capture_output=True, check=True
+        [sys.executable, "-c", show.format(code)],
+        env={**unset, **more},
+        capture_output=True,
+        check=True,
     )
     return json.loads(done.stdout)
 
@@ -64,8 +72,13 @@ def test_what_a_process_computes_with_is_measured() -> None:
         pytest.skip("this processor has no AVX2 and FMA, so nothing can be chosen")
     old = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3"}
     assert arithmetic.find_differing_parts(measured_with("pass", **old)) == ["BLAS", "NumPy"]
-    assert measured_with("arithmetic.pin_common_arithmetic()", **old) == arithmetic.measure_arithmetic()
-    assert measured_with("import numpy; arithmetic.pin_common_arithmetic()", **old) == measured_with("pass", **old)
+    assert (
+        measured_with("arithmetic.pin_common_arithmetic()", **old)
+        == arithmetic.measure_arithmetic()
+    )
+    assert measured_with(
+        "import numpy; arithmetic.pin_common_arithmetic()", **old
+    ) == measured_with("pass", **old)
 
 
 def test_arithmetic_digest_of_other_kernels_is_marked_as_local() -> None:
@@ -74,26 +87,41 @@ def test_arithmetic_digest_of_other_kernels_is_marked_as_local() -> None:
     said = arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts(other))
     otherwise = "round otherwise than on most computers with NumPy 2.2 to 2.4"
     assert said == f"0123456789abcdef, its own: BLAS and C library {otherwise}"
-    assert arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts({})) == "0123456789abcdef"
+    assert (
+        arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts({}))
+        == "0123456789abcdef"
+    )
 
 
 def test_arithmetic_difference_of_newer_wheel_names_the_wheel() -> None:
     of_2_5 = {**arithmetic.COMMON, "BLAS": "3f7c15b6"}
     assert arithmetic.find_differing_parts(of_2_5) == ["BLAS of NumPy 2.5"]
     said = arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts(of_2_5))
-    assert said.startswith("0123456789abcdef, as on most computers with the BLAS of NumPy 2.5, which rounds otherwise")
+    assert said.startswith(
+        "0123456789abcdef, as on most computers with the BLAS of NumPy 2.5, which rounds otherwise"
+    )
 
 
 @pytest.mark.parametrize(
     ("version", "first", "last"),
-    [("2.2.6", "AVX512F", "AVX512_KNM"), ("2.3.5", "AVX512F", "AVX512_SPR"), ("2.5.1", "X86_V4", "AVX512_SPR")],
+    [
+        ("2.2.6", "AVX512F", "AVX512_KNM"),
+        ("2.3.5", "AVX512F", "AVX512_SPR"),
+        ("2.5.1", "X86_V4", "AVX512_SPR"),
+    ],
 )
 def test_numpy_is_given_only_names_that_its_version_knows(
-    computer: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str, first: str, last: str
+    computer: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    version: str,
+    first: str,
+    last: str,
 ) -> None:
     (tmp_path / "version.py").write_text(f'\nversion = "{version}"\n')
     monkeypatch.setattr(
-        "importlib.util.find_spec", lambda _: ModuleSpec("numpy", None, origin=f"{tmp_path}/__init__.py")
+        "importlib.util.find_spec",
+        lambda _: ModuleSpec("numpy", None, origin=f"{tmp_path}/__init__.py"),
     )
     computer.write_text(INTEL)
     names = arithmetic.make_common_arithmetic_env()["NPY_DISABLE_CPU_FEATURES"].split()
@@ -103,5 +131,7 @@ def test_numpy_is_given_only_names_that_its_version_knows(
 
 def test_numpy_can_be_imported_where_warnings_are_errors() -> None:
     code = "import snakesim; import numpy"
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr

@@ -24,7 +24,10 @@ FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.p
 
 STARTS = {
     *(f"subprocess.{name}" for name in ("Popen", "run", "call", "check_call", "check_output")),
-    *(f"os.{name}" for name in ("fork", "forkpty", "posix_spawn", "posix_spawnp", "system", "popen")),
+    *(
+        f"os.{name}"
+        for name in ("fork", "forkpty", "posix_spawn", "posix_spawnp", "system", "popen")
+    ),
     *(f"os.exec{how}" for how in ("l", "le", "lp", "lpe", "v", "ve", "vp", "vpe")),
     *(f"os.spawn{how}" for how in ("l", "le", "lp", "lpe", "v", "ve", "vp", "vpe")),
     "pty.fork",
@@ -57,9 +60,8 @@ OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
     "snakesim_native/compile.py": "the C compiler",
     "snakesim_hal/base/process.py": "the same program again, with its own options",
 }
-FORKS = {
-    "snakesim_operator/run/guarded_process.py",
-}  # copies of a process, which import nothing
+# Copies of a process, which import nothing.
+FORKS = {"snakesim_operator/run/guarded_process.py"}
 
 
 def dotted(node: ast.expr) -> str:
@@ -75,7 +77,11 @@ def starts_in(path: Path) -> Iterator[tuple[ast.Call, ast.AST]]:
     if not any(name.rpartition(".")[2] in text for name in STARTS):
         return  # parsing all files takes seconds
     tree = ast.parse(text)
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and dotted(node.func) in STARTS]
+    calls = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and dotted(node.func) in STARTS
+    ]
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     for call in calls:
         around = [one for one in functions if one.lineno <= call.lineno <= (one.end_lineno or 0)]
@@ -103,18 +109,23 @@ def test_child_processes_all_start_with_prepared_command_and_environment() -> No
         "start it with make_python_command() and make_child_environment(), or add it to the table above"
     )
     listed = OTHER_PROGRAMS.keys() | FORKS
-    assert listed <= {path.relative_to(ROOT).as_posix() for path, calls in found.items() if calls}, "no longer needed"
+    assert listed <= {
+        path.relative_to(ROOT).as_posix() for path, calls in found.items() if calls
+    }, "no longer needed"
 
 
 def test_nothing_else_makes_a_command_line_of_this_interpreter() -> None:
-    allowed = {"snakesim_hal/base/process.py", "deploy/bootstrap.py", "snakesim_native/compile.py"}  # zig, a compiler
+    # Zig, a compiler.
+    allowed = {"snakesim_hal/base/process.py", "deploy/bootstrap.py", "snakesim_native/compile.py"}
     for path in FILES:
         text = path.read_text(encoding="utf-8")
         if "sys.executable" not in text or path.relative_to(ROOT).as_posix() in allowed:
             continue
         tree = ast.parse(text)
         sequences = [node for node in ast.walk(tree) if isinstance(node, ast.List | ast.Tuple)]
-        assert not [node.lineno for node in sequences if "sys.executable" in map(dotted, node.elts)], path
+        assert not [
+            node.lineno for node in sequences if "sys.executable" in map(dotted, node.elts)
+        ], path
 
 
 @pytest.mark.parametrize("search_path", ["", os.pathsep])
@@ -132,5 +143,7 @@ def test_a_file_in_the_working_folder_replaces_no_module(
     else:
         command = [sys.executable, *words, "--version"]  # as a user may type it
         variables = dict(os.environ)
-    ended = subprocess.run(command, cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=60)
+    ended = subprocess.run(
+        command, cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=60
+    )
     assert ended.returncode == 0, ended.stderr

@@ -31,13 +31,22 @@ time.sleep(60)
 def recorder_arguments(out: Path) -> list[str]:
     """The command line of a recorder whose network is never opened."""
     endpoint = find_free_endpoint()
-    return ["snakesim_operator.recording.recorder_process", "triplet", "--endpoint", endpoint, "--out", str(out)]
+    return [
+        "snakesim_operator.recording.recorder_process",
+        "triplet",
+        "--endpoint",
+        endpoint,
+        "--out",
+        str(out),
+    ]
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.02, 0.1])
 def test_an_interrupt_while_a_child_starts_leaves_no_traceback(after_s: float) -> None:
     said = bytearray()
-    child = start_child("control", ["snakesim_hal.programs.service_program", "control", "--help"], said.extend)
+    child = start_child(
+        "control", ["snakesim_hal.programs.service_program", "control", "--help"], said.extend
+    )
     time.sleep(after_s)
     child.process.send_signal(signal.SIGINT)
     assert child.process.wait(30) == 0, child.output.last_lines()
@@ -57,7 +66,11 @@ def test_recorder_that_waits_for_a_network_ends_at_once(tmp_path: Path) -> None:
 
 def test_recording_that_is_stopped_before_there_is_a_network_says_so(tmp_path: Path) -> None:
     with raises_error(NotConnectedError, code="network/nothing-listens"):
-        record_to_file(ConnectionSettings(find_free_endpoint(), "worm"), tmp_path / RECORDING_FILENAME, lambda: False)
+        record_to_file(
+            ConnectionSettings(find_free_endpoint(), "worm"),
+            tmp_path / RECORDING_FILENAME,
+            lambda: False,
+        )
     assert not (tmp_path / RECORDING_FILENAME).exists()
 
 
@@ -69,15 +82,24 @@ def test_child_that_is_ended_while_it_starts_is_reported_as_such(tmp_path: Path)
         supervisor.start("recorder", recorder_arguments(tmp_path), vital=False)
         supervisor.end_all_processes()
     files.close()
-    assert supervisor.losses_by_process == {"recorder": "recorder had not started when the run ended"}
-    assert printed == ["warning: recorder had not started when the run ended: there is nothing of it"]
+    assert supervisor.losses_by_process == {
+        "recorder": "recorder had not started when the run ended"
+    }
+    assert printed == [
+        "warning: recorder had not started when the run ended: there is nothing of it"
+    ]
 
 
-def test_child_that_does_not_end_is_killed_and_described(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_child_that_does_not_end_is_killed_and_described(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "deaf.py").write_text(DEAF)
     monkeypatch.setattr(children, "STOP_TIMEOUT_S", 0.2)
     said = bytearray()
     child = start_child("control", ["deaf"], said.extend, extra_env={"PYTHONPATH": str(tmp_path)})
     wait_until(lambda: b"ready" in said, "a child that ignores SIGTERM")
     stop_children([child])
-    assert child.describe_exit() == "control was killed: it had not ended 0.2 s after the request to end"
+    assert (
+        child.describe_exit()
+        == "control was killed: it had not ended 0.2 s after the request to end"
+    )

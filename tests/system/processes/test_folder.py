@@ -53,12 +53,21 @@ def test_an_earlier_run_is_moved_aside_every_time(tmp_path: Path) -> None:
             os.utime(out / "config.json", (1.8e9, 1.8e9))  # one after the other, within a second
     assert content(out)["config.json"] == "2"
     asides = sorted(path for path in tmp_path.iterdir() if path != out)
-    assert [content(aside) for aside in asides] == [{"config.json": f"{n}", "notes.txt": "mine"} for n in range(2)]
+    assert [content(aside) for aside in asides] == [
+        {"config.json": f"{n}", "notes.txt": "mine"} for n in range(2)
+    ]
     assert all(re.fullmatch(r"run\.\d{8}-\d{6}(-2)?", aside.name) for aside in asides)
     assert said == [f"{out} held an earlier run: moved to {aside}" for aside in asides]
 
 
-OLD = ["host.json", "blackbox.rows", "recording.mcap", "telemetry.jsonl", "blackbox.npz", "report.html"]
+OLD = [
+    "host.json",
+    "blackbox.rows",
+    "recording.mcap",
+    "telemetry.jsonl",
+    "blackbox.npz",
+    "report.html",
+]
 
 
 @pytest.mark.parametrize("name", OLD)
@@ -82,7 +91,9 @@ def test_half_written_files_of_a_killed_process_are_removed(tmp_path: Path) -> N
 
 def test_run_folder_in_use_refuses_second_process_until_killed(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, text=True)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, text=True
+    )
     try:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
@@ -109,14 +120,18 @@ def test_many_that_want_one_folder_at_once(tmp_path: Path) -> None:
     out = tmp_path / "run"
     leave(out, config_json="earlier")
     several = [
-        subprocess.Popen([sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        subprocess.Popen(
+            [sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
         for _ in range(5)
     ]
     try:
         wait_until(lambda: sum(one.poll() is None for one in several) == 1, "all but one refused")
         (winner,) = (one for one in several if one.poll() is None)
         wait_until(lambda: content(out) == {LOCK: str(winner.pid)}, "the winner's folder")
-        assert [content(path) for path in tmp_path.iterdir() if path != out] == [{"config.json": "earlier"}]
+        assert [content(path) for path in tmp_path.iterdir() if path != out] == [
+            {"config.json": "earlier"}
+        ]
     finally:
         for one in several:
             one.kill()
@@ -124,7 +139,9 @@ def test_many_that_want_one_folder_at_once(tmp_path: Path) -> None:
             assert b"Traceback" not in err or b"ConfigError" in err
 
 
-def test_run_folder_moved_aside_is_not_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_folder_moved_aside_is_not_written_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, aside, open_file = tmp_path / "run", tmp_path / "aside", os.open
     leave(out, notes_txt="mine")
 
@@ -147,7 +164,9 @@ def test_what_cannot_be_a_folder_is_wrong_input(tmp_path: Path, out: str) -> Non
     assert (tmp_path / "file").read_text() == "mine"
 
 
-def test_the_folder_that_one_is_in_is_not_moved_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_folder_that_one_is_in_is_not_moved_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     leave(tmp_path, config_json="x")
     monkeypatch.chdir(tmp_path)
     with raises_error(ConfigError, code="file/already-exists"):
@@ -155,7 +174,9 @@ def test_the_folder_that_one_is_in_is_not_moved_away(tmp_path: Path, monkeypatch
     assert content(tmp_path) == {"config.json": "x"}
 
 
-def test_run_folder_is_new_when_none_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_folder_is_new_when_none_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     first = choose_default_folder("triplet")
     first.mkdir(parents=True)

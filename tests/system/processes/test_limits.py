@@ -5,7 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_operator.features.evaluate.case import GAVE_UP_FIELD, CaseOutcome, compute_code_digest, run_case
+from snakesim_operator.features.evaluate.case import (
+    GAVE_UP_FIELD,
+    CaseOutcome,
+    compute_code_digest,
+    run_case,
+)
 from snakesim_operator.features.evaluate.suite import EvaluationSuite, make_cases
 
 ENDLESS = """
@@ -19,7 +24,9 @@ class Endless(HoldPose):
 """
 
 
-def ran(controller: str, duration_s: float = 4, give_up_s: float = 12.0, limit_s: float = 600.0) -> CaseOutcome:
+def ran(
+    controller: str, duration_s: float = 4, give_up_s: float = 12.0, limit_s: float = 600.0
+) -> CaseOutcome:
     """What comes of the first case."""
     goal = {"kind": "heading", "distance_m": 0.3}
     always = {"duration_s": duration_s, "mission.goal": goal}

@@ -12,9 +12,17 @@ PRINT = "from snakesim_hal.base.process import {0}; print({0}({1}))"
 
 def run_python(code: str, *, drop: str = "") -> str:
     """What a process of its own prints; drop: a capability that it must not have (an ordinary user's has none)."""
-    bounded = ["setpriv", f"--bounding-set=-{drop}", f"--inh-caps=-{drop}"] if drop and os.geteuid() == 0 else []
+    bounded = (
+        ["setpriv", f"--bounding-set=-{drop}", f"--inh-caps=-{drop}"]
+        if drop and os.geteuid() == 0
+        else []
+    )
     done = subprocess.run(
-        [*bounded, sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False
+        [*bounded, sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
     )
     return (done.stdout + done.stderr).strip()
 
@@ -26,7 +34,10 @@ def test_memory_is_not_locked_under_a_limit() -> None:
 
 
 def test_memory_is_locked_where_that_is_allowed() -> None:
-    code = PRINT.format("lock_memory", "") + "; print(open('/proc/self/status').read().split('VmLck:')[1].split()[0])"
+    code = (
+        PRINT.format("lock_memory", "")
+        + "; print(open('/proc/self/status').read().split('VmLck:')[1].split()[0])"
+    )
     verdict, *locked = run_python(code).splitlines()
     if verdict != "None":
         pytest.skip(verdict)
@@ -74,7 +85,9 @@ def test_a_closed_terminal_is_a_stop_but_under_nohup() -> None:
     code = PRINT.format("list_stop_signals", "")
     in_a_terminal = ["env", "--default-signal=HUP"]  # these tests may run under nohup
     words, under_nohup = (
-        subprocess.run([*prefix, sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        subprocess.run(
+            [*prefix, sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
         for prefix in (in_a_terminal, ["nohup"])
     )
     assert "SIGHUP" in words

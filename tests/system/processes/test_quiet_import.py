@@ -21,13 +21,19 @@ def run_python(code: str, mujoco_gl: str | None) -> list[str]:
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     if mujoco_gl is not None:
         environment["MUJOCO_GL"] = mujoco_gl
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
 
-@pytest.mark.parametrize(("mujoco_gl", "context"), [(None, "mujoco.glfw True"), ("egl", "mujoco.egl True")])
-def test_the_choice_of_opengl_stays_that_of_the_program(mujoco_gl: str | None, context: str) -> None:
+@pytest.mark.parametrize(
+    ("mujoco_gl", "context"), [(None, "mujoco.glfw True"), ("egl", "mujoco.egl True")]
+)
+def test_the_choice_of_opengl_stays_that_of_the_program(
+    mujoco_gl: str | None, context: str
+) -> None:
     assert run_python(IMPORTED + CONTEXT, mujoco_gl) == [str(mujoco_gl), context]
 
 

@@ -50,6 +50,12 @@ def folder(tmp_path: Path) -> Path:
 def test_plugin_file_imports_neighbors_and_only_what_it_names(folder: Path) -> None:
     command = make_python_command("-c", LOADS, str(folder))
     ended = subprocess.run(
-        command, env=make_child_environment(), cwd=folder, capture_output=True, text=True, timeout=60, check=False
+        command,
+        env=make_child_environment(),
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert (ended.returncode, ended.stdout) == (0, "as it must be\n"), ended.stderr

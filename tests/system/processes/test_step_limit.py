@@ -5,7 +5,12 @@ from contextlib import closing
 
 import pytest
 
-from snakesim_hal.base.step_limit import SharedStepTimes, StepTooLongError, StepWatchdog, describe_interrupted_line
+from snakesim_hal.base.step_limit import (
+    SharedStepTimes,
+    StepTooLongError,
+    StepWatchdog,
+    describe_interrupted_line,
+)
 
 
 def endless() -> None:
@@ -21,7 +26,9 @@ def test_an_endless_step_is_interrupted_and_its_place_is_known() -> None:
     with closing(StepWatchdog(0.1)) as limit:
         with pytest.raises(StepTooLongError) as caught, limit:
             endless()
-        assert describe_interrupted_line(caught.value).startswith("endless() (test_step_limit.py line ")
+        assert describe_interrupted_line(caught.value).startswith(
+            "endless() (test_step_limit.py line "
+        )
         with limit:
             pass
         time.sleep(0.4)  # between steps nothing is raised

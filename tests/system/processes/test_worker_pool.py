@@ -59,6 +59,14 @@ def test_a_call_that_fails_costs_no_other(tmp_path: Path) -> None:
     with WorkerPool(2) as pool:
         outcomes = dict(pool.run_calls(eval, calls, timeout_s=5.0))
         assert outcomes[3] == CallResult(2)
-        errors = [outcome.error for outcome in map(outcomes.get, range(3)) if isinstance(outcome, CallFailure)]
-        assert [type(error) for error in errors] == [WorkerDiedError, ZeroDivisionError, CallTookTooLongError]
+        errors = [
+            outcome.error
+            for outcome in map(outcomes.get, range(3))
+            if isinstance(outcome, CallFailure)
+        ]
+        assert [type(error) for error in errors] == [
+            WorkerDiedError,
+            ZeroDivisionError,
+            CallTookTooLongError,
+        ]
         assert pool.run_and_collect(exit_unless, [(str(tmp_path / "tried"),)]) == ["again"]

@@ -34,7 +34,12 @@ def test_worker_restarts_after_error_and_reports_it_once(capfd: pytest.CaptureFi
     start_restarting_thread("bellows", work, on_error=dropped.append).join(10.0)
     assert len(attempts) == 3
     assert len(dropped) == 2
-    assert capfd.readouterr().err.count("bellows: unexpected error, going on: BrokenError: no file is left") == 1
+    assert (
+        capfd.readouterr().err.count(
+            "bellows: unexpected error, going on: BrokenError: no file is left"
+        )
+        == 1
+    )
 
 
 def test_a_worker_that_is_over_does_not_begin_again() -> None:
@@ -114,5 +119,7 @@ def test_what_stops_a_robot_is_served_after_an_error(tmp_path: Path) -> None:
 
 def test_a_jobs_thread_is_there_before_it_is_needed() -> None:
     worker = BackgroundThread("hammer")
-    wait_until(lambda: any(thread.name == "hammer" for thread in threading.enumerate()), "the thread", 5.0)
+    wait_until(
+        lambda: any(thread.name == "hammer" for thread in threading.enumerate()), "the thread", 5.0
+    )
     worker.close()

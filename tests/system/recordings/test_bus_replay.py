@@ -43,7 +43,9 @@ def test_the_log_gives_the_recorded_states(run: Path, suffix: str) -> None:
 
 def test_a_lost_answer_is_found(run: Path, tmp_path: Path) -> None:
     lines = run.with_name("bus.log").read_text().splitlines(keepends=True)
-    answers = [i for i, line in enumerate(lines) if f" {frame_id(Opcode.JOINT_STATE, 4):03X}#" in line]
+    answers = [
+        i for i, line in enumerate(lines) if f" {frame_id(Opcode.JOINT_STATE, 4):03X}#" in line
+    ]
     del lines[answers[30]]
     log = tmp_path / "lost.log"
     log.write_text("".join(lines))
@@ -64,7 +66,9 @@ def test_bus_replay_of_cut_log_compares_up_to_the_cut(run: Path, tmp_path: Path)
     assert ended.code == 0 and ticks is not None and 10 < int(ticks[1]) < 50, ended.out
     last = len(log.read_bytes().splitlines())
     assert f"1 line is no whole frame and was left out: line {last}: '(" in ended.out
-    assert "did not answer" not in ended.out, "the log ends there; nothing is known of the rest of that tick"
+    assert "did not answer" not in ended.out, (
+        "the log ends there; nothing is known of the rest of that tick"
+    )
 
 
 def test_what_candump_prints_without_times_gives_them_too(run: Path, tmp_path: Path) -> None:
@@ -75,7 +79,10 @@ def test_what_candump_prints_without_times_gives_them_too(run: Path, tmp_path: P
     log = tmp_path / "printed.log"
     log.write_text(printed)
     ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=tmp_path)
-    assert ended.code == 0 and "joint states of 50 ticks are those of the record, to the bit" in ended.out, ended.out
+    assert (
+        ended.code == 0
+        and "joint states of 50 ticks are those of the record, to the bit" in ended.out
+    ), ended.out
     assert "the frames have no times" in ended.out
 
 
@@ -83,10 +90,15 @@ def test_bus_replay_refuses_log_of_another_drive_type(run: Path, tmp_path: Path)
     log = tmp_path / "odrive.log"
     heartbeats = "".join(f"(1700000000.{tick:06d}) can0 {node << 5 | 1:03X}#0000000001000000 R\n"
                          for tick in range(20) for node in range(1, 14))  # fmt: skip
-    versions = "".join(f"(1700000001.{tick:06d}) can0 080#020404580006{tick:02X}00 R\n" for tick in range(20))
+    versions = "".join(
+        f"(1700000001.{tick:06d}) can0 080#020404580006{tick:02X}00 R\n" for tick in range(20)
+    )
     log.write_text(heartbeats + versions)  # of axis 4; the id is that of a Sync
     ended = snakesim("drive", "replay", "can", str(run), str(log), cwd=tmp_path)
-    assert ended.code == 1 and "280 frames, and no Sync among them: the log of another bus; " in ended.out, ended.out
+    assert (
+        ended.code == 1
+        and "280 frames, and no Sync among them: the log of another bus; " in ended.out
+    ), ended.out
     assert "frames look like ODrive's heartbeat" in ended.out
     other = tmp_path / "run"
     shutil.copytree(run, other)
@@ -98,9 +110,12 @@ def test_bus_replay_refuses_log_of_another_drive_type(run: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("name", "content"), [("bus.log", "not a frame\n"), ("bus.blf", "LOGG damaged"), ("bus.txt", ""), ("bus.asc", None)]
+    ("name", "content"),
+    [("bus.log", "not a frame\n"), ("bus.blf", "LOGG damaged"), ("bus.txt", ""), ("bus.asc", None)],
 )
-def test_what_is_no_log_is_refused(run: Path, tmp_path: Path, name: str, content: str | None) -> None:
+def test_what_is_no_log_is_refused(
+    run: Path, tmp_path: Path, name: str, content: str | None
+) -> None:
     log = tmp_path / name
     if content is not None:
         log.write_text(content)

@@ -23,7 +23,14 @@ from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
-from snakesim_testing.operator.damaged_recordings import chunks, flipped, packed, recorded, spans, written
+from snakesim_testing.operator.damaged_recordings import (
+    chunks,
+    flipped,
+    packed,
+    recorded,
+    spans,
+    written,
+)
 from snakesim_testing.runs.in_process_command import snakesim
 
 INCOMPLETE = 3
@@ -43,11 +50,15 @@ def whole(run: Path) -> bytes:
 
 def lost(whole_path: Path, path: Path) -> Counter[str]:
     """By key, by comparison with the file as it was."""
-    before, after = (Counter(one.key for one in RecordingReader(of).read_messages()) for of in (whole_path, path))
+    before, after = (
+        Counter(one.key for one in RecordingReader(of).read_messages()) for of in (whole_path, path)
+    )
     return before - after
 
 
-def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(run: Path, whole: bytes, tmp_path: Path) -> None:
+def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(
+    run: Path, whole: bytes, tmp_path: Path
+) -> None:
     damaged, following = chunks(whole)[2:4]
     path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
     reader = RecordingReader(path)
@@ -55,7 +66,9 @@ def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(run: Path, whole: b
     truth = lost(run / RECORDING_FILENAME, path)
     assert truth[keys.JOINTS] >= 2
     assert len(kept) > 500
-    assert {key: count for key, count in reader.losses.lost_by_key.items() if not key.startswith("/")} == truth
+    assert {
+        key: count for key, count in reader.losses.lost_by_key.items() if not key.startswith("/")
+    } == truth
     (gap,) = [gap for gap in reader.losses.gaps if gap.lost]
     clocks = [one.robot_time_ns for one in kept if one.key == keys.CLOCK]
     hole = next((a, b) for a, b in pairwise(clocks) if b - a > 20_000_000)
@@ -68,11 +81,18 @@ def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(run: Path, whole: b
 @pytest.mark.slow  # one flipped bit in one of them below
 def test_each_chunk_may_be_the_damaged_one(run: Path, whole: bytes, tmp_path: Path) -> None:
     for chunk in chunks(whole):
-        for at in (chunk.begin, chunk.begin + 2, chunk.begin + 45, chunk.end - 5):  # kind, length, name, data
+        for at in (
+            chunk.begin,
+            chunk.begin + 2,
+            chunk.begin + 45,
+            chunk.end - 5,
+        ):  # kind, length, name, data
             path = written(tmp_path / "a.mcap", flipped(whole, at))
             reader = RecordingReader(path)
             kept = list(reader.read_messages())
-            ours = {key: n for key, n in reader.losses.lost_by_key.items() if not key.startswith("/")}
+            ours = {
+                key: n for key, n in reader.losses.lost_by_key.items() if not key.startswith("/")
+            }
             assert kept and reader.is_complete and ours == lost(run / RECORDING_FILENAME, path), (
                 chunk,
                 at,
@@ -94,7 +114,11 @@ COMMANDS = [
 
 @pytest.mark.parametrize(
     ("command", "damage"),
-    [*((command, "flipped") for command in COMMANDS), (COMMANDS[0], "halved"), (COMMANDS[0], "taken out")],
+    [
+        *((command, "flipped") for command in COMMANDS),
+        (COMMANDS[0], "halved"),
+        (COMMANDS[0], "taken out"),
+    ],
 )
 def test_every_command_tells_of_the_damage_and_ends_with_3(
     whole: bytes, tmp_path: Path, command: list[str], damage: str
@@ -109,7 +133,8 @@ def test_every_command_tells_of_the_damage_and_ends_with_3(
     written(tmp_path / "a.mcap", damaged)
     ended = snakesim(*command, cwd=tmp_path)
     assert ended.code == INCOMPLETE, ended
-    said = [line for line in ended.err.splitlines() if "update() took" not in line]  # a busy computer
+    # A busy computer.
+    said = [line for line in ended.err.splitlines() if "update() took" not in line]
     assert len(said) == 1
     assert said[0].startswith("snakesim: a.mcap is incomplete: ")
     assert ("breaks off at" if damage == "halved" else "actuator/joints") in ended.err
@@ -119,12 +144,15 @@ def test_every_command_tells_of_the_damage_and_ends_with_3(
 
 
 @pytest.mark.slow
-def test_undamaged_recording_is_not_reported_and_names_its_command(whole: bytes, tmp_path: Path) -> None:
+def test_undamaged_recording_is_not_reported_and_names_its_command(
+    whole: bytes, tmp_path: Path
+) -> None:
     for name in ("whole.mcap", "a.mcap"):
         written(tmp_path / name, whole)
     for command in COMMANDS:
         ended = snakesim(*command, cwd=tmp_path)
-        errors = [line for line in ended.err.splitlines() if "update() took" not in line]  # by a busy computer
+        # By a busy computer.
+        errors = [line for line in ended.err.splitlines() if "update() took" not in line]
         assert ended.code == 0 and not errors, ended
     page = (tmp_path / "a.html").read_text()
     assert "The run ended early" not in page
@@ -135,10 +163,14 @@ def test_undamaged_recording_is_not_reported_and_names_its_command(whole: bytes,
     assert "Save the effective configuration below as <code>config.json</code>" in page
 
 
-def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(run: Path, whole: bytes, tmp_path: Path) -> None:
+def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(
+    run: Path, whole: bytes, tmp_path: Path
+) -> None:
     first = chunks(whole)[0]
     written(tmp_path / "a.mcap", flipped(whole, (first.begin + first.end) // 2))
-    ended = snakesim("recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path)
+    ended = snakesim(
+        "recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path
+    )
     count = len(list(RecordingReader(tmp_path / "a.mcap").read_messages()))
     assert ended.code == INCOMPLETE
     assert int(ended.out.split()[0]) > count > 500  # and those for Foxglove
@@ -154,7 +186,9 @@ def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(run: Path, who
 def test_tables_and_arrays_carry_what_is_lost(whole: bytes, tmp_path: Path) -> None:
     written(tmp_path / "a.mcap", whole[: len(whole) // 2])
     for form in ("csv", "npz"):
-        snakesim("recording", "export", "a.mcap", "--format", form, "--out", f"a.{form}", cwd=tmp_path)
+        snakesim(
+            "recording", "export", "a.mcap", "--format", form, "--out", f"a.{form}", cwd=tmp_path
+        )
     with (tmp_path / "a.csv").open() as file:
         assert next(file).startswith("# incomplete: recording: its end: it breaks off at ")
         rows = list(csv.DictReader(file))
@@ -168,19 +202,30 @@ def test_who_reads_parquet_and_datasets_finds_it_too(whole: bytes, tmp_path: Pat
     written(tmp_path / "a.mcap", whole[: len(whole) // 2])
     for form, out in (("parquet", "a.parquet"), ("lerobot", "set")):
         assert (
-            snakesim("recording", "export", "a.mcap", "--format", form, "--out", out, cwd=tmp_path).code == INCOMPLETE
+            snakesim(
+                "recording", "export", "a.mcap", "--format", form, "--out", out, cwd=tmp_path
+            ).code
+            == INCOMPLETE
         )
-    assert b"its end" in parquet.read_table(tmp_path / "a.parquet").schema.metadata[b"snakesim.missing"]
+    assert (
+        b"its end"
+        in parquet.read_table(tmp_path / "a.parquet").schema.metadata[b"snakesim.missing"]
+    )
     assert "its end" in json.loads((tmp_path / "set" / "meta" / "missing.json").read_text())["0"][0]
 
 
 @pytest.mark.parametrize("fps", [None, 50.0])
-def test_a_gap_ends_an_episode_of_a_dataset(run: Path, whole: bytes, tmp_path: Path, fps: float | None) -> None:
+def test_a_gap_ends_an_episode_of_a_dataset(
+    run: Path, whole: bytes, tmp_path: Path, fps: float | None
+) -> None:
     """No frame gets a time that it did not have, and no reward is earned while nothing was recorded."""
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     damaged = chunks(whole)[len(chunks(whole)) // 2]
     path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
-    (intact,), parts = read_episodes([run], None, images=False), read_episodes([path], None, images=False)
+    (intact,), parts = (
+        read_episodes([run], None, images=False),
+        read_episodes([path], None, images=False),
+    )
     write_lerobot(parts, tmp_path / "set", write_parquet, fps)
     files = sorted((tmp_path / "set" / "data").rglob("*.parquet"))
     assert len(files) == 2
@@ -191,15 +236,20 @@ def test_a_gap_ends_an_episode_of_a_dataset(run: Path, whole: bytes, tmp_path: P
     assert intact.reward_m is not None
     for file, begin_s in zip(files, begins_s, strict=True):
         frames = parquet.read_table(file).to_pydict()
-        rows = [intact.record.find_nearest_row(begin_s + timestamp) for timestamp in frames["timestamp"]]
+        rows = [
+            intact.record.find_nearest_row(begin_s + timestamp) for timestamp in frames["timestamp"]
+        ]
         angles = np.array(frames["observation.state"])[:, : intact.record.angle_rad.shape[1]]
-        assert np.allclose(angles, intact.record.angle_rad[rows], atol=1e-6)  # they were measured at that time
+        # They were measured at that time.
+        assert np.allclose(angles, intact.record.angle_rad[rows], atol=1e-6)
         earned_m = float(intact.reward_m[rows[0] : rows[-1] + 1].sum())
         assert sum(frames["next.reward"]) == pytest.approx(earned_m, abs=0.002)
         assert max(frames["next.reward"]) < 4 * intact.reward_m.max()
         assert frames["next.done"] == [False] * (len(rows) - 1) + [True]
     summary = summarize_run(record, "complete")
-    assert summary.mean_speed_m_s == pytest.approx(summarize_run(intact.record, "complete").mean_speed_m_s, rel=1e-6)
+    assert summary.mean_speed_m_s == pytest.approx(
+        summarize_run(intact.record, "complete").mean_speed_m_s, rel=1e-6
+    )
 
 
 def test_damaged_episode_after_a_gap_starts_with_an_image(whole: bytes, tmp_path: Path) -> None:
@@ -215,7 +265,9 @@ def test_damaged_episode_after_a_gap_starts_with_an_image(whole: bytes, tmp_path
         pictures.add(tick, np.full((1, 2, 3), shade, np.uint8))
     parts = [dataclasses.replace(part, pictures={"head": pictures}) for part in (before, after)]
     write_lerobot(parts, tmp_path / "set", write_parquet)
-    lengths = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pydict()["length"]
+    lengths = parquet.read_table(
+        tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
+    ).to_pydict()["length"]
     assert lengths == [len(before.rows), len(after.rows) - 3]
 
 
@@ -223,10 +275,13 @@ def test_a_film_stands_still_in_a_gap(whole: bytes, tmp_path: Path) -> None:
     damaged = chunks(whole)[len(chunks(whole)) // 2]
     path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
     record = RunRecord.load(path)
-    before, after = (int(rows[end]) for rows, end in zip(record.contiguous_rows, (-1, 0), strict=True))
+    before, after = (
+        int(rows[end]) for rows, end in zip(record.contiguous_rows, (-1, 0), strict=True)
+    )
     times_s = video.choose_frame_times_s(record, 100.0, 1.0, (0.0, np.inf))
     gap_s = record.time_s[after] - record.time_s[before]
-    assert (times_s == record.time_s[before]).sum() == round(gap_s * 100)  # and never the pose that came later
+    # And never the pose that came later.
+    assert (times_s == record.time_s[before]).sum() == round(gap_s * 100)
     (sentence,) = video.describe_frozen_spans(times_s, 0.01, 0.01)
     assert f"between {record.time_s[before]:.2f} and {record.time_s[after]:.2f} s" in sentence
 
@@ -240,7 +295,10 @@ def test_truncated_recording_says_nothing_about_end_of_run(whole: bytes, tmp_pat
     assert "ended early" not in page
     assert "The record is incomplete. recording: its end" in page
     compared = snakesim("study", "compare", "whole.mcap", "a.mcap", cwd=tmp_path)
-    assert "Only a part of the runs is compared, because the record of B is incomplete." in compared.out
+    assert (
+        "Only a part of the runs is compared, because the record of B is incomplete."
+        in compared.out
+    )
     assert "in what both records hold: " in compared.out
     assert "for all of their" not in compared.out
 
@@ -269,12 +327,16 @@ def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_
 def test_damaged_lz4_chunk_and_impossible_time_are_reported(whole: bytes, tmp_path: Path) -> None:
     first, second = chunks(whole)[:2]
     bad = packed(b"abc", "lz4", data=b"no lz4 at all")
-    reader = RecordingReader(written(tmp_path / "a.mcap", whole[: first.end] + bad + whole[first.end :]))
+    reader = RecordingReader(
+        written(tmp_path / "a.mcap", whole[: first.end] + bad + whole[first.end :])
+    )
     assert len(list(reader.read_messages())) > 500
     assert "a chunk that cannot be unpacked" in reader.missing[0]
     (channel,) = struct.unpack("<H", b"\x01\x00")
     late = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, channel, 10**6, 2**63, 0)
-    reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + packed(late) + whole[second.begin :]))
+    reader = RecordingReader(
+        written(tmp_path / "a.mcap", whole[: second.begin] + packed(late) + whole[second.begin :])
+    )
     assert max(one.robot_time_ns for one in reader.read_messages()) < 2**62
     assert reader.missing
     assert snakesim("recording", "info", "a.mcap", cwd=tmp_path).code == INCOMPLETE
@@ -284,7 +346,9 @@ def test_a_record_of_absurd_length_is_damage(whole: bytes, tmp_path: Path) -> No
     second = chunks(whole)[1]
     for opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.MESSAGE, Opcode.ATTACHMENT):
         absurd = struct.pack("<BQ", opcode, 2**63) + b"x" * 50
-        reader = RecordingReader(written(tmp_path / "a.mcap", whole[: second.begin] + absurd + whole[second.begin :]))
+        reader = RecordingReader(
+            written(tmp_path / "a.mcap", whole[: second.begin] + absurd + whole[second.begin :])
+        )
         list(reader.read_messages())
         assert reader.is_complete
         assert not reader.losses.lost_by_key
@@ -307,7 +371,11 @@ def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
 
 NAVIGATION = "services.navigation.plugin="
 NAMED = {  # the class that is made another; how a run names that one, how the refusal calls it, and what stands for it
-    "controller": ("control.hold import HoldPose", ("--controller", "./mine.py:Mine"), ("--controller", "hold")),
+    "controller": (
+        "control.hold import HoldPose",
+        ("--controller", "./mine.py:Mine"),
+        ("--controller", "hold"),
+    ),
     "service navigation": (
         "navigation.service import NavigationService",
         ("--set", f"{NAVIGATION}./mine.py:Mine"),
@@ -325,7 +393,9 @@ def test_recording_runs_named_files_only_on_request(tmp_path: Path, kind: str) -
         "(Path(__file__).parent / 'ran').touch()\n"
         "class Mine(Base):\n    pass\n"
     )
-    begun = snakesim("run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", *own, cwd=tmp_path)
+    begun = snakesim(
+        "run", "triplet", "--in-process", "--duration", "0.2", "--out", "run", *own, cwd=tmp_path
+    )
     assert begun.code == 0 and (tmp_path / "ran").exists(), begun
     (tmp_path / "ran").unlink()
     commands = (
@@ -336,7 +406,8 @@ def test_recording_runs_named_files_only_on_request(tmp_path: Path, kind: str) -
     )
     for words in commands:
         assert snakesim(*words.split(), cwd=tmp_path).code == 0
-    more = () if kind == "controller" else ("--controller", "hold")  # which says nothing of a service
+    # Which says nothing of a service.
+    more = () if kind == "controller" else ("--controller", "hold")
     refused = snakesim("replay", "run", "--control", *more, cwd=tmp_path)
     assert refused.code == 2
     assert f"the recording names './mine.py:Mine' as its {kind}" in refused.err
@@ -350,7 +421,9 @@ def test_recording_runs_named_files_only_on_request(tmp_path: Path, kind: str) -
         (tmp_path / "ran").unlink(missing_ok=True)
 
 
-def test_damaged_recording_is_reported_for_its_run_folder(run: Path, whole: bytes, tmp_path: Path) -> None:
+def test_damaged_recording_is_reported_for_its_run_folder(
+    run: Path, whole: bytes, tmp_path: Path
+) -> None:
     for path in run.iterdir():
         if path.is_file():
             written(tmp_path / path.name, path.read_bytes())

@@ -46,7 +46,15 @@ class Recording:
     """`snakesim record --episodes`, at its keyboard."""
 
     def __init__(self, run: RunningCommand, cwd: Path) -> None:
-        command = ("record", "--endpoint", run.endpoint, "--episodes", "demos", "--task", "through the field")
+        command = (
+            "record",
+            "--endpoint",
+            run.endpoint,
+            "--episodes",
+            "demos",
+            "--task",
+            "through the field",
+        )
         self.process = subprocess.Popen(
             [*SNAKESIM_COMMAND, *command],
             cwd=cwd,
@@ -82,13 +90,23 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _demonstrate(run: RunningCommand, home: Path) -> None:
     at = Recording(run, home)
     with at_the_keyboard(run, home) as terminal:
-        wait_until(lambda: "Enter begins an episode" in at.printed, "the recorder at the robot", 20.0)
+        wait_until(
+            lambda: "Enter begins an episode" in at.printed, "the recorder at the robot", 20.0
+        )
         terminal.type(UP + UP)
-        for number, word, became in ((0, "s", "succeeded"), (1, "f", "failed"), (2, "d", "dropped")):
+        for number, word, became in (
+            (0, "s", "succeeded"),
+            (1, "f", "failed"),
+            (2, "d", "dropped"),
+        ):
             name = f"episode-{number:03d}.mcap"
             at.type("", f"{name}: recording")
             file = home / "demos" / name
-            wait_until(lambda file=file: file.is_file() and file.stat().st_size > 150_000, "something in it", 20.0)
+            wait_until(
+                lambda file=file: file.is_file() and file.stat().st_size > 150_000,
+                "something in it",
+                20.0,
+            )
             before = at.printed
             at.type("", f"{before}{name}: ")
             if number == 0:
@@ -102,13 +120,18 @@ def _demonstrate(run: RunningCommand, home: Path) -> None:
 
 @pytest.mark.slow
 def test_episodes_keep_what_was_said_of_them(demos: Path) -> None:
-    labels = [json.loads(line) for line in (demos / "demos" / "episodes.jsonl").read_text().splitlines()]
+    labels = [
+        json.loads(line) for line in (demos / "demos" / "episodes.jsonl").read_text().splitlines()
+    ]
     assert [(one["file"], one["success"]) for one in labels] == [
         ("episode-000.mcap", True),
         ("episode-001.mcap", False),
     ]
     assert {one["task"] for one in labels} == {"through the field"}
-    assert {path.name for path in (demos / "demos").iterdir()} == {"episodes.jsonl", *(one["file"] for one in labels)}
+    assert {path.name for path in (demos / "demos").iterdir()} == {
+        "episodes.jsonl",
+        *(one["file"] for one in labels),
+    }
     info = snakesim("recording", "info", "demos/episode-000.mcap", cwd=demos)
     assert "operator/intent" in info.out and "sensor/depth/head" in info.out, info.printed
 
@@ -128,7 +151,9 @@ def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path
     assert info["total_tasks"] == 1
     assert info["features"]["observation.images.head_depth"]["shape"] == [120, 160, 3]
     first, second = (
-        parquet.read_table(tmp_path / "set" / info["data_path"].format(chunk_index=0, file_index=i)).to_pydict()
+        parquet.read_table(
+            tmp_path / "set" / info["data_path"].format(chunk_index=0, file_index=i)
+        ).to_pydict()
         for i in (0, 1)
     )
     assert first["next.success"][-1]
@@ -145,7 +170,10 @@ def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path
 def test_lerobot_itself_loads_the_dataset(demos: Path, tmp_path: Path) -> None:
     """Installs it, once, into build/lerobot."""
     python = THEIRS / "bin" / "python"
-    for command in (["venv", "--allow-existing", str(THEIRS)], ["pip", "install", "--python", str(python), LEROBOT]):
+    for command in (
+        ["venv", "--allow-existing", str(THEIRS)],
+        ["pip", "install", "--python", str(python), LEROBOT],
+    ):
         made = subprocess.run([UV, *command], capture_output=True, text=True, check=False)
         if made.returncode:
             pytest.skip(f"{LEROBOT} cannot be installed here: {made.stderr[-300:]}")

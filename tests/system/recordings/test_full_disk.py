@@ -68,6 +68,11 @@ def test_what_searches_and_evaluations_leave_is_whole_or_as_before(
     tmp_path: Path, write: Callable[[Path], object], name: str
 ) -> None:
     (tmp_path / name).write_text("an earlier one")
-    with limited_file_size(FITS_BYTES), raises_error(ConfigError, code="file/not-writable", field=name):
+    with (
+        limited_file_size(FITS_BYTES),
+        raises_error(ConfigError, code="file/not-writable", field=name),
+    ):
         write(tmp_path)
-    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "an earlier one")]
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [
+        (name, "an earlier one")
+    ]

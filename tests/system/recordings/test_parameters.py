@@ -43,13 +43,17 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_replay_changes_them_in_the_same_tick(tuned: Path, tmp_path: Path) -> None:
     replayed = snakesim("replay", str(tuned), "--control", cwd=tmp_path)
-    assert replayed.code == 0 and replayed.out == "60 commands, the same to the bit\n", replayed.out + replayed.err
+    assert replayed.code == 0 and replayed.out == "60 commands, the same to the bit\n", (
+        replayed.out + replayed.err
+    )
 
 
 def test_the_recording_names_who_set_what_and_when(tuned: Path, tmp_path: Path) -> None:
     said = snakesim("recording", "info", str(tuned), cwd=tmp_path).out
     row = next(line for line in said.splitlines() if line.startswith("  set "))
-    assert row.endswith(" s by ada: control.propulsion_n: 35.0 -> 20.0, control.damping_nm_s_per_rad: 0.5 -> 0.9")
+    assert row.endswith(
+        " s by ada: control.propulsion_n: 35.0 -> 20.0, control.damping_nm_s_per_rad: 0.5 -> 0.9"
+    )
 
 
 def test_what_is_set_for_the_replay_stays(tuned: Path, tmp_path: Path) -> None:
@@ -76,7 +80,11 @@ def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
     found = parse_parameters(in_force)
     assert len(found) == len(msgspec.structs.fields(parameters_type))
     for one in found:
-        assert one.description and one.range_text and (one.unit or one.name in ("push_scale", "model", "slides")), one
+        assert (
+            one.description
+            and one.range_text
+            and (one.unit or one.name in ("push_scale", "model", "slides"))
+        ), one
 
 
 def test_ranges_are_told_in_words() -> None:

@@ -33,7 +33,17 @@ from snakesim_testing.runs.command import (
 pytestmark = pytest.mark.e2e
 
 # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
-LONG = ["triplet", "--controller", "hold", "--duration", "30", "--clock-mode", "realtime", "--set", "rate_hz=50"]
+LONG = [
+    "triplet",
+    "--controller",
+    "hold",
+    "--duration",
+    "30",
+    "--clock-mode",
+    "realtime",
+    "--set",
+    "rate_hz=50",
+]
 SHORT = ["triplet", "--duration", "5", "--seed", "7"]
 RATE_HZ = 50
 IN_ONE, LOCKED = ["--in-process"], "mount -o remount,ro ."
@@ -122,7 +132,7 @@ def test_a_host_that_is_stopped_is_no_complete_run(tmp_path: Path, when: str) ->
 @pytest.mark.slow
 def test_record_time_while_disarmed_does_not_count(tmp_path: Path) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG, "--duration", "2") as run:
-        assert command.tell(run, "robot", "disarm").code == 0
+        assert command.run_command_for_robot(run, "robot", "disarm").code == 0
         assert run.end() == 1, run.printed()
     ended = read_summary(tmp_path / "run").ended
     assert "of 2 s" in ended
@@ -132,9 +142,14 @@ def test_record_time_while_disarmed_does_not_count(tmp_path: Path) -> None:
 # --- the disk --------------------------------------------------------------------------------------------------
 
 
-def in_a_file_system(tmp_path: Path, options: str, prepare: str, *arguments: str) -> tuple[CompletedRun, Path]:
+def in_a_file_system(
+    tmp_path: Path, options: str, prepare: str, *arguments: str
+) -> tuple[CompletedRun, Path]:
     """A run whose --out is in a tmpfs of its own, mounted where nobody else sees it; what it left is copied out."""
-    if shutil.which("unshare") is None or subprocess.run(["unshare", "-rm", "true"], check=False).returncode:
+    if (
+        shutil.which("unshare") is None
+        or subprocess.run(["unshare", "-rm", "true"], check=False).returncode
+    ):
         pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
     disk, left = tmp_path / "disk", tmp_path / "left"
     disk.mkdir()
@@ -161,7 +176,9 @@ def orderly(ended: CompletedRun, left: Path, *, code: int, warning: str) -> None
     assert "\nrecord: incomplete: " in ended.out
     files = [path for path in left.rglob("*") if path.is_file()]
     assert all(path.stat().st_size > 0 and path.suffix != ".partial" for path in files), files
-    assert not any("Traceback" in path.read_text(errors="replace") for path in files if path.suffix == ".log")
+    assert not any(
+        "Traceback" in path.read_text(errors="replace") for path in files if path.suffix == ".log"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +189,9 @@ def digest(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.mark.parametrize(
     ("options", "prepare", "more", "warning"),
     [
-        pytest.param("size=1M", "cat /dev/zero > ballast 2> /dev/null", IN_ONE, FULL, marks=pytest.mark.slow),
+        pytest.param(
+            "size=1M", "cat /dev/zero > ballast 2> /dev/null", IN_ONE, FULL, marks=pytest.mark.slow
+        ),
         ("size=48k", "", IN_ONE, FULL),  # room for the configuration and little else
         # less than the black box alone takes: rows are lost whoever fills it first
         pytest.param("size=250k", "", [], FULL, marks=pytest.mark.slow),
@@ -193,7 +212,9 @@ def test_record_on_full_or_readonly_disk_does_not_affect_run(
 
 @pytest.mark.slow
 def test_a_fault_outranks_a_full_disk(tmp_path: Path) -> None:
-    ended, left = in_a_file_system(tmp_path, "size=100k", "", *SHORT, "--in-process", "--fault", "mute:joint_3@1")
+    ended, left = in_a_file_system(
+        tmp_path, "size=100k", "", *SHORT, "--in-process", "--fault", "mute:joint_3@1"
+    )
     orderly(ended, left, code=1, warning="No space left on device")
     assert "joint_3" in ended.out.partition("\nfault: ")[2].partition("\n")[0]
 

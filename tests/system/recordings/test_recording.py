@@ -22,7 +22,13 @@ from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.custom_sample import make_message_schema
-from snakesim_hal.wire.messages import Clock, CustomSample, LocomotionIntent, RobotDescription, TickDone
+from snakesim_hal.wire.messages import (
+    Clock,
+    CustomSample,
+    LocomotionIntent,
+    RobotDescription,
+    TickDone,
+)
 from snakesim_hal.wire.quantities import bounded
 from snakesim_operator.recording import tap as tap_module
 from snakesim_operator.recording.reader import RecordingReader
@@ -46,7 +52,10 @@ class Whisker(CustomSample, frozen=True, kw_only=True):
 
 def done(tick: int, service: str = "control") -> ReceivedSample:
     return ReceivedSample(
-        keys.done_key(service), encode(TickDone(tick=tick)), format_encoding(TickDone), time.monotonic_ns()
+        keys.done_key(service),
+        encode(TickDone(tick=tick)),
+        format_encoding(TickDone),
+        time.monotonic_ns(),
     )
 
 
@@ -64,7 +73,9 @@ def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
         recording.write_arrival(arrival)
     recording.close({"dropped": {}})
     found = list((reader := RecordingReader(tmp_path / "a.mcap")).read_messages())
-    assert [(one.key, one.payload, one.encoding) for one in found] == [(a.key, a.payload, a.encoding) for a in sent]
+    assert [(one.key, one.payload, one.encoding) for one in found] == [
+        (a.key, a.payload, a.encoding) for a in sent
+    ]
     # A tick that cannot be true, or none: the time of the newest clock.
     assert [one.robot_time_ns // PERIOD_NS for one in found] == [7, 8, 7, 7, 6, 7]
     assert all(abs(one.wall_time_ns - time.time_ns()) < 60e9 for one in found)
@@ -83,7 +94,9 @@ def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         found = list(reader.iter_messages())
-        late = [message.log_time for *_, message in reader.iter_messages(starting_at=25 * PERIOD_NS)]
+        late = [
+            message.log_time for *_, message in reader.iter_messages(starting_at=25 * PERIOD_NS)
+        ]
         summary, about = reader.get_summary(), list(reader.iter_metadata())
     assert summary is not None
     assert summary.statistics is not None
@@ -120,7 +133,9 @@ for tick in range(10**9):
 
 def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     ticks: list[tuple[float, int]] = []
     while not ticks or ticks[-1][0] - ticks[0][0] < 1.2:
@@ -135,8 +150,14 @@ def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
     assert kept > a_second_before[-1]
     assert not reader.is_complete
     assert "its end: it breaks off" in reader.missing[0]
-    with path.open("rb") as file, contextlib.suppress(Exception):  # the stock reader, as far as it goes
-        stock = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
+    with (
+        path.open("rb") as file,
+        contextlib.suppress(Exception),
+    ):  # the stock reader, as far as it goes
+        stock = [
+            message.log_time
+            for _, _, message in make_reader(file).iter_messages(log_time_order=False)
+        ]
         assert len(stock) == kept
 
 
@@ -201,13 +222,18 @@ def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
     endpoint, told = find_free_endpoint(), threading.Event()
     link, path = ConnectionSettings(endpoint, "planar13"), tmp_path / "a.mcap"
     recorder = threading.Thread(
-        target=lambda: record_to_file(link, path, lambda: not told.is_set(), wait_for_host_exit=True)
+        target=lambda: record_to_file(
+            link, path, lambda: not told.is_set(), wait_for_host_exit=True
+        )
     )
     with open_session(ConnectionSettings(endpoint, "planar13", listen=True)) as host:
         host.declare_alive(HAL)
         clocks = host.declare_publisher(keys.CLOCK, Clock, lossless=True)
         recorder.start()
-        wait_until(lambda: clocks.has_subscriber() and host.list_tokens(keys.alive_key("recorder")), "the recorder")
+        wait_until(
+            lambda: clocks.has_subscriber() and host.list_tokens(keys.alive_key("recorder")),
+            "the recorder",
+        )
         for tick in range(40):
             host.send(keys.CLOCK, clock(tick).payload)
             if tick == 20:
@@ -222,7 +248,9 @@ def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
 def test_recording_sample_before_description_keeps_its_schema(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     own = keys.custom_key("left")
-    early = ReceivedSample(own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.CustomSample/1", 0)
+    early = ReceivedSample(
+        own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.CustomSample/1", 0
+    )
     schema = make_message_schema(Whisker, "test")
     described = encode(msgspec.structs.replace(make_description(), custom={own: schema}))
     robot = ReceivedSample(keys.DESCRIPTION, described, format_encoding(RobotDescription), 0)
@@ -231,6 +259,10 @@ def test_recording_sample_before_description_keeps_its_schema(tmp_path: Path) ->
         recording.write_arrival(arrival)
     recording.close({})
     with path.open("rb") as file:
-        schemas = {schema.name for schema, channel, _ in make_reader(file).iter_messages(topics=[own]) if schema}
+        schemas = {
+            schema.name
+            for schema, channel, _ in make_reader(file).iter_messages(topics=[own])
+            if schema
+        }
     assert schemas == {"snakesim.custom.Whisker"}
     assert recording.counts[own] == 2

@@ -65,10 +65,13 @@ def test_recordings_report_ticks_that_never_reached_the_recorder(run: Path, tmp_
                 ReceivedSample(message.key, message.payload, message.encoding, message.wall_time_ns)
             )
     recording.close({})
-    assert RunRecord.load(tmp_path / RECORDING_FILENAME).missing == []  # nothing in the file itself tells
+    # Nothing in the file itself tells.
+    assert RunRecord.load(tmp_path / RECORDING_FILENAME).missing == []
     ended = snakesim("recording", "report", ".", cwd=tmp_path)
     said = "recording: 99 of 200 ticks did not reach the recorder; the last that came is of "
-    assert ended.code == 3 and said in ended.err and said in (tmp_path / "report.html").read_text(), ended.err
+    assert (
+        ended.code == 3 and said in ended.err and said in (tmp_path / "report.html").read_text()
+    ), ended.err
 
 
 def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path) -> None:
@@ -93,7 +96,9 @@ def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path)
 def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
     record = RunRecord.load(run)
     for form in ("npz", "csv", "mcap"):
-        ended = snakesim("recording", "export", str(run), "--format", form, "--out", f"a.{form}", cwd=tmp_path)
+        ended = snakesim(
+            "recording", "export", str(run), "--format", form, "--out", f"a.{form}", cwd=tmp_path
+        )
         assert ended.code == 0, ended.err
     with np.load(tmp_path / "a.npz") as arrays:
         assert np.array_equal(arrays["angle_rad"], record.angle_rad)
@@ -103,7 +108,9 @@ def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
     assert [float(row["target.joint_3"]) for row in rows] == record.target[:, 2].tolist()
     assert [float(row["position_w_m.y"]) for row in rows] == record.position_w_m[:, 1].tolist()
     assert np.array_equal(RunRecord.load(tmp_path / "a.mcap").angle_rad, record.angle_rad)
-    again = snakesim("recording", "export", str(run), "--format", "csv", "--out", "a.csv", cwd=tmp_path)
+    again = snakesim(
+        "recording", "export", str(run), "--format", "csv", "--out", "a.csv", cwd=tmp_path
+    )
     assert again.code == 2
     assert "there is such a file already" in again.err
 
@@ -111,13 +118,25 @@ def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
 def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     record = RunRecord.load(run)
-    ended = snakesim("recording", "export", str(run), str(run), "--format", "lerobot", "--out", "set", cwd=tmp_path)
+    ended = snakesim(
+        "recording",
+        "export",
+        str(run),
+        str(run),
+        "--format",
+        "lerobot",
+        "--out",
+        "set",
+        cwd=tmp_path,
+    )
     assert ended.code == 0 and "2 episodes, 400 frames" in ended.out, ended.err
     info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
     wanted = {"codebase_version": "v3.0", "fps": 100, "total_frames": 400, "total_episodes": 2}
     assert info.items() >= wanted.items(), info
     n = 200
-    episode, second = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    episode, second = parquet.read_table(
+        tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
+    ).to_pylist()
     assert [episode[f"dataset_{end}_index"] for end in ("from", "to")] == [0, n]
     assert second["dataset_from_index"] == n
     assert second["tasks"] == ["clutter"]
@@ -127,15 +146,21 @@ def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
     rows = parquet.read_table(tmp_path / "set" / info["data_path"].format(**at)).to_pydict()
     assert sorted(rows) == sorted(info["features"])
     assert rows["index"] == list(range(n, 2 * n))
-    state, names = np.array(rows["observation.state"]), info["features"]["observation.state"]["names"]
+    state, names = (
+        np.array(rows["observation.state"]),
+        info["features"]["observation.state"]["names"],
+    )
     assert info["features"]["observation.state"]["shape"] == [state.shape[1]]
-    assert np.allclose(state[:, names.index("angle_rad.joint_5")], record.angle_rad[:, 4], atol=1e-6)
+    assert np.allclose(
+        state[:, names.index("angle_rad.joint_5")], record.angle_rad[:, 4], atol=1e-6
+    )
     assert rows["timestamp"][1] == pytest.approx(0.01)
     stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
     assert sorted(stats) == sorted(info["features"])
     assert stats["action"]["count"] == [400]
     assert np.allclose(stats["observation.state"]["q50"], np.median(state, axis=0), atol=1e-5)
-    tasks = parquet.read_table(tmp_path / "set/meta/tasks.parquet")  # pandas reads the names as the index
+    # Pandas reads the names as the index.
+    tasks = parquet.read_table(tmp_path / "set/meta/tasks.parquet")
     assert tasks.to_pydict() == {"task_index": [0], "__index_level_0__": ["clutter"]}
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
 
@@ -143,7 +168,10 @@ def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["info", "report"])
 def test_what_is_no_recording_is_named(tmp_path: Path, command: str) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    assert "notes.txt is not a recording" in snakesim("recording", command, "notes.txt", cwd=tmp_path).err
+    assert (
+        "notes.txt is not a recording"
+        in snakesim("recording", command, "notes.txt", cwd=tmp_path).err
+    )
     assert "gone" in snakesim("recording", command, "gone", cwd=tmp_path).err
 
 
@@ -151,7 +179,9 @@ def test_a_stock_reader_gets_our_messages_by_their_fields(run: Path) -> None:
     """Beside Foxglove's, each by its own decoder."""
     with (run / RECORDING_FILENAME).open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory(), ProtobufDecoder()])
-        decoded = [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
+        decoded = [
+            (channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()
+        ]
     angles = {message.tick: message.angle_rad for topic, message in decoded if topic == keys.JOINTS}
     assert np.array_equal([angles[tick] for tick in range(200)], RunRecord.load(run).angle_rad)
     assert {"/planar13_camera/joint_states", keys.CLOCK} <= {topic for topic, _ in decoded}

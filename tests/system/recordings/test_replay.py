@@ -26,10 +26,15 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     "scenario",
-    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in list_shipped_names("scenarios")],
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+        for name in list_shipped_names("scenarios")
+    ],
 )
 def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str) -> None:
-    ended, _ = run_to_summary(tmp_path / "run", scenario, "--duration", str(DURATION_S), "--clock-mode", "lockstep")
+    ended, _ = run_to_summary(
+        tmp_path / "run", scenario, "--duration", str(DURATION_S), "--clock-mode", "lockstep"
+    )
     assert ended.code == 0, ended.printed
     replayed = snakesim("replay", "run", "--control", cwd=tmp_path)
     ticks = round(DURATION_S * load_scenario(scenario).config.rate_hz)
@@ -40,7 +45,10 @@ def test_every_shipped_scenario_replays_to_the_bit(tmp_path: Path, scenario: str
 def test_the_replay_of_the_same_is_the_same_run(recorded: Path, tmp_path: Path) -> None:
     ended = snakesim("replay", str(recorded), "--control", "--out", "again", cwd=tmp_path)
     assert ended.code == 0, ended.err
-    before, again = RunRecord.load(recorded), RunRecord.load(tmp_path / "again" / RECORDING_FILENAME)
+    before, again = (
+        RunRecord.load(recorded),
+        RunRecord.load(tmp_path / "again" / RECORDING_FILENAME),
+    )
     assert again.host.command_digest == before.host.command_digest
     assert again.control_states == before.control_states
     assert again.worlds == before.worlds
@@ -69,7 +77,9 @@ def test_a_changed_gain_shows_in_compare(recorded: Path, tmp_path: Path) -> None
     assert "B is a replay: its robot moves as in" in compared.out
 
 
-def test_changes_that_need_the_services_are_refused_without_them(recorded: Path, tmp_path: Path) -> None:
+def test_changes_that_need_the_services_are_refused_without_them(
+    recorded: Path, tmp_path: Path
+) -> None:
     ended = snakesim("replay", str(recorded), "--set", "control.propulsion_n=20", cwd=tmp_path)
     assert ended.code == 2
     assert "--set, --controller, --run-recorded-code and --out are for --control" in ended.err

@@ -19,7 +19,9 @@ def record() -> RunRecord:
 
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 @pytest.mark.parametrize("width", [1400, 400])
-def test_every_chart_of_a_report_is_drawn_without_errors(record: RunRecord, tmp_path: Path, width: int) -> None:
+def test_every_chart_of_a_report_is_drawn_without_errors(
+    record: RunRecord, tmp_path: Path, width: int
+) -> None:
     reader: ReportReader = read(record)
     page = tmp_path / "report.html"
     page.write_text(reader.html)

@@ -30,11 +30,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tmp_path = tmp_path_factory.mktemp("wrong")
     scenario = SCENARIO.read_text()
     (tmp_path / "broken.toml").write_text("robot = \n")
-    (tmp_path / "missing.toml").write_text(scenario.replace('controller = "obstacle_triplet"\n', ""))
-    (tmp_path / "my_robot.toml").write_text(ROBOT.read_text().replace("mass_kg = 0.3", 'mass_kg = "heavy"'))
+    (tmp_path / "missing.toml").write_text(
+        scenario.replace('controller = "obstacle_triplet"\n', "")
+    )
+    (tmp_path / "my_robot.toml").write_text(
+        ROBOT.read_text().replace("mass_kg = 0.3", 'mass_kg = "heavy"')
+    )
     (tmp_path / "bad_robot.toml").write_text(scenario.replace('"planar13"', '"my_robot.toml"'))
-    (tmp_path / "my_scene.toml").write_text(SCENE.read_text().replace("friction = 0.1", "friction = 99.0"))
-    (tmp_path / "bad_scene.toml").write_text(scenario.replace('scene = "triplet"', 'scene = "my_scene.toml"'))
+    (tmp_path / "my_scene.toml").write_text(
+        SCENE.read_text().replace("friction = 0.1", "friction = 99.0")
+    )
+    (tmp_path / "bad_scene.toml").write_text(
+        scenario.replace('scene = "triplet"', 'scene = "my_scene.toml"')
+    )
     (tmp_path / "wave.py").write_text("class Wave: ...\n")
     for name in ("pipe.py", "pipe.toml"):
         os.mkfifo(tmp_path / name)
@@ -42,10 +50,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (tmp_path / "deep.json").write_text('{"a":' * 100_000)
     (tmp_path / "utf16.toml").write_text(scenario, encoding="utf-16")
     (tmp_path / "steering.toml").write_text(f'"\\u001b[2J\\u202e" = 1\n{scenario}')
-    pegs = "".join(f"[[cylinder]]\nposition_m = [{9 + i % 900}, 9]\nradius_m = 0.1\n" for i in range(20_000))
+    pegs = "".join(
+        f"[[cylinder]]\nposition_m = [{9 + i % 900}, 9]\nradius_m = 0.1\n" for i in range(20_000)
+    )
     (tmp_path / "crowd.toml").write_text(f"name = 'crowd'\n[ground]\nfriction = 0.1\n{pegs}")
     (tmp_path / "crowded.toml").write_text(
-        scenario.replace('scene = "triplet"', 'scene = "crowd.toml"').replace("tail_s_m = 0.0", "on_route = false")
+        scenario.replace('scene = "triplet"', 'scene = "crowd.toml"').replace(
+            "tail_s_m = 0.0", "on_route = false"
+        )
     )
     return tmp_path
 
@@ -56,7 +68,9 @@ def list_files(folder: Path) -> set[Path]:
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_one_clear_error_and_nothing_started(folder: Path, wrong: str, messages: StoredMessages) -> None:
+def test_one_clear_error_and_nothing_started(
+    folder: Path, wrong: str, messages: StoredMessages
+) -> None:
     before = list_files(folder)
     ended = snakesim(*WRONG[wrong], cwd=folder)
     assert ended.code == 2, ended.out + ended.err

@@ -31,9 +31,16 @@ def test_controller_without_declared_needs_is_named_at_first_command() -> None:
             return command
 
     config = load_scenario("triplet", [parse_set_option(text) for text in SERVOS]).config
-    robot = describe_robot(config.robot, backend="sim", period_ns=10**7, lease_ns=10**8, config_hash="0")
+    robot = describe_robot(
+        config.robot, backend="sim", period_ns=10**7, lease_ns=10**8, config_hash="0"
+    )
     observation = Observation(
-        tick=0, time_s=0.0, period_s=0.01, joints=make_joint_state(robot), world=None, trajectory=None
+        tick=0,
+        time_s=0.0,
+        period_s=0.01,
+        joints=make_joint_state(robot),
+        world=None,
+        trajectory=None,
     )
     with raises_error(ControllerError, code="controller/failed", field="joint_2"):
         GuardedController("pushes", Pushes, robot, NoParameters()).update(observation)  # pyright: ignore[reportArgumentType]

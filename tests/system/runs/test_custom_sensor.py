@@ -16,7 +16,12 @@ from snakesim_operator.features.console.robot_data.live_robot import LiveRobot
 from snakesim_operator.recording.decoder import DecoderFactory
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as in_process
-from snakesim_testing.runs.command import CompletedRun, make_environment, run_to_end, running_snakesim
+from snakesim_testing.runs.command import (
+    CompletedRun,
+    make_environment,
+    run_to_end,
+    running_snakesim,
+)
 from snakesim_testing.runs.command import snakesim as command
 from snakesim_testing.runs.documents import REPOSITORY
 
@@ -58,12 +63,17 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
             assert abs(bent.bend_rad) <= bent.bend_max_rad
             assert 0 <= live.age_s(bent) < 1.0
             namespace = live.description.robot
-        with open_session(ConnectionSettings(endpoint=started.endpoint, namespace=namespace)) as session:
+        with open_session(
+            ConnectionSettings(endpoint=started.endpoint, namespace=namespace)
+        ) as session:
             watch = LiveRobot(session)
 
             def shown() -> bool:
                 snapshot = watch.take_snapshot()
-                return snapshot is not None and {LEFT, keys.custom_key("right")} <= snapshot.custom.keys()
+                return (
+                    snapshot is not None
+                    and {LEFT, keys.custom_key("right")} <= snapshot.custom.keys()
+                )
 
             wait_until(shown, "whiskers on the console")
             snapshot = watch.take_snapshot()
@@ -76,7 +86,9 @@ def test_a_whisker_is_published_shown_recorded_and_exported(tmp_path: Path, robo
         echoed = started.run_tool("topic", "echo", LEFT, "--count", "1")
         assert json.loads(echoed.out)["message"]["bend_max_rad"] == 1.4, echoed.printed
         started.interrupt()  # in order: a killed recorder lacks its last half second, here that is all
-    done = command("recording", "export", "run", "--format", "csv", "--out", "whiskers.csv", cwd=tmp_path)
+    done = command(
+        "recording", "export", "run", "--format", "csv", "--out", "whiskers.csv", cwd=tmp_path
+    )
     assert done.code in (0, 3), done.printed  # 3: the run was ended from outside
     with (tmp_path / "whiskers.csv").open() as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
@@ -116,7 +128,9 @@ def suite(folder: Path, robot: str, clause: str) -> CompletedRun:
 
 
 @pytest.mark.slow
-def test_contract_suite_accepts_custom_sensor_and_refuses_false_one(tmp_path: Path, robot: str) -> None:
+def test_contract_suite_accepts_custom_sensor_and_refuses_false_one(
+    tmp_path: Path, robot: str
+) -> None:
     clauses = " or ".join([*SAID, "sensor_listed", "description"])
     honest = suite(tmp_path, robot, clauses)
     assert honest.code == 0, honest.out[-3000:]
@@ -135,6 +149,8 @@ def test_a_lying_whisker_stops_the_robot_and_is_named(tmp_path: Path, robot: str
     whisker = tmp_path / "examples" / "whisker.py"
     late = "bend_rad=7.0 if tick > 30 else 0.0"
     whisker.write_text(whisker.read_text().replace(BENT, late))
-    done = in_process.snakesim("run", "peg_row", "--in-process", "--set", robot, "--duration", "5", cwd=tmp_path)
+    done = in_process.snakesim(
+        "run", "peg_row", "--in-process", "--set", robot, "--duration", "5", cwd=tmp_path
+    )
     assert done.code != 0, done.printed
     assert "sensor/custom/left cannot be published: Whisker.bend_rad is 7.0" in done.printed

@@ -13,23 +13,36 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointMode, RobotStatus
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import read_summary, run_to_summary, running_armed_snakesim, snakesim
+from snakesim_testing.runs.command import (
+    read_summary,
+    run_to_summary,
+    running_armed_snakesim,
+    snakesim,
+)
 
 pytestmark = pytest.mark.e2e
 
 LONG = ["triplet", "--controller", "hold", "--duration", "600"]
 
 
-@pytest.mark.parametrize("clock_mode", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"])
-def test_killed_controller_leads_to_safe_joints_and_failed_run(tmp_path: Path, clock_mode: str) -> None:
+@pytest.mark.parametrize(
+    "clock_mode", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"]
+)
+def test_killed_controller_leads_to_safe_joints_and_failed_run(
+    tmp_path: Path, clock_mode: str
+) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", clock_mode) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             statuses = session.declare_reader(keys.STATUS, RobotStatus)
             wait_until(lambda: bool(statuses.drain()), "a status")
             os.kill(run.part("control"), signal.SIGKILL)
-            wait_until(lambda: any("lease of control expired" in one.reason for one in statuses.drain()), "the reason")
+            wait_until(
+                lambda: any("lease of control expired" in one.reason for one in statuses.drain()),
+                "the reason",
+            )
         assert run.end() == 1
-    faults = {fault.what: fault for fault in read_summary(run.out).faults}  # a busy computer may see any of them first
+    # A busy computer may see any of them first.
+    faults = {fault.what: fault for fault in read_summary(run.out).faults}
     assert set(faults) == {"service_lost", "lease_expired"}
     lost, expired = faults["service_lost"], faults["lease_expired"]
     record = RunRecord.load(tmp_path / "run")
@@ -46,8 +59,12 @@ def test_killed_controller_leads_to_safe_joints_and_failed_run(tmp_path: Path, c
 
 
 @pytest.mark.slow  # tests/unit/gnc/test_guarded.py has each wrong answer
-@pytest.mark.parametrize("clock_mode", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)])
-def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, clock_mode: str) -> None:
+@pytest.mark.parametrize(
+    "clock_mode", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)]
+)
+def test_a_controller_that_answers_wrongly_is_named_at_once(
+    tmp_path: Path, clock_mode: str
+) -> None:
     """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""
     (tmp_path / "wave.py").write_text(
         "from snakesim_hal.controller import ControllerCommand, RequestedSetpoints\n"
@@ -72,7 +89,12 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(tmp_path: Path, cloc
     assert f"fault: control ended with exit code 1: {said}" in ended.out
     assert summary.last_reason is not None
     assert summary.last_reason.startswith(said)
-    assert (tmp_path / "run" / "control.log").read_text().splitlines()[-1].startswith(f"snakesim control: {said}")
+    assert (
+        (tmp_path / "run" / "control.log")
+        .read_text()
+        .splitlines()[-1]
+        .startswith(f"snakesim control: {said}")
+    )
 
 
 @pytest.mark.slow  # tests/system/host/test_control_service.py has what control reports of it
@@ -88,4 +110,6 @@ def test_slow_controller_is_named_as_cause_of_stop(tmp_path: Path) -> None:
     flags = ["--controller", "./slow.py:Slow", "--clock-mode", "realtime", "--duration", "10"]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
     assert ended.code == 1
-    assert re.match(r"control: update\(\) took \d\d\d ms of 10 ms; lease of control expired", summary.ended)
+    assert re.match(
+        r"control: update\(\) took \d\d\d ms of 10 ms; lease of control expired", summary.ended
+    )

@@ -40,9 +40,13 @@ slow = partial(pytest.param, marks=pytest.mark.slow)
         slow("mixed", "cut:bus_2@1-1.3", "interface_down"),
     ],
 )
-def test_planned_fault_occurs_at_its_tick_and_ends_run(tmp_path: Path, backend: str, fault: str, what: str) -> None:
+def test_planned_fault_occurs_at_its_tick_and_ends_run(
+    tmp_path: Path, backend: str, fault: str, what: str
+) -> None:
     robot = ("--set", "robot=planar13_mixed") if backend == "mixed" else ()
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", backend, *robot, "--fault", fault)
+    ended, summary = run_to_summary(
+        tmp_path / "run", "triplet", "--backend", backend, *robot, "--fault", fault
+    )
     record = RunRecord.load(tmp_path / "run").host
     by = 112 if what == "drive_fault" else 104  # a heartbeat of 10 Hz later
     assert ended.code == 1
@@ -52,9 +56,20 @@ def test_planned_fault_occurs_at_its_tick_and_ends_run(tmp_path: Path, backend: 
     assert record.lifecycle == "fault"
 
 
-@pytest.mark.parametrize("backend", ["sim", "can", slow("odrive"), slow("moteus"), slow("dynamixel")])
+@pytest.mark.parametrize(
+    "backend", ["sim", "can", slow("odrive"), slow("moteus"), slow("dynamixel")]
+)
 def test_isolated_joint_is_passive_while_run_continues(tmp_path: Path, backend: str) -> None:
-    flags = ["--backend", backend, "--fault", "mute:joint_5@1", "--duration", "1.5", "--set", MAY_LOSE_ONE]
+    flags = [
+        "--backend",
+        backend,
+        "--fault",
+        "mute:joint_5@1",
+        "--duration",
+        "1.5",
+        "--set",
+        MAY_LOSE_ONE,
+    ]
     ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
     assert ended.code == 0 and summary.ended == "complete" and summary.duration_s == 1.5, ended.out
     assert summary.isolated == ["joint_5"]

@@ -8,21 +8,36 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import run_to_summary, running_armed_snakesim, snakesim
-from snakesim_testing.runs.in_process_command import tell
+from snakesim_testing.runs.in_process_command import run_command_for_robot
 
 pytestmark = pytest.mark.e2e
 
 
 @pytest.mark.slow  # rows of the fault table
 @pytest.mark.parametrize(
-    ("backend", "clock_mode"), [pytest.param("can", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")]
+    ("backend", "clock_mode"),
+    [pytest.param("can", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")],
 )
-def test_a_fault_that_is_no_danger_disturbs_nothing(tmp_path: Path, backend: str, clock_mode: str) -> None:
+def test_a_fault_that_is_no_danger_disturbs_nothing(
+    tmp_path: Path, backend: str, clock_mode: str
+) -> None:
     """Messages that come twice are what networks do; a simulator that takes its time is no reason to stop."""
-    faults = ["duplicate:actuator/joints@0.5-1.5", "duplicate:sensor/joints@0.5-1.5", "slow:simulator@1-1.2=0.5"]
+    faults = [
+        "duplicate:actuator/joints@0.5-1.5",
+        "duplicate:sensor/joints@0.5-1.5",
+        "slow:simulator@1-1.2=0.5",
+    ]
     flags = [word for fault in faults for word in ("--fault", fault)]
     ended, _ = run_to_summary(
-        tmp_path / "run", "triplet", "--backend", backend, "--duration", "2", "--clock-mode", clock_mode, *flags
+        tmp_path / "run",
+        "triplet",
+        "--backend",
+        backend,
+        "--duration",
+        "2",
+        "--clock-mode",
+        clock_mode,
+        *flags,
     )
     record = RunRecord.load(tmp_path / "run").host
     assert ended.code == 0
@@ -51,16 +66,29 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
         backend,
     ]
     with running_armed_snakesim(tmp_path / "run", *arguments) as run:
-        result = tell(run, "fault", "inject", *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")))
+        result = run_command_for_robot(
+            run,
+            "fault",
+            "inject",
+            *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")),
+        )
         assert result.code == 1
         assert f"backend '{backend}' cannot do" in result.err
-        result = tell(run, "fault", "inject", "mute", "joint_99")
+        result = run_command_for_robot(run, "fault", "inject", "mute", "joint_99")
         assert result.code == 1
         assert "no joint_99" in result.err
-        result = tell(run, "fault", "inject", "drop", "guidance/world", "--amount", "0.2", "--duration", "0.5")
-        assert result.code == 0 and result.out.startswith("drop of guidance/world has begun, at "), result.err
-        result = tell(run, "fault", "inject", "mute", "joint_3", "--duration", "30")
-        assert result.code == 0 and result.out.startswith("mute of joint_3 has begun, at "), result.err
+        result = run_command_for_robot(
+            run, "fault", "inject", "drop", "guidance/world", "--amount", "0.2", "--duration", "0.5"
+        )
+        assert result.code == 0 and result.out.startswith(
+            "drop of guidance/world has begun, at "
+        ), result.err
+        result = run_command_for_robot(
+            run, "fault", "inject", "mute", "joint_3", "--duration", "30"
+        )
+        assert result.code == 0 and result.out.startswith("mute of joint_3 has begun, at "), (
+            result.err
+        )
         assert run.end() == 1
     record = RunRecord.load(tmp_path / "run").host
     assert record.faults[0].joint in (None, "joint_3")
@@ -107,16 +135,33 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
     loaded = [tmp_path / part for part in ("host", "control")]
     with running_armed_snakesim(tmp_path / "run", *arguments, "--duration", "600") as run:
         for words in (("mute", "joint_3"), ("hang", "control")):
-            result = tell(run, "fault", "inject", *words)
+            result = run_command_for_robot(run, "fault", "inject", *words)
             assert result.code == 1
             assert "fault injection is not allowed: something real moves here" in result.err
         run.process.terminate()
         run.end()
-    assert [file.read_text() for file in loaded] == ["", ""], "no process has the code that carries them out"
-    allowed = ("--set", "allow_fault_injection=true", "--duration", "0.5", "--out", str(tmp_path / "allowed"))
+    assert [file.read_text() for file in loaded] == ["", ""], (
+        "no process has the code that carries them out"
+    )
+    allowed = (
+        "--set",
+        "allow_fault_injection=true",
+        "--duration",
+        "0.5",
+        "--out",
+        str(tmp_path / "allowed"),
+    )
     snakesim("run", *arguments, *allowed, "--endpoint", find_free_endpoint(), cwd=tmp_path)
     assert all("snakesim_hal.faults.injector" in file.read_text() for file in loaded)
-    ended = snakesim("run", *arguments, "--fault", "mute:joint_3@1", "--out", str(tmp_path / "other"), cwd=tmp_path)
+    ended = snakesim(
+        "run",
+        *arguments,
+        "--fault",
+        "mute:joint_3@1",
+        "--out",
+        str(tmp_path / "other"),
+        cwd=tmp_path,
+    )
     assert ended.code == 1
     assert "`faults` are planned, and something real moves here" in ended.out
     wait_until(lambda: not list((tmp_path / "other").glob("host.json")), "no record of it")

@@ -15,9 +15,12 @@ DIFFERING = arithmetic.find_differing_parts(arithmetic.measure_arithmetic())
 QUICK = ("triplet", "peg_row")
 
 
-@pytest.mark.skipif(bool(DIFFERING), reason=f"the digests of this computer are its own: {' and '.join(DIFFERING)}")
+@pytest.mark.skipif(
+    bool(DIFFERING), reason=f"the digests of this computer are its own: {' and '.join(DIFFERING)}"
+)
 @pytest.mark.parametrize(
-    "scenario", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in GOLDEN]
+    "scenario",
+    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in GOLDEN],
 )
 def test_shipped_scenario_has_its_digest(scenario: str) -> None:
     """After a change that is meant to change what robots do, `make golden` writes the digests again."""

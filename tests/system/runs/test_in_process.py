@@ -19,12 +19,22 @@ from snakesim_testing.harness.command import SNAKESIM_COMMAND, make_environment
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.in_process_command import snakesim
 
-LEFT = {BLACK_BOX, CONFIG_FILENAME, DESCRIPTION, HOST_RECORD, RECORDING_FILENAME, REPORT_FILENAME, SUMMARY_FILENAME}
+LEFT = {
+    BLACK_BOX,
+    CONFIG_FILENAME,
+    DESCRIPTION,
+    HOST_RECORD,
+    RECORDING_FILENAME,
+    REPORT_FILENAME,
+    SUMMARY_FILENAME,
+}
 
 
 def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    ended = snakesim("run", "triplet", "--in-process", "--duration", "1", "--out", str(out), cwd=tmp_path)
+    ended = snakesim(
+        "run", "triplet", "--in-process", "--duration", "1", "--out", str(out), cwd=tmp_path
+    )
     assert ended.code == 0, ended.out + ended.err
     assert {path.name for path in out.iterdir()} == LEFT | {LOG_FILE}
     assert "in one process" in ended.out
@@ -47,7 +57,9 @@ class Failing(HoldPose):
 def test_in_process_controller_error_ends_in_safe_stop(tmp_path: Path) -> None:
     (tmp_path / "failing.py").write_text(FAILING)
     result = simulate(
-        load_scenario("triplet", [KeyOverride("controller", f"{tmp_path}/failing.py:Failing", "the test")]).config
+        load_scenario(
+            "triplet", [KeyOverride("controller", f"{tmp_path}/failing.py:Failing", "the test")]
+        ).config
     )
     assert "control ended: controller" in result.summary.ended
     assert "no idea" in result.summary.ended
@@ -85,19 +97,31 @@ class Compiled(HoldPose):
 """
 
 
-def test_in_process_controller_that_hangs_ends_in_safe_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_process_controller_that_hangs_ends_in_safe_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("snakesim_hal.programs.single_process.TURN_TIMEOUT_S", 2.0)
     (tmp_path / "endless.py").write_text(ENDLESS)
-    changes = [KeyOverride("controller", "./endless.py:Endless", "the test"), parse_set_option("start_limit_s=1")]
+    changes = [
+        KeyOverride("controller", "./endless.py:Endless", "the test"),
+        parse_set_option("start_limit_s=1"),
+    ]
     result = simulate(load_scenario("triplet", changes).config)
     assert "control ended: " in result.summary.ended, result.summary.ended
-    assert "took longer than 2 s in one tick; if it needs so long, allow it with --set" in result.summary.ended
+    assert (
+        "took longer than 2 s in one tick; if it needs so long, allow it with --set"
+        in result.summary.ended
+    )
     assert result.record.host.lifecycle == "fault"
 
 
-@pytest.mark.parametrize("controller", ["Endless", pytest.param("Compiled", marks=pytest.mark.slow)])
-def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "controller", ["Endless", pytest.param("Compiled", marks=pytest.mark.slow)]
+)
+def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(
+    controller: str, tmp_path: Path
+) -> None:
     (tmp_path / "endless.py").write_text(ENDLESS)
     typed = [
         *SNAKESIM_COMMAND,
@@ -110,7 +134,12 @@ def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, 
         "run",
     ]
     with subprocess.Popen(
-        typed, cwd=tmp_path, env=make_environment(tmp_path), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        typed,
+        cwd=tmp_path,
+        env=make_environment(tmp_path),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     ) as process:
         try:
             wait_until((tmp_path / "begun").exists, "a tick that does not end", 60)
@@ -125,15 +154,22 @@ def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(controller: str, 
         assert "The run ended early: interrupted." in said
         assert (tmp_path / "run" / REPORT_FILENAME).is_file()
     else:
-        assert "had not returned 3 s after it received the signal to stop; its process was killed" in said
+        assert (
+            "had not returned 3 s after it received the signal to stop; its process was killed"
+            in said
+        )
 
 
-def test_ctrl_c_after_the_last_tick_costs_no_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_after_the_last_tick_costs_no_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def conclude_interrupted(*arguments: Any) -> int:
         os.kill(os.getpid(), signal.SIGINT)
         return write_and_print_results(*arguments)
 
-    monkeypatch.setattr("snakesim_operator.run.in_process.write_and_print_results", conclude_interrupted)
+    monkeypatch.setattr(
+        "snakesim_operator.run.in_process.write_and_print_results", conclude_interrupted
+    )
     config = load_scenario(
         "triplet", [parse_set_option("duration_s=0.1"), parse_set_option("clock_mode=lockstep")]
     ).config
@@ -143,7 +179,8 @@ def test_ctrl_c_after_the_last_tick_costs_no_report(tmp_path: Path, monkeypatch:
 
 def test_in_process_run_with_fault_is_repeatable() -> None:
     config = load_scenario(
-        "peg_row", [parse_set_option("duration_s=3"), parse_set_option('faults=["mute:joint_3@0.5"]')]
+        "peg_row",
+        [parse_set_option("duration_s=3"), parse_set_option('faults=["mute:joint_3@0.5"]')],
     ).config
     first, second = (simulate(config).summary for _ in range(2))
     assert "joint_3" in first.ended

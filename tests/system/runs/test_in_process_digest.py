@@ -28,10 +28,14 @@ def same_both_ways(out: Path, scenario: str, *arguments: str) -> InProcessResult
     assert ours.summary.command_digest == summary.command_digest
     assert ours.summary.path_distance_m == summary.path_distance_m
     for name in ("angle_rad", "torque_nm", "target", "position_w_m", "contact_peak_n"):
-        assert np.array_equal(getattr(ours.record, name), getattr(theirs, name), equal_nan=True), name
+        assert np.array_equal(getattr(ours.record, name), getattr(theirs, name), equal_nan=True), (
+            name
+        )
     # Not every tick's: on a busy computer a network drops some, and control reports that time is paused.
     for name in ("control_states", "worlds"):
-        mine, other = ({said.tick: said for said in getattr(record, name)} for record in (ours.record, theirs))
+        mine, other = (
+            {said.tick: said for said in getattr(record, name)} for record in (ours.record, theirs)
+        )
         shared = [t for t in mine.keys() & other.keys() if t and not _stands(other[t])]
         assert len(shared) > 0.8 * len(mine) - 3 and all(mine[t] == other[t] for t in shared), name
     return ours
@@ -54,7 +58,9 @@ def test_so_they_do_in_every_shipped_scenario(scenario: str, tmp_path: Path) -> 
 @pytest.mark.slow  # above is a robot with a camera, too
 def test_in_process_digest_of_robot_is_unchanged_by_camera(tmp_path: Path) -> None:
     """An image of the camera is named by the clock, and is there for whoever reads it at that tick."""
-    seeing = same_both_ways(tmp_path / "run", "peg_row", "--duration", "1", "--set", "robot=planar13_camera")
+    seeing = same_both_ways(
+        tmp_path / "run", "peg_row", "--duration", "1", "--set", "robot=planar13_camera"
+    )
     blind = simulate(load_scenario("peg_row", [parse_set_option("duration_s=1")]).config)
     assert seeing.summary.command_digest == blind.summary.command_digest
     config = load_scenario(
@@ -62,7 +68,10 @@ def test_in_process_digest_of_robot_is_unchanged_by_camera(tmp_path: Path) -> No
     ).config
     with InProcessRun(config) as run:
         client = HostClient(run.network.create_session(), "onlooker")
-        images, client_ticks = client.subscribe(keys.depth_key("head"), DepthImage), client.iterate_ticks(0.0)
+        images, client_ticks = (
+            client.subscribe(keys.depth_key("head"), DepthImage),
+            client.iterate_ticks(0.0),
+        )
         read: list[tuple[int, int]] = []
         for _ in run.iterate_ticks():
             while (clock := next(client_ticks)) is not None:
@@ -80,6 +89,11 @@ def test_so_do_joint_modules_behind_their_bus(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_faults_on_request_are_the_same_too(tmp_path: Path) -> None:
-    faults = ["--fault", "wrong:joint_3@0.3-0.5=0.01", "--fault", "duplicate:guidance/world@0.2-0.6"]
+    faults = [
+        "--fault",
+        "wrong:joint_3@0.3-0.5=0.01",
+        "--fault",
+        "duplicate:guidance/world@0.2-0.6",
+    ]
     result = same_both_ways(tmp_path / "run", "triplet", "--duration", "1", *faults)
     assert any("wrong:joint_3" in text for text in result.record.host.injected)

@@ -17,8 +17,16 @@ from snakesim_operator.results.metrics.map_score import score_map
 from snakesim_operator.run.in_process import simulate
 
 pytestmark = pytest.mark.e2e
-LIES = [Cylinder(position_m=(1.75 + 0.3 * k, 0.55 * (-1) ** k), radius_m=0.07, name=f"lie_{k}") for k in range(12)]
-HOW = ("robot=planar13_camera", "controller=path_following", "control.look_ahead_m=0.1", "duration_s=2.5")
+LIES = [
+    Cylinder(position_m=(1.75 + 0.3 * k, 0.55 * (-1) ** k), radius_m=0.07, name=f"lie_{k}")
+    for k in range(12)
+]
+HOW = (
+    "robot=planar13_camera",
+    "controller=path_following",
+    "control.look_ahead_m=0.1",
+    "duration_s=2.5",
+)
 
 
 class Deceived(GuidanceService):
@@ -27,7 +35,9 @@ class Deceived(GuidanceService):
     seen: ClassVar[list[WorldModel]] = []
 
     def __init__(self, client: HostClient, config: RunConfig) -> None:
-        scene = msgspec.structs.replace(config.scene, cylinder=LIES, pegs_along_route=[], random_field=[])
+        scene = msgspec.structs.replace(
+            config.scene, cylinder=LIES, pegs_along_route=[], random_field=[]
+        )
         super().__init__(client, msgspec.structs.replace(config, scene=scene))
 
 
@@ -36,7 +46,9 @@ def worlds(map_: str, *more: str, deceived: bool = False) -> tuple[list[WorldMod
     config = load_scenario(
         "peg_row", [parse_set_option(text) for text in (*HOW, f'mission.map="{map_}"', *more)]
     ).config
-    with register_plugin_temporarily(SERVICES, "guidance", Deceived if deceived else GuidanceService):
+    with register_plugin_temporarily(
+        SERVICES, "guidance", Deceived if deceived else GuidanceService
+    ):
         result = simulate(config)
     assert result.summary.ended == "complete"
     assert (result.summary.path_distance_m or 0) > 0.3

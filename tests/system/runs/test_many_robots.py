@@ -61,7 +61,11 @@ class Listener:
 
 @pytest.mark.slow  # tests/system/lab keeps robots apart
 @pytest.mark.parametrize(
-    "form", ["quick", pytest.param("a million messages", marks=[pytest.mark.slow, pytest.mark.timeout(3000)])]
+    "form",
+    [
+        "quick",
+        pytest.param("a million messages", marks=[pytest.mark.slow, pytest.mark.timeout(3000)]),
+    ],
 )
 def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: LabPrograms) -> None:
     lab.start("start", "router", str(lab.router_file))
@@ -71,16 +75,26 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: LabPrograms) -
         path = lab.folder / f"{robot}.toml"
         path.write_text(SCENARIO.format(robot=robot, controller=controller, seconds=SECONDS[form]))
         network = ("--session", str(lab.session), "--namespace", namespace)
-        hosts[namespace] = lab.start("start", "host", str(path), "--end-after-duration", "--out", robot, *network)
+        hosts[namespace] = lab.start(
+            "start", "host", str(path), "--end-after-duration", "--out", robot, *network
+        )
         lab.start("start", "service", "control", str(path), *network)
-    wait_until(lambda: lab.tell("status").out.count("next: `snakesim robot arm") == 2, "both ready")
+    wait_until(
+        lambda: lab.run_operator_command("status").out.count("next: `snakesim robot arm") == 2,
+        "both ready",
+    )
     listener = Listener()
     with open_session(ConnectionSettings.from_session_file(read_session(lab.session))) as session:
         session.on_arrival("**", listener.take)
         only_one_is_armed_when_one_is_named(lab)
         for namespace, (robot, _, _) in ROBOTS.items():
             if namespace != "lab":
-                assert lab.tell("robot", "arm", robot, "sim", "--namespace", namespace).code == 0
+                assert (
+                    lab.run_operator_command(
+                        "robot", "arm", robot, "sim", "--namespace", namespace
+                    ).code
+                    == 0
+                )
         began = time.monotonic()
         for namespace, host in hosts.items():
             assert host.wait(2500) == 0, namespace
@@ -89,7 +103,9 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: LabPrograms) -
     for robot, _, _ in ROBOTS.values():
         record = RunRecord.load(lab.folder / robot).host
         assert record.rejected_commands == {}
-        _, alone = command.run_to_summary(lab.folder / f"{robot}-alone", str(lab.folder / f"{robot}.toml"))
+        _, alone = command.run_to_summary(
+            lab.folder / f"{robot}-alone", str(lab.folder / f"{robot}.toml")
+        )
         assert record.command_digest == alone.command_digest
     least = 1000 if form == "quick" else 1_000_000
     assert sum(listener.heard.values()) > least
@@ -99,14 +115,19 @@ def test_two_robots_on_one_router_run_as_if_alone(form: str, lab: LabPrograms) -
 def only_one_is_armed_when_one_is_named(lab: LabPrograms) -> None:
     """A command that names no robot goes to none of two; one that names the wrong robot is refused by the right one."""
     for arguments in (("robot", "arm", "planar13", "sim"), ("robot", "disarm")):
-        ended = lab.tell(*arguments)
+        ended = lab.run_operator_command(*arguments)
         assert ended.code == 1
         assert "several robots found" in ended.err
         assert "--namespace lab/second" in ended.err
-    wrong = lab.tell("robot", "arm", "planar13", "sim", "--namespace", "lab/second")
+    wrong = lab.run_operator_command("robot", "arm", "planar13", "sim", "--namespace", "lab/second")
     assert wrong.code == 1
     assert "the robot here is 'mamba', not 'planar13'" in wrong.err
-    assert lab.tell("robot", "disarm", "--namespace", "la").code == 1
-    assert lab.tell("robot", "disarm", "--namespace", "lab*").code == 2
-    assert lab.tell("robot", "arm", "planar13", "sim", "--namespace", "lab").code == 0
-    assert "lab/second: disarmed" in lab.tell("status", "--namespace", "lab/second").out
+    assert lab.run_operator_command("robot", "disarm", "--namespace", "la").code == 1
+    assert lab.run_operator_command("robot", "disarm", "--namespace", "lab*").code == 2
+    assert (
+        lab.run_operator_command("robot", "arm", "planar13", "sim", "--namespace", "lab").code == 0
+    )
+    assert (
+        "lab/second: disarmed"
+        in lab.run_operator_command("status", "--namespace", "lab/second").out
+    )

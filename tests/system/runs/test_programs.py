@@ -24,14 +24,25 @@ def test_programs_started_in_any_order_equal_one_run(lab: LabPrograms) -> None:
     waited = lab.folder / "service-control.log"
     wait_until(lambda: "control: waiting for the network" in waited.read_text(), "control waits")
     router = lab.start("start", "router", str(lab.router_file))
-    wait_until(lambda: "DIFFERS: `mission.speed_m_s` is 0.3 on " in lab.tell("status").out, "the difference")
-    refused = lab.tell("robot", "arm", "planar13", "sim").err
+    wait_until(
+        lambda: "DIFFERS: `mission.speed_m_s` is 0.3 on " in lab.run_operator_command("status").out,
+        "the difference",
+    )
+    refused = lab.run_operator_command("robot", "arm", "planar13", "sim").err
     assert "not armed: " in refused and f"(control, process {other_goal.pid})" in refused, refused
     other_goal.kill()
     lab.service("control")
-    wait_until(lambda: "next: `snakesim robot arm planar13 sim --session " in lab.tell("status").out, "ready to arm")
-    said = lab.tell("status").out
-    assert all(f"  process {name}: " in said for name in ("host", *SERVICES)) and "DIFFERS" not in said, said
+    wait_until(
+        lambda: (
+            "next: `snakesim robot arm planar13 sim --session "
+            in lab.run_operator_command("status").out
+        ),
+        "ready to arm",
+    )
+    said = lab.run_operator_command("status").out
+    assert (
+        all(f"  process {name}: " in said for name in ("host", *SERVICES)) and "DIFFERS" not in said
+    ), said
     first.send_signal(signal.SIGKILL)  # at tick 0, where the next host begins as well
     first.wait()
     second = lab.host("second")
@@ -49,11 +60,16 @@ def test_an_operator_names_the_network_once_by_flag_or_environment(
 ) -> None:
     (endpoint,) = read_session(lab.session).endpoints
     monkeypatch.setenv("SNAKESIM_SESSION", str(lab.session))
-    for ended in (lab.tell("robot", "disarm"), command.snakesim("robot", "disarm", cwd=lab.folder)):
+    for ended in (
+        lab.run_operator_command("robot", "disarm"),
+        command.snakesim("robot", "disarm", cwd=lab.folder),
+    ):
         assert ended.code == 1
         assert f"no robot on {endpoint}" in ended.err
-    elsewhere = command.snakesim("robot", "disarm", "--endpoint", find_free_endpoint(), cwd=lab.folder)
+    elsewhere = command.snakesim(
+        "robot", "disarm", "--endpoint", find_free_endpoint(), cwd=lab.folder
+    )
     assert elsewhere.code == 1
     assert endpoint not in elsewhere.err
-    ended = lab.tell("estop", "--router", "tcp/127.0.0.1:7447")
+    ended = lab.run_operator_command("estop", "--router", "tcp/127.0.0.1:7447")
     assert ended.code == 2 and "--router and --session" in ended.err, ended.err

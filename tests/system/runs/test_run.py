@@ -11,13 +11,20 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_reader import REPORT_FILENAME
-from snakesim_testing.runs.command import TOO_SLOW, read_summary, run_to_summary, running_armed_snakesim
+from snakesim_testing.runs.command import (
+    TOO_SLOW,
+    read_summary,
+    run_to_summary,
+    running_armed_snakesim,
+)
 
 pytestmark = pytest.mark.e2e
 
 
 def test_triplet_moves_forward_and_hands_over_backward(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", "--clock-mode", "lockstep")
+    ended, summary = run_to_summary(
+        tmp_path / "run", "triplet", "--duration", "10", "--clock-mode", "lockstep"
+    )
     assert ended.code == 0, ended.out + ended.err
     assert summary.path_distance_m is not None
     assert summary.path_distance_m >= 0.5
@@ -40,8 +47,11 @@ def starved(pid: int) -> Iterator[None]:
     core = max(os.sched_getaffinity(0))
     spin = f"import os; os.sched_setaffinity(0, {{{core}}})\nwhile True: pass"
     # Each in a session of its own: where a session has one share, all in one would leave enough to a quiet computer.
-    load = [subprocess.Popen([sys.executable, "-c", spin], start_new_session=True) for _ in range(4)]
-    group = Path(f"/proc/{pid}/autogroup")  # its session has a share of its own, where the kernel is made so
+    load = [
+        subprocess.Popen([sys.executable, "-c", spin], start_new_session=True) for _ in range(4)
+    ]
+    # Its session has a share of its own, where the kernel is made so.
+    group = Path(f"/proc/{pid}/autogroup")
     if group.exists():
         group.write_text("19")
     for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -71,7 +81,9 @@ def test_slow_computer_is_named_before_expired_lease(tmp_path: Path) -> None:
     with running_armed_snakesim(tmp_path / "run", *arguments) as run, starved(run.part("control")):
         assert run.end() == 1, run.printed()
     ended = read_summary(tmp_path / "run").ended
-    assert re.match(rf"{TOO_SLOW}(control|host) waited for a processor for \d+ of \d+ ms", ended), ended
+    assert re.match(rf"{TOO_SLOW}(control|host) waited for a processor for \d+ of \d+ ms", ended), (
+        ended
+    )
     assert "; lease of control expired: " in ended
     assert f"fault: {TOO_SLOW}" in run.printed()
 
@@ -92,7 +104,9 @@ def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
         "--set",
         "rate_hz=50",
     ]
-    if clock_mode == "free":  # the host waits for nothing, so a recorder that joins late misses ticks
+    if (
+        clock_mode == "free"
+    ):  # the host waits for nothing, so a recorder that joins late misses ticks
         arguments.append("--no-record")
     ended, summary = run_to_summary(tmp_path / "run", *arguments)
     assert summary.clock_mode == clock_mode
@@ -107,7 +121,15 @@ def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
 
 @pytest.mark.slow  # in one process: test_advance.py
 def test_a_run_in_processes_may_end_with_its_mission(tmp_path: Path) -> None:
-    short = ["--until-goal", "--set", "mission.goal.distance_m=0.4", "--duration", "8", "--clock-mode", "lockstep"]
+    short = [
+        "--until-goal",
+        "--set",
+        "mission.goal.distance_m=0.4",
+        "--duration",
+        "8",
+        "--clock-mode",
+        "lockstep",
+    ]
     ended, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *short)
     assert ended.code == 0, ended.out + ended.err
     assert summary.ended == "complete"

@@ -15,13 +15,20 @@ from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.run.in_process import LOG_FILE
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.runs import in_process_command as in_process
-from snakesim_testing.runs.command import SNAKESIM_COMMAND, CompletedRun, make_environment, run_to_summary
+from snakesim_testing.runs.command import (
+    SNAKESIM_COMMAND,
+    CompletedRun,
+    make_environment,
+    run_to_summary,
+)
 from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
 pytestmark = pytest.mark.e2e
 
 PAGE = REPOSITORY / "docs" / "how-to" / "write-a-service.md"
-SERVICE = next(section.files["mocap.py"] for section in parse_sections(PAGE) if "mocap.py" in section.files)
+SERVICE = next(
+    section.files["mocap.py"] for section in parse_sections(PAGE) if "mocap.py" in section.files
+)
 MORE = """
 
 class Another(MotionCapture):
@@ -56,7 +63,9 @@ def home(tmp_path: Path) -> Path:
 SHORT = ["triplet", "--duration", "0.5", "--set", "robot=./bare.toml"]
 
 
-def digest_of(home: Path, out: str, run: Callable[..., tuple[CompletedRun, RunSummary]]) -> str | None:
+def digest_of(
+    home: Path, out: str, run: Callable[..., tuple[CompletedRun, RunSummary]]
+) -> str | None:
     """Of a run in which guidance knows the pose from the service alone."""
     ended, summary = run(home / out, *SHORT, "--set", NAMED)
     assert ended.code == 0, ended.out + ended.err
@@ -67,7 +76,9 @@ def digest_of(home: Path, out: str, run: Callable[..., tuple[CompletedRun, RunSu
 
 
 def test_file_service_publishes_pose_in_all_process_layouts(home: Path) -> None:
-    assert digest_of(home, "many", run_to_summary) == digest_of(home, "one", in_process.run_to_summary)
+    assert digest_of(home, "many", run_to_summary) == digest_of(
+        home, "one", in_process.run_to_summary
+    )
 
 
 WRONG = {
@@ -83,7 +94,9 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_file_without_that_service_is_refused_before_anything_starts(home: Path, wrong: str) -> None:
+def test_a_file_without_that_service_is_refused_before_anything_starts(
+    home: Path, wrong: str
+) -> None:
     name, *words = WRONG[wrong]
     code = f"services.sensor.plugin=./lab/mocap.py:{name}"
     ended = in_process.snakesim("run", *SHORT, "--set", code, "--out", "run", cwd=home)
@@ -96,7 +109,10 @@ def test_showing_a_configuration_runs_none_of_its_services(home: Path) -> None:
     shown = in_process.snakesim("config", "triplet", "--set", NAMED, cwd=home)
     assert shown.code == 0
     assert not (home / "lab" / "ran").exists()
-    assert "services.sensor: not checked, because that would run ./lab/mocap.py:MotionCapture" in shown.out
+    assert (
+        "services.sensor: not checked, because that would run ./lab/mocap.py:MotionCapture"
+        in shown.out
+    )
 
 
 @pytest.mark.slow
@@ -124,9 +140,18 @@ def test_file_service_starts_alone_by_path_or_name(home: Path) -> None:
 
 
 MALFORMED = {
-    "number": ("position_w=(0.0, float('nan'), 0.0)", "Pose.position_w[1] is nan, must be `float` >= -"),
-    "array": ("position_w=np.zeros(3)", "Pose.position_w is array([0., 0., 0.]), must be plain Python numbers, "),
-    "rotation": ("orientation_wxyz=(0.5, 0.0, 0.0, 0.0)", "(0.5, 0.0, 0.0, 0.0) of norm 0.5, must be a rotation"),
+    "number": (
+        "position_w=(0.0, float('nan'), 0.0)",
+        "Pose.position_w[1] is nan, must be `float` >= -",
+    ),
+    "array": (
+        "position_w=np.zeros(3)",
+        "Pose.position_w is array([0., 0., 0.]), must be plain Python numbers, ",
+    ),
+    "rotation": (
+        "orientation_wxyz=(0.5, 0.0, 0.0, 0.0)",
+        "(0.5, 0.0, 0.0, 0.0) of norm 0.5, must be a rotation",
+    ),
 }
 LOST = """
 
@@ -145,7 +170,10 @@ class Lost(MotionCapture):
     [
         ("lockstep", "array"),
         ("one", "number"),
-        *(pytest.param(*row, marks=pytest.mark.slow) for row in (("realtime", "number"), ("one", "rotation"))),
+        *(
+            pytest.param(*row, marks=pytest.mark.slow)
+            for row in (("realtime", "number"), ("one", "rotation"))
+        ),
     ],
 )
 def test_malformed_message_is_named_in_log_and_run(home: Path, clock_mode: str, wrong: str) -> None:
@@ -162,9 +190,12 @@ def test_malformed_message_is_named_in_log_and_run(home: Path, clock_mode: str, 
     assert ended.code == 1
     assert summary.duration_s < 5.0  # it ends at once
     said = re.compile(
-        r"service ./lab/lost.py:Lost \(class Lost\): sensor/pose of tick \d+ cannot be published: .*" + re.escape(words)
+        r"service ./lab/lost.py:Lost \(class Lost\): sensor/pose of tick \d+ cannot be published: .*"
+        + re.escape(words)
     )
-    assert all(said.search(text) for text in (log, summary.ended, ended.out)), f"{log}\n{summary.ended}\n{ended.out}"
+    assert all(said.search(text) for text in (log, summary.ended, ended.out)), (
+        f"{log}\n{summary.ended}\n{ended.out}"
+    )
 
 
 @pytest.mark.slow
@@ -190,12 +221,20 @@ class Silent(MotionCapture):
 @pytest.mark.slow
 def test_run_names_missing_stream_and_stops_after_stated_time(home: Path) -> None:
     (home / "lab" / "silent.py").write_text(SERVICE + SILENT)
-    flags = [*SHORT, "--set", "services.sensor.plugin=./lab/silent.py:Silent", "--set", "start_limit_s=3"]
+    flags = [
+        *SHORT,
+        "--set",
+        "services.sensor.plugin=./lab/silent.py:Silent",
+        "--set",
+        "start_limit_s=3",
+    ]
     ended, summary = run_to_summary(home / "run", *flags)
     why = "waiting for guidance, which has no sensor/pose yet (mission.localization=dead_reckoning does without"
     given_up = "not ready to arm within 3 s"
     for said in (summary.ended, ended.out):
-        assert f"{given_up} (start_limit_s) with every service there: " in said and why in said, ended.out
+        assert f"{given_up} (start_limit_s) with every service there: " in said and why in said, (
+            ended.out
+        )
     assert ended.code == 1
     assert summary.duration_s == 0.0
     alone = in_process.snakesim("run", *flags, "--in-process", "--out", "one", cwd=home)
@@ -224,7 +263,9 @@ def test_control_holds_while_service_repeats_an_old_pose(home: Path) -> None:
 def test_pose_service_alone_makes_no_one_wait_for_contacts(home: Path) -> None:
     """On a robot whose file has no contact sensors."""
     robot = (home / "bare.toml").read_text()
-    bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.contacts]"))
+    bare = "\n[".join(
+        part for part in robot.split("\n[") if not part.startswith("sensors.contacts]")
+    )
     (home / "bare.toml").write_text(bare)
     ended, _ = in_process.run_to_summary(home / "run", *SHORT, "--set", NAMED)
     assert ended.code == 0, ended.out

@@ -15,7 +15,7 @@ from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.processes import assert_no_process_left
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import running_snakesim
-from snakesim_testing.runs.in_process_command import snakesim, tell
+from snakesim_testing.runs.in_process_command import run_command_for_robot, snakesim
 
 pytestmark = pytest.mark.e2e
 
@@ -29,7 +29,7 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
     with running_snakesim(out, *RUN) as run:
 
         def sim(*asked: str, code: int = 0) -> str:
-            ended = tell(run, "sim", *asked)
+            ended = run_command_for_robot(run, "sim", *asked)
             assert ended.code == code, ended.out + ended.err
             return ended.out + ended.err
 
@@ -52,7 +52,7 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
             assert len(hosts) == 2, hosts
             assert "as fast as it can" in sim("speed", "2", code=1)
             sim("pause")
-            assert tell(run, "robot", "arm", "planar13", "sim").code == 0
+            assert run_command_for_robot(run, "robot", "arm", "planar13", "sim").code == 0
             sim("step", "7")
             wait_until(lambda: shows("armed", 7), "7 ticks")
             wait_until(lambda: "PAUSED" in run.printed(), "the pause on the terminal")
@@ -71,12 +71,15 @@ def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None
     told = snakesim("recording", "info", str(out), cwd=tmp_path)
     assert told.code == 0 and "missing" not in told.out, told.printed
     replayed = snakesim("replay", str(out), "--control", cwd=tmp_path)
-    same = {f"{count} commands, the same to the bit\n" for count in (100, 99)}  # the last may come too late
+    # The last may come too late.
+    same = {f"{count} commands, the same to the bit\n" for count in (100, 99)}
     assert replayed.out in same, replayed.out + replayed.err
 
 
 def pause(session: Session) -> bool:
     """False while there is no host that answers."""
     with contextlib.suppress(NotConnectedError):
-        return session.send_request(keys.SIMULATOR, SimulatorRequest(action="pause", requester="ada")).ok
+        return session.send_request(
+            keys.SIMULATOR, SimulatorRequest(action="pause", requester="ada")
+        ).ok
     return False

@@ -18,7 +18,9 @@ FADED_S = 0.9  # after the push has ended: three time constants of the fade
 
 
 def run_with_fault(out: Path, fault: str) -> tuple[CompletedRun, RunSummary]:
-    return run_to_summary(out, "triplet", "--clock-mode", "realtime", "--duration", "6", "--fault", fault)
+    return run_to_summary(
+        out, "triplet", "--clock-mode", "realtime", "--duration", "6", "--fault", fault
+    )
 
 
 def stopped_after_s(out: Path, summary: RunSummary) -> float:
@@ -29,9 +31,8 @@ def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -
     ended, summary = run_with_fault(tmp_path / "run", f"drop:sensor/joints@{FROM_S}")
     assert ended.code == 1
     assert summary.faults[0].what == "lease_expired"
-    assert (
-        FROM_S < stopped_after_s(tmp_path / "run", summary) < FROM_S + 0.2
-    )  # a state may be 30 ms old, a lease lasts 50 ms
+    # A state may be 30 ms old, a lease lasts 50 ms.
+    assert FROM_S < stopped_after_s(tmp_path / "run", summary) < FROM_S + 0.2
     assert "sensor/joints is 0.0" in (tmp_path / "run" / "control.log").read_text()
     assert "at most 0.03 s: no commands" in (tmp_path / "run" / "control.log").read_text()
     assert "Control said: sensor/joints is 0.0" in (tmp_path / "run" / REPORT_FILENAME).read_text()
@@ -55,7 +56,9 @@ def test_control_without_stream_holds_and_continues_when_it_returns(tmp_path: Pa
     assert reported
     assert all(state.state == "NotLocomoting" for state in reported)
     assert any(f"s old, at most {limit_s:g} s" in state.reason for state in reported)
-    assert "Locomoting" in {state.state for state in record.control_states[-20:]}, "in the last second"
+    assert "Locomoting" in {state.state for state in record.control_states[-20:]}, (
+        "in the last second"
+    )
     late = (time_s > FROM_S + limit_s + FADED_S) & (time_s < TO_S)
     if late.any():  # nothing moves any more, and no target moves
         assert np.ptp(record.target[late], axis=0).max() < 0.02

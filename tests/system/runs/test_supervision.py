@@ -10,11 +10,22 @@ import pytest
 
 from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Answer, FaultRequest, LifecycleRequest, RobotDescription, RobotStatus
+from snakesim_hal.wire.messages import (
+    Answer,
+    FaultRequest,
+    LifecycleRequest,
+    RobotDescription,
+    RobotStatus,
+)
 from snakesim_operator.results.summary import RunSummary
 from snakesim_testing.harness.processes import assert_no_process_left, find_processes_of_run
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import RunningCommand, read_summary, running_armed_snakesim, running_snakesim
+from snakesim_testing.runs.command import (
+    RunningCommand,
+    read_summary,
+    running_armed_snakesim,
+    running_snakesim,
+)
 from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -29,7 +40,10 @@ class Robot:
     """A run as somebody on its network sees it."""
 
     def __init__(self, session: Session) -> None:
-        self._session, self._statuses = session, session.declare_latched_reader(keys.STATUS, RobotStatus)
+        self._session, self._statuses = (
+            session,
+            session.declare_latched_reader(keys.STATUS, RobotStatus),
+        )
         self._status: RobotStatus | None = None
 
     def status(self) -> RobotStatus:
@@ -79,14 +93,22 @@ def interrupt(run: RunningCommand) -> RunSummary:
     return read_summary(run.out)
 
 
-@pytest.mark.parametrize("clock_mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)])
+@pytest.mark.parametrize(
+    "clock_mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)]
+)
 def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode: str) -> None:
-    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", clock_mode, "--stay") as run:
+    with running_armed_snakesim(
+        tmp_path / "run", *LONG, "--clock-mode", clock_mode, "--stay"
+    ) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             first, services = robot.reaches("armed"), pids(run, *SERVICES)
             os.kill(run.part("host"), signal.SIGKILL)
-            wait_until(lambda: robot.status().lease_epoch > first.lease_epoch + 1, "another host's lease", BACK_S)
+            wait_until(
+                lambda: robot.status().lease_epoch > first.lease_epoch + 1,
+                "another host's lease",
+                BACK_S,
+            )
             robot.is_ready()
             assert robot.status().lifecycle == "disarmed"
             assert robot.status().commands_accepted == 0
@@ -102,14 +124,21 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode
 
 
 def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -> None:
-    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
+    with running_armed_snakesim(
+        tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay"
+    ) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             robot, before = Robot(session), run.part("control")
             os.kill(before, signal.SIGKILL)
             robot.reaches("fault")
-            wait_until(lambda: run.parts().get("control", before) != before, "another process of control")
             wait_until(
-                lambda: "control" in robot.status().alive and robot.status().lease_holder == "control", "control"
+                lambda: run.parts().get("control", before) != before, "another process of control"
+            )
+            wait_until(
+                lambda: (
+                    "control" in robot.status().alive and robot.status().lease_holder == "control"
+                ),
+                "control",
             )
             assert robot.status().lifecycle == "fault"
             assert not robot.tell("arm").ok
@@ -125,7 +154,9 @@ def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -
 
 @pytest.mark.slow  # a row of the fault table
 def test_dead_router_stops_robot_and_nothing_rearms_it(tmp_path: Path) -> None:
-    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router") as run:
+    with running_armed_snakesim(
+        tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router"
+    ) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")
@@ -147,7 +178,9 @@ def test_dead_router_stops_robot_and_nothing_rearms_it(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> None:
-    with running_armed_snakesim(tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false") as run:
+    with running_armed_snakesim(
+        tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false"
+    ) as run:
         os.kill(run.part("guidance"), signal.SIGKILL)
         assert run.end() == 1
         assert "guidance was ended by SIGKILL" in run.printed()
@@ -155,7 +188,9 @@ def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> Non
 
 @pytest.mark.slow  # rows of the fault table
 def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
-    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay") as run:
+    with running_armed_snakesim(
+        tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay"
+    ) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             robot = Robot(session)
             robot.reaches("armed")
@@ -175,7 +210,9 @@ def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
                 ("freeze", "host", "give --for SECONDS"),
             ):
                 answer = robot.fault(kind, target)
-                assert not answer.ok and answer.refusal == "unknown_fault" and word in answer.reason, answer
+                assert (
+                    not answer.ok and answer.refusal == "unknown_fault" and word in answer.reason
+                ), answer
             assert robot.fault("freeze", "host", for_s=60.0).ok
             run.wait_for("injected fault: freeze:host")
         interrupt(run)  # a frozen host is thawed to end in order
@@ -183,11 +220,14 @@ def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
 
 def test_a_killed_supervisor_leaves_no_frozen_child(tmp_path: Path) -> None:
     frozen_soon = ("--set", 'faults=["freeze:control@0.2","freeze:host@0.2"]')
-    with running_snakesim(tmp_path / "run", *LONG, "--clock-mode", "realtime", "--with-router", *frozen_soon) as run:
+    with running_snakesim(
+        tmp_path / "run", *LONG, "--clock-mode", "realtime", "--with-router", *frozen_soon
+    ) as run:
         run.wait_for("injected fault: freeze:host")
         frozen = [Path(f"/proc/{run.part(name)}/stat").read_text() for name in ("control", "host")]
         assert [re.sub(r".*\) ", "", line)[0] for line in frozen] == ["T", "T"]
-        assert len(find_processes_of_run(tmp_path / "run")) == 6  # router, host, three services, recorder
+        # Router, host, three services, recorder.
+        assert len(find_processes_of_run(tmp_path / "run")) == 6
         os.kill(run.process.pid, signal.SIGKILL)
         run.end()
         assert_no_process_left(tmp_path / "run")

@@ -28,14 +28,17 @@ STILL = (
 
 def test_silent_standing_controller_does_not_locomote(tmp_path: Path) -> None:
     (tmp_path / "still.py").write_text(STILL)
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--controller", "./still.py:Still", "--duration", "3")
+    ended, summary = run_to_summary(
+        tmp_path / "run", "triplet", "--controller", "./still.py:Still", "--duration", "3"
+    )
     assert ended.code == 0
     assert summary.locomoting_fraction == 0.0
     assert summary.last_state == "NotLocomoting"
     assert summary.last_reason == "standing still: less than 20 mm in 1 s"
     assert "locomoting            0 %" in ended.out
     assert (
-        "Did not locomote: standing still: less than 20 mm in 1 s." in (tmp_path / "run" / REPORT_FILENAME).read_text()
+        "Did not locomote: standing still: less than 20 mm in 1 s."
+        in (tmp_path / "run" / REPORT_FILENAME).read_text()
     )
 
 
@@ -47,7 +50,11 @@ def test_moving_snake_locomotes_from_first_measured_motion(tmp_path: Path) -> No
     assert summary.path_distance_m > 0.5
     assert summary.locomoting_fraction is not None
     assert summary.locomoting_fraction > 0.95
-    states = [state.state for state in RunRecord.load(tmp_path / "run").control_states if state.state != "Idle"]
+    states = [
+        state.state
+        for state in RunRecord.load(tmp_path / "run").control_states
+        if state.state != "Idle"
+    ]
     assert states[0] == "NotLocomoting"
     assert states[-1] == "Locomoting"
 

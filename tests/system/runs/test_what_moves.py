@@ -53,7 +53,10 @@ def opened(config: RunConfig) -> Any:
 def test_drives_without_a_bus_are_emulated_and_say_so(backend: str) -> None:
     robot = opened(configured(backend))
     try:
-        assert describe_what_moves(robot.describe()) == f"EMULATED: nothing real moves (backend {backend})"
+        assert (
+            describe_what_moves(robot.describe())
+            == f"EMULATED: nothing real moves (backend {backend})"
+        )
     finally:
         robot.close()
 
@@ -76,19 +79,32 @@ def test_drives_without_a_bus_are_emulated_and_say_so(backend: str) -> None:
 def test_emulation_is_stated_only_without_real_drives(
     monkeypatch: pytest.MonkeyPatch, backend: str, buses: dict[str, list[str]], emulated: bool
 ) -> None:
-    monkeypatch.setattr(can_family, "open_wire", lambda channel, *_rates: SimpleNamespace(channel=channel))
-    monkeypatch.setattr(servo_backend, "SerialWire", lambda port, *_: SimpleNamespace(port=port, latency_s=0.0))
-    sections = {name: {"ports" if name == "dynamixel" else "channels": own} for name, own in buses.items()}
+    monkeypatch.setattr(
+        can_family, "open_wire", lambda channel, *_rates: SimpleNamespace(channel=channel)
+    )
+    monkeypatch.setattr(
+        servo_backend, "SerialWire", lambda port, *_: SimpleNamespace(port=port, latency_s=0.0)
+    )
+    sections = {
+        name: {"ports" if name == "dynamixel" else "channels": own} for name, own in buses.items()
+    }
     config = configured(backend, **sections)
     factory = load_plugin(BACKENDS, backend)
     clock = DriverClock(config)
     opened_buses: list[BusSpec] = []
-    for part in factory.group_joints_by_driver_type(config, decode_backend_settings(config, factory)):
+    for part in factory.group_joints_by_driver_type(
+        config, decode_backend_settings(config, factory)
+    ):
         context = DriverTypeContext(config, part.settings, part.joints, clock, None)
         opened_buses += part.driver_type.plan_buses(context)
     in_turn = msgspec.structs.replace(config, clock_mode="lockstep")  # without threads
     assert (
-        RobotBuses(in_turn, DriveReadings(config.robot.joint_table, clock.now_ns), opened_buses, clock.now_ns).emulated
+        RobotBuses(
+            in_turn,
+            DriveReadings(config.robot.joint_table, clock.now_ns),
+            opened_buses,
+            clock.now_ns,
+        ).emulated
         == emulated
     )
 
@@ -110,7 +126,9 @@ def test_one_real_joint_module_makes_a_robot_real(monkeypatch: pytest.MonkeyPatc
 
 
 def test_run_states_emulation_at_start_and_end(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--backend", "odrive", "--duration", "0.1")
+    ended, summary = run_to_summary(
+        tmp_path / "run", "triplet", "--backend", "odrive", "--duration", "0.1"
+    )
     assert summary.emulated
     first, second, *others = ended.out.splitlines()
     assert first.startswith("triplet: planar13")

@@ -15,7 +15,9 @@ from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
 @pytest.mark.slow
 def test_the_control_experiment_stays_where_it_is(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "10", "--controller", "hold")
+    ended, summary = run_to_summary(
+        tmp_path / "run", "triplet", "--duration", "10", "--controller", "hold"
+    )
     assert ended.code == 0, ended.out + ended.err
     assert summary.path_distance_m is not None
     assert abs(summary.path_distance_m) < 0.02
@@ -25,7 +27,9 @@ def test_the_control_experiment_stays_where_it_is(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_run_repeats_from_the_configuration_that_it_left(tmp_path: Path) -> None:
-    _, first = run_to_summary(tmp_path / "first", "triplet", "--duration", "2", "--set", "scene.ground.friction=0.08")
+    _, first = run_to_summary(
+        tmp_path / "first", "triplet", "--duration", "2", "--set", "scene.ground.friction=0.08"
+    )
     _, again = run_to_summary(tmp_path / "again", str(tmp_path / "first" / "config.json"))
     assert again.command_digest == first.command_digest
     assert again.config == first.config
@@ -55,9 +59,16 @@ def test_what_was_not_recorded_is_unknown_and_not_none(tmp_path: Path) -> None:
     told = snakesim("run", *short, "--out", "told", cwd=tmp_path)
     untold = snakesim("run", *short, "--no-record", "--out", "untold", cwd=tmp_path)
     assert told.code == untold.code == 0, untold.out + untold.err
-    said = {line.split("  ")[1]: line.split("  ")[-1].strip() for line in untold.out.splitlines() if line[:2] == "  "}
+    said = {
+        line.split("  ")[1]: line.split("  ")[-1].strip()
+        for line in untold.out.splitlines()
+        if line[:2] == "  "
+    }
     assert said["propulsion joints"] == "unknown"
-    assert (said["locomoting"], said["last state"]) == ("100 % of the time", "Locomoting: moving"), "they are measured"
+    assert (said["locomoting"], said["last state"]) == (
+        "100 % of the time",
+        "Locomoting: moving",
+    ), "they are measured"
     assert said["not known"] == UNRECORDED
     compared = snakesim("study", "compare", "told", "untold", cwd=tmp_path)
     assert "propulsion joints" in compared.out
@@ -73,10 +84,16 @@ def test_run_without_pose_sensor_uses_joints_or_dead_reckoning(
     ended, summary = run_to_summary(tmp_path / "held", *short, "--controller", "hold")
     assert ended.code == 0 and summary.pose_from is None, ended.err
     ended, summary = run_to_summary(tmp_path / "pushed", *short)
-    assert ended.code == 0 and summary.pose_from == "dead_reckoning" and summary.contacts_from == "sensor", ended.err
+    assert (
+        ended.code == 0
+        and summary.pose_from == "dead_reckoning"
+        and summary.contacts_from == "sensor"
+    ), ended.err
     assert summary.path_distance_m is None
     assert (summary.dead_reckoned_distance_m or 0.0) > 0.03
-    wrong = snakesim("run", *short, "--unset", "robot.sensors.contact", "--out", "wrong", cwd=tmp_path)
+    wrong = snakesim(
+        "run", *short, "--unset", "robot.sensors.contact", "--out", "wrong", cwd=tmp_path
+    )
     assert wrong.code == 2
     assert "contact" in wrong.err
     assert not (tmp_path / "wrong").exists()
@@ -90,7 +107,9 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) 
     assert "reached after" in ended.out
     record = RunRecord.load(tmp_path / "run")
     reached_s = next(
-        state.timestamp_ns * 1e-9 for state in record.control_states if "the goal is reached" in state.reason
+        state.timestamp_ns * 1e-9
+        for state in record.control_states
+        if "the goal is reached" in state.reason
     )
     assert 1.0 < reached_s < 4.0
     after = record.position_w_m[record.time_s > reached_s + 0.5, :2]
@@ -101,7 +120,9 @@ def test_at_its_goal_the_snake_stands_still_whatever_it_touches(tmp_path: Path) 
 @pytest.mark.slow
 def test_report_shows_perceived_map_and_paths_beside_truth(tmp_path: Path) -> None:
     film = make_playback(
-        simulate(load_scenario("clutter", [parse_set_option("duration_s=1")]).config, tmp_path / "run").record
+        simulate(
+            load_scenario("clutter", [parse_set_option("duration_s=1")]).config, tmp_path / "run"
+        ).record
     )
     assert film is not None
     assert film.data["maps"]

@@ -57,7 +57,25 @@ def test_load_takes_the_settings_of_the_backend(capsys: pytest.CaptureFixture[st
 
 
 def test_load_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["drive", "load", "can", "triplet", "--joints", "13", "18", "30", "--hz", "50", "100", "200"]) == 0
+    assert (
+        run(
+            [
+                "drive",
+                "load",
+                "can",
+                "triplet",
+                "--joints",
+                "13",
+                "18",
+                "30",
+                "--hz",
+                "50",
+                "100",
+                "200",
+            ]
+        )
+        == 0
+    )
     heading, *rows, about = capsys.readouterr().out.splitlines()
     assert heading.split() == ["joints", "50", "Hz", "100", "Hz", "200", "Hz"]
     for row, joints in zip(rows, (13, 18, 30), strict=True):
@@ -79,8 +97,12 @@ def test_a_table_of_several_buses_is_of_the_fullest(capsys: pytest.CaptureFixtur
     assert "the fullest of 2 buses" in said
 
 
-@pytest.mark.parametrize("flags", [["--joints", "0"], ["--joints", "63"], ["--hz", "19"], ["--hz", "fast"]])
-def test_load_refuses_what_no_robot_is(flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "flags", [["--joints", "0"], ["--joints", "63"], ["--hz", "19"], ["--hz", "fast"]]
+)
+def test_load_refuses_what_no_robot_is(
+    flags: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as caught:
         run(["drive", "load", "can", "triplet", *flags])
     assert caught.value.code == 2
@@ -101,7 +123,9 @@ def test_the_dbc_file_needs_a_folder(tmp_path: Path) -> None:
 
 
 def identity(node: int, serial: int) -> CanFrame:
-    return load_layouts()[Opcode.IDENTITY].encode(node, serial=serial, firmware_major=1, protocol=1, emulated=1)
+    return load_layouts()[Opcode.IDENTITY].encode(
+        node, serial=serial, firmware_major=1, protocol=1, emulated=1
+    )
 
 
 def scanned(*frames_on_bus: CanFrame) -> tuple[list[dict[str, str]], list[CanFrame]]:
@@ -120,7 +144,11 @@ def scanned(*frames_on_bus: CanFrame) -> tuple[list[dict[str, str]], list[CanFra
 
 def test_can_scan_lists_modules_by_node_and_serial() -> None:
     rows, _ = scanned(identity(62, 0xBEEF), identity(3, 0xCAFE), identity(3, 0xF00D))
-    assert [(row["node"], row["serial"]) for row in rows] == [("3", "0000CAFE"), ("3", "0000F00D"), ("62", "0000BEEF")]
+    assert [(row["node"], row["serial"]) for row in rows] == [
+        ("3", "0000CAFE"),
+        ("3", "0000F00D"),
+        ("62", "0000BEEF"),
+    ]
 
 
 def test_can_scan_sends_only_requests_for_identities() -> None:
@@ -172,11 +200,16 @@ def test_can_scan_of_minimal_module_invents_no_values() -> None:
     rows, _ = scanned(identity(5, 1), identity(0, 2), identity(63, 3))
     assert [row["node"] for row in rows] == ["0", "5", "63"]
     for row in rows:
-        assert {row[name] for name in ("state", "faults", "uptime", "voltage", "motor", "shaft")} == {UNKNOWN}
+        assert {
+            row[name] for name in ("state", "faults", "uptime", "voltage", "motor", "shaft")
+        } == {UNKNOWN}
 
 
 def test_scan_of_an_empty_bus_is_a_failure(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["drive", "scan", "can", f"virtual:scan-{uuid.uuid4().hex[:8]}", "--duration", "0.05"]) == 1
+    assert (
+        run(["drive", "scan", "can", f"virtual:scan-{uuid.uuid4().hex[:8]}", "--duration", "0.05"])
+        == 1
+    )
     assert "no module answers" in capsys.readouterr().out
 
 
@@ -185,11 +218,15 @@ def test_scan_of_an_interface_that_is_not_there() -> None:
         run(["drive", "scan", "can", "nocan7"])
 
 
-def test_can_scan_of_foreign_bus_names_it_and_sends_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_can_scan_of_foreign_bus_names_it_and_sends_nothing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     channel = f"scan-{uuid.uuid4().hex[:8]}"
     theirs = [
         can.Message(arbitration_id=0x705, data=b"\x05", is_extended_id=False),
-        can.Message(arbitration_id=0x061, data=bytes([0, 0, 0, 0, 8, 0, 0, 0]), is_extended_id=False),
+        can.Message(
+            arbitration_id=0x061, data=bytes([0, 0, 0, 0, 8, 0, 0, 0]), is_extended_id=False
+        ),
         can.Message(arbitration_id=0x1234567, data=bytes(8)),
         can.Message(arbitration_id=0x7FF, data=bytes(3), is_extended_id=False),
         to_python_can(heartbeat(4, 1.0)),
@@ -198,7 +235,10 @@ def test_can_scan_of_foreign_bus_names_it_and_sends_nothing(capsys: pytest.Captu
         chatter = [bus.send_periodic(message, 0.01) for message in theirs]
         said_no = run(["drive", "scan", "can", f"virtual:{channel}", "--duration", "0.05"])
         assert bus.recv(0) is None, "something was sent"
-        assert run(["drive", "scan", "can", f"virtual:{channel}", "--duration", "0.05", "--anyway"]) == 1
+        assert (
+            run(["drive", "scan", "can", f"virtual:{channel}", "--duration", "0.05", "--anyway"])
+            == 1
+        )
         heard = [bus.recv(0.5)]
         for task in chatter:
             task.stop()

@@ -15,7 +15,9 @@ def test_the_pages_are_those_of_the_code() -> None:
     """`make schemas` writes them."""
     pages = make_pages()
     assert {path for path in FOLDER.iterdir() if path.suffix == ".md"} == set(pages)
-    assert [path.name for path, text in pages.items() if path.read_text(encoding="utf-8") != text] == []
+    assert [
+        path.name for path, text in pages.items() if path.read_text(encoding="utf-8") != text
+    ] == []
 
 
 def test_everything_public_is_documented() -> None:
@@ -28,10 +30,14 @@ def test_internal_names_exist() -> None:
             assert find(module, name) is not None
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.example], ids=lambda page: page.file)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.example], ids=lambda page: page.file
+)
 def test_the_example_is_valid_python(page: Page) -> None:
     compile(page.example, page.file, "exec")
-    if "snakesim.run" not in page.example and "gymnasium" not in page.example:  # tests of runs are elsewhere
+    if (
+        "snakesim.run" not in page.example and "gymnasium" not in page.example
+    ):  # tests of runs are elsewhere
         exec(page.example, {"__name__": "example"})
 
 
@@ -58,8 +64,14 @@ def test_a_docstring_is_split_by_its_sections() -> None:
 
 
 def test_indented_code_becomes_a_block() -> None:
-    assert format_text("Run it:\n\n    x = 1\n\nThen stop.") == "Run it:\n\n```python\nx = 1\n```\n\nThen stop."
-    assert format_text("Threads\n    One thread makes all calls.") == "**Threads.** One thread makes all calls."
+    assert (
+        format_text("Run it:\n\n    x = 1\n\nThen stop.")
+        == "Run it:\n\n```python\nx = 1\n```\n\nThen stop."
+    )
+    assert (
+        format_text("Threads\n    One thread makes all calls.")
+        == "**Threads.** One thread makes all calls."
+    )
 
 
 def test_private_members_are_left_out() -> None:

@@ -49,17 +49,25 @@ def test_empty_header_cell_is_found(checker: ModuleType) -> None:
 
 def test_long_sentence_is_found_with_its_line(checker: ModuleType) -> None:
     long = " ".join(["word"] * (checker.MAX_SENTENCE_WORDS + 1)) + "."
-    assert list(checker.find_long_sentences(["Short one.", "", long])) == [(3, checker.MAX_SENTENCE_WORDS + 1)]
+    assert list(checker.find_long_sentences(["Short one.", "", long])) == [
+        (3, checker.MAX_SENTENCE_WORDS + 1)
+    ]
 
 
 def test_headings_follow_an_empty_line() -> None:
     """A heading directly after a table would be a row of it on the site."""
     root = CHECKER.parents[2]
-    pages = [page for folder in ("docs", "schemas", "benchmarks", "deploy") for page in (root / folder).rglob("*.md")]
+    pages = [
+        page
+        for folder in ("docs", "schemas", "benchmarks", "deploy")
+        for page in (root / folder).rglob("*.md")
+    ]
     found = [
         f"{page.relative_to(root)}:{number}"
         for page in [*pages, *root.glob("*.md")]
-        for number, (line, following) in enumerate(itertools.pairwise(page.read_text(encoding="utf-8").splitlines()), 2)
+        for number, (line, following) in enumerate(
+            itertools.pairwise(page.read_text(encoding="utf-8").splitlines()), 2
+        )
         if line.startswith("|") and following.startswith("#")
     ]
     assert found == []

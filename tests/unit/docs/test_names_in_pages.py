@@ -11,12 +11,15 @@ import pytest
 
 from docs.style.check_prose import ROOT, list_pages
 
-COMMAND = re.compile(r"^#+ `?snakesim ([a-z][\w -]*?)`?$", re.MULTILINE)  # a heading of the reference of commands
+# A heading of the reference of commands.
+COMMAND = re.compile(r"^#+ `?snakesim ([a-z][\w -]*?)`?$", re.MULTILINE)
 NAMED_COMMAND = re.compile(r"(?:`|^|\$ |bin/)snakesim ([a-z][\w-]*)(?: ([a-z][\w-]*))?")
 IMPORT = re.compile(r"^\s*from (snakesim[\w.]*) import ([\w, ]+)", re.MULTILINE)
 NAMED_FILE = re.compile(r"`((?:\w[\w-]*/)+[\w.-]+\.(?:py|c|toml|md|sh))(?:::\w+)?`")
 FILES = tuple(
-    subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
 )
 WRITTEN_BY_THE_READER = ("acme_servo_driver/", "waves/")
 
@@ -33,7 +36,9 @@ def find_unknown_commands(text: str) -> Iterator[str]:
     groups = {command.split()[0] for command in commands if " " in command}
     for line in text.splitlines():
         for verb, second in NAMED_COMMAND.findall(line):
-            if verb not in commands or (verb in groups and second and f"{verb} {second}" not in commands):
+            if verb not in commands or (
+                verb in groups and second and f"{verb} {second}" not in commands
+            ):
                 yield f"snakesim {verb} {second}".rstrip()
 
 
@@ -63,11 +68,17 @@ def test_what_a_page_names_exists(page: Path) -> None:
 
 
 def test_unknown_names_are_found() -> None:
-    assert list(find_unknown_commands("run `snakesim router`, `snakesim topic list` or `snakesim topic hear`")) == [
+    assert list(
+        find_unknown_commands(
+            "run `snakesim router`, `snakesim topic list` or `snakesim topic hear`"
+        )
+    ) == [
         "snakesim router",
         "snakesim topic hear",
     ]
-    assert list(find_unknown_imports("from snakesim_hal.model.scenario import load_scenario, load")) == [
-        "snakesim_hal.model.scenario.load"
-    ]
-    assert list(find_unknown_files("`snakesim_hal/host/host.py`, `host/host.py`, `host/guest.py`")) == ["host/guest.py"]
+    assert list(
+        find_unknown_imports("from snakesim_hal.model.scenario import load_scenario, load")
+    ) == ["snakesim_hal.model.scenario.load"]
+    assert list(
+        find_unknown_files("`snakesim_hal/host/host.py`, `host/host.py`, `host/guest.py`")
+    ) == ["host/guest.py"]

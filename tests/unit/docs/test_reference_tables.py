@@ -27,17 +27,23 @@ def list_variables() -> Iterator[str]:
 
 @pytest.mark.parametrize("extra", PROJECT["optional-dependencies"])
 def test_an_extra_has_a_row_with_its_size(extra: str) -> None:
-    assert re.search(rf"^\| `{extra}` \|.*\| \d+ MB \|$", read_page("get-started/installation.md"), re.MULTILINE)
+    assert re.search(
+        rf"^\| `{extra}` \|.*\| \d+ MB \|$", read_page("get-started/installation.md"), re.MULTILINE
+    )
 
 
-@pytest.mark.parametrize("group", [group for group in PROJECT["entry-points"] if group.startswith("snakesim.")])
+@pytest.mark.parametrize(
+    "group", [group for group in PROJECT["entry-points"] if group.startswith("snakesim.")]
+)
 def test_an_entry_point_group_has_a_row(group: str) -> None:
     assert f"| `{group}` |" in read_page("reference/plugins.md")
 
 
 @pytest.mark.parametrize("controller", PROJECT["entry-points"]["snakesim.controllers"])
 def test_a_controller_has_a_row(controller: str) -> None:
-    assert re.search(rf"^\| [^|]*`{controller}`[^|]* \|", read_page("reference/controllers.md"), re.MULTILINE)
+    assert re.search(
+        rf"^\| [^|]*`{controller}`[^|]* \|", read_page("reference/controllers.md"), re.MULTILINE
+    )
 
 
 @pytest.mark.parametrize("backend", PROJECT["entry-points"]["snakesim.backends"])
@@ -51,6 +57,8 @@ def test_an_environment_variable_has_a_row(variable: str) -> None:
 
 
 def test_each_key_of_a_file_has_a_description() -> None:
-    rows = re.findall(r"^\| `([^`]+)` \|.*\| (.*) \|$", read_page("reference/configuration.md"), re.MULTILINE)
+    rows = re.findall(
+        r"^\| `([^`]+)` \|.*\| (.*) \|$", read_page("reference/configuration.md"), re.MULTILINE
+    )
     assert len(rows) > 500
     assert [key for key, description in rows if len(description.split()) < 2] == []

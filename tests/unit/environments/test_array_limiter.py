@@ -62,13 +62,17 @@ def test_arrays_of_robots_are_limited_as_each_robot_alone(mode: JointMode) -> No
         requested = draw(random, 2.0)
         last_target = draw(random, 1.0)
         angle_rad, velocity_rad_s = draw(random, 1.0), draw(random, 3.0)
-        fraction = np.where(random.random((ROBOTS, JOINTS)) < 0.7, 1.0, random.uniform(0.2, 1.0, (ROBOTS, JOINTS)))
+        fraction = np.where(
+            random.random((ROBOTS, JOINTS)) < 0.7, 1.0, random.uniform(0.2, 1.0, (ROBOTS, JOINTS))
+        )
         last_limit_nm = limits.torque_nm * random.choice([0.0, 0.5, 1.0], (ROBOTS, JOINTS))
         measured = MeasuredArrays(angle_rad, velocity_rad_s)
 
         torque_limit_nm = limit_torque_limits(last_limit_nm, fraction, limits)
         target = limit_targets(mode, requested, last_target, torque_limit_nm, measured, limits)
-        names = find_active_limit_indices(mode, requested, target, torque_limit_nm, fraction, measured, limits)
+        names = find_active_limit_indices(
+            mode, requested, target, torque_limit_nm, fraction, measured, limits
+        )
 
         for i, robot_limits in enumerate(limits_of_robot):
             asked: JointCommand = make_joint_command(
@@ -79,10 +83,14 @@ def test_arrays_of_robots_are_limited_as_each_robot_alone(mode: JointMode) -> No
             )
             state = MeasuredState(angle_rad[i], velocity_rad_s[i], np.zeros(JOINTS))
             last = AppliedSetpoints(np.full(JOINTS, int(mode)), last_target[i], last_limit_nm[i])
-            expected = limit_command(asked, measured=state, last=last, limits=robot_limits, torque_fraction=fraction[i])
+            expected = limit_command(
+                asked, measured=state, last=last, limits=robot_limits, torque_fraction=fraction[i]
+            )
             assert target[i].tobytes() == expected.target.tobytes()
             assert torque_limit_nm[i].tobytes() == expected.torque_limit_nm.tobytes()
             expected_names = find_active_limits(
                 asked, expected, measured=state, limits=robot_limits, torque_fraction=fraction[i]
             )
-            assert {joint: LIMIT_NAMES[name] for joint, name in enumerate(names[i].tolist()) if name} == expected_names
+            assert {
+                joint: LIMIT_NAMES[name] for joint, name in enumerate(names[i].tolist()) if name
+            } == expected_names

@@ -22,7 +22,10 @@ def test_blind_controller_without_push_holds_and_continues_without_jump(plugin, 
     controller = plugin(stage.robot, plugin.Parameters())
 
     def act(ticks, tail_s_m=TAIL_S_M, **more):
-        return [controller.update(stage.make_observation(t, tail_s_m, torque_nm=TORQUE_NM, **more)) for t in ticks]
+        return [
+            controller.update(stage.make_observation(t, tail_s_m, torque_nm=TORQUE_NM, **more))
+            for t in ticks
+        ]
 
     before = act(range(100))[-1]
     pushing = JointMode.TORQUE in before.setpoints.mode
@@ -34,7 +37,9 @@ def test_blind_controller_without_push_holds_and_continues_without_jump(plugin, 
     angles = np.array(stage.make_observation(0, TAIL_S_M).joints.angle_rad)
     assert np.abs(np.diff(targets, axis=0)).max() < STEP_RAD
     assert np.abs(targets[-1] - targets[-100]).max() < 2e-3  # it stays
-    if pushing:  # what the joint pushed with has faded, and is not kept up by a position target far away
+    if (
+        pushing
+    ):  # what the joint pushed with has faded, and is not kept up by a position target far away
         turn = before.setpoints.mode.index(JointMode.TORQUE)
         stiffness = stage.robot.joints[turn].stiffness_nm_per_rad
         assert abs(targets[0, turn] - angles[turn]) * stiffness == pytest.approx(TORQUE_NM, rel=0.2)
@@ -53,7 +58,10 @@ def test_blind_controller_before_data_holds_pose_and_names_it(plugin, without):
     controller = plugin(stage.robot, plugin.Parameters())
     observation = stage.make_observation(0, TAIL_S_M, without=without)
     first = controller.update(observation)
-    assert first.telemetry.reason == {"world": "no world model", "trajectory": "no trajectory"}[without]
+    assert (
+        first.telemetry.reason
+        == {"world": "no world model", "trajectory": "no trajectory"}[without]
+    )
     assert first.setpoints.target == pytest.approx(observation.joints.angle_rad)
     assert set(first.setpoints.mode) == {JointMode.POSITION}
     slid = controller.update(stage.make_observation(1, TAIL_S_M, without=without, turned={3: 0.2}))

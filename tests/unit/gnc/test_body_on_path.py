@@ -8,9 +8,19 @@ from hypothesis import strategies as st
 from snakesim_gnc.control.progress import BodyLocation, PathProgress
 from snakesim_gnc.geometry.body_on_path import BodyOnPath, compute_chain_points, compute_heading_rad
 from snakesim_gnc.geometry.planar_body import PlanarBody
-from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.kinematics import (
+    compute_link_frames,
+    quaternion_from_yaw,
+    rotation_from_quaternion,
+)
 from snakesim_hal.model.route import place_chain_on_route
-from snakesim_testing.gnc.stage import PERIOD_S, compute_body_points, make_robot, make_route, make_stage
+from snakesim_testing.gnc.stage import (
+    PERIOD_S,
+    compute_body_points,
+    make_robot,
+    make_route,
+    make_stage,
+)
 
 SEGMENTS = [0.055, *[0.11] * 12, 0.055]
 ROUTE = make_route()
@@ -42,7 +52,9 @@ def test_a_body_beside_the_path_is_where_it_fits_best():
 def test_nodes_are_those_of_the_3d_kinematics():
     angles = np.linspace(-0.5, 0.6, 13)
     rotation = rotation_from_quaternion(quaternion_from_yaw(0.7))
-    origins, rotations = compute_link_frames((1.0, 2.0, 0.0), rotation, angles, ["yaw"] * 13, SEGMENTS)
+    origins, rotations = compute_link_frames(
+        (1.0, 2.0, 0.0), rotation, angles, ["yaw"] * 13, SEGMENTS
+    )
     nodes = compute_chain_points((1.0, 2.0), 0.7, angles.tolist(), SEGMENTS)
     assert nodes[:, :-1].T.ravel() == pytest.approx(origins[:, :2].ravel())
     assert nodes[:, -1] == pytest.approx((origins[-1] + 0.055 * rotations[-1][:, 0])[:2])
@@ -59,7 +71,9 @@ def test_pitch_joints_count_as_straight():
     assert body.segments_m == pytest.approx([0.055, 0.22, 0.165])
     assert body.body_points_s_m == pytest.approx([0.0, 0.055, 0.275, 0.44])
     lie = BodyOnPath(ROUTE, body.segments_m).compute_pose_at(0.1)
-    assert body.expand_joint_angles(lie) == pytest.approx([lie.angles_rad[0], 0.0, lie.angles_rad[1], 0.0])
+    assert body.expand_joint_angles(lie) == pytest.approx(
+        [lie.angles_rad[0], 0.0, lie.angles_rad[1], 0.0]
+    )
     joints = body.compute_joint_positions_w(lie)
     assert joints[1] == pytest.approx((joints[0] + joints[2]) / 2)
     assert [body.find_link_at(s) for s in (0.0, 0.06, 0.2, 0.43)] == [0, 1, 2, 4]
@@ -99,7 +113,10 @@ def test_body_on_path_repeated_pose_is_not_standing_still():
     for tick in range(61, 71):  # new world models, all with the pose of tick 58
         located = progress.update(
             stage.make_observation(
-                tick, 0.3 + 0.2 * tick * PERIOD_S, world_tail_s_m=0.3 + 0.2 * 0.58, pose_age_ticks=tick - 58
+                tick,
+                0.3 + 0.2 * tick * PERIOD_S,
+                world_tail_s_m=0.3 + 0.2 * 0.58,
+                pose_age_ticks=tick - 58,
             )
         )
         assert isinstance(located, BodyLocation)
@@ -129,4 +146,8 @@ def test_a_new_path_is_noticed():
     assert isinstance(first, BodyLocation)
     assert isinstance(again, BodyLocation)
     assert isinstance(other, BodyLocation)
-    assert (first.may_have_jumped, again.may_have_jumped, other.may_have_jumped) == (True, False, True)
+    assert (first.may_have_jumped, again.may_have_jumped, other.may_have_jumped) == (
+        True,
+        False,
+        True,
+    )

@@ -24,7 +24,9 @@ def bumpless(mode: JointMode, angle, velocity, torque):
 @given(values, values, values, values)
 def test_bumpless_starts_from_present_motor_targets(angle, velocity, torque, reference):
     hand_over = BumplessTransfer(ROBOT)
-    hand_over.start_in_position_mode(make_joint_state(ROBOT, angle, velocity, torque), np.array(reference))
+    hand_over.start_in_position_mode(
+        make_joint_state(ROBOT, angle, velocity, torque), np.array(reference)
+    )
     targets = hand_over.compute_position_targets_rad(np.array(reference))
     assert targets == pytest.approx(bumpless(JointMode.POSITION, angle, velocity, torque))
 
@@ -41,7 +43,10 @@ def test_nothing_jumps_by_more_than_the_fade(angle, velocity, torque, reference,
     held = bumpless(JointMode.POSITION, angle, velocity, torque)
     position = hand_over.compute_position_targets_rad(reference)[2]
     assert abs(position - held[2]) <= fade * abs(held[2] - reference[2]) + 1e-9
-    assert abs(hand_over.compute_torque_target_nm(wanted) - torque[1]) <= fade * abs(wanted - torque[1]) + 1e-9
+    assert (
+        abs(hand_over.compute_torque_target_nm(wanted) - torque[1])
+        <= fade * abs(wanted - torque[1]) + 1e-9
+    )
 
 
 def test_the_same_joint_keeps_its_turn():
@@ -60,4 +65,6 @@ def test_bumpless_new_reference_keeps_targets_and_fades_differences():
     assert hand_over.compute_position_targets_rad(np.full(4, 0.2)) == pytest.approx([0.5] * 4)
     for _ in range(200):
         hand_over.advance_ramps(0.05)
-    assert hand_over.compute_position_targets_rad(np.full(4, 0.2)) == pytest.approx([0.2] * 4, abs=1e-3)
+    assert hand_over.compute_position_targets_rad(np.full(4, 0.2)) == pytest.approx(
+        [0.2] * 4, abs=1e-3
+    )

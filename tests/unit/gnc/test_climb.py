@@ -21,7 +21,12 @@ STRAIGHT = [(0.0, 0.0), (4.0, 0.0)]
 def platform(x_m: float, length_m: float, yaw_rad: float = 0.0) -> KnownObstacle:
     half = (0.5 * length_m, 0.5, 0.05)
     return KnownObstacle(
-        name="step", shape="box", position_w=(x_m, 0.0, 0.05), half_size_m=half, height_m=0.1, yaw_rad=yaw_rad
+        name="step",
+        shape="box",
+        position_w=(x_m, 0.0, 0.05),
+        half_size_m=half,
+        height_m=0.1,
+        yaw_rad=yaw_rad,
     )
 
 
@@ -38,10 +43,13 @@ def test_a_path_rises_where_it_leads_over_a_platform(yaw_rad: float) -> None:
 
 @pytest.mark.parametrize("tail_s_m", [-0.9, -0.3, 0.2, 0.6, 1.1, 1.5])
 def test_climb_every_body_part_has_height_of_path(tail_s_m: float) -> None:
-    angles = PlatformClimb(make_robot(18, ("yaw", "pitch"))).compute_pitch_angles_rad([RISE], tail_s_m)
+    angles = PlatformClimb(make_robot(18, ("yaw", "pitch"))).compute_pitch_angles_rad(
+        [RISE], tail_s_m
+    )
     lengths = [link.length_m for link in make_robot(18, ("yaw", "pitch")).links]
     wanted = [compute_path_height_m([RISE], tail_s_m + s) for s in np.cumsum([0.0, *lengths])]
-    begins_up = np.arcsin((wanted[2] - wanted[0]) / (lengths[0] + lengths[1]))  # the tail's slope, to its first pitch
+    # The tail's slope, to its first pitch.
+    begins_up = np.arcsin((wanted[2] - wanted[0]) / (lengths[0] + lengths[1]))
     c, s = math.cos(begins_up), math.sin(begins_up)
     rotation = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
     heights = compute_link_frames((0.0, 0.0, wanted[0]), rotation, angles, AXES, lengths)[0][:, 2]
@@ -56,7 +64,8 @@ def test_climb_needs_pitch_joints() -> None:
 def test_seen_from_above_a_body_on_a_ramp_is_shorter() -> None:
     segments = [0.1, *[0.2] * 8, 0.1]
     level, climbing = (
-        BodyOnPath(Route(STRAIGHT), segments, rises).compute_pose_at(0.0).body_points_w[0] for rises in ([], [RISE])
+        BodyOnPath(Route(STRAIGHT), segments, rises).compute_pose_at(0.0).body_points_w[0]
+        for rises in ([], [RISE])
     )
     assert np.all(level[:4] == climbing[:4])
     assert level[-1] == pytest.approx(1.8)

@@ -36,17 +36,28 @@ def field(density: float = 8.0) -> tuple[list[KnownObstacle], np.ndarray]:
     """Obstacles, and the nodes of the body where it is laid down."""
     flags = ("scene.random_field.0.seed=1", f"scene.random_field.0.density_per_m2={density}")
     config = load_scenario("surveyed_clutter", [parse_set_option(flag) for flag in flags]).config
-    start, segments = compute_start_pose(config), compute_yaw_segments_m(config.robot.axes, config.robot.link_lengths_m)
-    body = compute_chain_points(start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments).T
+    start, segments = (
+        compute_start_pose(config),
+        compute_yaw_segments_m(config.robot.axes, config.robot.link_lengths_m),
+    )
+    body = compute_chain_points(
+        start.position_w, start.yaw_rad, start.angles_rad.tolist(), segments
+    ).T
     return [placed.obstacle for placed in place_obstacles(config)], body
 
 
 def world(at_s: float, obstacles: list[KnownObstacle]) -> WorldModel:
-    return make_world(tick=round(100 * at_s), timestamp_ns=round(at_s * SECOND), obstacles=obstacles)
+    return make_world(
+        tick=round(100 * at_s), timestamp_ns=round(at_s * SECOND), obstacles=obstacles
+    )
 
 
-def planner(known: list[KnownObstacle] | None, goal: HeadingGoal | WaypointGoal | None = None) -> ClutterPlanner:
-    return ClutterPlanner(goal or HeadingGoal(), known, search_parameters=SEARCH, update_period_s=TURN_S)
+def planner(
+    known: list[KnownObstacle] | None, goal: HeadingGoal | WaypointGoal | None = None
+) -> ClutterPlanner:
+    return ClutterPlanner(
+        goal or HeadingGoal(), known, search_parameters=SEARCH, update_period_s=TURN_S
+    )
 
 
 def planned(
@@ -85,7 +96,10 @@ def test_the_map_knows_the_nearest_obstacle_and_its_distance() -> None:
         if near.obstacle_index[k] != NO_OBSTACLE and near.distance_m[k] > 1e-6:
             assert np.hypot(*near.normal_w[k]) == pytest.approx(1.0)
             moved = point + 1e-4 * near.normal_w[k]
-            grown = compute_outline_distance_m(obstacles[near.obstacle_index[k]], moved) - near.distance_m[k]
+            grown = (
+                compute_outline_distance_m(obstacles[near.obstacle_index[k]], moved)
+                - near.distance_m[k]
+            )
             assert grown == pytest.approx(1e-4, rel=1e-3)
 
 
@@ -133,7 +147,11 @@ def test_only_what_is_seen_is_planned_around() -> None:
     made = planner(None)
     blind = planned(made, body)
     wall = KnownObstacle(
-        name="wall", shape="box", position_w=(2.2, 0.0, 0.1), half_size_m=(0.05, 0.4, 0.1), height_m=0.2
+        name="wall",
+        shape="box",
+        position_w=(2.2, 0.0, 0.1),
+        half_size_m=(0.05, 0.4, 0.1),
+        height_m=0.2,
     )
     points = np.array(blind.path_w)
     assert min(compute_outline_distance_m(wall, p) for p in points) < 0.0  # it does not know yet
@@ -152,7 +170,8 @@ def test_a_goal_is_reached() -> None:
     assert there.speed_m_s == 0.0
     assert there.reason == "the goal is reached"
     assert planned(made, body + np.array([0.495, 0.0]), 2.0).finished  # noise
-    assert not planned(made, body + np.array([0.45, 0.0]), 3.0).finished  # it was measured wrong, or slid back
+    # It was measured wrong, or slid back.
+    assert not planned(made, body + np.array([0.45, 0.0]), 3.0).finished
     head = body[-1]
     points = [(float(head[0]) + 0.1, float(head[1])), (float(head[0]) + 1.0, float(head[1]))]
     made = planner(obstacles, WaypointGoal(points_m=points, within_m=0.2))
@@ -160,7 +179,9 @@ def test_a_goal_is_reached() -> None:
     assert planned(made, body + np.array([0.95, 0.0]), 1.0).finished
 
 
-@pytest.mark.parametrize("heading_rad", [0.7, *(pytest.param(at, marks=pytest.mark.slow) for at in (-0.7, 3.0))])
+@pytest.mark.parametrize(
+    "heading_rad", [0.7, *(pytest.param(at, marks=pytest.mark.slow) for at in (-0.7, 3.0))]
+)
 def test_planner_requested_heading_overrides_mission(heading_rad: float) -> None:
     obstacles, body = field()
     made = planner(obstacles, HeadingGoal(distance_m=0.1))
@@ -176,7 +197,9 @@ def test_planner_requested_heading_overrides_mission(heading_rad: float) -> None
     assert planned(made, moved, 0.6).finished  # the mission again
 
 
-def turns(made: ClutterPlanner, body: np.ndarray, count: int, heading_rad: float | None = None) -> list[Trajectory]:
+def turns(
+    made: ClutterPlanner, body: np.ndarray, count: int, heading_rad: float | None = None
+) -> list[Trajectory]:
     """Turns of 0.2 s, in which the body stays where it is."""
     desired = DesiredMotion(0.2, heading_w_rad=heading_rad)
     return [made.update(20 * k, world(0.01 * k, []), body, desired) for k in range(count)]
@@ -203,7 +226,8 @@ def test_planner_follows_old_path_while_work_per_turn_is_bounded() -> None:
     assert after[1].searched_nodes == 0
     begin = np.array(after[0].path_w)
     ahead = route.compute_positions_w(route.length_m - 6.0 + np.arange(0.02, 0.1, 0.02))
-    assert max(np.hypot(*(begin - point).T).min() for point in ahead) < 0.01  # it begins with the path before
+    # It begins with the path before.
+    assert max(np.hypot(*(begin - point).T).min() for point in ahead) < 0.01
 
 
 def test_a_plan_is_the_same_in_however_many_slices() -> None:
@@ -243,14 +267,24 @@ def test_a_tick_that_is_shown_again_is_one_turn() -> None:
 
 @pytest.mark.parametrize(
     ("seen", "turn_s"),
-    [(False, 0.2), *(pytest.param(*row, marks=pytest.mark.slow) for row in ((True, 0.2), (False, 0.02), (True, 0.02)))],
+    [
+        (False, 0.2),
+        *(
+            pytest.param(*row, marks=pytest.mark.slow)
+            for row in ((True, 0.2), (False, 0.02), (True, 0.02))
+        ),
+    ],
 )
 def test_the_work_of_a_turn_is_bounded_whatever_is_planned(seen: bool, turn_s: float) -> None:
     """Counted, and in CPU time: ten times what the rate allows, so that a slow computer passes."""
     obstacles, body = field(density=12.0)
-    made = ClutterPlanner(HeadingGoal(), None if seen else obstacles, search_parameters=SEARCH, update_period_s=turn_s)
+    made = ClutterPlanner(
+        HeadingGoal(), None if seen else obstacles, search_parameters=SEARCH, update_period_s=turn_s
+    )
     done, paths, took_s = [], set(), []
-    for k in range(round(12.0 / turn_s)):  # it stands: stuck paths, backing out, and a turn to the left
+    for k in range(
+        round(12.0 / turn_s)
+    ):  # it stands: stuck paths, backing out, and a turn to the left
         desired = DesiredMotion(0.2, heading_w_rad=None if k * turn_s < 8.0 else 0.7)
         began = time.thread_time()
         found = made.update(k, world(k * turn_s, obstacles), body, desired)

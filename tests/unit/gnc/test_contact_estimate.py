@@ -28,17 +28,30 @@ def readings(pushes, *, friction=0.0, acceleration=(0.0, 0.0)):
     middles = rear + frames[:, :, 0] * np.array(LENGTHS)[:, None] / 2
     masses = np.array([link.mass_kg for link in ROBOT.links])
     loads = [
-        (k, middles[k], masses[k] * (np.array([-friction * GRAVITY_M_S2, 0, 0]) - [*acceleration, 0]))
+        (
+            k,
+            middles[k],
+            masses[k] * (np.array([-friction * GRAVITY_M_S2, 0, 0]) - [*acceleration, 0]),
+        )
         for k in range(COUNT + 1)
     ]
     for link, side, along_m, force_n in pushes:
         outward = side * frames[link][:, 1] if side else frames[link][:, 0]
         point = rear[link] + along_m * frames[link][:, 0] + ROBOT.links[link].radius_m * outward
         loads.append((link, point, -force_n * outward))
-    torques = [-sum(np.cross(at - rear[i + 1], load)[2] for k, at, load in loads if k > i) for i in range(COUNT)]
+    torques = [
+        -sum(np.cross(at - rear[i + 1], load)[2] for k, at, load in loads if k > i)
+        for i in range(COUNT)
+    ]
     felt = [tuple(frame.T @ [*acceleration, GRAVITY_M_S2]) for frame in frames]
     still = [(0.0, 0.0, 0.0)] * (COUNT + 1)
-    imu = Imu(tick=0, timestamp_ns=0, link=list(range(COUNT + 1)), angular_velocity_rad_s=still, acceleration_m_s2=felt)
+    imu = Imu(
+        tick=0,
+        timestamp_ns=0,
+        link=list(range(COUNT + 1)),
+        angular_velocity_rad_s=still,
+        acceleration_m_s2=felt,
+    )
     center = masses @ middles / masses.sum()
     turning_nm = sum(np.cross(at - center, load)[2] for _, at, load in loads)
     return torques, imu, np.sum([load for _, _, load in loads], axis=0), turning_nm
@@ -48,7 +61,9 @@ def estimated(torques, imu, pose: Pose | None = None) -> list[EstimatedPush]:
     return estimate_pushes(ROBOT, SHAPE.tolist(), [0.0] * COUNT, torques, imu, pose)
 
 
-@pytest.mark.parametrize(("friction", "moves"), [(0.0, None), (0.3, make_pose(velocity_w=(0.3, 0.0, 0.0)))])
+@pytest.mark.parametrize(
+    ("friction", "moves"), [(0.0, None), (0.3, make_pose(velocity_w=(0.3, 0.0, 0.0)))]
+)
 def test_contact_estimate_without_contact_is_zero_despite_ground_friction(friction, moves):
     torques, imu, *_ = readings([], friction=friction, acceleration=(-friction * GRAVITY_M_S2, 0.0))
     assert estimated(torques, imu, pose=moves) == []
@@ -77,9 +92,9 @@ def test_contact_estimate_locates_side_and_force_of_accelerating_pushes(side):
             and abs(STARTS_M[c.link] + c.distance_from_rear_joint_m - place_m) < 0.08
         ]
         assert sum(c.force_n for c in near) == pytest.approx(force_n, rel=0.1), found
-        middle_m = sum((STARTS_M[c.link] + c.distance_from_rear_joint_m) * c.force_n for c in near) / sum(
-            c.force_n for c in near
-        )
+        middle_m = sum(
+            (STARTS_M[c.link] + c.distance_from_rear_joint_m) * c.force_n for c in near
+        ) / sum(c.force_n for c in near)
         assert middle_m == pytest.approx(place_m, abs=0.02)
         assert all(0.5 < c.confidence <= 1.0 for c in near)
 
@@ -92,5 +107,8 @@ def test_contact_estimate_without_imu_relies_on_torques():
 def test_pitch_joints_give_no_equation_and_break_nothing():
     mixed = make_robot(axes=("yaw", "pitch"))
     torques, imu, *_ = readings([])
-    torques = [3.0 if joint.axis == "pitch" else torque for joint, torque in zip(mixed.joints, torques, strict=True)]
+    torques = [
+        3.0 if joint.axis == "pitch" else torque
+        for joint, torque in zip(mixed.joints, torques, strict=True)
+    ]
     assert estimate_pushes(mixed, [0.0] * COUNT, [0.0] * COUNT, torques, imu, None) == []

@@ -23,14 +23,20 @@ SEARCHES = "in search of contacts"
 JUMP_RAD = 0.08  # of a target from one tick to the next; the waves themselves make 0.03
 
 
-def searching(*, among_pegs: bool = False, **parameters: float) -> tuple[ObservationStage, ObstacleAided]:
+def searching(
+    *, among_pegs: bool = False, **parameters: float
+) -> tuple[ObservationStage, ObstacleAided]:
     """A body on its path that searches for contacts after a second, unless configured otherwise."""
     stage = make_stage()
     stage.pegs = stage.pegs if among_pegs else []
-    return stage, ObstacleAided(stage.robot, ObstacleAidedParameters(**{"search_after_s": 1.0, **parameters}))
+    return stage, ObstacleAided(
+        stage.robot, ObstacleAidedParameters(**{"search_after_s": 1.0, **parameters})
+    )
 
 
-def stands(controller: ObstacleAided, stage: ObservationStage, ticks: range) -> list[ControllerCommand]:
+def stands(
+    controller: ObstacleAided, stage: ObservationStage, ticks: range
+) -> list[ControllerCommand]:
     """What is commanded while the body stays where it is."""
     return [controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in ticks]
 
@@ -77,7 +83,10 @@ def test_contact_search_wave_starts_slow_and_continues_fast() -> None:
     for tick in range(100):
         controller.update(stage.make_observation(tick, TAIL_S_M - 0.15 + 0.0015 * tick))
     seen = stands(controller, stage, range(100, 1150))
-    slow, fast = pytest.approx(2 * math.tau / 5.39, rel=0.15), pytest.approx(math.tau / 5.39, rel=0.15)
+    slow, fast = (
+        pytest.approx(2 * math.tau / 5.39, rel=0.15),
+        pytest.approx(math.tau / 5.39, rel=0.15),
+    )
     assert [period_s(seen[first : first + 240]) for first in (150, 750)] == [slow, fast]
     assert np.abs(np.diff(targets(seen), axis=0)).max() < JUMP_RAD
 
@@ -86,21 +95,30 @@ def test_a_wave_that_leads_to_the_goal_goes_on() -> None:
     stage, controller = searching()
     stands(controller, stage, range(110))
     led = [
-        controller.update(stage.make_observation(tick, TAIL_S_M + 0.0003 * (tick - 110))) for tick in range(110, 900)
+        controller.update(stage.make_observation(tick, TAIL_S_M + 0.0003 * (tick - 110)))
+        for tick in range(110, 900)
     ]
     assert all(SEARCHES in command.telemetry.reason for command in led)
-    assert [period_s(led[first : first + 240]) for first in (60, 300, 540)] == [pytest.approx(0.8, rel=0.05)] * 3
+    assert [period_s(led[first : first + 240]) for first in (60, 300, 540)] == [
+        pytest.approx(0.8, rel=0.05)
+    ] * 3
 
 
 def test_contact_search_detects_standing_body_despite_pose_noise() -> None:
     (stage, controller), noise = searching(search_after_s=1.2), np.random.default_rng(1)
-    observations = (stage.make_observation(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300))
-    assert any(SEARCHES in controller.update(observation).telemetry.reason for observation in observations)
+    observations = (
+        stage.make_observation(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300)
+    )
+    assert any(
+        SEARCHES in controller.update(observation).telemetry.reason for observation in observations
+    )
 
 
 def test_contact_search_can_be_disabled() -> None:
     stage, never = searching(search_after_s=0.0)
-    assert not any(SEARCHES in command.telemetry.reason for command in stands(never, stage, range(500)))
+    assert not any(
+        SEARCHES in command.telemetry.reason for command in stands(never, stage, range(500))
+    )
 
 
 def test_the_wave_is_that_of_the_shipped_policy() -> None:
@@ -109,7 +127,8 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     assert observation.world is not None
     assert observation.trajectory is not None
     contacts = [
-        make_contact("peg", (3.0, force_n, 4.0), link) for link, force_n in ((0, 12.0), (4, 0.0), (4, 20.0), (13, 7.0))
+        make_contact("peg", (3.0, force_n, 4.0), link)
+        for link, force_n in ((0, 12.0), (4, 0.0), (4, 20.0), (13, 7.0))
     ]
     forces_n = np.zeros(14)
     for contact in contacts:
@@ -121,10 +140,24 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     bearing_rad = np.arctan2(2.0, 0.5) - np.arctan2(*(nodes[:, -1] - nodes[:, 0])[::-1])
     session = onnxruntime.InferenceSession(POLICY_FOLDER / "lab.onnx")
     learned = msgspec.json.decode(session.get_modelmeta().custom_metadata_map["snakesim.learned"])
-    sizes = {"time_s": 1, "goal_bearing": 2, "angle_rad": 13, "velocity_rad_s": 13, "torque_nm": 13, "contact_n": 14}
+    sizes = {
+        "time_s": 1,
+        "goal_bearing": 2,
+        "angle_rad": 13,
+        "velocity_rad_s": 13,
+        "torque_nm": 13,
+        "contact_n": 14,
+    }
     policy = PolicyArrays.make_from_parameters(learned, ["yaw"] * 13, sizes)
     goal = [np.cos(bearing_rad), np.sin(bearing_rad)]
-    seen = [passed_s, *goal, *joints.angle_rad, *joints.velocity_rad_s, *joints.torque_nm, *forces_n]
+    seen = [
+        passed_s,
+        *goal,
+        *joints.angle_rad,
+        *joints.velocity_rad_s,
+        *joints.torque_nm,
+        *forces_n,
+    ]
     felt = replace(
         observation,
         joints=joints,
@@ -151,7 +184,9 @@ def test_contact_search_bends_along_same_curve_for_any_joint_spacing() -> None:
 
 
 def test_contact_search_scales_torque_by_its_limit() -> None:
-    weak, strong = (felt_by(make_stage(torque_nm=limit_nm), 0.2 * limit_nm) for limit_nm in (3.5, 7.0))
+    weak, strong = (
+        felt_by(make_stage(torque_nm=limit_nm), 0.2 * limit_nm) for limit_nm in (3.5, 7.0)
+    )
     assert weak == pytest.approx(strong)
     assert weak != pytest.approx(felt_by(make_stage()))
 
@@ -159,12 +194,20 @@ def test_contact_search_scales_torque_by_its_limit() -> None:
 def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
     stage = make_stage()
     observation = stage.make_observation(0, TAIL_S_M)
-    knocked = replace(observation, joints=msgspec.structs.replace(observation.joints, velocity_rad_s=[20.0] * 13))
+    knocked = replace(
+        observation, joints=msgspec.structs.replace(observation.joints, velocity_rad_s=[20.0] * 13)
+    )
     calm, struck = ForceFeedbackWave(stage.robot), ForceFeedbackWave(stage.robot)
     for wave in (calm, struck):
         wave.compute_reference_rad(observation, 0.01)
     apart = [
-        np.ptp([calm.compute_reference_rad(observation, 0.01), struck.compute_reference_rad(knocked, 0.01)], axis=0)
+        np.ptp(
+            [
+                calm.compute_reference_rad(observation, 0.01),
+                struck.compute_reference_rad(knocked, 0.01),
+            ],
+            axis=0,
+        )
         for _ in range(20)
     ]
     assert np.max(np.diff(apart, axis=0)) < 0.11
@@ -176,12 +219,16 @@ def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
 def test_contact_search_of_moving_body_does_not_start(speed_m_s: float) -> None:
     stage, controller = searching()
     stage.speed_m_s = speed_m_s
-    moving = [controller.update(stage.make_observation(tick, 1.5 + speed_m_s * 0.01 * tick)) for tick in range(400)]
+    moving = [
+        controller.update(stage.make_observation(tick, 1.5 + speed_m_s * 0.01 * tick))
+        for tick in range(400)
+    ]
     assert not any(SEARCHES in command.telemetry.reason for command in moving)
 
 
 @pytest.mark.parametrize(
-    "pegs", [[], [KnownObstacle(name="p", shape="cylinder", position_w=(0.5, 0.12, 0.1), radius_m=0.05)]]
+    "pegs",
+    [[], [KnownObstacle(name="p", shape="cylinder", position_w=(0.5, 0.12, 0.1), radius_m=0.05)]],
 )
 def test_contact_search_of_u_shaped_body_raises_no_error(pegs: list[KnownObstacle]) -> None:
     stage = make_stage()
@@ -192,4 +239,6 @@ def test_contact_search_of_u_shaped_body_raises_no_error(pegs: list[KnownObstacl
     for tail_s_m in np.linspace(0.3, 0.7, 9):
         controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
         for tick in range(5):
-            assert np.isfinite(controller.update(stage.make_observation(tick, float(tail_s_m))).setpoints.target).all()
+            assert np.isfinite(
+                controller.update(stage.make_observation(tick, float(tail_s_m))).setpoints.target
+            ).all()

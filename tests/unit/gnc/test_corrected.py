@@ -18,7 +18,9 @@ MEMBERS = [name for name in vars(Controller) if not name.startswith("_") and nam
 
 @pytest.mark.parametrize("controller", [HoldPose, ObstacleTriplet, PolicyController])
 def test_it_has_every_declaration_of_the_other_controller(controller: type[Controller]) -> None:
-    corrected = require_base_class(_make_correcting_class(controller, []), Controller, "controller 'corrected'")
+    corrected = require_base_class(
+        _make_correcting_class(controller, []), Controller, "controller 'corrected'"
+    )
     for name in MEMBERS:
         own, other = (getattr(cls, name) for cls in (corrected, controller))
         assert getattr(own, "__func__", own) is getattr(other, "__func__", other), name
@@ -31,7 +33,10 @@ def test_it_adds_corrections_to_targets_in_position_mode_alone() -> None:
     command = corrected.update(observation)
     assert command.setpoints.mode == [JointMode.POSITION] * 3
     added = [
-        target - angle for target, angle in zip(command.setpoints.target, observation.joints.angle_rad, strict=True)
+        target - angle
+        for target, angle in zip(
+            command.setpoints.target, observation.joints.angle_rad, strict=True
+        )
     ]
     assert added == pytest.approx(residual_rad)
     assert command.telemetry.reason == "holding"

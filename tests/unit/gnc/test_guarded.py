@@ -9,7 +9,13 @@ import pytest
 
 from snakesim_gnc.control.guarded import GuardedController
 from snakesim_hal.base.errors import ControllerError
-from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry, make_position_setpoints
+from snakesim_hal.controller import (
+    Controller,
+    ControllerCommand,
+    Observation,
+    Telemetry,
+    make_position_setpoints,
+)
 from snakesim_hal.wire.messages import JointMode, RobotDescription
 from snakesim_testing.gnc.stage import make_stage
 from snakesim_testing.messages import raises_error
@@ -52,7 +58,11 @@ def made_of(setpoints: Any, telemetry: Any = None) -> ControllerCommand:
 
 
 def test_guarded_valid_answer_passes_unchanged() -> None:
-    for answer in (ControllerCommand(GOOD), points(target=[1, 0.5, -2]), points(mode=list(JointMode)[:3])):
+    for answer in (
+        ControllerCommand(GOOD),
+        points(target=[1, 0.5, -2]),
+        points(mode=list(JointMode)[:3]),
+    ):
         assert update(answer) is answer
 
 

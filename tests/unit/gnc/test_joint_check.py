@@ -15,7 +15,9 @@ def targets(start_rad: float, seconds: float, dead: int | None = None) -> list[l
     angles = [start_rad] * len(ROBOT.joints)
     made: list[list[float]] = []
     for tick in range(round(seconds / PERIOD_S)):
-        observation = Observation(tick, tick * PERIOD_S, PERIOD_S, make_joint_state(ROBOT, angles), None, None)
+        observation = Observation(
+            tick, tick * PERIOD_S, PERIOD_S, make_joint_state(ROBOT, angles), None, None
+        )
         made.append(list(check.update(observation).setpoints.target))
         angles = [angle if joint == dead else made[-1][joint] for joint, angle in enumerate(angles)]
     return made

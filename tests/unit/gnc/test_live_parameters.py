@@ -38,7 +38,8 @@ class Bench:
 
     def ask(self, parameters: str, controller: str = "obstacle_triplet") -> Answer:
         return self.operator.send_request(
-            keys.PARAMETERS, ParametersRequest(requester="ada", controller=controller, parameters=parameters)
+            keys.PARAMETERS,
+            ParametersRequest(requester="ada", controller=controller, parameters=parameters),
         )
 
     def in_force(self) -> ControlParameters:
@@ -72,7 +73,10 @@ def test_live_parameters_start_from_configuration_and_rebuild_the_controller(
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
-        ('{"propulsion_n": -1}', "`controllers.obstacle_triplet.propulsion_n` = -1 N is not allowed"),
+        (
+            '{"propulsion_n": -1}',
+            "`controllers.obstacle_triplet.propulsion_n` = -1 N is not allowed",
+        ),
         ('{"propulsion": 1}', "did you mean `propulsion_n`?"),
         ('{"propulsion_n": NaN}', "malformed"),
         ("[]", "object"),

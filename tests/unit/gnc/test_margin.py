@@ -17,13 +17,19 @@ from snakesim_testing.gnc.stage import BODY_RADIUS_M, compute_body_points, make_
 SEEDS = st.integers(0, 2**31)
 
 
-def touching(tail_s_m: float, pegs: list[KnownObstacle] | None = None) -> tuple[np.ndarray, BodyContacts, np.ndarray]:
+def touching(
+    tail_s_m: float, pegs: list[KnownObstacle] | None = None
+) -> tuple[np.ndarray, BodyContacts, np.ndarray]:
     """Nodes of a body on the usual route, what touches it, and its joints' change of angle per metre of the way."""
     stage = make_stage()
     nodes = compute_body_points(stage, tail_s_m)
     outlines = ObstacleOutlines.from_obstacles(stage.pegs if pegs is None else pegs)
     slope = (angles_of(compute_body_points(stage, tail_s_m + 0.01)) - angles_of(nodes)) / 0.01
-    return nodes, find_body_contacts(nodes, BODY_RADIUS_M, outlines, max_gap_m=0.03, friction=0.0), slope
+    return (
+        nodes,
+        find_body_contacts(nodes, BODY_RADIUS_M, outlines, max_gap_m=0.03, friction=0.0),
+        slope,
+    )
 
 
 def angles_of(nodes: np.ndarray) -> np.ndarray:
@@ -46,7 +52,8 @@ def test_the_margin_is_that_of_the_best_three_contacts(seed: int, count: int) ->
                     best = max(best, MAX_CONTACT_FORCE_N / forces.max())
         found = compute_margins_n(contacts, drag)[body]
         assert found >= best * (1 - 1e-6)
-        assert found <= best * (1 + 1e-6) or best == 0.0 or found > best  # nearly singular threes may be better still
+        # Nearly singular threes may be better still.
+        assert found <= best * (1 + 1e-6) or best == 0.0 or found > best
 
 
 def test_contacts_on_one_side_cannot_push() -> None:
@@ -70,9 +77,13 @@ def test_a_push_is_in_balance_and_only_pushes(tail_s_m: float) -> None:
     drag = share[:, None] * run / np.hypot(*run.T)[:, None]
     assert forces.sum(axis=0) == pytest.approx(drag.sum(axis=0), abs=0.05)
     middles = nodes[:, :-1].T + 0.5 * run
-    moment = np.sum(compute_wrenches(touches.positions_w, forces)[:, 2]) - np.sum(compute_wrenches(middles, drag)[:, 2])
+    moment = np.sum(compute_wrenches(touches.positions_w, forces)[:, 2]) - np.sum(
+        compute_wrenches(middles, drag)[:, 2]
+    )
     assert moment == pytest.approx(0.0, abs=0.1)
-    for joint, torque in enumerate(push.joint_torques_nm):  # what is ahead of each joint is in balance, too
+    for joint, torque in enumerate(
+        push.joint_torques_nm
+    ):  # what is ahead of each joint is in balance, too
         at = nodes[:, joint + 1]
         ahead = touches.body_s_m > np.hypot(*run.T)[: joint + 1].sum()
         held = np.sum(compute_wrenches(touches.positions_w - at, forces)[ahead, 2])
@@ -97,7 +108,8 @@ def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
 def test_margin_joints_do_not_work_against_each_other(tail_s_m: float) -> None:
     nodes, touches, slope = touching(tail_s_m)
     thrifty, smallest = (
-        solve_push(nodes, touches, one, contact_gap_scale_m=0.005) for one in (slope, np.zeros_like(slope))
+        solve_push(nodes, touches, one, contact_gap_scale_m=0.005)
+        for one in (slope, np.zeros_like(slope))
     )
     assert thrifty.is_balanced
     assert smallest.is_balanced
@@ -117,5 +129,7 @@ def test_margin_contacts_with_extra_cost_leave_push_to_others(tail_s_m: float) -
     assert push.balance_residual < 0.1
     assert np.delete(push.contact_forces, three).sum() < 0.2 * push.contact_forces.sum()
     assert (
-        len(touches) == 3 or np.delete(usual.contact_forces, three).sum() > np.delete(push.contact_forces, three).sum()
+        len(touches) == 3
+        or np.delete(usual.contact_forces, three).sum()
+        > np.delete(push.contact_forces, three).sum()
     )

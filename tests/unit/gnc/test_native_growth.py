@@ -10,7 +10,11 @@ from snakesim_gnc.geometry.planar import resample_evenly
 from snakesim_gnc.navigation.obstacle_grid import ObstacleGrid
 from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearchSteps
 from snakesim_gnc.navigation.path_search.native_growth import NativeExpander
-from snakesim_gnc.navigation.path_search.native_library import PlannerLibraryError, is_native_available, load_library
+from snakesim_gnc.navigation.path_search.native_library import (
+    PlannerLibraryError,
+    is_native_available,
+    load_library,
+)
 from snakesim_gnc.navigation.path_search.search_nodes import NodeLayer, make_start_nodes
 from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath, SearchTask
@@ -22,9 +26,16 @@ from snakesim_native import load
 BODY_M = 1.0
 BODY_ARCS = 20
 SEARCH = SearchParameters(
-    body_length_m=BODY_M, radius_m=0.04, segment_m=0.11, kept_nodes=60, unused_tail_m=0.05, unused_head_m=0.05
+    body_length_m=BODY_M,
+    radius_m=0.04,
+    segment_m=0.11,
+    kept_nodes=60,
+    unused_tail_m=0.05,
+    unused_head_m=0.05,
 )
-needs_library = pytest.mark.skipif(not is_native_available(), reason="the C library cannot be compiled here")
+needs_library = pytest.mark.skipif(
+    not is_native_available(), reason="the C library cannot be compiled here"
+)
 
 
 def make_body(random: np.random.Generator) -> Floats:
@@ -40,7 +51,9 @@ def make_obstacles(random: np.random.Generator, body_w: Floats) -> list[KnownObs
     columns = np.arange(-1.2, 1.8, spacing_m)
     rows = np.arange(-0.8, 0.8, spacing_m)
     obstacles: list[KnownObstacle] = []
-    for x, y in np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2) + random.uniform(0.0, 0.1, 2):
+    for x, y in np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2) + random.uniform(
+        0.0, 0.1, 2
+    ):
         place_w = np.array([x, y]) + random.uniform(-0.2, 0.2, 2) * spacing_m
         radius_m = float(random.uniform(0.02, 0.05))
         if np.hypot(*(body_w - place_w).T).min() < 1.3 * radius_m + 0.045:
@@ -114,7 +127,9 @@ def test_paths_equal_those_of_the_specification_to_the_last_bit(kind: str, seed:
 def test_of_paths_that_cost_the_same_both_keep_the_same(kept_nodes: int) -> None:
     """Without obstacles, progress and curvature in the cost, all paths cost the same."""
     body_w = np.column_stack([np.linspace(-1.0, 0.0, 101), np.zeros(101)])
-    parameters = replace(SEARCH, kept_nodes=kept_nodes, progress_reward=0.0, curvature_change_cost_m=0.0)
+    parameters = replace(
+        SEARCH, kept_nodes=kept_nodes, progress_reward=0.0, curvature_change_cost_m=0.0
+    )
     found = [
         finish(BeamSearch(ObstacleGrid([]), parameters, growth).search_ahead(body_w, 0.3, 10))
         for growth in (NumpyExpander, NativeExpander)
@@ -185,7 +200,9 @@ def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @needs_library
-def test_the_grid_of_obstacles_is_the_same_without_the_library(request: pytest.FixtureRequest) -> None:
+def test_the_grid_of_obstacles_is_the_same_without_the_library(
+    request: pytest.FixtureRequest,
+) -> None:
     random = np.random.default_rng(5)
     obstacles = make_obstacles(random, make_body(random))
     native = ObstacleGrid(obstacles)

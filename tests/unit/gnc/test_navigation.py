@@ -14,18 +14,24 @@ MISSION_M_S = 0.2
 MISSION = DesiredMotion(MISSION_M_S)
 SECOND = 10**9
 ROUTE = Route([(0.0, 0.0), (1.0, 0.0), (10.0, 0.0)])
-PEG = KnownObstacle(name="peg", shape="cylinder", position_w=(2.0, 0.1, 0.1), radius_m=0.05, height_m=0.2)
+PEG = KnownObstacle(
+    name="peg", shape="cylinder", position_w=(2.0, 0.1, 0.1), radius_m=0.05, height_m=0.2
+)
 
 
 def intent(at_s: float, **more: Any) -> LocomotionIntent:
-    return LocomotionIntent(**{"timestamp_ns": round(at_s * SECOND), "requester": "ann", "speed_m_s": 0.1, **more})
+    return LocomotionIntent(
+        **{"timestamp_ns": round(at_s * SECOND), "requester": "ann", "speed_m_s": 0.1, **more}
+    )
 
 
 def world(tail_x_m: float, timestamp_ns: int = 0) -> WorldModel:
     return make_world(timestamp_ns=timestamp_ns, base_position_w=(tail_x_m, 0.0, 0.0))
 
 
-def desired(intents: IntentTracker, newest: LocomotionIntent | None, at_s: float) -> tuple[float, str]:
+def desired(
+    intents: IntentTracker, newest: LocomotionIntent | None, at_s: float
+) -> tuple[float, str]:
     found = intents.choose_motion(newest, round(at_s * SECOND))
     return found.speed_m_s, found.reason
 
@@ -42,7 +48,8 @@ def test_trajectory_age_is_that_of_its_world_model() -> None:
     assert seen.timestamp_ns == 18 * 10**7
     assert seen.push_points == ["peg"]
     again = planner.update(40, world(0.5, timestamp_ns=18 * 10**7), MISSION)
-    assert again.timestamp_ns == 18 * 10**7  # guidance has said nothing new: nor has the plan become new
+    # Guidance has said nothing new: nor has the plan become new.
+    assert again.timestamp_ns == 18 * 10**7
 
 
 def test_navigation_stops_at_the_end_of_path() -> None:
@@ -64,7 +71,10 @@ def test_intent_expires_after_its_validity_and_robot_stops() -> None:
     speed, why = desired(intents, None, 60.0)  # it does not go back to its mission
     assert speed == 0.0
     assert "send a new one to go on" in why
-    assert desired(intents, intent(60.0, requester="bob", speed_m_s=None), 60.1) == (MISSION_M_S, "as bob wants it")
+    assert desired(intents, intent(60.0, requester="bob", speed_m_s=None), 60.1) == (
+        MISSION_M_S,
+        "as bob wants it",
+    )
     assert desired(intents, intent(60.2, go=False), 60.3) == (0.0, "ann wants it to stop")
 
 
@@ -80,7 +90,8 @@ def test_intent_validity_is_shortened_but_never_extended_beyond_maximum() -> Non
 
 
 @pytest.mark.parametrize(
-    ("at_s", "words"), [(20.2, "stamped 10.2 s ahead of the robot's clock"), (8.0, "has expired: it is 2 s old")]
+    ("at_s", "words"),
+    [(20.2, "stamped 10.2 s ahead of the robot's clock"), (8.0, "has expired: it is 2 s old")],
 )
 def test_intent_with_future_or_old_timestamp_is_refused(at_s: float, words: str) -> None:
     intents = IntentTracker(MISSION_M_S)
@@ -89,7 +100,8 @@ def test_intent_with_future_or_old_timestamp_is_refused(at_s: float, words: str)
     assert words in why  # nobody has taken over from the mission
     good = intent(10.0)
     assert desired(intents, good, 10.1)[0] == 0.1
-    assert desired(intents, intent(at_s, speed_m_s=5.0), 10.2) == (0.1, "as ann wants it")  # the good one goes on
+    # The good one goes on.
+    assert desired(intents, intent(at_s, speed_m_s=5.0), 10.2) == (0.1, "as ann wants it")
     assert desired(intents, intent(at_s, speed_m_s=5.0), 11.5)[0] == 0.0  # and ends when it says
 
 
@@ -130,9 +142,14 @@ def test_intent_before_a_robot_restart_is_ignored_afterwards() -> None:
 def test_intent_sent_before_a_stop_does_not_move_robot() -> None:
     intents = IntentTracker(MISSION_M_S)
     assert desired(intents, intent(1.0, valid_for_ns=5 * SECOND), 1.1)[0] == 0.1
-    assert desired(intents, intent(2.0, go=False, valid_for_ns=5 * SECOND), 2.1) == (0.0, "ann wants it to stop")
+    assert desired(intents, intent(2.0, go=False, valid_for_ns=5 * SECOND), 2.1) == (
+        0.0,
+        "ann wants it to stop",
+    )
     late = intent(1.5, valid_for_ns=5 * SECOND, speed_m_s=0.3)
-    assert desired(intents, late, 2.2)[0] == 0.0, "held back by the network, and valid by its stamp alone"
+    assert desired(intents, late, 2.2)[0] == 0.0, (
+        "held back by the network, and valid by its stamp alone"
+    )
     assert desired(intents, intent(1.5, requester="bob"), 2.3) == (0.1, "as bob wants it"), (
         "others have clocks of their own"
     )

@@ -19,7 +19,9 @@ def test_obstacle_aided_leaving_torque_mode_holds_with_present_torque(lost: str)
     assert set(pushing.mode) == {JointMode.TORQUE}
     assert np.abs(pushing.target).max() > 0.1
 
-    holding = controller.update(stage.make_observation(40, 1.0, torque_nm=HELD_NM, without=lost)).setpoints
+    holding = controller.update(
+        stage.make_observation(40, 1.0, torque_nm=HELD_NM, without=lost)
+    ).setpoints
     assert set(holding.mode) == {JointMode.POSITION}
     stiffness = [joint.stiffness_nm_per_rad for joint in stage.robot.joints]
     by_spring_nm = (np.array(holding.target) - observations[-1].joints.angle_rad) * stiffness

@@ -20,7 +20,9 @@ def torque_joints(command) -> list[int]:
 
 def stay(controller, stage, ticks, **more):
     """The last of many updates of a body that does not move."""
-    return [controller.update(stage.make_observation(tick, TAIL_S_M, **more)) for tick in range(ticks)][-1]
+    return [
+        controller.update(stage.make_observation(tick, TAIL_S_M, **more)) for tick in range(ticks)
+    ][-1]
 
 
 STEADY_TICKS = 100  # until the controller of a body that does not move has settled
@@ -87,14 +89,18 @@ def test_triplet_servo_targets_lead_by_load_when_requested():
     assert np.abs(load[others]).max() > 0.03
     blind = controller.update(stage.make_observation(99, TAIL_S_M, without="world"))
     targets = np.array(blind.setpoints.target)
-    assert targets[others] == pytest.approx(np.array(command.setpoints.target)[others], abs=5e-3)  # and fades
+    # And fades.
+    assert targets[others] == pytest.approx(np.array(command.setpoints.target)[others], abs=5e-3)
 
 
 def test_the_faster_it_moves_the_less_it_pushes():
     stage = make_stage()
     controller = make_controller(stage)
     forces = [
-        controller.update(stage.make_observation(t, 0.1 + 0.1 * t * PERIOD_S)).telemetry.propulsion_n for t in range(60)
+        controller.update(
+            stage.make_observation(t, 0.1 + 0.1 * t * PERIOD_S)
+        ).telemetry.propulsion_n
+        for t in range(60)
     ]
     assert forces[-1] == pytest.approx(35.0 * 0.5, rel=0.1)
 
@@ -103,13 +109,20 @@ def test_a_joint_that_has_swung_out_pushes_less():
     stage = make_stage()
     controller = make_controller(stage)
     settled = stay(controller, stage, 50).telemetry
-    joint, way = require_value(settled.propulsion_joint), np.sign(require_value(settled.propulsion_torque_nm))
+    joint, way = (
+        require_value(settled.propulsion_joint),
+        np.sign(require_value(settled.propulsion_torque_nm)),
+    )
     for first, turned_rad, share in ((50, 0.3 * way, 0.5), (60, -0.3 * way, 1.0)):
         observations = [
-            stage.make_observation(tick, TAIL_S_M, world_age_ticks=tick - 49, turned={joint: turned_rad})
+            stage.make_observation(
+                tick, TAIL_S_M, world_age_ticks=tick - 49, turned={joint: turned_rad}
+            )
             for tick in range(first, first + 10)
         ]
-        pushed = [controller.update(observation).telemetry.propulsion_n for observation in observations]
+        pushed = [
+            controller.update(observation).telemetry.propulsion_n for observation in observations
+        ]
         assert pushed[-1] == pytest.approx(share * 35.0, rel=0.05)
 
 
@@ -118,13 +131,19 @@ def test_triplet_joint_off_its_reference_returns_to_position_mode():
     stage.pegs = stage.pegs[1:4]
     controller = make_controller(stage, guard_s=0.5)
     joint = require_value(stay(controller, stage, 10).telemetry.propulsion_joint)
-    command = controller.update(stage.make_observation(10, TAIL_S_M, world_age_ticks=1, turned={joint: 0.9}))
+    command = controller.update(
+        stage.make_observation(10, TAIL_S_M, world_age_ticks=1, turned={joint: 0.9})
+    )
     assert torque_joints(command) == []
     assert f"joint_{joint + 1} left its reference" in command.telemetry.reason
-    turns = [controller.update(stage.make_observation(t, TAIL_S_M)).telemetry.propulsion_joint for t in range(11, 40)]
+    turns = [
+        controller.update(stage.make_observation(t, TAIL_S_M)).telemetry.propulsion_joint
+        for t in range(11, 40)
+    ]
     assert joint not in turns
     assert joint in [
-        controller.update(stage.make_observation(t, TAIL_S_M)).telemetry.propulsion_joint for t in range(60, 80)
+        controller.update(stage.make_observation(t, TAIL_S_M)).telemetry.propulsion_joint
+        for t in range(60, 80)
     ]
 
 
@@ -135,8 +154,12 @@ def test_triplet_saturated_joint_is_reported_with_reduced_force():
     assert report.saturated
     assert require_value(report.torque_headroom_nm) < 0
     assert require_value(report.propulsion_n) < 35.0
-    assert abs(command.setpoints.target[require_value(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-3)
-    assert abs(report.bending_torque_nm[require_value(report.propulsion_joint)]) == pytest.approx(1.0, rel=1e-2)
+    assert abs(command.setpoints.target[require_value(report.propulsion_joint)]) == pytest.approx(
+        1.0, rel=1e-3
+    )
+    assert abs(report.bending_torque_nm[require_value(report.propulsion_joint)]) == pytest.approx(
+        1.0, rel=1e-2
+    )
 
 
 def test_triplet_hand_over_to_same_joint_keeps_torque_continuous():
@@ -147,7 +170,9 @@ def test_triplet_hand_over_to_same_joint_keeps_torque_continuous():
     for tick in range(200):
         if tick == 100:
             stage.pegs = [peg for peg in stage.pegs if peg.name != "peg_2"]
-        reports.append(controller.update(stage.make_observation(tick, tail_s_m, torque_nm=torque_nm)).telemetry)
+        reports.append(
+            controller.update(stage.make_observation(tick, tail_s_m, torque_nm=torque_nm)).telemetry
+        )
         torque_nm = require_value(reports[-1].propulsion_torque_nm)
     before, after = reports[99], reports[199]
     assert [[p.obstacle for p in report.push_points] for report in (before, after)] == [
@@ -187,7 +212,9 @@ def test_triplet_standing_still_is_reported_and_jam_released():
     contacts = [make_contact("peg_1", (400.0, 0.0, 0.0)), make_contact("peg_2", (-390.0, 0.0, 0.0))]
     pushed, released, jams = 0, 0, []
     for tick in range(200):
-        report = controller.update(stage.make_observation(tick, TAIL_S_M, contacts=contacts)).telemetry
+        report = controller.update(
+            stage.make_observation(tick, TAIL_S_M, contacts=contacts)
+        ).telemetry
         if report.jammed:
             jams.append(report.reason)
             pushed += report.propulsion_joint is not None
@@ -198,7 +225,10 @@ def test_triplet_standing_still_is_reported_and_jam_released():
     assert released
     moved = stay(controller, stage, 3)
     assert moved.telemetry.jammed
-    report = [controller.update(stage.make_observation(200 + t, TAIL_S_M + 0.002 * t)).telemetry for t in range(40)][-1]
+    report = [
+        controller.update(stage.make_observation(200 + t, TAIL_S_M + 0.002 * t)).telemetry
+        for t in range(40)
+    ][-1]
     assert not report.jammed
     assert report.reason == ""
 

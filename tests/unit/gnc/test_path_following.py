@@ -31,7 +31,8 @@ def test_the_reference_moves_with_the_mission_and_stops_with_it():
     for stage.speed_m_s in (0.0, 0.1, 0.3):
         controller = make_controller(stage, look_ahead_m=0.2)
         references = [
-            controller.update(stage.make_observation(tick, TAIL_S_M)).telemetry.reference_rad for tick in range(31)
+            controller.update(stage.make_observation(tick, TAIL_S_M)).telemetry.reference_rad
+            for tick in range(31)
         ]
         moved_rad.append(np.abs(np.array(references[-1]) - references[0]).max())
     stopped, slow, fast = moved_rad

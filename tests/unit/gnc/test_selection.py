@@ -63,12 +63,18 @@ def test_a_peg_is_met_at_its_inflection():
     [
         (0.1, {"shape": "sphere", "radius_m": 0.03}, 0.03),
         (-0.1, {"shape": "sphere", "radius_m": 0.03}, 0.03),
-        (0.3, {"shape": "box", "yaw_rad": math.pi / 4, "half_size_m": (0.1, 0.1, 0.1)}, 0.26 - 0.1 * math.sqrt(2)),
+        (
+            0.3,
+            {"shape": "box", "yaw_rad": math.pi / 4, "half_size_m": (0.1, 0.1, 0.1)},
+            0.26 - 0.1 * math.sqrt(2),
+        ),
     ],
     ids=["ball on the left", "ball on the right", "corner of a turned box"],
 )
 def test_selection_beside_straight_path_uses_nearest_obstacle_point(y_m, shape, clearance_m):
-    contact = plan_contact(STRAIGHT, KnownObstacle(name="it", position_w=(2.0, y_m, 0.0), **shape), 0.04, **NEAR)
+    contact = plan_contact(
+        STRAIGHT, KnownObstacle(name="it", position_w=(2.0, y_m, 0.0), **shape), 0.04, **NEAR
+    )
     assert contact.point_w == pytest.approx((2.0, 0.0), abs=1e-3)
     assert contact.normal_w == pytest.approx((0.0, -math.copysign(1.0, y_m)))
     assert contact.side == -math.copysign(1.0, y_m)
@@ -76,7 +82,9 @@ def test_selection_beside_straight_path_uses_nearest_obstacle_point(y_m, shape, 
 
 
 def test_a_box_that_the_path_runs_into_has_no_clearance():
-    box = KnownObstacle(name="box", shape="box", position_w=(2.0, -0.05, 0.0), half_size_m=(0.1, 0.1, 0.1))
+    box = KnownObstacle(
+        name="box", shape="box", position_w=(2.0, -0.05, 0.0), half_size_m=(0.1, 0.1, 0.1)
+    )
     contact = plan_contact(STRAIGHT, box, 0.04, **NEAR)
     assert contact.clearance_m < -0.04
     assert contact.side == 1
@@ -126,7 +134,9 @@ def test_selection_propulsion_joint_is_first_ahead_of_middle_contact(behind, dis
         assert not between
     else:
         assert joint in between
-        assert joint == between[0] or (joint == present == between[0] + 1 and NODE_S[between[0] + 1] - behind < 0.003)
+        assert joint == between[0] or (
+            joint == present == between[0] + 1 and NODE_S[between[0] + 1] - behind < 0.003
+        )
 
 
 def test_noise_does_not_pass_the_turn_to_and_fro():
@@ -139,9 +149,12 @@ def test_noise_does_not_pass_the_turn_to_and_fro():
 
 def choices_in_row(count=7):
     row = planned_row()
-    triplets = solve_triplets([(row[i], row[i + 1], row[i + 2]) for i in range(count)], condition_max=100.0)
+    triplets = solve_triplets(
+        [(row[i], row[i + 1], row[i + 2]) for i in range(count)], condition_max=100.0
+    )
     return [
-        PropulsionChoice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1) for i, t in enumerate(triplets)
+        PropulsionChoice(t, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1)
+        for i, t in enumerate(triplets)
     ]
 
 
@@ -155,8 +168,16 @@ def test_selection_keeps_triplet_and_successor_shares_most_push_points():
 def test_of_equals_the_one_nearest_to_the_tail_is_chosen():
     row = choices_in_row()
     assert choose_triplet(row, None, switch_fraction=0.5) is row[0]
-    assert choose_triplet(row, None, switch_fraction=0.5, banned_triplets=[row[0].triplet.names]) is row[1]
-    assert choose_triplet(row, None, switch_fraction=0.5, banned_triplets=[c.triplet.names for c in row]) is None
+    assert (
+        choose_triplet(row, None, switch_fraction=0.5, banned_triplets=[row[0].triplet.names])
+        is row[1]
+    )
+    assert (
+        choose_triplet(
+            row, None, switch_fraction=0.5, banned_triplets=[c.triplet.names for c in row]
+        )
+        is None
+    )
 
 
 def test_points_become_choices_with_a_joint_each():
@@ -170,13 +191,16 @@ def test_points_become_choices_with_a_joint_each():
     for choice in found:
         assert choice.body_s_m[1] < NODE_S[choice.joint + 1] < choice.body_s_m[2]
         assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9
-    barred, why = triplets.find_propulsion_choices(points, lie.body_points_w, NODE_S, None, found[0].joint)
+    barred, why = triplets.find_propulsion_choices(
+        points, lie.body_points_w, NODE_S, None, found[0].joint
+    )
     assert [c.joint for c in barred] == [c.joint for c in found if c.joint != found[0].joint]
     assert len(barred) + len(why) == len(found) + len(refused)
 
 
 @pytest.mark.parametrize(
-    ("slope_deg", "pushes"), [(29.5, ["012", "014", "123", "234"]), (30.5, ["014"]), (37.5, ["014"]), (38.0, [])]
+    ("slope_deg", "pushes"),
+    [(29.5, ["012", "014", "123", "234"]), (30.5, ["014"]), (37.5, ["014"]), (38.0, [])],
 )
 def test_the_steepest_wave_depends_on_the_spacing(slope_deg: float, pushes: list[str]):
     """On a row of pegs at distances a and b along a wave of slope alpha, lambda_1 > 0 where cos 2 alpha > a/(a + b)."""

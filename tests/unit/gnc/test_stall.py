@@ -49,7 +49,8 @@ def along(*forces: tuple[str, float, float]) -> NetContactForce:
     return require_value(felt.resolve_along((2.0, 0.0)))
 
 
-PUSHED = (("peg_0", 0.0, 8.0), ("peg_1", 30.0, -40.0), ("peg_2", -0.5, 20.0))  # as a triplet of 30 N is
+# As a triplet of 30 N is.
+PUSHED = ("peg_0", 0.0, 8.0), ("peg_1", 30.0, -40.0), ("peg_2", -0.5, 20.0)
 
 
 def cause(**more):
@@ -86,7 +87,12 @@ def test_a_push_point_that_is_not_felt_is_named():
 @pytest.mark.parametrize("saturated_joint", [None, "joint_7"])
 @pytest.mark.parametrize("desired_force_n", [8.0, 35.0, 300.0])
 def test_a_body_that_touches_nothing_is_not_jammed(desired_force_n, saturated_joint):
-    stall = cause(desired_force_n=desired_force_n, net_force=along(), weight_n=40.0, saturated_joint=saturated_joint)
+    stall = cause(
+        desired_force_n=desired_force_n,
+        net_force=along(),
+        weight_n=40.0,
+        saturated_joint=saturated_joint,
+    )
     assert not stall.is_jammed
     assert not stall.should_release_triplet
     assert "no obstacle touches the body" in stall.reason
@@ -118,7 +124,10 @@ def test_a_jam_is_what_obstacles_hold_back():
             "joint_7 at its limit of torque gives no more of the 35.0 N desired",
         ),
         ({"weight_n": 40.0}, ""),
-        ({"swung_out_joint": "joint_5"}, "joint_5 has swung out and leaves no more of the 35.0 N desired"),
+        (
+            {"swung_out_joint": "joint_5"},
+            "joint_5 has swung out and leaves no more of the 35.0 N desired",
+        ),
     ],
 )
 def test_stall_straining_body_that_stands_is_released_without_jam(given, words):
@@ -132,7 +141,11 @@ def test_stall_straining_body_that_stands_is_released_without_jam(given, words):
 def test_forces_are_judged_as_means_over_50_ms():
     felt = MeasuredContacts()
     for turn in range(9):
-        felt.add_world(world_with(("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), timestamp_ns=turn * 10_000_000))
+        felt.add_world(
+            world_with(
+                ("peg_0", 50.0 if turn % 5 == 0 else 0.0, 0.0), timestamp_ns=turn * 10_000_000
+            )
+        )
     net_force = require_value(felt.resolve_along((1.0, 0.0)))
     assert net_force.max_contact_n == pytest.approx(10.0)
     assert net_force.forward_n == pytest.approx(10.0)
@@ -141,6 +154,8 @@ def test_forces_are_judged_as_means_over_50_ms():
 def test_estimated_contacts_are_no_measured_forces():
     felt, world = MeasuredContacts(), world_with(*PUSHED)
     felt.add_world(world)
-    felt.add_world(msgspec.structs.replace(world, contacts_timestamp_ns=2, contacts_from="joint_torques"))
+    felt.add_world(
+        msgspec.structs.replace(world, contacts_timestamp_ns=2, contacts_from="joint_torques")
+    )
     assert felt.resolve_along((1.0, 0.0)) is None
     assert felt.compute_mean_magnitudes_n(["peg_1"]) == []

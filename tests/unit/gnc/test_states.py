@@ -17,16 +17,40 @@ READY = {"usable_push_points": 3, "recent_displacement_m": 0.1}
         ({"usable_push_points": 2}, "NotLocomoting", "2 usable push-points, 3 are needed"),
         ({"usable_push_points": 0, "obstruction_reason": "lost"}, "NotLocomoting", "lost"),
         ({"obstruction_reason": "jammed: x"}, "NotLocomoting", "jammed: x"),
-        ({"recent_displacement_m": 0.004}, "NotLocomoting", "standing still: less than 20 mm in 1 s"),
-        ({"recent_displacement_m": 0.004, "usable_push_points": None}, "NotLocomoting", "standing still"),
-        ({"recent_displacement_m": 0.004, "standstill_reason": "contacts lost"}, "NotLocomoting", "contacts lost"),
+        (
+            {"recent_displacement_m": 0.004},
+            "NotLocomoting",
+            "standing still: less than 20 mm in 1 s",
+        ),
+        (
+            {"recent_displacement_m": 0.004, "usable_push_points": None},
+            "NotLocomoting",
+            "standing still",
+        ),
+        (
+            {"recent_displacement_m": 0.004, "standstill_reason": "contacts lost"},
+            "NotLocomoting",
+            "contacts lost",
+        ),
         ({"standstill_reason": "contacts lost"}, "Locomoting", "pushing"),
-        ({"recent_displacement_m": None}, "NotLocomoting", "the motion of the body is not measured"),
+        (
+            {"recent_displacement_m": None},
+            "NotLocomoting",
+            "the motion of the body is not measured",
+        ),
         ({"missing_inputs": "sensor/pose is 1 s old"}, "NotLocomoting", "sensor/pose is 1 s old"),
         ({"rest_reason": "speed zero"}, "Idle", "no motion intended: speed zero"),
         ({"is_armed": False}, "Idle", "the robot is not armed"),
-        ({"is_armed": False, "missing_inputs": "sensor/joints is old"}, "Idle", "not armed; sensor/joints is old"),
-        ({"silence_reason": "no clock from the HAL for 1 s"}, "PowerOff", "no clock from the HAL for 1 s"),
+        (
+            {"is_armed": False, "missing_inputs": "sensor/joints is old"},
+            "Idle",
+            "not armed; sensor/joints is old",
+        ),
+        (
+            {"silence_reason": "no clock from the HAL for 1 s"},
+            "PowerOff",
+            "no clock from the HAL for 1 s",
+        ),
     ],
 )
 def test_states_have_a_reason(change, state, word):
@@ -48,7 +72,8 @@ def test_the_advance_is_that_of_the_last_second():
     far = advanced(0.1, 5.0)
     assert far[0] == 0.0
     assert far[-1] == pytest.approx(0.1, rel=0.03)
-    assert next(i for i, metres in enumerate(far) if metres >= 0.005) * 0.02 < 0.3  # soon after the start
+    # Soon after the start.
+    assert next(i for i, metres in enumerate(far) if metres >= 0.005) * 0.02 < 0.3
 
 
 def test_noise_is_no_advance():

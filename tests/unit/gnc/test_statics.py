@@ -30,7 +30,9 @@ class Case:
     joint: np.ndarray
 
     def solve(self, propulsion_n=PROPULSION_N, **more):
-        return solve_triplet(self.points, self.normals, self.tangent, propulsion_n, self.joint, **more)
+        return solve_triplet(
+            self.points, self.normals, self.tangent, propulsion_n, self.joint, **more
+        )
 
 
 def at_inflections(slope_rad: float) -> Case:
@@ -49,7 +51,11 @@ def cases(draw) -> Case:
     headings = [draw(st.floats(-0.5, 0.5)) for _ in range(3)]
     first = draw(st.sampled_from([-1, 1]))
     normals = np.array([unit(h + first * (-1) ** i * np.pi / 2) for i, h in enumerate(headings)])
-    joint = points[1] + draw(st.floats(0.1, 0.8)) * (points[2] - points[1]) + np.array([0.0, draw(jitter)])
+    joint = (
+        points[1]
+        + draw(st.floats(0.1, 0.8)) * (points[2] - points[1])
+        + np.array([0.0, draw(jitter)])
+    )
     case = Case(points, normals, unit(headings[0]), joint)
     assume(case.solve().condition < 50)
     return case
@@ -63,7 +69,9 @@ def test_contacts_at_inflections_have_a_closed_form(slope_deg):
     assert solved.forces_n == pytest.approx([third - np.tan(a), 2 * third, third], rel=1e-9)
 
 
-@pytest.mark.parametrize(("slope_deg", "feasible"), [(29.9, True), (30.1, False), (40.0, False), (1.0, True)])
+@pytest.mark.parametrize(
+    ("slope_deg", "feasible"), [(29.9, True), (30.1, False), (40.0, False), (1.0, True)]
+)
 def test_beyond_30_degrees_the_tail_contact_would_have_to_pull(slope_deg, feasible):
     solved = at_inflections(np.radians(slope_deg)).solve()
     assert solved.is_feasible is feasible
@@ -100,7 +108,9 @@ def test_nothing_depends_on_where_the_world_is(case, turn, x, y):
 @given(cases())
 def test_statics_of_mirror_image_has_equal_forces_opposite_torque(case):
     mirror = np.array([1.0, -1.0])
-    mirrored = Case(case.points * mirror, case.normals * mirror, case.tangent * mirror, case.joint * mirror).solve()
+    mirrored = Case(
+        case.points * mirror, case.normals * mirror, case.tangent * mirror, case.joint * mirror
+    ).solve()
     solved = case.solve()
     assert mirrored.forces_n == pytest.approx(solved.forces_n, rel=1e-9, abs=1e-9)
     assert mirrored.torque_nm == pytest.approx(-solved.torque_nm, rel=1e-9, abs=1e-9)
@@ -109,7 +119,9 @@ def test_statics_of_mirror_image_has_equal_forces_opposite_torque(case):
 @given(cases(), st.floats(0.1, 10), st.floats(0.1, 10))
 def test_forces_scale_with_propulsion_and_torque_also_with_size(case, force, size):
     solved = case.solve()
-    scaled = Case(case.points * size, case.normals, case.tangent, case.joint * size).solve(PROPULSION_N * force)
+    scaled = Case(case.points * size, case.normals, case.tangent, case.joint * size).solve(
+        PROPULSION_N * force
+    )
     assert scaled.forces_n == pytest.approx(force * solved.forces_n, rel=1e-7, abs=1e-9)
     assert scaled.torque_nm == pytest.approx(force * size * solved.torque_nm, rel=1e-7, abs=1e-9)
     assert scaled.condition == pytest.approx(solved.condition, rel=1e-7)
@@ -144,7 +156,9 @@ def test_statics_agrees_with_corrected_paper_equations(case):
     assert tau == pytest.approx(solved.torque_nm, rel=1e-6, abs=1e-6)
 
 
-@given(cases(), st.lists(st.tuples(st.floats(-0.2, 0.9), st.floats(-0.3, 0.3)), min_size=1, max_size=8))
+@given(
+    cases(), st.lists(st.tuples(st.floats(-0.2, 0.9), st.floats(-0.3, 0.3)), min_size=1, max_size=8)
+)
 def test_statics_bending_torque_from_head_and_tail_agrees(case, joints):
     places = np.array([0.0, 0.3, 0.6])
     solved = case.solve()

@@ -18,7 +18,10 @@ PERIOD_S, LEASE_S = ROBOT.period_ns * 1e-9, ROBOT.lease_ns * 1e-9
         ([0.1 * PERIOD_S] * 45 + [1.5 * PERIOD_S] * 5, ""),
         ([10 * PERIOD_S], "update() took 100 ms of 10 ms"),
         ([0.1 * PERIOD_S] * 999 + [1.1 * LEASE_S], "1 of 1000 updates took longer than a period"),
-        ([0.1 * PERIOD_S] * 30 + [1.5 * PERIOD_S] * 5, "update() took 15 ms of 10 ms; 5 of 35 updates"),
+        (
+            [0.1 * PERIOD_S] * 30 + [1.5 * PERIOD_S] * 5,
+            "update() took 15 ms of 10 ms; 5 of 35 updates",
+        ),
     ],
     ids=["none", "quick", "few", "a busy computer", "one", "a stop", "often"],
 )

@@ -58,7 +58,9 @@ def test_a_subclass_with_update_alone_has_all_defaults() -> None:
 
 def test_controller_parameters_are_checked_by_struct_naming_file_or_flag() -> None:
     assert decode_parameters(Gained, {"gain": 2.0}, "a.toml", "controllers.p").gain == 2.0
-    with pytest.raises(ConfigError, match=r"^a\.toml: unknown field `controllers\.p\.gian`; did you mean `gain`\?"):
+    with pytest.raises(
+        ConfigError, match=r"^a\.toml: unknown field `controllers\.p\.gian`; did you mean `gain`\?"
+    ):
         decode_parameters(Gained, {"gian": 1}, "a.toml", "controllers.p")
     origin = {"controllers.p.gain": "--set control.gain=x"}
     with pytest.raises(ConfigError, match=r"^--set control\.gain=x: `controllers\.p\.gain` = 'x'"):
@@ -69,7 +71,10 @@ def test_parameters_that_are_no_struct_are_refused() -> None:
     class Odd(Plain):
         Parameters: Any = dict
 
-    with pytest.raises(ConfigError, match=r"class Odd in .*test_controller\.py: `Parameters` is .*dict.*, must be a"):
+    with pytest.raises(
+        ConfigError,
+        match=r"class Odd in .*test_controller\.py: `Parameters` is .*dict.*, must be a",
+    ):
         decode_parameters(Odd, {}, "a.toml", "controllers.odd")
 
 
@@ -89,7 +94,9 @@ def test_controller_shipped_declarations_have_types_of_base_class(name: str) -> 
     controller = load_controller(name)
     assert issubclass(controller.Parameters, msgspec.Struct)
     for declaration in DECLARATIONS - {"Parameters"}:
-        assert type(vars(Controller)[declaration]) is type(inspect.getattr_static(controller, declaration)), declaration
+        assert type(vars(Controller)[declaration]) is type(
+            inspect.getattr_static(controller, declaration)
+        ), declaration
 
 
 def test_every_declaration_of_the_base_class_is_documented() -> None:
@@ -127,7 +134,9 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_controller_preflight_refuses_other_classes_with_instructions(wrong: str, tmp_path: Path) -> None:
+def test_controller_preflight_refuses_other_classes_with_instructions(
+    wrong: str, tmp_path: Path
+) -> None:
     text, words = WRONG[wrong]
     file = tmp_path / "wave.py"
     file.write_text(text)
@@ -147,11 +156,15 @@ def test_preflight_calls_the_check_of_a_controller(tmp_path: Path) -> None:
         "    def check(cls, robot, parameters):\n"
         "        raise ConfigError(f'{cls.__name__} does not move {robot.robot}')\n"
     )
-    config = load_scenario("triplet", [parse_set_option(f"controller={tmp_path}/picky.py:Picky")]).config
+    config = load_scenario(
+        "triplet", [parse_set_option(f"controller={tmp_path}/picky.py:Picky")]
+    ).config
     with pytest.raises(ConfigError, match=r"^Picky does not move planar13$"):
         validate_and_complete_config(config)
 
 
 def test_a_class_without_a_file_is_named_by_its_module() -> None:
-    with pytest.raises(ConfigError, match="class int in module builtins does not derive from Controller"):
+    with pytest.raises(
+        ConfigError, match="class int in module builtins does not derive from Controller"
+    ):
         require_base_class(int, Controller, "controller 'program:int'")

@@ -35,14 +35,21 @@ def iterate_nodes() -> Iterator[ast.AST]:
 
 
 def find_texts(node: ast.AST) -> set[str]:
-    return {part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)}
+    return {
+        part.value
+        for part in ast.walk(node)
+        if isinstance(part, ast.Constant) and isinstance(part.value, str)
+    }
 
 
 def find_codes(nodes: list[ast.AST]) -> Iterator[str]:
     """The texts that `code` is set to: as an argument, as a default of a class, as a constant, or returned."""
     for node in nodes:
         match node:
-            case ast.keyword(arg="code", value=value) | ast.Assign(targets=[ast.Name(id="code")], value=value):
+            case (
+                ast.keyword(arg="code", value=value)
+                | ast.Assign(targets=[ast.Name(id="code")], value=value)
+            ):
                 yield from find_texts(value)
             case ast.Assign(targets=[ast.Name(id="INCOMPLETE_ERROR_CODE")], value=value):
                 yield from find_texts(value)
@@ -70,8 +77,16 @@ def test_faults_are_those_of_the_registry(nodes: list[ast.AST]) -> None:
     for node in nodes:
         match node:
             case ast.Call(func=ast.Name(id="Fault"), keywords=keywords):
-                used |= {text for word in keywords if word.arg == "what" for text in find_texts(word.value)}
-            case ast.Call(func=ast.Name(id="FaultFinding" | "report"), args=[ast.Constant(value=str(word)), *_]):
+                used |= {
+                    text
+                    for word in keywords
+                    if word.arg == "what"
+                    for text in find_texts(word.value)
+                }
+            case ast.Call(
+                func=ast.Name(id="FaultFinding" | "report"),
+                args=[ast.Constant(value=str(word)), *_],
+            ):
                 used.add(word)
             case _:
                 pass
@@ -79,7 +94,11 @@ def test_faults_are_those_of_the_registry(nodes: list[ast.AST]) -> None:
 
 
 def test_every_class_has_a_default_that_is_explained() -> None:
-    classes = [value for value in vars(errors).values() if isinstance(value, type) and hasattr(value, "code")]
+    classes = [
+        value
+        for value in vars(errors).values()
+        if isinstance(value, type) and hasattr(value, "code")
+    ]
     assert len(classes) > 8
     assert all(error_type.code in ERROR_CODES for error_type in classes)
 
@@ -92,13 +111,20 @@ def test_entries_are_sentences() -> None:
 
 def test_linked_pages_exist_and_name_the_code() -> None:
     docs = PAGE.parents[1]
-    linked = {code: entry.page for code, entry in [*ERROR_CODES.items(), *FAULT_CODES.items(), *REFUSAL_CODES.items()]}
+    linked = {
+        code: entry.page
+        for code, entry in [*ERROR_CODES.items(), *FAULT_CODES.items(), *REFUSAL_CODES.items()]
+    }
     for code, page in linked.items():
         assert not page or code in (docs / page).read_text(encoding="utf-8"), f"{code}: docs/{page}"
-    troubleshooting = {f"troubleshooting/{path.name}" for path in (docs / "troubleshooting").glob("*.md")}
+    troubleshooting = {
+        f"troubleshooting/{path.name}" for path in (docs / "troubleshooting").glob("*.md")
+    }
     assert troubleshooting - {"troubleshooting/README.md"} <= set(linked.values())
     table = (docs / "troubleshooting" / "README.md").read_text(encoding="utf-8")
-    assert all(f"]({page.removeprefix('troubleshooting/')})" in table for page in linked.values() if page)
+    assert all(
+        f"]({page.removeprefix('troubleshooting/')})" in table for page in linked.values() if page
+    )
 
 
 def test_the_page_is_current() -> None:

@@ -19,7 +19,8 @@ def described(folder: Path, package: str) -> str:
     exec(compile(PLUGIN, str(folder / "plugin.py"), "exec"), names)
     with pytest.raises(np.linalg.LinAlgError) as caught:
         names["solve"]()
-    return describe_exception(caught.value.with_traceback(caught.tb.tb_next), package)  # without this test's own line
+    # Without this test's own line.
+    return describe_exception(caught.value.with_traceback(caught.tb.tb_next), package)
 
 
 @pytest.mark.parametrize(
@@ -31,6 +32,8 @@ def described(folder: Path, package: str) -> str:
         ("site-packages", "another", r"_linalg.py line \d+"),
     ],
 )
-def test_error_location_is_plugin_line_and_not_of_numpy(tmp_path: Path, folder: str, package: str, place: str) -> None:
+def test_error_location_is_plugin_line_and_not_of_numpy(
+    tmp_path: Path, folder: str, package: str, place: str
+) -> None:
     said = described(tmp_path / folder, package)
     assert re.fullmatch(rf"raised LinAlgError: Singular matrix \({place}\)", said)

@@ -46,7 +46,11 @@ def injections(draw: st.DrawFn) -> FaultInjection:
     start_s = draw(seconds)
     end_s = draw(st.one_of(st.just(inf), seconds.map(lambda s: round(start_s + s + 0.01, 2))))
     amount = FAULT_KINDS[sort][name].amount
-    drawn = None if amount is None else draw(st.sampled_from([amount.min_value, amount.default, amount.max_value]))
+    drawn = (
+        None
+        if amount is None
+        else draw(st.sampled_from([amount.min_value, amount.default, amount.max_value]))
+    )
     return FaultInjection(name, draw(st.sampled_from(TARGETS[sort])), start_s, end_s, drawn)
 
 
@@ -97,7 +101,10 @@ def test_what_is_not_there_cannot_go_wrong() -> None:
     )
     with raises_error(ConfigError, code="injection/unknown-target"):
         validate_injection_targets(
-            [parse_injection("drop:guidance/world@1")], services=["control"], joint_count=13, bus_count=0
+            [parse_injection("drop:guidance/world@1")],
+            services=["control"],
+            joint_count=13,
+            bus_count=0,
         )
 
 
@@ -108,11 +115,15 @@ def test_a_request_is_checked_like_a_text() -> None:
 
 
 @given(st.lists(injections(), max_size=8), st.lists(seconds, max_size=8))
-def test_injection_plan_yields_each_change_once_in_time_order(given_: list[FaultInjection], looks: list[float]) -> None:
+def test_injection_plan_yields_each_change_once_in_time_order(
+    given_: list[FaultInjection], looks: list[float]
+) -> None:
     plan, seen = InjectionPlan(given_), []
     for now_s in [*sorted(looks), inf]:
         due = plan.pop_due_transitions(now_s)
-        assert (all(change.time_s <= now_s for change in due) and plan.next_transition_s() > now_s) or now_s == inf
+        assert (
+            all(change.time_s <= now_s for change in due) and plan.next_transition_s() > now_s
+        ) or now_s == inf
         seen += due
     assert [change.time_s for change in seen] == sorted(change.time_s for change in seen)
     ends = [i for i in given_ if i.end_s != inf and not i.kind_info.is_instantaneous]
@@ -130,19 +141,25 @@ def test_help_explains_every_kind() -> None:
 
 
 def test_the_page_has_every_kind() -> None:
-    assert PAGE.read_text(encoding="utf-8") == with_table(), "run `make schemas` and commit what it changes"
+    assert PAGE.read_text(encoding="utf-8") == with_table(), (
+        "run `make schemas` and commit what it changes"
+    )
 
 
 # --- of a run ------------------------------------------------------------------------------------------------
 
 
 def test_a_runs_plan_names_the_entry_that_is_wrong() -> None:
-    assert [str(i) for i in parse_planned_faults(make_run_config(faults=["mute:joint_1@1"]))] == ["mute:joint_1@1"]
+    assert [str(i) for i in parse_planned_faults(make_run_config(faults=["mute:joint_1@1"]))] == [
+        "mute:joint_1@1"
+    ]
     with raises_error(ConfigError, code="injection/unknown-fault", field="crawl"):
         parse_planned_faults(make_run_config(faults=["mute:joint_1@1", "mute"]))
     with raises_error(ConfigError, code="injection/unknown-target", field="faults[0]"):
         parse_and_validate_planned_faults(make_run_config(faults=["mute:joint_4@1"]))
-    parse_and_validate_planned_faults(make_run_config(faults=["cut:bus_8@1", "hang:control@1", "leak:joint_3@1"]))
+    parse_and_validate_planned_faults(
+        make_run_config(faults=["cut:bus_8@1", "hang:control@1", "leak:joint_3@1"])
+    )
 
 
 def test_a_backend_is_not_asked_for_what_it_cannot_do() -> None:
@@ -151,7 +168,9 @@ def test_a_backend_is_not_asked_for_what_it_cannot_do() -> None:
         make_run_config(faults=["leak:joint_1@1", "mute:joint_1@1", "slow:simulator@1"]), **backend
     )
     with raises_error(ConfigError, code="injection/not-supported", field="faults[1]"):
-        validate_faults_for_backend(make_run_config(faults=["leak:joint_1@1", "reboot:joint_1@1"]), **backend)
+        validate_faults_for_backend(
+            make_run_config(faults=["leak:joint_1@1", "reboot:joint_1@1"]), **backend
+        )
     with raises_error(ConfigError, code="injection/unknown-target", field="bus_2"):
         validate_faults_for_backend(make_run_config(faults=["cut:bus_2@1"]), **backend)
 
@@ -159,4 +178,6 @@ def test_a_backend_is_not_asked_for_what_it_cannot_do() -> None:
 def test_injection_by_host_alone_refuses_killing_processes() -> None:
     validate_faults_without_supervisor(make_run_config(faults=["hang:control@1", "mute:joint_2@1"]))
     with raises_error(ConfigError, code="injection/not-supported"):
-        validate_faults_without_supervisor(make_run_config(faults=["mute:joint_2@1", "kill:control@1"]))
+        validate_faults_without_supervisor(
+            make_run_config(faults=["mute:joint_2@1", "kill:control@1"])
+        )

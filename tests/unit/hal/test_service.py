@@ -5,7 +5,14 @@ from typing import Any
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.service import Service, ServiceLoop
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Clock, JointState, Message, ProcessInfo, RobotDescription, TickDone
+from snakesim_hal.wire.messages import (
+    Clock,
+    JointState,
+    Message,
+    ProcessInfo,
+    RobotDescription,
+    TickDone,
+)
 from snakesim_testing.hal.foreign_samples import CLOCK, ROBOT
 from snakesim_testing.hal.small_robots import make_joint_state, make_run_config
 
@@ -29,9 +36,14 @@ def test_service_waits_for_the_joints_before_it_answers_ticks() -> None:
     network = LocalNetwork()
     hal = network.create_session()
     hal.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(ROBOT)
-    clocks, felt = hal.declare_publisher(keys.CLOCK, Clock), hal.declare_publisher(keys.JOINTS, JointState)
+    clocks, felt = (
+        hal.declare_publisher(keys.CLOCK, Clock),
+        hal.declare_publisher(keys.JOINTS, JointState),
+    )
     done = hal.declare_reader(keys.done_key("navigation"), TickDone)
-    loop = ServiceLoop(Undemanding, make_run_config(clock_mode=CLOCK.clock_mode), network.create_session())
+    loop = ServiceLoop(
+        Undemanding, make_run_config(clock_mode=CLOCK.clock_mode), network.create_session()
+    )
     clocks.put(CLOCK)
     loop.connect()
     entries = hal.declare_latched_reader(keys.PROCESS_ALL, ProcessInfo)

@@ -14,14 +14,18 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import escape_invisible, overwrite_line, print_line, report_error
 
 REPOSITORY = Path(__file__).parents[3]
-STEERING = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidirectional overrides too), surrogates, separators
+# Control, format (bidirectional overrides too), surrogates, separators.
+STEERING = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
 def test_every_character_that_could_steer_is_shown_as_an_escape() -> None:
     for code in range(sys.maxunicode + 1):
         if unicodedata.category(chr(code)) in STEERING:
             assert escape_invisible(f"a{chr(code)}b").isascii(), hex(code)
-    assert escape_invisible("\x1b[2J\x9b31m\r\n\u202eoff") == "\\u001b[2J\\u009b31m\\u000d\\u000a\\u202eoff"
+    assert (
+        escape_invisible("\x1b[2J\x9b31m\r\n\u202eoff")
+        == "\\u001b[2J\\u009b31m\\u000d\\u000a\\u202eoff"
+    )
     assert escape_invisible("\U000e0041") == "\\udb40\\udc41"
     assert escape_invisible("3 N·m, ü, 関節, ⟂") == "3 N·m, ü, 関節, ⟂"
     assert escape_invisible("a\nb\tc", keep="\n") == "a\nb\\u0009c"
@@ -41,7 +45,10 @@ def test_terminal_output_has_no_control_characters(capsys: pytest.CaptureFixture
     assert overwrite_line("tick 10 \x1b[1A and much more", 24, 3) == 24
     out, err = capsys.readouterr()
     assert out == "\\u001b]0;title\\u0007\n\rtick 10 \\u001b[1A and mu"
-    assert err == "snakesim: a.toml: \\u009b2J\\u000a  next: trust me [config/invalid-value]\nsecond line\n"
+    assert (
+        err
+        == "snakesim: a.toml: \\u009b2J\\u000a  next: trust me [config/invalid-value]\nsecond line\n"
+    )
 
 
 def test_terminal_streams_are_never_written_directly() -> None:
@@ -49,7 +56,9 @@ def test_terminal_streams_are_never_written_directly() -> None:
     for package in REPOSITORY.glob("snakesim*"):
         for path in package.rglob("*.py"):
             text = path.read_text(encoding="utf-8")
-            if ".stdout.write" not in text and ".stderr.write" not in text:  # parsing all files takes seconds
+            if (
+                ".stdout.write" not in text and ".stderr.write" not in text
+            ):  # parsing all files takes seconds
                 continue
             for node in ast.walk(ast.parse(text)):
                 if isinstance(node, ast.Attribute) and node.attr in ("write", "writelines"):

@@ -31,7 +31,9 @@ def test_arming_is_tried_again_until_the_robot_is_ready(monkeypatch: pytest.Monk
     assert printed == ["waiting: no robot", "waiting: waiting for control"], "each reason once"
 
 
-def test_a_refusal_that_does_not_pass_by_itself_ends_the_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_that_does_not_pass_by_itself_ends_the_wait(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def refuse(*_: Any, **__: Any) -> int:
         raise RefusedError("state is fault")
 

@@ -17,7 +17,12 @@ WITHOUT_REPORT = {  # they move, start or write something; what they print says 
     *("run", "replay", "console", "teleop", "record", "estop", "completion"),
     *("start host", "start service", "start preview", "start ros2", "start router"),
     *("robot arm", "robot disarm", "robot reset", "robot export", "robot jog"),
-    *("robot calibrate zero", "robot calibrate direction", "robot calibrate limits", "robot calibrate gear"),
+    *(
+        "robot calibrate zero",
+        "robot calibrate direction",
+        "robot calibrate limits",
+        "robot calibrate gear",
+    ),
     *("robot shape draw", "robot shape check"),
     *("param set", "fault inject", "sim pause", "sim resume", "sim step", "sim speed", "sim reset"),
     *(
@@ -29,7 +34,13 @@ WITHOUT_REPORT = {  # they move, start or write something; what they print says 
         "drive emulate feetech",
     ),
     *("drive replay can", "drive dbc", "drive new"),
-    *("recording report", "recording export", "recording video", "recording plot", "recording rosbag"),
+    *(
+        "recording report",
+        "recording export",
+        "recording video",
+        "recording plot",
+        "recording rosbag",
+    ),
     *("study evaluate", "study sweep", "study optimize", "policy train"),
     *("lab example", "lab render", "lab certs"),
     "topic echo",  # always JSON
@@ -81,7 +92,10 @@ def test_each_option_means_the_same_everywhere() -> None:
     for name, leaf in LEAVES.items():
         for action in leaf._actions:
             for option in action.option_strings:
-                meaning = (action.dest, action.metavar if action.choices is None else tuple(action.choices))
+                meaning = (
+                    action.dest,
+                    action.metavar if action.choices is None else tuple(action.choices),
+                )
                 meanings.setdefault(option, {}).setdefault(meaning, []).append(name)
     assert not {option: found for option, found in meanings.items() if len(found) > 1}
 
@@ -101,7 +115,10 @@ def test_each_robot_is_addressed_in_the_same_way() -> None:
 def test_messages_and_pages_name_commands_that_exist() -> None:
     page = make_page()
     for words in re.findall(r"`snakesim ([a-z0-9 ]+)`", page):
-        assert TREE.has_command(words.split()) or words in {*TREE.subparsers.choices, "robot calibrate"}, words
+        assert TREE.has_command(words.split()) or words in {
+            *TREE.subparsers.choices,
+            "robot calibrate",
+        }, words
 
 
 def test_command_reference_page_is_current() -> None:

@@ -12,8 +12,12 @@ parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report
 
 
 def test_every_column_of_an_export_has_its_unit(tmp_path: Path) -> None:
-    simulate(load_scenario("triplet", [parse_set_option("duration_s=0.3")]).config, tmp_path / "run")
-    assert export_run([tmp_path / "run"], "parquet", tmp_path / "a.parquet", lambda _line: None) == 0
+    simulate(
+        load_scenario("triplet", [parse_set_option("duration_s=0.3")]).config, tmp_path / "run"
+    )
+    assert (
+        export_run([tmp_path / "run"], "parquet", tmp_path / "a.parquet", lambda _line: None) == 0
+    )
     schema = parquet.read_schema(tmp_path / "a.parquet")
     units = {column.name: column.metadata[b"unit"].decode() for column in schema}
     assert units["time_s"] == "s"

@@ -41,7 +41,11 @@ def test_serial_port_is_exclusive_and_late_bytes_are_discarded(tmp_path: Path) -
         assert pty.receive() == b"first?"
         wire.close()
     lines = [line.split(maxsplit=3)[2:] for line in log.read_text().splitlines()]
-    assert lines == [["out", b"first?".hex(" ")], ["in", b"late".hex(" ")], ["in", b"later".hex(" ")]]
+    assert lines == [
+        ["out", b"first?".hex(" ")],
+        ["in", b"late".hex(" ")],
+        ["in", b"later".hex(" ")],
+    ]
     pty.close()
 
 

@@ -12,8 +12,13 @@ from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 RESPONSE_S = 0.01
 NOTHING = 1e-12  # N·m
-TWO_LINKS = {"chain": {"modules": 1}, "limits": {"angle_rad": 3.0}, "motor": {"response_time_s": RESPONSE_S}}
-HEAVY_ROTOR = {**TWO_LINKS, "motor": {"response_time_s": RESPONSE_S, "armature_kg_m2": 10.0}}  # hardly moves
+TWO_LINKS = {
+    "chain": {"modules": 1},
+    "limits": {"angle_rad": 3.0},
+    "motor": {"response_time_s": RESPONSE_S},
+}
+# Hardly moves.
+HEAVY_ROTOR = {**TWO_LINKS, "motor": {"response_time_s": RESPONSE_S, "armature_kg_m2": 10.0}}
 ICE = {"ground": {"friction": 0.0}}
 
 
@@ -79,7 +84,8 @@ def test_the_motor_does_not_drive_a_joint_beyond_its_speed():
         torques.append(torque(run))
         if abs(run.sim.true_state().angles_rad[0]) > 2.5:
             break
-    assert 0.9 * limit < max(speeds) < 1.15 * limit  # beyond it by what the motor's response lets through
+    # Beyond it by what the motor's response lets through.
+    assert 0.9 * limit < max(speeds) < 1.15 * limit
     assert speeds[-1] == pytest.approx(limit, rel=0.02)
     assert torques[-1] < 0.1
 
@@ -97,7 +103,12 @@ def test_actuator_below_nine_tenths_speed_has_full_torque():
 @pytest.mark.parametrize("before", list(JointMode))
 @pytest.mark.parametrize("after", list(JointMode))
 def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
-    targets = {JointMode.PASSIVE: 0.0, JointMode.POSITION: 0.1, JointMode.VELOCITY: 1.5, JointMode.TORQUE: -2.0}
+    targets = {
+        JointMode.PASSIVE: 0.0,
+        JointMode.POSITION: 0.1,
+        JointMode.VELOCITY: 1.5,
+        JointMode.TORQUE: -2.0,
+    }
     run = fast_run(HEAVY_ROTOR)
     robot = run.config.robot
     run.command(before, targets[before])
@@ -121,8 +132,14 @@ def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
 @pytest.mark.parametrize("response_s", [0.0, 0.005])
 @pytest.mark.parametrize(("torque_nm", "speed"), [(7.0, 7.5), (1000.0, 100.0)])
 def test_very_stiff_joints_are_stable(response_s, torque_nm, speed):
-    stiff = {"stiffness_nm_per_rad": 1000.0, "damping_nm_s_per_rad": 20.0, "response_time_s": response_s}
-    run = SimulatorRig(make_config({"motor": stiff, "limits": {"torque_nm": torque_nm, "speed_rad_s": speed}}))
+    stiff = {
+        "stiffness_nm_per_rad": 1000.0,
+        "damping_nm_s_per_rad": 20.0,
+        "response_time_s": response_s,
+    }
+    run = SimulatorRig(
+        make_config({"motor": stiff, "limits": {"torque_nm": torque_nm, "speed_rad_s": speed}})
+    )
     zigzag = [0.3 * (-1) ** i for i in range(13)]
     run.command([JointMode.POSITION] * 13, zigzag)
     run.advance(1.0)
@@ -131,12 +148,16 @@ def test_very_stiff_joints_are_stable(response_s, torque_nm, speed):
 
 def test_gains_that_swing_up_are_refused():
     with raises_error(ConfigError, code="drive/unsupported-setting"):
-        SimulatorRig(make_config({"motor": {"response_time_s": 0.015, "damping_nm_s_per_rad": 0.5}}))
+        SimulatorRig(
+            make_config({"motor": {"response_time_s": 0.015, "damping_nm_s_per_rad": 0.5}})
+        )
 
 
 def test_a_body_that_is_not_as_its_file_says():
     """Twice as heavy, motors twice as stiff; and a description that knows nothing of it."""
-    plain, other = (fast_run(HEAVY_ROTOR, mass_scale=scale, motor_gain_scale=scale) for scale in (1.0, 2.0))
+    plain, other = (
+        fast_run(HEAVY_ROTOR, mass_scale=scale, motor_gain_scale=scale) for scale in (1.0, 2.0)
+    )
     for run in (plain, other):
         run.command(JointMode.POSITION, 0.01)
         run.advance()
@@ -144,7 +165,8 @@ def test_a_body_that_is_not_as_its_file_says():
     assert torque(plain) > 0.01
     assert other.sim.describe() == plain.sim.describe()
     light, heavy = (
-        build_sim_model(make_config(), SimSettings(mass_scale=scale)).model.body_mass.sum() for scale in (1.0, 2.0)
+        build_sim_model(make_config(), SimSettings(mass_scale=scale)).model.body_mass.sum()
+        for scale in (1.0, 2.0)
     )
     assert heavy == pytest.approx(2 * light)
 
@@ -188,7 +210,9 @@ def test_a_motor_with_latency_changes_its_mode_at_once_and_never_follows_an_olde
 
 def test_latency_of_single_joints_may_differ():
     joints = {"joint_2": {"latency_s": 0.003}}
-    run = fast_run({"chain": {"modules": 2}, "motor": {"response_time_s": RESPONSE_S}, "joints": joints})
+    run = fast_run(
+        {"chain": {"modules": 2}, "motor": {"response_time_s": RESPONSE_S}, "joints": joints}
+    )
     run.command(JointMode.TORQUE, 0.0)
     run.advance(0.01)
     run.command(JointMode.TORQUE, 0.5)

@@ -32,7 +32,9 @@ def test_sliding_force_is_that_of_hu_in_every_direction(angle_rad: float) -> Non
     x, y, z = isotropic.tolist()
     force = apply_directional_friction((x, y, z), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), hu(), 0.0)
     along = HU[0] if velocity[0] > 0 else HU[1]
-    assert force == pytest.approx((-NORMAL_N * along * velocity[0], -NORMAL_N * HU[2] * velocity[1], 0.0))
+    assert force == pytest.approx(
+        (-NORMAL_N * along * velocity[0], -NORMAL_N * HU[2] * velocity[1], 0.0)
+    )
     assert np.dot(force, velocity) < 0.0
 
 
@@ -46,7 +48,11 @@ def test_equal_coefficients_are_not_directional() -> None:
 
 def test_without_an_axis_all_directions_are_sideways() -> None:
     force = apply_directional_friction(
-        (-1.0, 2.0, 0.0), (0.0, 0.0, 0.0), NO_AXIS, DirectionalCoefficients(1.0, 0.2, 0.3, 0.5, 0, 0), 0.0
+        (-1.0, 2.0, 0.0),
+        (0.0, 0.0, 0.0),
+        NO_AXIS,
+        DirectionalCoefficients(1.0, 0.2, 0.3, 0.5, 0, 0),
+        0.0,
     )
     assert force == (-0.5, 1.0, 0.0)
 
@@ -55,12 +61,16 @@ def test_viscous_force_is_normal_force_times_coefficient_times_speed() -> None:
     step_s, speed = 0.002, np.array([0.3, -0.2, 0.0])
     x, y, z = (speed * step_s).tolist()
     coefficients = combine_coefficients(0.0, 0.0, 0.0, 0.5, 3.0, 0.0)
-    force = apply_directional_friction((0.0, 0.0, 0.0), (x, y, z), (0.0, 1.0, 0.0), coefficients, NORMAL_N / step_s)
+    force = apply_directional_friction(
+        (0.0, 0.0, 0.0), (x, y, z), (0.0, 1.0, 0.0), coefficients, NORMAL_N / step_s
+    )
     assert force == pytest.approx((-NORMAL_N * 3.0 * 0.3, NORMAL_N * 0.5 * 0.2, 0.0))
 
 
 @pytest.mark.parametrize("coefficients", [HU, (0.01, 0.01, 0.6), (0.5, 0.1, 0.1), (0.1, 0.3, 0.2)])
-def test_friction_never_gives_more_energy_than_its_spring_has(coefficients: tuple[float, float, float]) -> None:
+def test_friction_never_gives_more_energy_than_its_spring_has(
+    coefficients: tuple[float, float, float],
+) -> None:
     """A foot moves at random, jerks and reverses, and its link turns: the work that friction does is bounded."""
     random = np.random.default_rng(5)
     found = combine_coefficients(*coefficients, 0.0, 0.0, 0.0)
@@ -80,7 +90,9 @@ def test_friction_never_gives_more_energy_than_its_spring_has(coefficients: tupl
             pull = -STIFFNESS * stretch - DAMPING * slip
             pull *= min(1.0, limit_n / max(np.hypot(*pull), 1e-12))
             axis = (math.cos(heading), math.sin(heading), 0.0)
-            x, y, _ = apply_directional_friction((pull[0], pull[1], 0.0), (slip[0], slip[1], 0.0), axis, found, 0.0)
+            x, y, _ = apply_directional_friction(
+                (pull[0], pull[1], 0.0), (slip[0], slip[1], 0.0), axis, found, 0.0
+            )
             force = np.array([x, y])
             work_j += 0.5 * float((last_force + force) @ slip)
             last_force = force
@@ -105,7 +117,9 @@ def test_underside_turns_from_link_to_link() -> None:
     assert heading_rad(0, 0.0) == pytest.approx(0.0)
     assert heading_rad(1, lengths_m[1] / 2) == pytest.approx(0.4)
     assert heading_rad(0, lengths_m[0]) == pytest.approx(0.2)
-    assert heading_rad(1, 0.0) == pytest.approx(0.2), "both links of a joint have the same direction there"
+    assert heading_rad(1, 0.0) == pytest.approx(0.2), (
+        "both links of a joint have the same direction there"
+    )
     assert heading_rad(1, lengths_m[1]) == pytest.approx(0.6)
     assert heading_rad(3, lengths_m[3]) == pytest.approx(1.2)
 

@@ -25,7 +25,9 @@ def test_divergence_names_tick_joint_and_value_and_keeps_last_state():
         run.advance()
 
 
-@pytest.mark.parametrize(("where", "value"), [("qpos", np.nan), ("qvel", np.inf), ("xfrc_applied", np.nan)])
+@pytest.mark.parametrize(
+    ("where", "value"), [("qpos", np.nan), ("qvel", np.inf), ("xfrc_applied", np.nan)]
+)
 def test_what_is_no_number_is_found_at_once(where, value):
     run = SimulatorRig(make_config())
     getattr(run.sim.data, where).flat[10] = value
@@ -34,13 +36,16 @@ def test_what_is_no_number_is_found_at_once(where, value):
     samples = run.sample()
     for message in (samples.joints, *samples.by_key.values()):
         assert (
-            MessageDecoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
+            MessageDecoder(type(message)).decode(encode(message), format_encoding(type(message)))
+            == message
         )  # refuses NaN
 
 
 def test_a_robot_too_quick_for_the_step_is_found_out():
     """The motor's lag is far shorter than a step, its rotor weighs nothing, its torque is that of a lorry."""
-    wild = {"motor": {"stiffness_nm_per_rad": 1e5, "damping_nm_s_per_rad": 1e3, "armature_kg_m2": 0.0}}
+    wild = {
+        "motor": {"stiffness_nm_per_rad": 1e5, "damping_nm_s_per_rad": 1e3, "armature_kg_m2": 0.0}
+    }
     wild["motor"] |= {"response_time_s": 0.005}
     wild["limits"] = {"torque_nm": 1000.0, "speed_rad_s": 100.0}
     run = SimulatorRig(make_config(wild), timestep_s=0.01, contact_time_s=0.02)

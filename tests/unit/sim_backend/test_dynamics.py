@@ -34,7 +34,9 @@ def momentum(run):
     mujoco.mj_subtreeVel(model, data)
     snake = model.body("link_0").id
     linear = model.body_subtreemass[snake] * data.subtree_linvel[snake]
-    return np.array([*linear[:2], (data.subtree_angmom[snake] + np.cross(data.subtree_com[snake], linear))[2]])
+    return np.array(
+        [*linear[:2], (data.subtree_angmom[snake] + np.cross(data.subtree_com[snake], linear))[2]]
+    )
 
 
 def mass_kg(config):
@@ -78,10 +80,18 @@ CURLED = [0.5] * 8  # a straight, round body would roll
 @pytest.mark.parametrize("friction", [0.1, 0.5])
 def test_towing_drags_with_friction_times_weight_in_every_direction(yaw, friction):
     config = make_config(
-        {"chain": {"modules": 4}}, {"ground": {"friction": friction}}, start={"yaw_rad": yaw}, rate_hz=500
+        {"chain": {"modules": 4}},
+        {"ground": {"friction": friction}},
+        start={"yaw_rad": yaw},
+        rate_hz=500,
     )
     run = SimulatorRig(
-        config, tether={"link": 4, "direction_w": [float(np.cos(yaw)), float(np.sin(yaw))], "reel_in_m_s": 0.1}
+        config,
+        tether={
+            "link": 4,
+            "direction_w": [float(np.cos(yaw)), float(np.sin(yaw))],
+            "reel_in_m_s": 0.1,
+        },
     )
     run.command(JointMode.POSITION)
     run.advance(1.0)
@@ -94,7 +104,9 @@ def test_towing_drags_with_friction_times_weight_in_every_direction(yaw, frictio
 
 def test_a_snake_that_slides_does_not_hop():
     config = make_config(scene={"ground": {"friction": 0.1}})
-    run = SimulatorRig(config, tether={"link": 13, "point_m": 0.055, "direction_w": [1.0, 0.0], "reel_in_m_s": 0.2})
+    run = SimulatorRig(
+        config, tether={"link": 13, "point_m": 0.055, "direction_w": [1.0, 0.0], "reel_in_m_s": 0.2}
+    )
     run.command(JointMode.POSITION)
     run.advance(1.0)
     heights, tensions = [], []
@@ -133,7 +145,11 @@ def test_snake_on_slope_slides_only_beyond_friction_angle(along, tilt, slides):
         {"wall": [{"from_m": [-1, 0.07], "to_m": [2, 0.07], "friction": 0.4}]},
         {"wall": [{"from_m": [-1, 0.07], "to_m": [2, 0.07], "friction": 0.0}]},
         {"cylinder": [{"position_m": [0.22, 0.0905], "radius_m": 0.05, "friction": 0.25}]},
-        {"cylinder": [{"position_m": [0.22, 0.0905], "radius_m": 0.05, "height_m": 0.1, "friction": 0.25}]},
+        {
+            "cylinder": [
+                {"position_m": [0.22, 0.0905], "radius_m": 0.05, "height_m": 0.1, "friction": 0.25}
+            ]
+        },
     ],
 )
 def test_sliding_along_an_obstacle_rubs_with_the_obstacle_s_friction(obstacle):

@@ -31,9 +31,13 @@ class EnergyBalance:
     squared_velocity_rad2_s: float = 0.0  # of all joints, integrated over time
 
 
-def run_wave(duration_s: float = 2.0, friction: float = SLIPPERY, rate_hz: int = 100, motor=None) -> EnergyBalance:
+def run_wave(
+    duration_s: float = 2.0, friction: float = SLIPPERY, rate_hz: int = 100, motor=None
+) -> EnergyBalance:
     """Undulate in position mode, and add up the work of every physics step and of every sample."""
-    config = make_config({"motor": motor or {}}, {"ground": {"friction": friction}}, rate_hz=rate_hz)
+    config = make_config(
+        {"motor": motor or {}}, {"ground": {"friction": friction}}, rate_hz=rate_hz
+    )
     rig = SimulatorRig(config, timestep_s=STEP_S)
     period_s = config.period_ns * 1e-9
     balance = EnergyBalance()
@@ -66,7 +70,8 @@ def _add_physics_step(rig: SimulatorRig, balance: EnergyBalance) -> None:
     balance.motor_work_j += float(data.qfrc_actuator @ displacement)
     balance.ground_work_j += float((data.qfrc_passive - data.qfrc_damper) @ displacement)
     balance.damping_work_j += float(viscous_torques @ displacement)
-    balance.dry_friction_work_j += float(data.qfrc_constraint @ displacement)  # nothing else constrains the body
+    # Nothing else constrains the body.
+    balance.dry_friction_work_j += float(data.qfrc_constraint @ displacement)
     balance.squared_velocity_rad2_s += float(np.sum(displacement[6:] ** 2)) / STEP_S
 
 
@@ -79,7 +84,9 @@ def test_work_of_motors_is_what_friction_dissipates_and_the_kinetic_energy(frict
     assert dissipated_j + balance.kinetic_energy_j == pytest.approx(balance.motor_work_j, rel=0.01)
 
 
-def compute_missing_torque_nm_s_per_rad(stiffness: float, period_s: float, response_time_s: float) -> float:
+def compute_missing_torque_nm_s_per_rad(
+    stiffness: float, period_s: float, response_time_s: float
+) -> float:
     """Return how much the torque at the end of a control period is below its mean, per speed of the joint.
 
     The target leads the joint by a sawtooth, because it steps once in a period. The torque follows that sawtooth with
@@ -102,7 +109,9 @@ def test_samples_miss_the_torque_that_each_new_target_causes(friction):
     """The missing work depends on the motion, and not on the ground."""
     balance = run_wave(friction=friction)
     motor = make_config().robot.motor
-    missing = compute_missing_torque_nm_s_per_rad(motor.stiffness_nm_per_rad, 0.01, motor.response_time_s)
+    missing = compute_missing_torque_nm_s_per_rad(
+        motor.stiffness_nm_per_rad, 0.01, motor.response_time_s
+    )
     expected_j = missing * balance.squared_velocity_rad2_s
     assert balance.motor_work_j - balance.sampled_work_j == pytest.approx(expected_j, rel=0.1)
 

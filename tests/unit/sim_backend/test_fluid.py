@@ -26,7 +26,9 @@ VERSIONS: list[LawsVersion] = ["c", "python"]
 
 
 @pytest.mark.parametrize("fluid", [WATER, HONEY, STRANGE])
-@pytest.mark.parametrize("velocity", [(1.0, 0.0, 0.0), (0.0, -0.5, 0.0), (0.6, 0.3, 0.0), (-0.4, 0.2, 0.5)])
+@pytest.mark.parametrize(
+    "velocity", [(1.0, 0.0, 0.0), (0.0, -0.5, 0.0), (0.6, 0.3, 0.0), (-0.4, 0.2, 0.5)]
+)
 def test_force_on_moving_links_is_that_of_the_documented_formula(
     fluid: dict[str, Any], velocity: tuple[float, float, float]
 ) -> None:
@@ -94,7 +96,9 @@ def test_ground_carries_the_rest_of_the_weight(buoyancy: float) -> None:
 
 def test_robot_without_fluid_falls_to_the_ground_before_the_run() -> None:
     run = SimulatorRig(make_config(start={**FLOATING, "height_m": 0.05}))
-    assert run.sim.true_state().base_position_w[2] == pytest.approx(run.config.robot.module.radius_m, abs=1e-3)
+    assert run.sim.true_state().base_position_w[2] == pytest.approx(
+        run.config.robot.module.radius_m, abs=1e-3
+    )
 
 
 def test_both_versions_of_the_laws_compute_the_same_bits_on_the_bottom() -> None:
@@ -127,7 +131,8 @@ def test_exported_model_has_the_fluid_of_the_scene() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"density_kg_m3": -1}, {"viscosity_pa_s": 101}, {"buoyancy": 1.1}, {"blunt_drag": 11}]
+    "change",
+    [{"density_kg_m3": -1}, {"viscosity_pa_s": 101}, {"buoyancy": 1.1}, {"blunt_drag": 11}],
 )
 def test_values_out_of_range_are_refused(change: dict[str, Any]) -> None:
     with raises_error(ConfigError, code="config/out-of-range"):

@@ -28,12 +28,29 @@ BATCH_STEPS = 20
 STEPS_PER_STATE = 2  # the second begins with the memory that the first has left
 
 PEGS = [
-    {"name": f"peg{i}", "position_m": [0.25 * i - 0.2, 0.12 * (-1) ** i], "radius_m": 0.05, "friction": 0.4}
+    {
+        "name": f"peg{i}",
+        "position_m": [0.25 * i - 0.2, 0.12 * (-1) ** i],
+        "radius_m": 0.05,
+        "friction": 0.4,
+    }
     for i in range(6)
 ]
 MOVING = [
-    {"name": "post", "position_m": [0.3, 0.1], "size_m": [0.1, 0.1, 0.2], "friction": 0.3, "stiffness_n_per_m": 300.0},
-    {"name": "block", "position_m": [0.6, -0.1], "size_m": [0.2, 0.1, 0.2], "friction": 0.5, "mass_kg": 0.4},
+    {
+        "name": "post",
+        "position_m": [0.3, 0.1],
+        "size_m": [0.1, 0.1, 0.2],
+        "friction": 0.3,
+        "stiffness_n_per_m": 300.0,
+    },
+    {
+        "name": "block",
+        "position_m": [0.6, -0.1],
+        "size_m": [0.2, 0.1, 0.2],
+        "friction": 0.5,
+        "mass_kg": 0.4,
+    },
     {
         "name": "both",
         "position_m": [0.9, 0.1],
@@ -48,7 +65,12 @@ SCENES: dict[str, dict[str, Any]] = {
     "pegs": {"ground": {"friction": 0.1}, "cylinder": PEGS},
     "one obstacle that moves": {"ground": {"friction": 0.3}, "box": MOVING[:1]},
     "obstacles that move": {"ground": {"friction": 0.3}, "box": MOVING, "cylinder": PEGS[:2]},
-    "hills": {"ground": {"friction": 0.3, "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0}}},
+    "hills": {
+        "ground": {
+            "friction": 0.3,
+            "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0},
+        }
+    },
     "slope": {
         "gravity_m_s2": 3.7,
         "ground": {"friction": 0.3, "slope_rad": 0.2, "slope_towards_rad": 2.5},
@@ -58,12 +80,30 @@ SCENES: dict[str, dict[str, Any]] = {
     "pipes and stairs": {
         "ground": {"friction": 0.1},
         "pipe": [
-            {"position_m": [1.0, 0.0], "length_m": 6.0, "radius_m": 0.12, "inner_radius_m": 0.1, "friction": 0.4},
-            {"position_m": [0.5, 0.0], "length_m": 2.0, "radius_m": 0.2, "axis_height_m": -0.18, "yaw_rad": 1.5},
+            {
+                "position_m": [1.0, 0.0],
+                "length_m": 6.0,
+                "radius_m": 0.12,
+                "inner_radius_m": 0.1,
+                "friction": 0.4,
+            },
+            {
+                "position_m": [0.5, 0.0],
+                "length_m": 2.0,
+                "radius_m": 0.2,
+                "axis_height_m": -0.18,
+                "yaw_rad": 1.5,
+            },
         ],
-        "stairs": [{"position_m": [1.2, 0.0], "count": 3, "rise_m": 0.01, "run_m": 0.1, "width_m": 3.0}],
+        "stairs": [
+            {"position_m": [1.2, 0.0], "count": 3, "rise_m": 0.01, "run_m": 0.1, "width_m": 3.0}
+        ],
     },
-    "water": {"ground": {"friction": 0.2}, "fluid": {"density_kg_m3": 1000.0, "buoyancy": 0.5}, "cylinder": PEGS[:2]},
+    "water": {
+        "ground": {"friction": 0.2},
+        "fluid": {"density_kg_m3": 1000.0, "buoyancy": 0.5},
+        "cylinder": PEGS[:2],
+    },
     "cloth": {"ground": {"friction": 0.19, "backward_friction": 0.14}},
     "mud": {"ground": {"friction": 0.1, "viscous": {"along_s_per_m": 0.5, "across_s_per_m": 4.0}}},
     "turning wheels": {
@@ -72,7 +112,10 @@ SCENES: dict[str, dict[str, Any]] = {
         "cylinder": PEGS[:2],
     },
     "turning wheels on hills": {
-        "ground": {"friction": 0.3, "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0}},
+        "ground": {
+            "friction": 0.3,
+            "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0},
+        },
         "box": MOVING[:1],
     },
     "rough hills": {
@@ -85,8 +128,22 @@ SCENES: dict[str, dict[str, Any]] = {
     },
     "steps": {
         "ground": {"friction": 0.1, "forward_friction": 0.3},
-        "step": [{"position_m": [0.5, 0.0], "size_m": [0.5, 2.0], "height_m": 0.002, "forward_friction": 0.1}],
-        "box": [{"position_m": [1.68, 0.0], "size_m": [0.4, 2.0, 0.001], "backward_friction": 0.1, "mass_kg": 0.5}],
+        "step": [
+            {
+                "position_m": [0.5, 0.0],
+                "size_m": [0.5, 2.0],
+                "height_m": 0.002,
+                "forward_friction": 0.1,
+            }
+        ],
+        "box": [
+            {
+                "position_m": [1.68, 0.0],
+                "size_m": [0.4, 2.0, 0.001],
+                "backward_friction": 0.1,
+                "mass_kg": 0.5,
+            }
+        ],
         "cylinder": PEGS[:2],
     },
 }
@@ -98,7 +155,14 @@ SCALES = {
         "links": {"link_3": {"forward": 0.3}, "link_13": {"sideways": 0.05}},
     }
 }
-WHEELS = {"wheels": {"radius_m": 0.03, "bearing_radius_m": 0.004, "bearing_friction": 0.1, "tire_friction": 0.6}}
+WHEELS = {
+    "wheels": {
+        "radius_m": 0.03,
+        "bearing_radius_m": 0.004,
+        "bearing_friction": 0.1,
+        "tire_friction": 0.6,
+    }
+}
 SEPARATE = {"wheels": {**WHEELS["wheels"], "separate_limits": True}}
 ROBOTS: dict[str, dict[str, Any]] = {
     "cloth": SCALES,
@@ -108,14 +172,8 @@ ROBOTS: dict[str, dict[str, Any]] = {
     "turning wheels": SEPARATE,
     "turning wheels on hills": SEPARATE,
 }
-ROLLED = (
-    "cloth",
-    "mud",
-    "rough hills",
-    "steps",
-    "turning wheels",
-    "turning wheels on hills",
-)  # scenes in which some robots lie on their sides and backs
+# Scenes in which some robots lie on their sides and backs.
+ROLLED = "cloth", "mud", "rough hills", "steps", "turning wheels", "turning wheels on hills"
 
 
 class Simulation:
@@ -161,7 +219,9 @@ class Simulation:
 class State:
     """A random state of a model."""
 
-    def __init__(self, model: mujoco.MjModel, random: np.random.Generator, *, rolls: bool = False) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, random: np.random.Generator, *, rolls: bool = False
+    ) -> None:
         speed = 10.0 ** random.uniform(-3, 0.7)
         self.positions = model.qpos0.copy()
         self.positions[FREE_QPOS:] = random.normal(0.0, 0.3, model.nq - FREE_QPOS)
@@ -251,7 +311,9 @@ def test_a_plain_mujoco_program_begins_with_feet_that_stick_where_they_are() -> 
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
-def test_a_batch_computes_the_bits_of_single_simulations_on_any_number_of_threads(threads: int) -> None:
+def test_a_batch_computes_the_bits_of_single_simulations_on_any_number_of_threads(
+    threads: int,
+) -> None:
     config = make_config(scene=SCENES["obstacles that move"])
     single = Simulation(config, "c")
     simulations = batch.Batch(single.model, nsim=BATCH_SIZE, nthread=threads)

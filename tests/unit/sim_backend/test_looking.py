@@ -17,9 +17,20 @@ from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 NOSE_M = 13 * 0.11 + 0.04
-CAMERA = {"name": "head", "width": 161, "height": 121, "rate_hz": 100.0, "delay_s": 0.0, "range_min_m": 0.02}
+CAMERA = {
+    "name": "head",
+    "width": 161,
+    "height": 121,
+    "rate_hz": 100.0,
+    "delay_s": 0.0,
+    "range_min_m": 0.02,
+}
 HEAD = keys.depth_key("head")
-POST = {"cylinder": [{"position_m": [NOSE_M + 1.05, 0.0], "radius_m": 0.05, "height_m": 1.0, "name": "post"}]}
+POST = {
+    "cylinder": [
+        {"position_m": [NOSE_M + 1.05, 0.0], "radius_m": 0.05, "height_m": 1.0, "name": "post"}
+    ]
+}
 
 
 def simulate(scene=None, *, kind="depth", **sensor):
@@ -34,7 +45,10 @@ def newest(run, key=HEAD) -> Any:
     run.advance()
     message = run.sample().by_key[key]
     run.sim.close()
-    assert MessageDecoder(type(message)).decode(encode(message), format_encoding(type(message))) == message
+    assert (
+        MessageDecoder(type(message)).decode(encode(message), format_encoding(type(message)))
+        == message
+    )
     return message
 
 
@@ -68,7 +82,9 @@ def test_the_ground_is_as_far_as_height_and_pitch_say():
         wanted = height_m / (np.sin(0.3) - up * np.cos(0.3))
     below = (wanted > image.range_min_m) & (wanted < image.range_max_m)
     assert below.sum() > 80
-    assert depth_m[below] == pytest.approx(np.tile(wanted[below, None], image.width), rel=0.003, abs=0.001)
+    assert depth_m[below] == pytest.approx(
+        np.tile(wanted[below, None], image.width), rel=0.003, abs=0.001
+    )
     assert np.isnan(depth_m[~below]).all()
 
 
@@ -79,7 +95,10 @@ def test_camera_points_along_its_yaw_pitch_and_message():
     depth_m = metres(image)
     v, u = np.unravel_index(np.nanargmin(depth_m), depth_m.shape)
     ray_c = np.array([1.0, -(u - image.cx_px) / image.fx_px, -(v - image.cy_px) / image.fy_px])
-    point_l = np.array(image.position_l) + rotation_from_quaternion(image.orientation_l_wxyz) @ ray_c * depth_m[v, u]
+    point_l = (
+        np.array(image.position_l)
+        + rotation_from_quaternion(image.orientation_l_wxyz) @ ray_c * depth_m[v, u]
+    )
     data, sim = run.sim.data, run.sim.sim
     body = sim.first_link_body + image.link
     point_w = data.xpos[body] + data.xmat[body].reshape(3, 3) @ point_l
@@ -120,12 +139,19 @@ def test_a_lidar_measures_along_each_beam_from_right_to_left():
 def test_a_range_finder_is_a_lidar_of_one_beam():
     scan = newest(simulate(POST, kind="range"), keys.ranges_key("front"))
     assert scan.range_m == [pytest.approx(1.0, abs=1e-6)]
-    assert newest(simulate(POST, kind="range", range_max_m=0.9), keys.ranges_key("front")).range_m == [None]
+    assert newest(
+        simulate(POST, kind="range", range_max_m=0.9), keys.ranges_key("front")
+    ).range_m == [None]
 
 
 def test_noise_and_dropouts_have_the_size_of_the_robot_file():
     wall = {"box": [{"position_m": [NOSE_M + 2.5, 0.0], "size_m": [1.0, 19.0, 9.0]}]}
-    place = {"position_m": [0.095, 0.0, 3.0], "noise_m": 0.002, "noise_m_per_m2": 0.003, "dropout": 0.1}
+    place = {
+        "position_m": [0.095, 0.0, 3.0],
+        "noise_m": 0.002,
+        "noise_m_per_m2": 0.003,
+        "dropout": 0.1,
+    }
     depth_m = metres(newest(simulate(wall, **place)))
     assert np.isnan(depth_m).mean() == pytest.approx(0.1, abs=0.01)
     assert np.nanmean(depth_m) == pytest.approx(2.0, abs=0.001)
@@ -140,13 +166,18 @@ def test_noise_and_dropouts_have_the_size_of_the_robot_file():
 
 def test_custom_sonar_is_one_file_and_one_robot_line():
     """The example of docs/how-to/custom-sensors.md."""
-    sonar = {"model": f"{Path(__file__).parents[3] / 'examples' / 'sonar.py'}:Sonar", "settings": {"cone_rad": 0.5}}
+    sonar = {
+        "model": f"{Path(__file__).parents[3] / 'examples' / 'sonar.py'}:Sonar",
+        "settings": {"cone_rad": 0.5},
+    }
     aside = {"cylinder": [{"position_m": [NOSE_M + 1.0, 0.2], "radius_m": 0.05, "height_m": 1.0}]}
     place = {"position_m": [0.095, 0.0, 0.5], "pitch_rad": 0.0, "range_max_m": 2.0}
     heard = newest(simulate(aside, kind="range", **place, **sonar), keys.ranges_key("front"))
     assert heard.range_m == [pytest.approx(np.hypot(1.0, 0.2) - 0.05, abs=0.02)]
     narrow = {**sonar, "settings": {"cone_rad": 0.2}}
-    assert newest(simulate(aside, kind="range", **place, **narrow), keys.ranges_key("front")).range_m == [None]
+    assert newest(
+        simulate(aside, kind="range", **place, **narrow), keys.ranges_key("front")
+    ).range_m == [None]
 
 
 # --- by OpenGL -------------------------------------------------------------------------------------------------

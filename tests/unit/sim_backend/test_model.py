@@ -48,7 +48,10 @@ def test_model_joints_have_axes_limits_and_places_of_robot_file(robot_and_model)
 def test_model_motors_have_values_of_robot_file(robot_and_model):
     robot, model = robot_and_model
     base_dofs = 6  # of the free joint
-    assert model.dof_armature[base_dofs:].tolist() == [robot.motor.armature_kg_m2] * robot.chain.modules
+    assert (
+        model.dof_armature[base_dofs:].tolist()
+        == [robot.motor.armature_kg_m2] * robot.chain.modules
+    )
     assert model.dof_frictionloss[base_dofs:] == pytest.approx(FRICTION_NM)
     assert model.dof_damping[base_dofs:] == pytest.approx(VISCOUS_NM_S_PER_RAD)
     assert model.actuator_forcerange[:, 1] == pytest.approx(robot.limits.torque_nm)
@@ -59,16 +62,25 @@ def test_model_motors_have_values_of_robot_file(robot_and_model):
 def test_model_link_inertia_is_that_of_a_capsule():
     config = make_config()
     model = open_sim(config).sim.model
-    r, length, mass = config.robot.module.radius_m, config.robot.module.length_m, config.robot.module.mass_kg
+    r, length, mass = (
+        config.robot.module.radius_m,
+        config.robot.module.length_m,
+        config.robot.module.mass_kg,
+    )
     cylinder, sphere = np.pi * r**2 * length, 4 / 3 * np.pi * r**3
     m_c, m_s = mass * np.array([cylinder, sphere]) / (cylinder + sphere)
     about_axis = m_c * r**2 / 2 + m_s * 2 / 5 * r**2
-    across = m_c * (r**2 / 4 + length**2 / 12) + m_s * (2 / 5 * r**2 + length**2 / 4 + 3 / 8 * length * r)
-    assert sorted(model.body("link_5").inertia) == pytest.approx(sorted([about_axis, across, across]), rel=1e-6)
+    across = m_c * (r**2 / 4 + length**2 / 12) + m_s * (
+        2 / 5 * r**2 + length**2 / 4 + 3 / 8 * length * r
+    )
+    assert sorted(model.body("link_5").inertia) == pytest.approx(
+        sorted([about_axis, across, across]), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "timestep_s", "steps"), [(100, 0.001, 10), (100, 0.003, 4), (1000, 0.004, 1), (300, 0.001, 4)]
+    ("rate_hz", "timestep_s", "steps"),
+    [(100, 0.001, 10), (100, 0.003, 4), (1000, 0.004, 1), (300, 0.001, 4)],
 )
 def test_a_whole_number_of_steps_makes_a_period(rate_hz, timestep_s, steps):
     config = make_config(rate_hz=rate_hz)

@@ -42,4 +42,6 @@ def accelerations(jacobian: Literal["dense", "sparse"]) -> Floats:
 def test_sparse_and_dense_factorization_give_the_same_accelerations() -> None:
     """MuJoCo 4.0.0 gave other accelerations for every degree of freedom of these branching bodies."""
     dense = accelerations("dense")
-    np.testing.assert_allclose(accelerations("sparse"), dense, rtol=0.0, atol=1e-8 * np.abs(dense).max())
+    np.testing.assert_allclose(
+        accelerations("sparse"), dense, rtol=0.0, atol=1e-8 * np.abs(dense).max()
+    )

@@ -27,10 +27,13 @@ def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
     radius = config.robot.module.radius_m
     for angle in np.arange(0.2, 2 * np.pi, 0.7):
         outward = np.array([np.cos(angle), np.sin(angle)])
-        data.qpos[3:7] = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]  # the snake points away from the obstacle
+        # The snake points away from the obstacle.
+        data.qpos[3:7] = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
         data.qpos[7:] = 0.0
         reach = np.linspace(0.0, 1.0, 20001)
-        gaps = np.array([compute_outline_distance_m(placed.obstacle, center + r * outward) for r in reach[::20]])
+        gaps = np.array(
+            [compute_outline_distance_m(placed.obstacle, center + r * outward) for r in reach[::20]]
+        )
         touching = float(np.interp(radius, gaps, reach[::20]))
         for offset, touched in ((2e-5, set[str]()), (-2e-5, {placed.obstacle.name})):
             data.qpos[:3] = [*(center + (touching + offset) * outward), radius]
@@ -51,7 +54,8 @@ def test_steps_and_ground_and_the_snake_itself_are_no_contacts():
 
 def test_obstacle_may_have_the_name_of_a_link():
     pegs = [
-        {"position_m": [2.0 + i, 1.0], "radius_m": 0.05, "name": name} for i, name in enumerate(["ground", "link_3"])
+        {"position_m": [2.0 + i, 1.0], "radius_m": 0.05, "name": name}
+        for i, name in enumerate(["ground", "link_3"])
     ]
     run = SimulatorRig(make_config(scene={"cylinder": pegs}))
     assert [name for name in run.sim.sim.obstacle_of_geom if name] == ["ground", "link_3"]

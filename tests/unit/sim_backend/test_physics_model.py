@@ -39,7 +39,11 @@ def pass_time(physics_model, torque_nm: ArrayLike = 0.0, seconds=0.0):
 
 def touches_of(physics_model):
     """Link -> (position, force) in the world's frame of every touch by an obstacle, pushed as MuJoCo says."""
-    model, data, rub_w = physics_model.sim.model, physics_model.data, physics_model.physics.contacts.friction_force_w
+    model, data, rub_w = (
+        physics_model.sim.model,
+        physics_model.data,
+        physics_model.physics.contacts.friction_force_w,
+    )
     found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     wrench = np.zeros(6)
     for i in range(data.ncon):
@@ -65,7 +69,10 @@ def true_loads(physics_model):
             continue
         link_from_world = body.xmat.reshape(3, 3).T
         position = np.average([p for p, _ in touches], axis=0, weights=weights) - body.xpos
-        result[link] = link_from_world @ position, link_from_world @ np.sum([f for _, f in touches], axis=0)
+        result[link] = (
+            link_from_world @ position,
+            link_from_world @ np.sum([f for _, f in touches], axis=0),
+        )
     return result
 
 
@@ -76,7 +83,10 @@ def through_joints_nm(physics_model, torques):
     data.qfrc_applied[6:] = torques
     PhysicsStepper(physics_model.sim, data).forward()
     mujoco.mj_rnePostConstraint(model, data)
-    through = [data.cdof[6 + i] @ data.cfrc_int[model.jnt_bodyid[1 + i]] for i in range(len(physics_model.angle_rad))]
+    through = [
+        data.cdof[6 + i] @ data.cfrc_int[model.jnt_bodyid[1 + i]]
+        for i in range(len(physics_model.angle_rad))
+    ]
     of_the_ground = data.qfrc_passive - data.qfrc_damper
     return np.array(through) - of_the_ground[6:]
 
@@ -146,7 +156,9 @@ def test_free_joint_accelerates_by_inertia_and_gauge_measures_links():
     links = physics_model.sim.model.body("link_1").inertia.max() / 2  # about an axis across the bar
     pass_time(physics_model, torque)
     expected = torque / (links + rotor)
-    assert physics_model.velocity_rad_s[0] / physics_model.step_s == pytest.approx(expected, rel=1e-3)
+    assert physics_model.velocity_rad_s[0] / physics_model.step_s == pytest.approx(
+        expected, rel=1e-3
+    )
     assert physics_model.shaft_torque_nm()[0] == pytest.approx(torque - rotor * expected, rel=1e-3)
 
 
@@ -175,10 +187,17 @@ def test_shaft_at_rest_has_motor_torque_minus_dry_friction():
 @pytest.mark.parametrize("motor", [{}, RUBBING], ids=["smooth", "rubbing"])
 def test_in_motion_the_shafts_carry_what_the_outer_links_need(motor):
     """Among pegs, with inertia, gravity, friction and touches: against the forces between the links."""
-    peg = {"cylinder": [{"position_m": [0.22 + 0.2 * k, 0.0905], "radius_m": 0.05, "friction": 0.3} for k in range(3)]}
-    robot = {"motor": motor, "limits": {"angle_rad": 3.1}}  # no end stops: they are not felt, but between the links
+    peg = {
+        "cylinder": [
+            {"position_m": [0.22 + 0.2 * k, 0.0905], "radius_m": 0.05, "friction": 0.3}
+            for k in range(3)
+        ]
+    }
+    # No end stops: they are not felt, but between the links.
+    robot = {"motor": motor, "limits": {"angle_rad": 3.1}}
     physics_model = make_physics_model(make_config(robot, {"ground": {"friction": 0.2}, **peg}))
-    physics_model.sim.model.opt.tolerance = 1e-14  # of the solver, whose default leaves 1e-3 N·m open
+    # Of the solver, whose default leaves 1e-3 N·m open.
+    physics_model.sim.model.opt.tolerance = 1e-14
     touched = 0
     for k in range(1500):
         torques = np.array([0.5 * np.sin(0.01 * k + 0.9 * i) for i in range(13)])
@@ -198,7 +217,9 @@ def test_position_loop_once_a_step_equals_simulator_motors():
     firmware = Firmware(config, physics_model.step_s)
     worst_rad, worst_nm, max_rad, max_nm = 0.0, 0.0, 0.0, 0.0
     for k in range(1000):
-        target = np.array([0.1 * np.sin(0.0063 * k - 0.8 * i) - 0.1 * np.sin(-0.8 * i) for i in range(6)])
+        target = np.array(
+            [0.1 * np.sin(0.0063 * k - 0.8 * i) - 0.1 * np.sin(-0.8 * i) for i in range(6)]
+        )
         run.command(JointMode.POSITION, target.tolist())
         run.advance()
         firmware.drive(physics_model, target)
@@ -210,7 +231,9 @@ def test_position_loop_once_a_step_equals_simulator_motors():
     assert max_rad > 0.1
     assert worst_rad < 1e-3 * max_rad
     assert worst_nm < 0.03 * max_nm
-    assert physics_model.pose().position_w == pytest.approx(run.sim.true_state().base_position_w, abs=1e-4)
+    assert physics_model.pose().position_w == pytest.approx(
+        run.sim.true_state().base_position_w, abs=1e-4
+    )
 
 
 # --- what is felt -------------------------------------------------------------------------------------------------
@@ -239,7 +262,8 @@ def test_motor_between_three_pegs_measures_their_moment():
     assert head.link == 6
     assert middle.force_l[1] < -1.0 < 1.0 < min(tail.force_l[1], head.force_l[1])
     assert tail.position_l[1] < 0.0 < middle.position_l[1]
-    assert np.abs(physics_model.velocity_rad_s).max() < 0.02  # it is being squeezed out forwards, slowly
+    # It is being squeezed out forwards, slowly.
+    assert np.abs(physics_model.velocity_rad_s).max() < 0.02
     joint, body = physics_model.data.body("link_3").xpos, physics_model.data.body("link_6")
     rotation = body.xmat.reshape(3, 3)
     arm = body.xpos + rotation @ head.position_l - joint
@@ -252,7 +276,10 @@ def test_motor_between_three_pegs_measures_their_moment():
 def test_loads_are_the_sums_of_the_true_touches(friction):
     """Jammed between walls and pegs, links are touched at several places at once."""
     walls = [{"from_m": [-1, y], "to_m": [3, y], "friction": friction} for y in (0.09, -0.09)]
-    pegs = [{"position_m": [0.4 + 0.3 * k, 0.06], "radius_m": 0.02, "friction": friction} for k in range(3)]
+    pegs = [
+        {"position_m": [0.4 + 0.3 * k, 0.06], "radius_m": 0.02, "friction": friction}
+        for k in range(3)
+    ]
     config = make_config(scene={"wall": walls, "cylinder": pegs})
     physics_model = make_physics_model(config)
     firmware = Firmware(config, physics_model.step_s)
@@ -287,7 +314,9 @@ def test_imu_samples_equal_those_computed_every_step():
     assert imu is not None
     assert imu == physics_model.imu()
     assert imu.link == list(range(14))
-    assert np.ravel(imu.angular_velocity_rad_s + imu.acceleration_m_s2) == pytest.approx(other.sensordata, abs=1e-12)
+    assert np.ravel(imu.angular_velocity_rad_s + imu.acceleration_m_s2) == pytest.approx(
+        other.sensordata, abs=1e-12
+    )
     assert np.abs(imu.angular_velocity_rad_s).max() > 0.1
 
 
@@ -303,7 +332,8 @@ def test_at_the_start_imus_feel_gravity_alone():
 
 def test_the_pose_is_true_and_of_now():
     physics_model = make_physics_model(make_config(start={"yaw_rad": 0.7}))
-    physics_model.data.qvel[:6] = [0.3, -0.2, 0.0, 1.0, 0.0, 0.5]  # it rolls about its own axis, too
+    # It rolls about its own axis, too.
+    physics_model.data.qvel[:6] = [0.3, -0.2, 0.0, 1.0, 0.0, 0.5]
     pass_time(physics_model, 0.05, seconds=0.1)
     pose = physics_model.pose()
     assert pose.position_w == pytest.approx(physics_model.data.qpos[:3], abs=0)
@@ -311,7 +341,9 @@ def test_the_pose_is_true_and_of_now():
     mujoco.mj_kinematics(physics_model.sim.model, physics_model.data)
     rotation = physics_model.data.body("link_0").xmat.reshape(3, 3)
     assert rotation_from_quaternion(pose.orientation_wxyz) == pytest.approx(rotation, abs=1e-12)
-    assert pose.angular_velocity_w == pytest.approx(rotation @ physics_model.data.qvel[3:6], abs=1e-12)
+    assert pose.angular_velocity_w == pytest.approx(
+        rotation @ physics_model.data.qvel[3:6], abs=1e-12
+    )
 
 
 # --- the rest -----------------------------------------------------------------------------------------------------
@@ -323,7 +355,9 @@ def test_physics_model_is_towed_by_a_tether():
     )
     pass_time(physics_model, seconds=1.0)
     friction = 0.3 * 4 * 0.3 * G
-    assert physics_model.pose().velocity_w[0] == pytest.approx(0.1 - friction / WINCH_N_S_PER_M, rel=0.02)
+    assert physics_model.pose().velocity_w[0] == pytest.approx(
+        0.1 - friction / WINCH_N_S_PER_M, rel=0.02
+    )
 
 
 @pytest.mark.parametrize("torque", [math.nan, math.inf, 1e12])

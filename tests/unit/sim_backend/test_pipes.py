@@ -17,7 +17,8 @@ from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import G, SimulatorRig, make_config
 
 FRICTION = 0.3
-CORNER = 1.0 / math.cos(math.pi / STAVES)  # radius of the polygon's corners, divided by that of its sides
+# Radius of the polygon's corners, divided by that of its sides.
+CORNER = 1.0 / math.cos(math.pi / STAVES)
 PIPE: dict[str, Any] = {
     "position_m": [1.0, 0.5],
     "length_m": 8.0,
@@ -69,7 +70,9 @@ def test_top_of_a_half_pipe_is_open() -> None:
 def test_robot_starts_at_rest_at_the_bottom_of_a_pipe(open_top: bool) -> None:
     run = SimulatorRig(make_pipe_config(open_top=open_top))
     state = run.sim.true_state()
-    bottom_m = PIPE["radius_m"] - CORNER * (PIPE["inner_radius_m"] - run.config.robot.module.radius_m)
+    bottom_m = PIPE["radius_m"] - CORNER * (
+        PIPE["inner_radius_m"] - run.config.robot.module.radius_m
+    )
     assert state.base_position_w[:2] == pytest.approx(PIPE["position_m"], abs=1e-3)
     assert state.base_position_w[2] == pytest.approx(bottom_m, abs=1e-3)
     before_w = np.array(state.base_position_w)
@@ -93,14 +96,24 @@ def test_body_slides_in_a_pipe_by_its_friction(laws: LawsVersion) -> None:
     before_m_s = data.qvel[:2] @ direction_w
     physics.step(100)
     step_s = sim.model.opt.timestep
-    assert before_m_s - data.qvel[:2] @ direction_w == pytest.approx(FRICTION * G * CORNER * 100 * step_s, rel=0.01)
+    assert before_m_s - data.qvel[:2] @ direction_w == pytest.approx(
+        FRICTION * G * CORNER * 100 * step_s, rel=0.01
+    )
 
 
 def test_robot_starts_and_stays_on_a_solid_pipe() -> None:
     """The pipe is below the middle of the robot, and across."""
-    pipe = {"position_m": [0.75, 0.0], "length_m": 4.0, "radius_m": 0.1, "yaw_rad": math.pi / 2, "friction": 0.5}
+    pipe = {
+        "position_m": [0.75, 0.0],
+        "length_m": 4.0,
+        "radius_m": 0.1,
+        "yaw_rad": math.pi / 2,
+        "friction": 0.5,
+    }
     run = SimulatorRig(make_config(scene={"pipe": [{**pipe, "axis_height_m": 0.0}]}))
-    assert run.sim.data.body("link_0").xpos[2] == pytest.approx(run.config.robot.module.radius_m, abs=1e-3)
+    assert run.sim.data.body("link_0").xpos[2] == pytest.approx(
+        run.config.robot.module.radius_m, abs=1e-3
+    )
     assert run.sim.data.body("link_13").xpos[2] > 0.2  # it leans on the pipe, like a plank
     before_w = run.sim.true_state().base_position_w
     run.advance(1.0)

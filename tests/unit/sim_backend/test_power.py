@@ -66,5 +66,7 @@ def test_without_the_sensor_there_is_no_heat_on_request():
     config = make_config({"sensors!": {"joints": {}}}, faults=["overheat:joint_1@1"])
     with raises_error(ConfigError, code="injection/not-supported"):
         SimBackend.check(config, SimSettings())
-    assert not SimulatorRig(make_config({"sensors!": {"joints": {}}})).sim.inject(overheat(), begins=True)
+    assert not SimulatorRig(make_config({"sensors!": {"joints": {}}})).sim.inject(
+        overheat(), begins=True
+    )
     assert SimBackend.check(make_config(WITH, faults=["overheat:joint_1@1"]), SimSettings())

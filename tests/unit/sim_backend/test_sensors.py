@@ -62,7 +62,9 @@ def test_contacts_in_link_frames_are_the_true_contacts():
         rotation = rotations[felt.link]
         assert (felt.link, felt.obstacle) == (true.link, true.obstacle) == (2, "post")
         # The contact is that at the beginning of the last physics step, in which the link slides and turns on.
-        assert origins[felt.link] + rotation @ felt.position_l == pytest.approx(true.position_w, abs=1e-3)
+        assert origins[felt.link] + rotation @ felt.position_l == pytest.approx(
+            true.position_w, abs=1e-3
+        )
         assert rotation @ felt.normal_l == pytest.approx(true.normal_w, abs=5e-3)
         assert rotation @ felt.force_l == pytest.approx(true.force_w, abs=0.1)
         axes = np.array([felt.normal_l, felt.tangent_1_l, felt.tangent_2_l])
@@ -70,7 +72,8 @@ def test_contacts_in_link_frames_are_the_true_contacts():
         assert np.linalg.det(axes) == pytest.approx(1.0)
         assert felt.tangent_1_l[0] > 0  # towards the head
         assert np.dot(felt.force_l, felt.normal_l) > 0  # an obstacle pushes, it does not pull
-        assert np.hypot(felt.position_l[1], felt.position_l[2]) == pytest.approx(0.04, abs=1e-3)  # on the skin
+        # On the skin.
+        assert np.hypot(felt.position_l[1], felt.position_l[2]) == pytest.approx(0.04, abs=1e-3)
 
 
 def test_weak_touches_go_unfelt():
@@ -91,7 +94,9 @@ def test_imu_on_spinning_snake_measures_centripetal_acceleration():
     lengths = np.array(run.config.robot.link_lengths_m)
     centers = np.cumsum(lengths) - lengths / 2
     assert np.array(imu.angular_velocity_rad_s)[:, 2] == pytest.approx(spin, rel=0.01)
-    assert np.array(imu.acceleration_m_s2)[:, 0] == pytest.approx(-(spin**2) * (centers - middle), abs=0.05)
+    assert np.array(imu.acceleration_m_s2)[:, 0] == pytest.approx(
+        -(spin**2) * (centers - middle), abs=0.05
+    )
 
 
 def test_pose_velocity_is_the_derivative_of_pose():
@@ -103,8 +108,13 @@ def test_pose_velocity_is_the_derivative_of_pose():
     after = run.sample_only_sensor(Pose)
     change = (np.array(after.position_w) - before.position_w) / 1e-3
     assert after.velocity_w == pytest.approx(change, abs=5e-3)
-    turned = rotation_from_quaternion(after.orientation_wxyz) @ rotation_from_quaternion(before.orientation_wxyz).T
-    assert after.angular_velocity_w[2] == pytest.approx((turned[1, 0] - turned[0, 1]) / 2 / 1e-3, rel=1e-3)
+    turned = (
+        rotation_from_quaternion(after.orientation_wxyz)
+        @ rotation_from_quaternion(before.orientation_wxyz).T
+    )
+    assert after.angular_velocity_w[2] == pytest.approx(
+        (turned[1, 0] - turned[0, 1]) / 2 / 1e-3, rel=1e-3
+    )
 
 
 def test_noise_has_the_deviations_of_the_robot_file():
@@ -119,6 +129,7 @@ def test_noise_has_the_deviations_of_the_robot_file():
         run.advance(0.5)
     errors: dict[tuple[str, float], list[np.ndarray]] = {}
     plain = quiet.sample()
+    plain_imu = plain.by_key[keys.IMU]
     contact = plain.by_key[keys.CONTACTS].contacts[0]  # pyright: ignore[reportAttributeAccessIssue]
     orientation = rotation_from_quaternion(plain.by_key[keys.POSE].orientation_wxyz)  # pyright: ignore[reportAttributeAccessIssue]
     for _ in range(1000):
@@ -130,8 +141,8 @@ def test_noise_has_the_deviations_of_the_robot_file():
             ("angle", 0.01, sample.joints.angle_rad, plain.joints.angle_rad),
             ("velocity", 0.2, sample.joints.velocity_rad_s, plain.joints.velocity_rad_s),
             ("torque", 0.5, sample.joints.torque_nm, plain.joints.torque_nm),
-            ("gyro", 0.03, imu.angular_velocity_rad_s, plain.by_key[keys.IMU].angular_velocity_rad_s),  # pyright: ignore[reportAttributeAccessIssue]
-            ("accelerometer", 0.4, imu.acceleration_m_s2, plain.by_key[keys.IMU].acceleration_m_s2),  # pyright: ignore[reportAttributeAccessIssue]
+            ("gyro", 0.03, imu.angular_velocity_rad_s, plain_imu.angular_velocity_rad_s),  # pyright: ignore[reportAttributeAccessIssue]
+            ("accelerometer", 0.4, imu.acceleration_m_s2, plain_imu.acceleration_m_s2),  # pyright: ignore[reportAttributeAccessIssue]
             ("position", 0.002, pose.position_w, plain.by_key[keys.POSE].position_w),  # pyright: ignore[reportAttributeAccessIssue]
             ("attitude", 0.01, [turn[2, 1], turn[0, 2], turn[1, 0]], [0.0, 0.0, 0.0]),
             ("contact position", 0.003, felt.position_l, contact.position_l),
@@ -156,7 +167,9 @@ def test_noise_has_the_deviations_of_the_robot_file():
 )
 def test_sensor_is_due_after_each_of_its_periods(tick_hz, sensor_hz, due):
     run = SimulatorRig(
-        make_config({"chain": {"modules": 1}, "sensors": {"pose": {"rate_hz": sensor_hz}}}, rate_hz=tick_hz)
+        make_config(
+            {"chain": {"modules": 1}, "sensors": {"pose": {"rate_hz": sensor_hz}}}, rate_hz=tick_hz
+        )
     )
     ticks = []
     for _ in range(due[-1] + 1):

@@ -30,7 +30,9 @@ class Sled:
     """A straight body without motors, whose length is along x, at rest on a slope."""
 
     def __init__(self, laws: LawsVersion, ground: dict[str, Any], gravity_m_s2: float = G) -> None:
-        config = make_config(scene={"ground": {"friction": FRICTION, **ground}, "gravity_m_s2": gravity_m_s2})
+        config = make_config(
+            scene={"ground": {"friction": FRICTION, **ground}, "gravity_m_s2": gravity_m_s2}
+        )
         sim = build_sim_model(config, SimSettings(), motors=False, laws=laws)
         self.data = MjData(sim.model)
         self.data.qpos[2] = config.robot.module.radius_m

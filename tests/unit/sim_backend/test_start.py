@@ -26,7 +26,9 @@ def deepest_m(run):
 def stays(run, seconds=1.0, within_m=2e-3):
     """Holding the angles of its start, the snake does not move any more."""
     start = run.sim.true_state()
-    run.command([JointMode.POSITION] * run.count, compute_start_pose(run.config).angles_rad.tolist())
+    run.command(
+        [JointMode.POSITION] * run.count, compute_start_pose(run.config).angles_rad.tolist()
+    )
     run.advance(seconds)
     end = run.sim.true_state()
     assert np.linalg.norm(end.base_position_w - start.base_position_w) < within_m
@@ -38,7 +40,9 @@ def test_start_on_flat_ground_is_at_rest_at_time_zero():
     run = SimulatorRig(config)
     state, pose = run.sim.true_state(), compute_start_pose(config)
     assert state.time_s == 0.0
-    assert state.base_position_w == pytest.approx([*pose.position_w, config.robot.module.radius_m], abs=1.1 * SINK_M)
+    assert state.base_position_w == pytest.approx(
+        [*pose.position_w, config.robot.module.radius_m], abs=1.1 * SINK_M
+    )
     assert state.angles_rad == pytest.approx(pose.angles_rad, abs=1e-3)
     assert not state.base_velocity_w.any()
     assert not state.velocities_rad_s.any()
@@ -52,7 +56,10 @@ def test_start_hills_have_requested_height_and_repeat_for_seed():
     assert (heights.min(), heights.max()) == pytest.approx((-0.03, 0.03))
     assert np.array_equal(heights, make_heights(uneven))
     spacing = uneven.area_m / (len(heights) - 1)
-    assert np.abs(np.diff(heights, axis=0)).max() / spacing < 2 * np.pi * uneven.height_m / uneven.wavelength_m
+    assert (
+        np.abs(np.diff(heights, axis=0)).max() / spacing
+        < 2 * np.pi * uneven.height_m / uneven.wavelength_m
+    )
     up_and_down = np.abs(np.diff(np.sign(heights - heights.mean()), axis=1)).sum(axis=1).mean() / 2
     assert up_and_down == pytest.approx(2 * uneven.area_m / uneven.wavelength_m, rel=0.5)
 
@@ -65,13 +72,17 @@ def test_the_height_field_is_where_the_heights_say():
     hit = np.zeros(1, dtype=np.int32)
     for i, j in ((5, 80), (60, 12), (33, 40)):
         above = np.array([grid[j], grid[i], 5.0])
-        drop = mujoco.mj_ray(run.sim.sim.model, run.sim.data, above, np.array([0.0, 0.0, -1.0]), None, 1, -1, hit)
+        drop = mujoco.mj_ray(
+            run.sim.sim.model, run.sim.data, above, np.array([0.0, 0.0, -1.0]), None, 1, -1, hit
+        )
         assert 5.0 - drop == pytest.approx(heights[i, j], abs=2e-3)
 
 
 @pytest.mark.parametrize("robot", ["planar13", "mamba"])
 def test_on_uneven_ground_it_rests_where_it_was_put(robot):
-    run = SimulatorRig(make_config(scene={**HILLS, **CURVE}, base_robot=robot, start={"on_route": True}))
+    run = SimulatorRig(
+        make_config(scene={**HILLS, **CURVE}, base_robot=robot, start={"on_route": True})
+    )
     assert deepest_m(run) < 2e-3
     state, pose = run.sim.true_state(), compute_start_pose(run.config)
     assert state.base_position_w[:2] == pytest.approx(pose.position_w, abs=0.05)
@@ -82,7 +93,9 @@ def test_on_uneven_ground_it_rests_where_it_was_put(robot):
 
 def test_start_half_on_a_step_does_not_sink_in():
     step = {"step": [{"position_m": [1.2, 0.0], "size_m": [1.2, 1.0], "height_m": 0.06}]}
-    run = SimulatorRig(make_config(scene={**step, **CURVE}, base_robot="mamba", start={"on_route": True}))
+    run = SimulatorRig(
+        make_config(scene={**step, **CURVE}, base_robot="mamba", start={"on_route": True})
+    )
     stays(run, within_m=0.01)
     assert deepest_m(run) < 2e-3
     state, robot = run.sim.true_state(), run.config.robot

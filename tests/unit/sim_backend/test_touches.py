@@ -18,17 +18,29 @@ from snakesim_testing.sim.simulator_rig import make_config
 
 STEPS = 300
 PEGS = [
-    {"name": f"peg{i}", "position_m": [0.25 * i - 0.1, 0.1 * (-1) ** i], "radius_m": 0.05, "friction": 0.2 * (i % 2)}
+    {
+        "name": f"peg{i}",
+        "position_m": [0.25 * i - 0.1, 0.1 * (-1) ** i],
+        "radius_m": 0.05,
+        "friction": 0.2 * (i % 2),
+    }
     for i in range(4)
 ]
-POST = {"name": "post", "position_m": [0.5, 0.095], "size_m": [0.1, 0.1, 0.2], "stiffness_n_per_m": 300.0}
+POST = {
+    "name": "post",
+    "position_m": [0.5, 0.095],
+    "size_m": [0.1, 0.1, 0.2],
+    "stiffness_n_per_m": 300.0,
+}
 SCENES: dict[str, dict[str, Any]] = {
     "rough and smooth pegs": {"ground": {"friction": 0.1}, "cylinder": PEGS},
     "an obstacle that yields": {"ground": {"friction": 0.1}, "cylinder": PEGS[:2], "box": [POST]},
 }
 
 
-needs_c = pytest.mark.skipif(choose_laws() == "python", reason="there is no C version of the laws here")
+needs_c = pytest.mark.skipif(
+    choose_laws() == "python", reason="there is no C version of the laws here"
+)
 
 
 @needs_c
@@ -58,7 +70,9 @@ class MeasuringRobot:
         config = make_config(scene={"name": "test", **scene})
         self.backend = SimBackend(config, SimSettings(timestep_s=step_s), laws=laws)
         self.step_s: float = self.backend.sim.model.opt.timestep
-        self.touches = ObstacleContactReader(self.backend.sim, self.backend.data, self.backend.physics.contacts)
+        self.touches = ObstacleContactReader(
+            self.backend.sim, self.backend.data, self.backend.physics.contacts
+        )
         self.measured_force = self.backend.physics.start_force_measurement()
         self._modes = [JointMode.POSITION] * config.robot.chain.modules
         self._limits_nm = [joint.limits.torque_nm for joint in config.robot.joint_table]
@@ -118,6 +132,8 @@ def test_computing_forces_again_adds_nothing_to_the_measured_force(laws: LawsVer
 
 @needs_c
 def test_force_cannot_be_measured_in_a_model_without_its_plugin() -> None:
-    placed = create_settled_robot(make_config(scene={"name": "test", **SCENES["rough and smooth pegs"]}))
+    placed = create_settled_robot(
+        make_config(scene={"name": "test", **SCENES["rough and smooth pegs"]})
+    )
     with pytest.raises(ValueError, match="measured_force"):
         placed.physics.start_force_measurement()

@@ -17,7 +17,11 @@ AGAIN_S = 0.05
 
 def stop(who: str | bytes = "operator", nonce: bytes | None = None) -> bytes:
     """A datagram that stops the robot."""
-    return ASK + (os.urandom(16) if nonce is None else nonce) + (who.encode() if isinstance(who, str) else who)
+    return (
+        ASK
+        + (os.urandom(16) if nonce is None else nonce)
+        + (who.encode() if isinstance(who, str) else who)
+    )
 
 
 def ask(endpoint: str, datagram: bytes, limit_s: float) -> bytes | None:

@@ -43,7 +43,10 @@ def lease(endpoint: str, amount: int) -> Iterator[str]:
 def noise(endpoint: str, amount: int) -> Iterator[str]:
     """Noise in queries to everything that answers."""
     dice = random.Random(1)
-    shots = [(key.replace("*", "run"), dice.randbytes(200), wire.encoding_of(key)) for key in wire.QUERIES]
+    shots = [
+        (key.replace("*", "run"), dice.randbytes(200), wire.encoding_of(key))
+        for key in wire.QUERIES
+    ]
     yield from _queries(endpoint, amount, shots)
 
 
@@ -54,7 +57,13 @@ def _queries(endpoint: str, amount: int, shots: list[tuple[str, bytes, str]]) ->
     while True:
         for key, payload, encoding in shots:
             # A channel that nobody reads costs this process less than a callback.
-            session.get(f"{NAMESPACE}/{key}", handlers.RingChannel(1), payload=payload, encoding=encoding, timeout=1.0)
+            session.get(
+                f"{NAMESPACE}/{key}",
+                handlers.RingChannel(1),
+                payload=payload,
+                encoding=encoding,
+                timeout=1.0,
+            )
         sent += len(shots)
         ahead_s = sent / amount - (time.monotonic() - began)
         if ahead_s > 0:
@@ -83,7 +92,11 @@ def garbage(endpoint: str, amount: int) -> Iterator[str]:
         if ahead_s > 0:
             time.sleep(ahead_s)
         if sent % 1000 == 0:
-            yield "ready" if sent == 1000 else f"{sent / (time.monotonic() - began):.0f} samples a second"
+            yield (
+                "ready"
+                if sent == 1000
+                else f"{sent / (time.monotonic() - began):.0f} samples a second"
+            )
 
 
 def readers(endpoint: str, amount: int) -> Iterator[str]:
@@ -91,7 +104,8 @@ def readers(endpoint: str, amount: int) -> Iterator[str]:
     session = zenoh.open(settings(endpoint))
     kept: list[Any] = []
     for i in range(amount):
-        kept.append(session.declare_subscriber(pattern(i), handlers.RingChannel(1)))  # unread: no thread each
+        # Unread: no thread each.
+        kept.append(session.declare_subscriber(pattern(i), handlers.RingChannel(1)))
     time.sleep(1.0)  # until the robot's host knows of them
     yield "ready"
     while True:

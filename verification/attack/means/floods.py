@@ -21,20 +21,33 @@ def flood(
     folder: Path, kind: str, endpoint: str, amount: int, process_count: int = 1
 ) -> Iterator[list[subprocess.Popen[bytes]]]:
     """So many processes of one kind of `verification.attack.means.flooder`, at work; killed at the end."""
-    command = [sys.executable, "-m", "verification.attack.means.flooder", kind, endpoint, str(amount)]
+    command = [
+        sys.executable,
+        "-m",
+        "verification.attack.means.flooder",
+        kind,
+        endpoint,
+        str(amount),
+    ]
     logs = [folder / f"{kind}-{i}.printed" for i in range(process_count)]
     with contextlib.ExitStack() as stack:
         started: list[subprocess.Popen[bytes]] = []
         for log in logs:
             output = stack.enter_context(log.open("wb"))
             process = subprocess.Popen(
-                command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT
+                command,
+                cwd=REPOSITORY,
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
             )
             started.append(stack.enter_context(process))
             stack.callback(process.kill)
 
         def at_work() -> bool:
-            assert all(process.poll() is None for process in started), [log.read_text() for log in logs]
+            assert all(process.poll() is None for process in started), [
+                log.read_text() for log in logs
+            ]
             return all("ready" in log.read_text(errors="replace") for log in logs)
 
         wait_until(at_work, f"{kind} at work", READY_S)
@@ -45,11 +58,20 @@ def flood(
 def half_sent(console: str, count: int, process_count: int) -> Iterator[None]:
     """Half-sent HTTP requests at a console, so many of each process, held open for as long as the context lives."""
     host, port = address(origin_of(console).replace("http://", "tcp/"))
-    command = [sys.executable, "-m", "verification.attack.means.half_sent", host, str(port), str(count)]
+    command = [
+        sys.executable,
+        "-m",
+        "verification.attack.means.half_sent",
+        host,
+        str(port),
+        str(count),
+    ]
     with contextlib.ExitStack() as stack:
         started: list[subprocess.Popen[bytes]] = []
         for _ in range(process_count):
-            process = subprocess.Popen(command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            process = subprocess.Popen(
+                command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            )
             started.append(stack.enter_context(process))
             stack.callback(process.kill)
         for process in started:

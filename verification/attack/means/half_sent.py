@@ -15,8 +15,14 @@ import time
 from itertools import cycle
 
 # What is sent on one connection after the other: for the pages, for the backup stop, and nothing at all.
-HALVES = (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n", b"POST /stop HTTP/1.1\r\nHost: ", b"GET /sig", b"")
-PAUSE_S = 0.02  # between two looks at closed connections: other processes of this computer get some time
+HALVES = (
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n",
+    b"POST /stop HTTP/1.1\r\nHost: ",
+    b"GET /sig",
+    b"",
+)
+# Between two looks at closed connections: other processes of this computer get some time.
+PAUSE_S = 0.02
 
 
 def main() -> None:

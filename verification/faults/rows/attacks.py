@@ -25,7 +25,9 @@ Flood = Callable[[ProcessRobot], AbstractContextManager[object]]
 
 
 def _flooding(kind: str, amount: int, process_count: int) -> Flood:
-    return lambda started_robot: flood(started_robot.folder, kind, started_robot.endpoint, amount, process_count)
+    return lambda started_robot: flood(
+        started_robot.folder, kind, started_robot.endpoint, amount, process_count
+    )
 
 
 FLOODS: dict[str, Flood] = {
@@ -49,9 +51,15 @@ def stopped_while_readers_leave(request: MeasurementRequest) -> Iterator[Injecti
     """The same, with many readers of everything that leave together just before."""
     with robot(request, **STANDING) as (started_robot, observer):
         for number in range(request.trials):
-            with flood(started_robot.folder, "readers", started_robot.endpoint, READERS) as (readers,):
+            with flood(started_robot.folder, "readers", started_robot.endpoint, READERS) as (
+                readers,
+            ):
                 yield _stopped(
-                    request, started_robot, observer, by_datagram=number % 2 == 1, before=partial(end, readers)
+                    request,
+                    started_robot,
+                    observer,
+                    by_datagram=number % 2 == 1,
+                    before=partial(end, readers),
                 )
     _explain(request)
 
@@ -87,14 +95,20 @@ def _stopped(
 
     def ask() -> None:
         if by_datagram:
-            answers.append(datagrams.ask(started_robot.endpoint, datagrams.stop("operator"), ANSWER_S))
+            answers.append(
+                datagrams.ask(started_robot.endpoint, datagrams.stop("operator"), ANSWER_S)
+            )
         else:
             answers.append(observer.ask(keys.ESTOP, EstopRequest(requester="operator")).ok)
 
     asking = threading.Thread(target=ask, daemon=True)
     asking.start()
-    stop = started_robot.host.first(lambda status: status.lifecycle != "armed", requested_ns, "a stop")
-    started_robot.host.first(lambda status: status.lifecycle == "estop", requested_ns, "the emergency stop")
+    stop = started_robot.host.first(
+        lambda status: status.lifecycle != "armed", requested_ns, "a stop"
+    )
+    started_robot.host.first(
+        lambda status: status.lifecycle == "estop", requested_ns, "the emergency stop"
+    )
     asking.join(ANSWER_S)
     period_ns = observer.description().period_ns
     failure = "" if answers and answers[0] else "the stop was not confirmed to who asked for it"
@@ -126,14 +140,29 @@ def second_run(request: MeasurementRequest) -> Iterator[InjectionTrial]:
             observer.watch(0.1)
             observer.forget()
             where = ["--router" if number % 2 else "--endpoint", started_robot.endpoint]
-            typed, output = [*command, *where, "--out", str(started_robot.folder / f"second{number}")], subprocess.PIPE
-            second = subprocess.run(typed, stdout=output, stderr=subprocess.STDOUT, text=True, check=False, timeout=60)
+            typed, output = (
+                [*command, *where, "--out", str(started_robot.folder / f"second{number}")],
+                subprocess.PIPE,
+            )
+            second = subprocess.run(
+                typed, stdout=output, stderr=subprocess.STDOUT, text=True, check=False, timeout=60
+            )
             observer.listen()
             failures: list[str] = []
-            if second.returncode not in (1, 2) or started_robot.config.robot.name not in second.stdout:
-                failures.append(f"the second run ended with {second.returncode}: {second.stdout[-300:]}")
-            moving = sum(any(mode is not JointMode.PASSIVE for mode in h.message.mode) for h in observer.applied)
+            if (
+                second.returncode not in (1, 2)
+                or started_robot.config.robot.name not in second.stdout
+            ):
+                failures.append(
+                    f"the second run ended with {second.returncode}: {second.stdout[-300:]}"
+                )
+            moving = sum(
+                any(mode is not JointMode.PASSIVE for mode in h.message.mode)
+                for h in observer.applied
+            )
             if observer.state() != "disarmed":
                 failures.append(f"the robot is {observer.in_words()}")
             yield InjectionTrial(value=float(moving), failure="; ".join(failures))
-        request.note("in turn on the robot's network (`--router`) and at its endpoint (`--endpoint`)")
+        request.note(
+            "in turn on the robot's network (`--router`) and at its endpoint (`--endpoint`)"
+        )

@@ -23,7 +23,8 @@ COUNTED_S = 1.5  # until the status must have counted them
 INTERLEAVINGS = 100_000
 MOVES = 4  # of two writers in one interleaving
 
-Kinds = Mapping[str, tuple[Callable[[], None], str]]  # name -> how it is sent, and the reason that it is counted by
+# Name -> how it is sent, and the reason that it is counted by.
+Kinds = Mapping[str, tuple[Callable[[], None], str]]
 
 
 def out_of_time(request: MeasurementRequest) -> Iterator[InjectionTrial]:
@@ -64,7 +65,9 @@ def wrong_in_itself(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     )
 
 
-def _among_good_ones(request: MeasurementRequest, make: Callable[[CommandForger], Kinds]) -> Iterator[InjectionTrial]:
+def _among_good_ones(
+    request: MeasurementRequest, make: Callable[[CommandForger], Kinds]
+) -> Iterator[InjectionTrial]:
     with robot(request) as (started_robot, observer):
         stranger = CommandForger(observer)
         kinds = make(stranger)
@@ -74,7 +77,9 @@ def _among_good_ones(request: MeasurementRequest, make: Callable[[CommandForger]
             if started_robot.ended():
                 raise AssertionError(f"{started_robot.ended()}: {started_robot.last_words()}")
         each = ", ".join(f"{name}: {reason}" for name, (_, reason) in kinds.items())
-        request.note(f"in each trial {EACH} of each kind among the controller's own; counted as {each}")
+        request.note(
+            f"in each trial {EACH} of each kind among the controller's own; counted as {each}"
+        )
 
 
 def _bombarded(observer: Observer, stranger: CommandForger, kinds: Kinds) -> InjectionTrial:
@@ -94,7 +99,9 @@ def _bombarded(observer: Observer, stranger: CommandForger, kinds: Kinds) -> Inj
     return _judged(observer, uncounted, [])
 
 
-def _judged(observer: Observer, uncounted: Callable[[], Counter[str]], failures: list[str]) -> InjectionTrial:
+def _judged(
+    observer: Observer, uncounted: Callable[[], Counter[str]], failures: list[str]
+) -> InjectionTrial:
     """How many setpoints got through; a failure besides `failures` when not all are counted, or the robot stopped."""
     try:
         observer.until(lambda: not uncounted(), "all counted", COUNTED_S)
@@ -115,7 +122,9 @@ def applied_of_others(observer: Observer) -> int:
     """Applied setpoints that were not the controller's own, each newer than the one before."""
     sequences = [h.message.sequence for h in observer.applied]
     forged = sum(s is None or s >= FORGED for s in sequences)
-    back = sum(1 for a, b in itertools.pairwise(sequences) if a is not None and b is not None and b < a)
+    back = sum(
+        1 for a, b in itertools.pairwise(sequences) if a is not None and b is not None and b < a
+    )
     return forged + back
 
 
@@ -133,7 +142,9 @@ def second_controller(request: MeasurementRequest) -> Iterator[InjectionTrial]:
         )
 
 
-def _second(observer: Observer, stranger: CommandForger, answered_ms: list[float]) -> InjectionTrial:
+def _second(
+    observer: Observer, stranger: CommandForger, answered_ms: list[float]
+) -> InjectionTrial:
     before = _counts(observer)
     request_start_s = time.monotonic()
     answer = observer.ask(keys.LEASE, LeaseRequest(action="acquire", holder="second"))
@@ -176,14 +187,23 @@ class TwoWriters:
     def interleave(self) -> int:
         """Some moves of both within a lease term; how many setpoints or rights the second one got by them."""
         got = 0
-        moves = [self.first, self.second_commands, self.second_asks, self.rng.choice((self.second_commands, self.ends))]
+        moves = [
+            self.first,
+            self.second_commands,
+            self.second_asks,
+            self.rng.choice((self.second_commands, self.ends)),
+        ]
         for move in self.rng.sample(moves, MOVES):
             self.rig.now_ns += self.rng.randrange(PERIOD_NS // 2)
             got += move()
         decision = self.authority.compute_setpoints()
         self.authority.latch_faults_and_expire_lease(self.rig.now_ns, self.rig.tick)
         stopped = self.authority.state != "armed"
-        return got + (decision.command_sequence is not None and decision.command_sequence >= FORGED) + stopped
+        return (
+            got
+            + (decision.command_sequence is not None and decision.command_sequence >= FORGED)
+            + stopped
+        )
 
     def first(self) -> bool:
         """The first commands, with its own epoch."""
@@ -194,7 +214,9 @@ class TwoWriters:
     def second_commands(self) -> bool:
         """The second commands, with an epoch that is not the first one's."""
         self.theirs += 1
-        guess = self.rng.choice((0, self.epoch - 1, self.epoch + 1, self.epoch + self.rng.randrange(1, 2**40)))
+        guess = self.rng.choice(
+            (0, self.epoch - 1, self.epoch + 1, self.epoch + self.rng.randrange(1, 2**40))
+        )
         return self._offer(THEIRS, self.theirs, guess) is None
 
     def second_asks(self) -> bool:

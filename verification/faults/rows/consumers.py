@@ -31,12 +31,18 @@ def cannot_keep_up(kind: str, request: MeasurementRequest) -> Iterator[Injection
     """
     with robot(request) as (started_robot, observer):
         before, with_it = [_missed(observer) for _ in range(request.trials)], list[int]()
-        with _consumer(kind, started_robot.endpoint, started_robot.config.robot.name, request.folder) as process:
+        with _consumer(
+            kind, started_robot.endpoint, started_robot.config.robot.name, request.folder
+        ) as process:
             for _ in range(request.trials):
                 with_it.append(_missed(observer))
                 trial = _beside_it(observer, with_it[-1] - max(before))
                 ended = process.poll() is not None and not trial.failure
-                yield msgspec.structs.replace(trial, failure="the consumer has ended") if ended else trial
+                yield (
+                    msgspec.structs.replace(trial, failure="the consumer has ended")
+                    if ended
+                    else trial
+                )
         request.note(
             f"in {request.trials} windows of {WINDOW_S:g} s: {sum(before)} cycles missed without the consumer, "
             f"worst {max(before)}; {sum(with_it)} with it, worst {max(with_it)}"
@@ -52,9 +58,14 @@ def frozen_readers(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     Their buffers are small and full at once, so a process that waits for them stops.
     """
     rate_hz = FROZEN_HZ[request.backend]
-    with robot(request, rate_hz=rate_hz, controller="hold") as (started_robot, observer), ExitStack() as stack:
+    with (
+        robot(request, rate_hz=rate_hz, controller="hold") as (started_robot, observer),
+        ExitStack() as stack,
+    ):
         before, with_them = [_missed(observer, FROZEN_WINDOW_S) for _ in range(5)], list[int]()
-        for reader in stack.enter_context(flood(request.folder, "everything", started_robot.endpoint, 0, FROZEN)):
+        for reader in stack.enter_context(
+            flood(request.folder, "everything", started_robot.endpoint, 0, FROZEN)
+        ):
             stack.callback(reader.send_signal, signal.SIGCONT)
             reader.send_signal(signal.SIGSTOP)
         if observer.state() != "armed":
@@ -82,18 +93,26 @@ def _missed(observer: Observer, window_s: float = WINDOW_S) -> int:
     observer.forget()
     observer.watch(window_s)
     rows = [received.message for received in observer.applied]
-    return sum(a.sequence == b.sequence for a, b in itertools.pairwise(rows) if b.sequence is not None)
+    return sum(
+        a.sequence == b.sequence for a, b in itertools.pairwise(rows) if b.sequence is not None
+    )
 
 
 @contextmanager
-def _consumer(kind: str, endpoint: str, namespace: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
+def _consumer(
+    kind: str, endpoint: str, namespace: str, folder: Path
+) -> Iterator[subprocess.Popen[str]]:
     """As soon as it is stuck."""
     command = [sys.executable, "-m", "verification.faults.consumer", kind, endpoint, namespace]
     log = folder / "consumer.log"
     with log.open("w") as output:
         process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, text=True)
     try:
-        wait_until(lambda: STUCK in log.read_text() or process.poll() is not None, "the consumer is stuck", 20.0)
+        wait_until(
+            lambda: STUCK in log.read_text() or process.poll() is not None,
+            "the consumer is stuck",
+            20.0,
+        )
         assert process.poll() is None, f"the consumer did not get stuck: {log.read_text()[-500:]}"
         yield process
     finally:

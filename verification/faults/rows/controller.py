@@ -21,7 +21,9 @@ Fail = Callable[[ProcessRobot, Observer], int]
 Mend = Callable[[ProcessRobot], object]
 
 
-def _trial(started_robot: ProcessRobot, observer: Observer, fail: Fail, mend: Mend) -> InjectionTrial:
+def _trial(
+    started_robot: ProcessRobot, observer: Observer, fail: Fail, mend: Mend
+) -> InjectionTrial:
     started_robot.set_in_motion(observer)
     failed_ns = fail(started_robot, observer)
     value = observer.safe_after_ms(failed_ns)
@@ -32,7 +34,10 @@ def _trial(started_robot: ProcessRobot, observer: Observer, fail: Fail, mend: Me
     if status.lease_holder is not None:
         failures.append(f"the lease is still {status.lease_holder}'s")
     mend(started_robot)
-    observer.until(lambda: observer.status is not None and observer.status.lease_holder == "control", "control is back")
+    observer.until(
+        lambda: observer.status is not None and observer.status.lease_holder == "control",
+        "control is back",
+    )
     observer.forget()
     observer.watch(LATCHED_S)
     if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
@@ -86,7 +91,9 @@ def host_restarts(request: MeasurementRequest) -> Iterator[InjectionTrial]:
             observer.until(lambda: observer.applied, "the new host's setpoints")
             failures = _objections(observer, streamed)
             if observer.status is None or 0 < observer.status.lease_epoch <= epoch:
-                failures.append(f"the lease's epoch did not grow from {epoch}: {observer.in_words()}")
+                failures.append(
+                    f"the lease's epoch did not grow from {epoch}: {observer.in_words()}"
+                )
             moved = sum(set(h.message.mode) != {JointMode.PASSIVE} for h in observer.applied)
             yield recovered(observer, float(moved), "; ".join(failures))
         request.note(f"in each trial {REPLAYED} commands of before were sent to the new host")
@@ -103,7 +110,9 @@ def _objections(observer: Observer, streamed: list[bytes]) -> list[str]:
         send_raw(observer.session, payload)
     failures: list[str] = []
     try:
-        observer.until(lambda: refused() >= before + len(streamed), "old commands refused", REFUSED_S)
+        observer.until(
+            lambda: refused() >= before + len(streamed), "old commands refused", REFUSED_S
+        )
     except TrialError:
         failures.append(f"{refused() - before} of {len(streamed)} old commands were refused")
     observer.watch(LATCHED_S)

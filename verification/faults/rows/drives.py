@@ -28,7 +28,8 @@ RATE_HZ = 50.0
 PERIOD_MS = 1000.0 / RATE_HZ
 FROZEN_S = 1.0
 WATCHED_S = 1.0  # for drives that are enabled again
-OFF_MS = 100.0 + 3 * PERIOD_MS  # a watchdog, the period that a setpoint may be old, and a busy computer
+# A watchdog, the period that a setpoint may be old, and a busy computer.
+OFF_MS = 100.0 + 3 * PERIOD_MS
 COOLS_IN_S = 2.0  # time constant of the windings, so that a trial need not wait for minutes
 MAX_RETRIES = 10  # of one trial
 BUS = "udp_multicast:239.74.163.9"
@@ -73,7 +74,13 @@ class DrivesOutside:
             log.write(words)
 
         write_config(config, folder / "drives.json")
-        module = ["verification.faults.drives_process", str(folder / "drives.json"), str(self._notes), "--pose", POSE]
+        module = [
+            "verification.faults.drives_process",
+            str(folder / "drives.json"),
+            str(self._notes),
+            "--pose",
+            POSE,
+        ]
         self._child = children.start_child("drives", module, keep)
         wait_until(lambda: READY in self.output(), "the drives", START_LIMIT_S)
 
@@ -138,7 +145,9 @@ def _set_in_motion(
     raise TrialError(f"this machine is too busy: the robot stopped by itself {MAX_RETRIES} times")
 
 
-def _frozen(started_robot: ProcessRobot, observer: Observer, drives: DrivesOutside) -> tuple[InjectionTrial, float]:
+def _frozen(
+    started_robot: ProcessRobot, observer: Observer, drives: DrivesOutside
+) -> tuple[InjectionTrial, float]:
     """Return a trial, and how long after the signal the last drive was off."""
     stopped_ns = started_robot.signal("host", signal.SIGSTOP)
     try:
@@ -172,19 +181,27 @@ def _unnamed(observer: Observer) -> list[str]:
 
 def _buses_in_words(request: MeasurementRequest) -> str:
     buses = [name for values in BUSES[request.backend].values() for name in values]
-    return " and ".join("a pseudo terminal" if name == SERVOS else "UDP multicast" for name in buses)
+    return " and ".join(
+        "a pseudo terminal" if name == SERVOS else "UDP multicast" for name in buses
+    )
 
 
 def _use_loopback() -> None:
     """Let multicast stay in this network namespace, in which nothing else is."""
-    for command in ("link set lo up", "link set lo multicast on", "route replace 239.0.0.0/8 dev lo"):
+    for command in (
+        "link set lo up",
+        "link set lo multicast on",
+        "route replace 239.0.0.0/8 dev lo",
+    ):
         subprocess.run(["ip", *command.split()], check=True, capture_output=True, timeout=10)
 
 
 # --- a drive, or its bus ---------------------------------------------------------------------------------------
 
 
-def at_host(kind: str, expected: dict[str, Sequence[str]], request: MeasurementRequest) -> Iterator[InjectionTrial]:
+def at_host(
+    kind: str, expected: dict[str, Sequence[str]], request: MeasurementRequest
+) -> Iterator[InjectionTrial]:
     """Inject a fault of joint_N or bus_1 into the host whose process emulates the drives.
 
     expected: names that the driver of each type gives it. The value: from its beginning to the stop mode.
@@ -192,10 +209,15 @@ def at_host(kind: str, expected: dict[str, Sequence[str]], request: MeasurementR
     rng = random.Random(9)
     config = robot_of(request.backend, robot__heat__time_constant_s=COOLS_IN_S)
     what = expected.get(request.backend, expected["others"])
-    with robot(request, validate_and_complete_config(config)) as (started_robot, observer):  # as `snakesim run` does
+    with robot(request, validate_and_complete_config(config)) as (
+        started_robot,
+        observer,
+    ):  # as `snakesim run` does
         joints = len(observer.description().joints)
         for _ in range(request.trials):
             _set_in_motion(request, started_robot, observer)
             target = "bus_1" if kind in modules.BUS_KINDS else f"joint_{rng.randrange(joints) + 1}"
             yield modules.injected(observer, FaultInjection(kind, target), what, PERIOD_MS)
-    request.note(f"the real host process at {RATE_HZ:g} Hz, drives emulated in it; counted in its periods")
+    request.note(
+        f"the real host process at {RATE_HZ:g} Hz, drives emulated in it; counted in its periods"
+    )

@@ -70,7 +70,9 @@ def host_gone(number: signal.Signals, request: MeasurementRequest) -> Iterator[I
                 continue
             request.retry()
             if request.retried > MAX_RETRIES * request.trials:
-                raise TrialError(f"this machine is too busy: the robot stopped by itself {request.retried} times")
+                raise TrialError(
+                    f"this machine is too busy: the robot stopped by itself {request.retried} times"
+                )
     request.note(
         f"the real host process and control, {JOINTS} modules in a process of their own, at {RATE_HZ:g} Hz on "
         f"{CHANNEL}; from the signal to the last module's fault by the kernel's clock: at most "
@@ -78,7 +80,9 @@ def host_gone(number: signal.Signals, request: MeasurementRequest) -> Iterator[I
     )
 
 
-host_killed, host_frozen = (partial(host_gone, number) for number in (signal.SIGKILL, signal.SIGSTOP))
+host_killed, host_frozen = (
+    partial(host_gone, number) for number in (signal.SIGKILL, signal.SIGSTOP)
+)
 
 
 def _left_alone(
@@ -88,14 +92,16 @@ def _left_alone(
     listener, fault = robot.listener, {ModuleState.FAULT}
     now_ns = time.time_ns()
     os.kill(pid, number)
-    time.sleep(LEFT_S)  # also for the heartbeats after it, from which the modules' own time is known
+    # Also for the heartbeats after it, from which the modules' own time is known.
+    time.sleep(LEFT_S)
     received = listener.listen()
     if not _went_well_until(received, now_ns):
         return None
     stopped = first_in(received, fault, now_ns)
     if len(stopped) < JOINTS:
         return InjectionTrial(
-            value=None, failure=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}"
+            value=None,
+            failure=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}",
         )
     by_kernel_ms.append(max(h.at_ns for h in stopped.values()) / 1e6 - now_ns / 1e6)
     failures: list[str] = []
@@ -104,7 +110,11 @@ def _left_alone(
         failures.append(f"stopped by {causes}")
     own_ms: list[float] = []
     for node in NODES:
-        points = [h.at_ns for h in received if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node]
+        points = [
+            h.at_ns
+            for h in received
+            if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node
+        ]
         own_ms.append(passed_for_module_ms(received, node, max(points), stopped[node].at_ns))
     return InjectionTrial(value=max(own_ms), failure="; ".join(failures), recovered=True)
 
@@ -112,7 +122,11 @@ def _left_alone(
 def _went_well_until(received: Sequence[ReceivedFrame], now_ns: int) -> bool:
     """Return whether every module had a setpoint within the last three periods, and none had a stop command."""
     recent_ns = now_ns - round(3e9 / RATE_HZ)
-    driven = {parse_node(h.frame.id) for h in received if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns}
+    driven = {
+        parse_node(h.frame.id)
+        for h in received
+        if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns
+    }
     return driven == set(NODES) and not stop_commands([h for h in received if h.at_ns > recent_ns])
 
 
@@ -179,7 +193,9 @@ def watchdog(request: MeasurementRequest) -> Iterator[InjectionTrial]:
 
 def clock_step(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """An hour ahead, then an hour back, while a robot moves at 25 Hz. The value: faults and stops."""
-    scenario = write_scenario_files(request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', ""))
+    scenario = write_scenario_files(
+        request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', "")
+    )
     settings = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
     config = load_scenario(
         scenario, [KeyOverride(key, value, "the fault table") for key, value in settings.items()]
@@ -214,7 +230,9 @@ def _stepped(started_robot: ProcessRobot, observer: Observer, by_s: float) -> In
     stops = sum(h.message.sequence is None for h in observer.applied)
     failure = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
     if len(observer.applied) < AFTER_STEP_S * RATE_HZ / 2:
-        failure = failure or f"only {len(observer.applied)} setpoints received of in {AFTER_STEP_S:g} s"
+        failure = (
+            failure or f"only {len(observer.applied)} setpoints received of in {AFTER_STEP_S:g} s"
+        )
     return InjectionTrial(value=float(faults + stops), failure=failure)
 
 

@@ -38,7 +38,9 @@ def _let_go(observer: Observer, joint_index: int, since_ns: int) -> ReceivedMess
 
     def found() -> list[ReceivedMessage[AppliedCommand]]:
         passive = (
-            h for h in observer.applied if h.at_ns >= since_ns and h.message.mode[joint_index] is JointMode.PASSIVE
+            h
+            for h in observer.applied
+            if h.at_ns >= since_ns and h.message.mode[joint_index] is JointMode.PASSIVE
         )
         return [received for received in passive if received.message.sequence is not None]
 
@@ -65,4 +67,8 @@ def _take_back(observer: Observer) -> None:
     """Disarm, and reset: then the joint counts again."""
     for action in ("disarm", "reset"):
         observer.ask(keys.LIFECYCLE, LifecycleRequest(action=action))
-    observer.until(lambda: observer.status is not None and not observer.status.isolated, "the joint is taken back", 3.0)
+    observer.until(
+        lambda: observer.status is not None and not observer.status.isolated,
+        "the joint is taken back",
+        3.0,
+    )

@@ -21,7 +21,8 @@ PERIOD_MS = 10.0
 FAULT_DURATION_S = 0.3
 REST_S = 0.4  # until all motors must be off
 OFF_NM = 0.1  # what noise makes of none
-CUT_OFF = ("cut", "bus_off", "full")  # of a bus that takes no frame any more: modules stop by themselves
+# Of a bus that takes no frame any more: modules stop by themselves.
+CUT_OFF = "cut", "bus_off", "full"
 BUS_KINDS = (*CUT_OFF, "error_passive", "overflow")
 BUS_LOG = "bus.log"
 ROBOT_TIME_PATTERN = re.compile(r"at ([0-9.]+) s of robot time")
@@ -46,15 +47,23 @@ def at_host(kind: str, what: str, request: MeasurementRequest) -> Iterator[Injec
     request.note("the real host process, in real time; counted in its periods")
 
 
-def injected(observer: Observer, injection: FaultInjection, what: Sequence[str], period_ms: float) -> InjectionTrial:
+def injected(
+    observer: Observer, injection: FaultInjection, what: Sequence[str], period_ms: float
+) -> InjectionTrial:
     """Inject a fault once, and return the trial. what: names that the driver may give it; period_ms: of the host."""
     injection, requested_ns = validate_and_complete_injection(injection), time.monotonic_ns()
     answer = observer.inject("hal", injection.kind, injection.target, for_s=FAULT_DURATION_S)
     begun = _begun_tick(answer, period_ms)
     status = observer.first_fault(requested_ns)
-    found = min((fault for fault in status.faults if fault.tick >= begun), key=lambda fault: fault.tick, default=None)
+    found = min(
+        (fault for fault in status.faults if fault.tick >= begun),
+        key=lambda fault: fault.tick,
+        default=None,
+    )
     if found is None:
-        return InjectionTrial(value=None, failure=f"nothing found after tick {begun}: {status.faults}")
+        return InjectionTrial(
+            value=None, failure=f"nothing found after tick {begun}: {status.faults}"
+        )
     observer.watch(REST_S)
     failures = _objections(observer, injection, what, requested_ns)
     if injection.target_type == "joint" and found.joint != injection.target:
@@ -72,10 +81,14 @@ def _begun_tick(answer: Answer, period_ms: float) -> int:
     return round(float(match[1]) * 1000 / period_ms)
 
 
-def _objections(observer: Observer, injection: FaultInjection, what: Sequence[str], requested_ns: int) -> list[str]:
+def _objections(
+    observer: Observer, injection: FaultInjection, what: Sequence[str], requested_ns: int
+) -> list[str]:
     """Return every condition that is not met after the stop mode."""
     failures: list[str] = []
-    reported: list[RobotStatus] = [received.message for received in observer.statuses if received.at_ns >= requested_ns]
+    reported: list[RobotStatus] = [
+        received.message for received in observer.statuses if received.at_ns >= requested_ns
+    ]
     words = {fault.what for status in reported for fault in status.faults}
     if words.isdisjoint(what):
         failures.append(f"found as {sorted(words)}, not {' or '.join(what)}")
@@ -100,7 +113,9 @@ def twice_at_start(request: MeasurementRequest) -> Iterator[InjectionTrial]:
         joint, folder = f"joint_{number % joints + 1}", request.folder / str(number)
         folder.mkdir()
         log = folder / BUS_LOG
-        config = configuration("can", backend__log=str(log), backend__faults=[f"duplicate:{joint}@0"])
+        config = configuration(
+            "can", backend__log=str(log), backend__faults=[f"duplicate:{joint}@0"]
+        )
         with ProcessRobot(folder, config) as started_robot:
             host = started_robot.start("host")
             host.process.wait(START_LIMIT_S)
@@ -108,9 +123,12 @@ def twice_at_start(request: MeasurementRequest) -> Iterator[InjectionTrial]:
         failure = "" if joint in words and "2 times" in words else f"in other words: {words}"
         frames = bus_log.read(log)
         yield InjectionTrial(
-            value=float(bus_log.commands(frames, CommandAction.ARM) + bus_log.setpoints(frames)), failure=failure
+            value=float(bus_log.commands(frames, CommandAction.ARM) + bus_log.setpoints(frames)),
+            failure=failure,
         )
-    request.note("the real host process, which reports why it refuses; enabled is what its bus log shows")
+    request.note(
+        "the real host process, which reports why it refuses; enabled is what its bus log shows"
+    )
 
 
 def through_robot(kind: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
@@ -129,6 +147,8 @@ def through_robot(kind: str, request: MeasurementRequest) -> Iterator[InjectionT
             status = observer.first_fault(requested_ns)
             failures: list[str] = []
             if not any(joint in fault.cause or fault.joint == joint for fault in status.faults):
-                failures.append(f"{joint} was not named: {[fault.cause for fault in status.faults]}")
+                failures.append(
+                    f"{joint} was not named: {[fault.cause for fault in status.faults]}"
+                )
             observer.watch(FAULT_DURATION_S)
             yield recovered(observer, value, "; ".join(failures))

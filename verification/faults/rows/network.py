@@ -36,11 +36,15 @@ def router_restarts(request: MeasurementRequest) -> Iterator[InjectionTrial]:
             observer.watch(0.05)
             dead_ns = started_robot.signal("router", signal.SIGKILL)
             observer.watch(DOWN_S)
-            stop = started_robot.host.first(lambda status: status.lifecycle != "armed", dead_ns, "a stop")
+            stop = started_robot.host.first(
+                lambda status: status.lifecycle != "armed", dead_ns, "a stop"
+            )
             observer.forget()
             started_robot.start("router")
             started = time.monotonic()
-            observer.until(lambda: observer.statuses and observer.clocks, "reconnected", START_LIMIT_S)
+            observer.until(
+                lambda: observer.statuses and observer.clocks, "reconnected", START_LIMIT_S
+            )
             observer.until(lambda: _all_back(observer), "every service reconnected", START_LIMIT_S)
             took_s = time.monotonic() - started
             slowest_s = max(slowest_s, took_s)
@@ -63,7 +67,9 @@ def _after(observer: Observer, value: float, failures: list[str]) -> InjectionTr
     observer.watch(STEADY_S)
     status = observer.status
     if status is None or status.lifecycle != "fault":
-        return recovered(observer, None, "; ".join([*failures, f"not stopped: {observer.in_words()}"]))
+        return recovered(
+            observer, None, "; ".join([*failures, f"not stopped: {observer.in_words()}"])
+        )
     if any(h.message.sequence is not None for h in observer.applied):
         failures.append("commands were applied without an arm session")
     if not any(fault.what == "lease_expired" for fault in status.faults):
@@ -79,7 +85,9 @@ def network_cut(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     endpoint = f"tcp/{OURS}:{PORT}"
     with (
         _far_side() as far,
-        ProcessRobot(request.folder, configuration(request.backend), endpoint=endpoint) as started_robot,
+        ProcessRobot(
+            request.folder, configuration(request.backend), endpoint=endpoint
+        ) as started_robot,
     ):
         started_robot.start("host")
         observer = started_robot.observe()
@@ -94,14 +102,20 @@ def network_cut(request: MeasurementRequest) -> Iterator[InjectionTrial]:
             _set_link("ours", up=False)
             value = observer.safe_after_ms(cut_ns)
             status = observer.first_fault(cut_ns)
-            failures = [] if status.lease_holder is None else [f"the lease is still {status.lease_holder}'s"]
+            failures = (
+                []
+                if status.lease_holder is None
+                else [f"the lease is still {status.lease_holder}'s"]
+            )
             observer.watch(CUTS_S[number % len(CUTS_S)])
             observer.forget()
             _set_link("ours", up=True)
             started = time.monotonic()
             observer.until(lambda: _all_back(observer), "every service reconnected", START_LIMIT_S)
             slowest_s = max(slowest_s, time.monotonic() - started)
-            if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
+            if observer.state() != "fault" or any(
+                h.message.sequence is not None for h in observer.applied
+            ):
                 failures.append(f"not latched: {observer.in_words()}")
             yield recovered(observer, value, "; ".join(failures))
         request.retry(observer.stumbles)

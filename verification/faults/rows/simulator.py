@@ -24,7 +24,11 @@ def slow(request: MeasurementRequest) -> Iterator[InjectionTrial]:
         period_s, shares = observer.description().period_ns * 1e-9, list[float]()
         for _ in range(request.trials):
             observer.forget()
-            observer.until(lambda: len(observer.clocks) > WINDOW_TICKS or observer.state() != "armed", "ticks", 30.0)
+            observer.until(
+                lambda: len(observer.clocks) > WINDOW_TICKS or observer.state() != "armed",
+                "ticks",
+                30.0,
+            )
             status = observer.status
             faults = len(status.faults) if status is not None else 0
             stops = sum(h.message.sequence is None for h in observer.applied)
@@ -36,7 +40,9 @@ def slow(request: MeasurementRequest) -> Iterator[InjectionTrial]:
                 failure = failure or f"the simulator was not slow: {shares[-1]:.2f} of real time"
             yield InjectionTrial(value=float(faults + stops), failure=failure)
         observer.inject("hal", "slow", "simulator", end=True)
-        request.note(f"{WINDOW_TICKS} ticks each, at {min(shares):.3f} to {max(shares):.3f} of real time")
+        request.note(
+            f"{WINDOW_TICKS} ticks each, at {min(shares):.3f} to {max(shares):.3f} of real time"
+        )
 
 
 def diverges(request: MeasurementRequest) -> Iterator[InjectionTrial]:
@@ -68,7 +74,10 @@ def diverges(request: MeasurementRequest) -> Iterator[InjectionTrial]:
             observer.forget()
             started_robot.start("host")
             observer.until(lambda: observer.statuses, "a status of the new host", START_LIMIT_S)
-            reported = next(text for text in left.injected if "diverge" in text)  # `tick 31: diverge:simulator@...`
+            # `tick 31: diverge:simulator@...`.
+            reported = next(text for text in left.injected if "diverge" in text)
             begun = int(reported.removeprefix("tick ").partition(":")[0])
             yield recovered(observer, float(fault.tick - begun + 1), "; ".join(failures))
-        request.note("the host process ends after a divergence, with its record; a new one was started and armed")
+        request.note(
+            "the host process ends after a divergence, with its record; a new one was started and armed"
+        )

@@ -10,7 +10,8 @@ from verification.faults.observer import Observer, TrialError
 from verification.faults.robot import ProcessRobot, recovered, robot
 from verification.faults.row import InjectionTrial, MeasurementRequest
 
-ALONG_PEGS = {"scene": "peg_row", "mission__speed_m_s": 0.2}  # where the snake pushes for as long as it takes
+# Where the snake pushes for as long as it takes.
+ALONG_PEGS = {"scene": "peg_row", "mission__speed_m_s": 0.2}
 PUSHES = 5  # ticks in a row with a joint in torque mode, before a stream is cut
 AWAY_S = 0.5  # from when the controller holds until the stream is back
 BACK_S = 5.0  # at most, until it pushes again
@@ -43,7 +44,9 @@ def withheld(key: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
             _pushing(started_robot, observer)
             states.drain()
             requested_ns = _cut(observer, key)
-            observer.until(lambda: _named(states.drain(), key), f"{key} named in control/state", BACK_S)
+            observer.until(
+                lambda: _named(states.drain(), key), f"{key} named in control/state", BACK_S
+            )
             observer.watch(AWAY_S)
             value, failures = _held(observer, requested_ns)
             yield _back(observer, key, value, failures, back_ms)
@@ -113,6 +116,10 @@ def _back(
     try:
         back_ns = observer.until(pushing, "a joint pushes again", BACK_S)[0]
     except TrialError as error:
-        return InjectionTrial(value=value, failure="; ".join([*failures, str(error)]), recovered=False)
+        return InjectionTrial(
+            value=value, failure="; ".join([*failures, str(error)]), recovered=False
+        )
     back_ms.append((back_ns - began_ns) / 1e6)
-    return InjectionTrial(value=value, failure="; ".join(failures), recovered=True, **observer.steps())
+    return InjectionTrial(
+        value=value, failure="; ".join(failures), recovered=True, **observer.steps()
+    )

@@ -74,8 +74,14 @@ JOINT_MODULE_FAILS = FaultHeading(
         joint_row("joint_wrong_counter", "counter", "wrong_counter"),
         joint_row("joint_bad_checksum", "checksum", "bad_checksum"),
         sensor_row("robot_joint_silent", "a joint is silent, by a whole robot", "mute"),
-        sensor_row("robot_joint_frozen", "a joint repeats its last value, by a whole robot", "freeze"),
-        sensor_row("robot_joint_wrong", "a joint's angle is suddenly off by 0.5 rad, by a whole robot", "wrong"),
+        sensor_row(
+            "robot_joint_frozen", "a joint repeats its last value, by a whole robot", "freeze"
+        ),
+        sensor_row(
+            "robot_joint_wrong",
+            "a joint's angle is suddenly off by 0.5 rad, by a whole robot",
+            "wrong",
+        ),
         sensor_row("robot_joint_nan", "a joint's angle is no number, by a whole robot", "nan"),
     ),
 )
@@ -103,7 +109,13 @@ BUS_FAILS = FaultHeading(
         bus_row("bus_interface_down", "the interface goes down", "cut", "interface_down"),
         bus_row("bus_receive_overflow", "received frames get lost", "overflow", "receive_overflow"),
         bus_row("bus_babbling", "a node floods the bus", "babble", "module_babbling", 100.0),
-        bus_row("bus_duplicate", "a second node with the same id appears", "duplicate", "duplicate_node", 100.0),
+        bus_row(
+            "bus_duplicate",
+            "a second node with the same id appears",
+            "duplicate",
+            "duplicate_node",
+            100.0,
+        ),
         FaultRow(
             name="bus_duplicate_at_start",
             fault="two nodes with the same id are there when the host opens the bus",

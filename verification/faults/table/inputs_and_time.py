@@ -74,7 +74,10 @@ SIMULATION_DIVERGES = FaultHeading(
             deadline="one step",
             limit=1.0,
             unit="steps",
-            measures={"sim": simulator.diverges, "can": "modules on a bus are no simulation that could diverge"},
+            measures={
+                "sim": simulator.diverges,
+                "can": "modules on a bus are no simulation that could diverge",
+            },
         ),
     ),
 )

@@ -2,14 +2,25 @@
 
 from verification.faults.row import FaultHeading
 from verification.faults.rows import attacks, consumers, network
-from verification.faults.table.row_kinds import STOP_MS, consumer_row, flood_row, lease_row, stop_row
+from verification.faults.table.row_kinds import (
+    STOP_MS,
+    consumer_row,
+    flood_row,
+    lease_row,
+    stop_row,
+)
 
 NETWORK_CUT = FaultHeading(
     fault="network cut between controller and robot (namespaces with a veth pair, link down)",
     expected="safe stop on the robot side",
     deadline="lease",
     rows=(
-        lease_row("network_cut", "link down between host and services", network.network_cut, environment="namespaces"),
+        lease_row(
+            "network_cut",
+            "link down between host and services",
+            network.network_cut,
+            environment="namespaces",
+        ),
     ),
 )
 
@@ -18,9 +29,19 @@ SLOW_CONSUMER = FaultHeading(
     expected="only that consumer suffers; zero missed control cycles",
     deadline="-",
     rows=(
-        consumer_row("consumer_sleeps", "a consumer's callback sleeps for 0.5 s at every sample", consumers.sleeps),
-        consumer_row("consumer_disk_full", "a consumer writes to a disk that is full", consumers.disk_full),
-        consumer_row("consumer_frozen", "four readers of everything are frozen (SIGSTOP)", consumers.frozen_readers),
+        consumer_row(
+            "consumer_sleeps",
+            "a consumer's callback sleeps for 0.5 s at every sample",
+            consumers.sleeps,
+        ),
+        consumer_row(
+            "consumer_disk_full", "a consumer writes to a disk that is full", consumers.disk_full
+        ),
+        consumer_row(
+            "consumer_frozen",
+            "four readers of everything are frozen (SIGSTOP)",
+            consumers.frozen_readers,
+        ),
     ),
 )
 
@@ -33,7 +54,15 @@ STOP_UNDER_ATTACK = FaultHeading(
         flood_row("stop_idle", "1000 sessions that do nothing, or as many as get in", "idle"),
         flood_row("stop_lease_flood", "lease queries, as many as two processes can", "lease"),
         flood_row("stop_sample_flood", "10,000 samples of noise a second on every key", "garbage"),
-        flood_row("stop_datagram_flood", "wrong datagrams at the stop port, as many as a thread can", "datagrams"),
-        stop_row("stop_readers_leave", "300 readers of everything leave at once", attacks.stopped_while_readers_leave),
+        flood_row(
+            "stop_datagram_flood",
+            "wrong datagrams at the stop port, as many as a thread can",
+            "datagrams",
+        ),
+        stop_row(
+            "stop_readers_leave",
+            "300 readers of everything leave at once",
+            attacks.stopped_while_readers_leave,
+        ),
     ),
 )

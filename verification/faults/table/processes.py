@@ -32,7 +32,9 @@ HOST_STOPS = FaultHeading(
     expected="modules' own watchdog",
     deadline="100 ms",
     rows=(
-        watchdog_row("host_silent", "the host sends nothing any more, at one module", guest.watchdog, 100.0),
+        watchdog_row(
+            "host_silent", "the host sends nothing any more, at one module", guest.watchdog, 100.0
+        ),
         watchdog_row("host_killed", "host: SIGKILL", guest.host_killed, GUEST_WATCHDOG_MS, "guest"),
         watchdog_row("host_frozen", "host: SIGSTOP", guest.host_frozen, GUEST_WATCHDOG_MS, "guest"),
     ),

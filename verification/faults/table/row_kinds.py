@@ -18,7 +18,8 @@ MAX_FLOOD_MS = 100.0  # to the stop mode, where a node floods the bus or has the
 # Deadlines, expected reactions and units that several rows have.
 WITHIN_LEASE = "lease, 50 ms after the last good command, and acted on within the period (10 ms)"
 WITHOUT_CONSUMER = (
-    "2 more in a window than in the worst one before it came: as many are missed without it, now and then"
+    "2 more in a window than in the worst one before it came: as many are missed "
+    "without it, now and then"
 )
 NAMES_JOINT = "fault names the joint, group to safe stop, latched"
 FRAMES_THROUGH = "messages got through"
@@ -26,8 +27,12 @@ FRAMES_THROUGH = "messages got through"
 # Why a row does not apply to the simulator.
 NO_BUS = "a simulator has no bus"
 NO_MODULES = "a simulator has no modules; what its sensors can do is in the rows by a whole robot"
-NO_WATCHDOG = "these servos have no watchdog: they hold their last angle until the driver runs again"
-NO_MODULES_LEFT = "the simulator is in the host's process: without a host nothing is there that could move"
+NO_WATCHDOG = (
+    "these servos have no watchdog: they hold their last angle until the driver runs again"
+)
+NO_MODULES_LEFT = (
+    "the simulator is in the host's process: without a host nothing is there that could move"
+)
 
 
 def both(measure: Measure) -> dict[Backend, Measure | str]:
@@ -122,7 +127,9 @@ def isolated_row(name: str, fault: str, kind: str) -> FaultRow:
     return injected_row(name, fault, expected, partial(isolation.set_aside, kind))
 
 
-def bus_row(name: str, fault: str, kind: str, fault_name: str, limit_ms: float = 3 * PERIOD_MS) -> FaultRow:
+def bus_row(
+    name: str, fault: str, kind: str, fault_name: str, limit_ms: float = 3 * PERIOD_MS
+) -> FaultRow:
     """Return a row about a CAN bus. fault_name: what the driver reports."""
     return FaultRow(
         name=name,
@@ -136,7 +143,12 @@ def bus_row(name: str, fault: str, kind: str, fault_name: str, limit_ms: float =
 
 
 def drive_row(
-    name: str, fault: str, kind: str, limit_periods: int, reason: str, fault_names: dict[str, Sequence[str]]
+    name: str,
+    fault: str,
+    kind: str,
+    limit_periods: int,
+    reason: str,
+    fault_names: dict[str, Sequence[str]],
 ) -> FaultRow:
     """Return a row about a drive of every type, or about its bus.
 

@@ -66,20 +66,26 @@ def check_shapes(path: Path, selection: RobotSelection) -> int:
     """
     require_own_robot_file(path)
     robot_file = decode_table(read_table_with_base(str(path), "robots"), RobotFile)
-    with open_session(find_single_robot(selection, "robot shape check"), CONNECT_TIMEOUT_S) as session:
+    with open_session(
+        find_single_robot(selection, "robot shape check"), CONNECT_TIMEOUT_S
+    ) as session:
         robot = HandMovedRobot(session, path)
         description = session.wait_for_latched(keys.DESCRIPTION, RobotDescription, HOST_TIMEOUT_S)
         if description is None:
             raise RefusedError(HOST_TIMEOUT_MESSAGE, code="network/no-answer")
         poses = design_poses(robot.joints)
         mark = compute_drawing_mark(robot_file, poses)
-        print_line(f"{len(poses)} poses. Use the sheets with drawing {mark}, by `snakesim robot shape draw {path}`.")
+        print_line(
+            f"{len(poses)} poses. Use the sheets with drawing {mark}, by `snakesim robot shape draw {path}`."
+        )
         reading_rad = np.array([_measure_pose(robot, pose) for pose in poses])
     verdicts = judge_shapes(robot.joints, poses, reading_rad)
     for line in format_verdicts(verdicts):
         print_line(line)
     if not all(verdict.all_confirmed for verdict in verdicts):
-        print_line(f"{path}: nothing was written: correct it, restart the host, and repeat the check")
+        print_line(
+            f"{path}: nothing was written: correct it, restart the host, and repeat the check"
+        )
         return 1
     write_shape_record(path, robot.joints, description)
     return 0
@@ -89,13 +95,20 @@ def format_verdicts(verdicts: Sequence[ShapeVerdict]) -> list[str]:
     """Return the verdict on each joint, one a line, and the counts."""
     lines = [_format_verdict(verdict) for verdict in verdicts]
     right = sum(verdict.all_confirmed for verdict in verdicts)
-    wrong = sum(any(finding.state == "wrong" for finding in verdict.findings.values()) for verdict in verdicts)
+    wrong = sum(
+        any(finding.state == "wrong" for finding in verdict.findings.values())
+        for verdict in verdicts
+    )
     unknown = len(verdicts) - right - wrong
-    lines.append(f"{right} of {len(verdicts)} joints match the robot file; {wrong} wrong; {unknown} unknown")
+    lines.append(
+        f"{right} of {len(verdicts)} joints match the robot file; {wrong} wrong; {unknown} unknown"
+    )
     hint = find_placement_hint(verdicts)
     if hint:
         lines.append(hint)
-    lines.append("not judged: drives, which the start check moves; backlash: no link may move before its drive does")
+    lines.append(
+        "not judged: drives, which the start check moves; backlash: no link may move before its drive does"
+    )
     return lines
 
 
@@ -132,12 +145,19 @@ def _show_angles_until_enter(robot: HandMovedRobot) -> None:
     for angle_rad in robot.read_angles_rad(is_enter_pressed):
         if sys.stdout.isatty() and time.monotonic() >= next_drawing_s:
             next_drawing_s = time.monotonic() + REDRAW_PERIOD_S
-            drawn_line_count = overwrite_lines(_format_angles(robot.joints, angle_rad), drawn_line_count)
+            drawn_line_count = overwrite_lines(
+                _format_angles(robot.joints, angle_rad), drawn_line_count
+            )
 
 
 def _format_angles(joints: Sequence[Joint], angle_rad: Floats) -> list[str]:
-    cells = [f"{joint.name:<9}{angle:+6.2f}" for joint, angle in zip(joints, angle_rad.tolist(), strict=True)]
-    rows = [cells[start : start + ANGLES_PER_LINE] for start in range(0, len(cells), ANGLES_PER_LINE)]
+    cells = [
+        f"{joint.name:<9}{angle:+6.2f}"
+        for joint, angle in zip(joints, angle_rad.tolist(), strict=True)
+    ]
+    rows = [
+        cells[start : start + ANGLES_PER_LINE] for start in range(0, len(cells), ANGLES_PER_LINE)
+    ]
     return ["  ".join(row) for row in rows]
 
 
@@ -148,7 +168,9 @@ def _read_angles_at_rest(robot: HandMovedRobot) -> Floats:
     for time_s, angle_rad in robot.read_samples(lambda: measurement.rests):
         measurement.add_sample(time_s, angle_rad)
         if measurement.duration_s > HINT_AFTER_S and not measurement.rests and not is_hint_printed:
-            print_line(f"  {robot.joints[measurement.find_most_moved_joint()].name} moves: hold it still")
+            print_line(
+                f"  {robot.joints[measurement.find_most_moved_joint()].name} moves: hold it still"
+            )
             is_hint_printed = True
     return measurement.compute_mean_rad()
 

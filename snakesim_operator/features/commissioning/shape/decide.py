@@ -23,11 +23,18 @@ from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import JointProperty
 from snakesim_hal.model.joints import Joint, JointDrive
-from snakesim_operator.features.commissioning.judge import CONFIRMED, MAX_RATIO_ERROR, PropertyFinding, PropertyState
+from snakesim_operator.features.commissioning.judge import (
+    CONFIRMED,
+    MAX_RATIO_ERROR,
+    PropertyFinding,
+    PropertyState,
+)
 from snakesim_operator.features.commissioning.shape.design import PLACEMENT_TOLERANCE_RAD, ShapePose
 
-SHAPE_PROPERTIES: tuple[JointProperty, ...] = ("order", "sign", "gear", "zero")  # that drawn shapes decide
-MIN_SPAN_TOLERANCES = 4  # tolerances by which a drawn joint bends at least; with less, its sign would not be certain
+# That drawn shapes decide.
+SHAPE_PROPERTIES: tuple[JointProperty, ...] = "order", "sign", "gear", "zero"
+# Tolerances by which a drawn joint bends at least; with less, its sign would not be certain.
+MIN_SPAN_TOLERANCES = 4
 MIN_READING_CHANGE_RAD = 1e-6  # encoders that change less do not move
 MAX_ERROR_RAD = 7.0  # of a search for the placement error that would explain readings
 ERROR_STEP_RAD = 1e-3  # accuracy of that search
@@ -82,7 +89,9 @@ def find_placement_hint(verdicts: Sequence[ShapeVerdict]) -> str:
 class _ShapeJudge:
     """Judges the joints of one robot. Indices of drives are those of the joints that the file gives them."""
 
-    def __init__(self, joints: Sequence[Joint], drawn_rad: Floats, reading_rad: Floats, tolerance_rad: float) -> None:
+    def __init__(
+        self, joints: Sequence[Joint], drawn_rad: Floats, reading_rad: Floats, tolerance_rad: float
+    ) -> None:
         """Find the joint that each drive measures.
 
         Args:
@@ -107,10 +116,14 @@ class _ShapeJudge:
             unknown = PropertyFinding("unknown", "judged once its order is known")
             if not self._is_bent_far_enough(i):
                 unknown = order
-            return ShapeVerdict(joint.name, {"order": order, "sign": unknown, "gear": unknown, "zero": unknown})
+            return ShapeVerdict(
+                joint.name, {"order": order, "sign": unknown, "gear": unknown, "zero": unknown}
+            )
         drive = self._joint_by_drive.index(i)
         reading_rad = _convert_readings(self._joints[drive], joint, self._reading_rad[:, drive])
-        mounting = judge_mounting(joint.drive, self._drawn_rad[:, i], reading_rad, self._tolerance_rad)
+        mounting = judge_mounting(
+            joint.drive, self._drawn_rad[:, i], reading_rad, self._tolerance_rad
+        )
         return ShapeVerdict(joint.name, {"order": order, **mounting})
 
     # --- order ---------------------------------------------------------------------------------------------------
@@ -121,7 +134,9 @@ class _ShapeJudge:
         for j in range(len(self._joints)):
             # A joint that bends little looks like others with a wrong gear. It is compared with its own drive only.
             is_comparable = self._is_bent_far_enough(j) if j == drive else self._is_gear_decided(j)
-            scales = _find_scales(self._drawn_rad[:, j], self._reading_rad[:, drive], self._tolerance_rad)
+            scales = _find_scales(
+                self._drawn_rad[:, j], self._reading_rad[:, drive], self._tolerance_rad
+            )
             if is_comparable and scales is not None:
                 candidates.append(j)
         return candidates
@@ -131,7 +146,9 @@ class _ShapeJudge:
         return span_rad > MIN_SPAN_TOLERANCES * self._tolerance_rad
 
     def _is_gear_decided(self, i: int) -> bool:
-        return _compute_gear_resolution(self._drawn_rad[:, i], self._tolerance_rad) <= MAX_RATIO_ERROR
+        return (
+            _compute_gear_resolution(self._drawn_rad[:, i], self._tolerance_rad) <= MAX_RATIO_ERROR
+        )
 
     def _judge_order(self, i: int) -> PropertyFinding:
         """Judge whether the drive that the file gives joint `i` is on joint `i`."""
@@ -151,7 +168,9 @@ class _ShapeJudge:
         if candidates:
             rivals = [j for j, options in enumerate(self._candidates) if options == candidates]
             names = " and ".join(self._joints[j].name for j in rivals)
-            return f"{names} all measure {self._joints[candidates[0]].name}: look at ids and encoders"
+            return (
+                f"{names} all measure {self._joints[candidates[0]].name}: look at ids and encoders"
+            )
         if not self._is_bent_far_enough(i):
             span_rad = float(np.ptp(self._drawn_rad[:, i]))
             return (
@@ -236,7 +255,11 @@ def judge_mounting(
         return {"sign": sign, "gear": _report_gear(drive, scale), "zero": CONFIRMED}
     scale = sum(scales) / 2
     shift_rad = _get_middle(drawn_rad - scale * reading_rad)
-    return {"sign": sign, "gear": _report_gear(drive, scale), "zero": _report_zero(drive, scale, shift_rad)}
+    return {
+        "sign": sign,
+        "gear": _report_gear(drive, scale),
+        "zero": _report_zero(drive, scale, shift_rad),
+    }
 
 
 def _confirm_gear(drawn_rad: Floats, tolerance_rad: float) -> PropertyFinding:
@@ -260,13 +283,17 @@ def _compute_gear_resolution(drawn_rad: Floats, tolerance_rad: float) -> float:
 
 def _report_gear(drive: JointDrive, scale: float) -> PropertyFinding:
     ratio = abs(scale)
-    return PropertyFinding("wrong", f"turns {ratio:.2f} as far as its drive measures: gear = {drive.gear / ratio:.3g}")
+    return PropertyFinding(
+        "wrong", f"turns {ratio:.2f} as far as its drive measures: gear = {drive.gear / ratio:.3g}"
+    )
 
 
 def _report_zero(drive: JointDrive, scale: float, shift_rad: float) -> PropertyFinding:
     error_rad = -shift_rad / scale  # the reading of the joint at its zero
     zero_rad = drive.zero_rad + drive.sign * drive.gear * error_rad
-    return PropertyFinding("wrong", f"its zero is off by {error_rad:+.3f} rad: zero_rad = {zero_rad:.3f}")
+    return PropertyFinding(
+        "wrong", f"its zero is off by {error_rad:+.3f} rad: zero_rad = {zero_rad:.3f}"
+    )
 
 
 def _get_middle(values: Floats) -> float:
@@ -276,7 +303,9 @@ def _get_middle(values: Floats) -> float:
 # --- scales that are possible ------------------------------------------------------------------------------------
 
 
-def _find_scales(drawn_rad: Floats, reading_rad: Floats, tolerance_rad: float) -> tuple[float, float] | None:
+def _find_scales(
+    drawn_rad: Floats, reading_rad: Floats, tolerance_rad: float
+) -> tuple[float, float] | None:
     """Find the scales with which readings are drawn angles within the tolerance, for some shift.
 
     A shift exists if the differences of all pairs of poses agree within twice the tolerance.
@@ -286,18 +315,24 @@ def _find_scales(drawn_rad: Floats, reading_rad: Floats, tolerance_rad: float) -
     """
     first, second = np.array(list(itertools.combinations(range(len(drawn_rad)), 2))).T
     return _intersect_scales(
-        drawn_rad[first] - drawn_rad[second], reading_rad[first] - reading_rad[second], 2 * tolerance_rad
+        drawn_rad[first] - drawn_rad[second],
+        reading_rad[first] - reading_rad[second],
+        2 * tolerance_rad,
     )
 
 
-def _intersect_scales(drawn_rad: Floats, reading_rad: Floats, max_error_rad: float) -> tuple[float, float] | None:
+def _intersect_scales(
+    drawn_rad: Floats, reading_rad: Floats, max_error_rad: float
+) -> tuple[float, float] | None:
     """Find the scales with |scale * reading - drawn| <= max_error for all poses: lowest and highest; None if none."""
     is_zero = np.abs(reading_rad) < MIN_READING_CHANGE_RAD
     if (np.abs(drawn_rad[is_zero]) > max_error_rad).any():
         return None
     drawn_rad = drawn_rad[~is_zero]
     reading_rad = reading_rad[~is_zero]
-    bounds = np.stack(((drawn_rad - max_error_rad) / reading_rad, (drawn_rad + max_error_rad) / reading_rad))
+    bounds = np.stack(
+        ((drawn_rad - max_error_rad) / reading_rad, (drawn_rad + max_error_rad) / reading_rad)
+    )
     lowest = float(bounds.min(axis=0).max(initial=-np.inf))
     highest = float(bounds.max(axis=0).min(initial=np.inf))
     return (lowest, highest) if lowest <= highest else None

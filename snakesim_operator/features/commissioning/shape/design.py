@@ -22,15 +22,18 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Axis
 from snakesim_operator.features.commissioning.judge import MAX_RATIO_ERROR
 
-PLACEMENT_TOLERANCE_RAD = 0.05  # 2.9 degrees: how far a joint of a well placed robot is from its drawn angle, at most
-MAX_SHAPE_ANGLE_RAD = 0.8  # 46 degrees; larger angles decide better, and bend more than many robots like
+# 2.9 degrees: how far a joint of a well placed robot is from its drawn angle, at most.
+PLACEMENT_TOLERANCE_RAD = 0.05
+# 46 degrees; larger angles decide better, and bend more than many robots like.
+MAX_SHAPE_ANGLE_RAD = 0.8
 LIMIT_FRACTION = 0.9  # of a joint's travel that a shape uses
 MIN_SHAPES = 2
 CODE_LEVELS = (5, 7)  # numbers of different angles in a code, from -1 to 1
 SEPARATION_MARGIN = 1.2  # smallest separation of two codes, in placement tolerances
 # A joint whose largest angle is smaller is not confirmed anyway: its gear would not be known to `MAX_RATIO_ERROR`.
 SMALLEST_DECIDING_ANGLE_RAD = PLACEMENT_TOLERANCE_RAD / MAX_RATIO_ERROR
-SCALES = np.concatenate((np.linspace(-4.0, 4.0, 161), (1e3, -1e3)))  # by which a code may be a multiple of another
+# By which a code may be a multiple of another.
+SCALES = np.concatenate((np.linspace(-4.0, 4.0, 161), (1e3, -1e3)))
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,9 @@ def design_poses(joints: Sequence[Joint]) -> list[ShapePose]:
         if not group:
             continue
         largest_rad = np.array([compute_largest_angle_rad(joints[i]) for i in group])
-        for code in _arrange_codes(choose_codes(len(group), float(largest_rad.min())), largest_rad).T:
+        for code in _arrange_codes(
+            choose_codes(len(group), float(largest_rad.min())), largest_rad
+        ).T:
             angle_rad = np.zeros(len(joints))
             angle_rad[group] = code * largest_rad + 0.0  # no -0.0
             poses.append(ShapePose(chr(ord("A") + len(poses) - 1), axis, angle_rad))
@@ -100,7 +105,8 @@ def compute_separations(code: Floats, codes: Floats) -> Floats:
     """
     with_straight = np.concatenate(([0.0], code))
     all_with_straight = np.column_stack((np.zeros(len(codes)), codes))
-    differences = SCALES[:, None, None] * with_straight - all_with_straight  # (n_scales, n_codes, n_poses)
+    # (n_scales, n_codes, n_poses).
+    differences = SCALES[:, None, None] * with_straight - all_with_straight
     needed_errors = np.ptp(differences, axis=2) / 2 / (1 + np.abs(SCALES[:, None]))
     return needed_errors.min(axis=0)
 
@@ -151,7 +157,9 @@ def _arrange_codes(codes: Floats, largest_rad: Floats) -> Floats:
     arranged: list[Floats] = []
     for joint_rad in largest_rad:
         options = [(index, mirror) for index in range(len(remaining)) for mirror in (1.0, -1.0)]
-        headings_rad = [heading_rad + mirror * joint_rad * remaining[index] for index, mirror in options]
+        headings_rad = [
+            heading_rad + mirror * joint_rad * remaining[index] for index, mirror in options
+        ]
         best = min(range(len(options)), key=lambda option: float(np.sum(headings_rad[option] ** 4)))
         index, mirror = options[best]
         heading_rad = headings_rad[best]

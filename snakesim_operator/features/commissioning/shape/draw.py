@@ -11,7 +11,11 @@ from snakesim_hal.model.files import decode_table, read_table_with_base
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.model.textfiles import export_atomically
 from snakesim_operator.features.commissioning.shape.decide import judge_shapes
-from snakesim_operator.features.commissioning.shape.design import PLACEMENT_TOLERANCE_RAD, ShapePose, design_poses
+from snakesim_operator.features.commissioning.shape.design import (
+    PLACEMENT_TOLERANCE_RAD,
+    ShapePose,
+    design_poses,
+)
 from snakesim_operator.features.commissioning.shape.drawing import encode_pdf, encode_svg
 from snakesim_operator.features.commissioning.shape.outline import compute_drawing_mark
 from snakesim_operator.features.commissioning.shape.pages import PaperName, make_pages, make_poster
@@ -65,9 +69,13 @@ def draw_shapes(robot_name: str, output_path: Path, paper: PaperName) -> int:
 def list_undecidable_properties(robot: RobotFile, poses: Sequence[ShapePose]) -> list[str]:
     """Return a line for each joint of which the shapes cannot decide every property, however well it is placed."""
     lines: list[str] = []
-    for verdict in judge_shapes(robot.joint_table, poses, np.array([pose.angle_rad for pose in poses])):
+    for verdict in judge_shapes(
+        robot.joint_table, poses, np.array([pose.angle_rad for pose in poses])
+    ):
         unknown = verdict.list_properties("unknown")
         if unknown:
             reasons = dict.fromkeys(verdict.findings[name].reason for name in unknown)
-            lines.append(f"{verdict.joint}: {', '.join(unknown)} will stay unknown: {'; '.join(reasons)}")
+            lines.append(
+                f"{verdict.joint}: {', '.join(unknown)} will stay unknown: {'; '.join(reasons)}"
+            )
     return lines

@@ -72,12 +72,17 @@ class Drawing:
 
     def transform(self, shift_mm: Floats, scale: float = 1.0) -> "Drawing":
         """Return the drawing scaled about the origin, then shifted. Widths of lines stay."""
-        strokes = [replace(stroke, points_mm=scale * stroke.points_mm + shift_mm) for stroke in self.strokes]
+        strokes = [
+            replace(stroke, points_mm=scale * stroke.points_mm + shift_mm)
+            for stroke in self.strokes
+        ]
         labels: list[Label] = []
         for label in self.labels:
             x_mm, y_mm = scale * np.array(label.position_mm) + shift_mm
             position_mm = (float(x_mm), float(y_mm))
-            labels.append(replace(label, position_mm=position_mm, height_mm=scale * label.height_mm))
+            labels.append(
+                replace(label, position_mm=position_mm, height_mm=scale * label.height_mm)
+            )
         return Drawing(strokes, labels)
 
 
@@ -151,7 +156,8 @@ def _list_pdf_operators(page: Page) -> Iterable[str]:
 def _list_pdf_shapes(drawing: Drawing) -> Iterable[str]:
     for stroke in drawing.strokes:
         path = " ".join(
-            f"{x:.3f} {y:.3f} {'l' if number else 'm'}" for number, (x, y) in enumerate(stroke.points_mm.tolist())
+            f"{x:.3f} {y:.3f} {'l' if number else 'm'}"
+            for number, (x, y) in enumerate(stroke.points_mm.tolist())
         )
         dash = "[3 2] 0 d" if stroke.dashed else "[] 0 d"
         yield f"{stroke.gray:g} G {stroke.width_mm:g} w {dash} {path} {'s' if stroke.closed else 'S'}"
@@ -192,7 +198,9 @@ def encode_svg(drawing: Drawing, title: str, border_mm: float = 10.0) -> str:
         f'<rect width="{width_mm}" height="{height_mm}" fill="white"/>',
     ]
     for stroke in drawing.strokes:
-        points = " ".join(f"{x - left_mm:.2f},{top_mm - y:.2f}" for x, y in stroke.points_mm.tolist())
+        points = " ".join(
+            f"{x - left_mm:.2f},{top_mm - y:.2f}" for x, y in stroke.points_mm.tolist()
+        )
         tag = "polygon" if stroke.closed else "polyline"
         dash = ' stroke-dasharray="3 2"' if stroke.dashed else ""
         lines.append(

@@ -39,7 +39,9 @@ def compute_joint_positions_mm(robot: RobotFile, pose: ShapePose, turn_rad: floa
         turn_rad: Direction of the tail link, counterclockwise from the x axis.
     """
     directions_rad = turn_rad + _compute_link_directions_rad(pose)
-    steps_mm = MM_PER_M * np.array(robot.link_lengths_m)[:, None] * _make_unit_vectors(directions_rad)
+    steps_mm = (
+        MM_PER_M * np.array(robot.link_lengths_m)[:, None] * _make_unit_vectors(directions_rad)
+    )
     return np.concatenate((np.zeros((1, 2)), np.cumsum(steps_mm, axis=0)))
 
 
@@ -59,7 +61,11 @@ def draw_shape(robot: RobotFile, pose: ShapePose, turn_rad: float = 0.0) -> Draw
     for link, direction_rad in enumerate(directions_rad):
         is_head = link == len(directions_rad) - 1
         outline_mm = _make_link_outline_mm(
-            positions_mm[link], positions_mm[link + 1], direction_rad, half_width_mm, round_front=is_head
+            positions_mm[link],
+            positions_mm[link + 1],
+            direction_rad,
+            half_width_mm,
+            round_front=is_head,
         )
         strokes.append(Stroke(outline_mm, width_mm=0.5, closed=True))
     strokes.append(Stroke(positions_mm, width_mm=0.25, gray=GRAY, dashed=True))
@@ -67,7 +73,9 @@ def draw_shape(robot: RobotFile, pose: ShapePose, turn_rad: float = 0.0) -> Draw
         center_mm = positions_mm[joint + 1]
         strokes += _draw_joint_mark(center_mm)
         middle_rad = (directions_rad[joint] + directions_rad[joint + 1]) / 2
-        labels.append(_label_joint(name, pose.angle_rad[joint], center_mm, middle_rad, half_width_mm))
+        labels.append(
+            _label_joint(name, pose.angle_rad[joint], center_mm, middle_rad, half_width_mm)
+        )
     strokes.append(_draw_head_arrow(positions_mm[-1], directions_rad[-1], half_width_mm))
     return Drawing(strokes, labels)
 
@@ -83,13 +91,20 @@ def _make_unit_vectors(direction_rad: Floats) -> Floats:
 
 
 def _make_link_outline_mm(
-    rear_mm: Floats, front_mm: Floats, direction_rad: float, half_width_mm: float, *, round_front: bool
+    rear_mm: Floats,
+    front_mm: Floats,
+    direction_rad: float,
+    half_width_mm: float,
+    *,
+    round_front: bool,
 ) -> Floats:
     """Return the outline of a link from above: a rectangle, with half a circle at the front of the head."""
     forward = _make_unit_vectors(np.array(direction_rad))
     side_mm = half_width_mm * np.array((-forward[1], forward[0]))
     if not round_front:
-        return np.array((rear_mm + side_mm, rear_mm - side_mm, front_mm - side_mm, front_mm + side_mm))
+        return np.array(
+            (rear_mm + side_mm, rear_mm - side_mm, front_mm - side_mm, front_mm + side_mm)
+        )
     arc_rad = direction_rad + np.linspace(-math.pi / 2, math.pi / 2, ARC_POINTS)
     cap_mm = front_mm + half_width_mm * _make_unit_vectors(arc_rad)
     return np.concatenate(((rear_mm + side_mm, rear_mm - side_mm), cap_mm))
@@ -97,7 +112,9 @@ def _make_link_outline_mm(
 
 def _draw_joint_mark(center_mm: Floats) -> list[Stroke]:
     """Draw a circle with a cross around the axis of a joint."""
-    circle_mm = center_mm + JOINT_MARK_MM * _make_unit_vectors(np.linspace(0.0, math.tau, 24, endpoint=False))
+    circle_mm = center_mm + JOINT_MARK_MM * _make_unit_vectors(
+        np.linspace(0.0, math.tau, 24, endpoint=False)
+    )
     across_mm = np.array(((-JOINT_MARK_MM, 0.0), (JOINT_MARK_MM, 0.0)))
     upright_mm = across_mm[:, ::-1]
     return [
@@ -107,7 +124,9 @@ def _draw_joint_mark(center_mm: Floats) -> list[Stroke]:
     ]
 
 
-def _label_joint(name: str, angle_rad: float, center_mm: Floats, direction_rad: float, half_width_mm: float) -> Label:
+def _label_joint(
+    name: str, angle_rad: float, center_mm: Floats, direction_rad: float, half_width_mm: float
+) -> Label:
     """Write name and angle of a joint beside the body, above it where the body is level."""
     left = _make_unit_vectors(np.array(direction_rad + math.pi / 2))
     upward = left if left[1] >= 0 else -left
@@ -120,5 +139,9 @@ def _draw_head_arrow(head_mm: Floats, direction_rad: float, half_width_mm: float
     forward = _make_unit_vectors(np.array(direction_rad))
     side = np.array((-forward[1], forward[0]))
     base_mm = head_mm + (half_width_mm + LABEL_GAP_MM) * forward
-    corners_mm = (base_mm + ARROW_MM / 2 * side, base_mm - ARROW_MM / 2 * side, base_mm + ARROW_MM * forward)
+    corners_mm = (
+        base_mm + ARROW_MM / 2 * side,
+        base_mm - ARROW_MM / 2 * side,
+        base_mm + ARROW_MM * forward,
+    )
     return Stroke(np.array(corners_mm), width_mm=0.5, closed=True)

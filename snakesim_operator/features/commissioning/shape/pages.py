@@ -11,17 +11,30 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot import RobotFile
 from snakesim_operator.features.commissioning.shape.design import ShapePose
-from snakesim_operator.features.commissioning.shape.drawing import GRAY, Drawing, Label, Page, Stroke, Window
+from snakesim_operator.features.commissioning.shape.drawing import (
+    GRAY,
+    Drawing,
+    Label,
+    Page,
+    Stroke,
+    Window,
+)
 from snakesim_operator.features.commissioning.shape.outline import draw_shape
 
 PaperName = Literal["a4", "a3", "letter"]
-PAPER_SIZES_MM: dict[PaperName, tuple[float, float]] = {"a4": (297, 210), "a3": (420, 297), "letter": (279.4, 215.9)}
+PAPER_SIZES_MM: dict[PaperName, tuple[float, float]] = {
+    "a4": (297, 210),
+    "a3": (420, 297),
+    "letter": (279.4, 215.9),
+}
 MARGIN_MM = 12.0  # around the drawing; most printers need 5 mm
 TEXT_HEIGHT_MM = 3.0
 SCALE_BAR_MM = 100.0
 SCALE_TEXT = "Print at 100 %, not fitted to the page. The line to the right must be 100 mm long."
-TURN_STEP_RAD = math.radians(7.5)  # of the search for the direction in which a shape needs the fewest sheets
-SLACK_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the free space in a grid, by which a shape is shifted in it
+# Of the search for the direction in which a shape needs the fewest sheets.
+TURN_STEP_RAD = math.radians(7.5)
+# Of the free space in a grid, by which a shape is shifted in it.
+SLACK_FRACTIONS = 0.0, 0.25, 0.5, 0.75, 1.0
 LINE_SAMPLES = 8  # of each side of an outline
 OVERVIEW_GAP_MM = 8.0
 SIDE_BY_AXIS = {"yaw": "belly down", "pitch": "left side down, its top to the top of this page"}
@@ -50,7 +63,9 @@ class _Placement:
     sheets: Sequence[tuple[int, int]]
 
 
-def make_pages(robot: RobotFile, poses: Sequence[ShapePose], mark: str, paper: PaperName) -> list[Page]:
+def make_pages(
+    robot: RobotFile, poses: Sequence[ShapePose], mark: str, paper: PaperName
+) -> list[Page]:
     """Return the overview, then every sheet of every shape in true scale.
 
     Args:
@@ -60,10 +75,14 @@ def make_pages(robot: RobotFile, poses: Sequence[ShapePose], mark: str, paper: P
         paper: Size of the paper, which is used in landscape.
     """
     paper_mm = np.array(PAPER_SIZES_MM[paper])
-    shapes = [tile_shape(robot, pose, paper_mm - 2 * MARGIN_MM) for pose in poses if pose.axis is not None]
+    shapes = [
+        tile_shape(robot, pose, paper_mm - 2 * MARGIN_MM) for pose in poses if pose.axis is not None
+    ]
     pages = [_make_overview(robot, shapes, mark, paper_mm)]
     for shape in shapes:
-        pages += [_make_sheet(robot, shape, number, mark, paper_mm) for number in range(len(shape.sheets))]
+        pages += [
+            _make_sheet(robot, shape, number, mark, paper_mm) for number in range(len(shape.sheets))
+        ]
     return pages
 
 
@@ -123,11 +142,17 @@ def _sample_lines(drawing: Drawing) -> Floats:
             points_mm = np.concatenate((points_mm, points_mm[:1]))
         numbers = np.arange(len(points_mm))
         fine_numbers = np.linspace(0.0, len(points_mm) - 1.0, LINE_SAMPLES * len(points_mm))
-        samples.append(np.column_stack([np.interp(fine_numbers, numbers, points_mm[:, axis]) for axis in (0, 1)]))
+        samples.append(
+            np.column_stack(
+                [np.interp(fine_numbers, numbers, points_mm[:, axis]) for axis in (0, 1)]
+            )
+        )
     return np.concatenate(samples)
 
 
-def _list_used_sheets(points_mm: Floats, rows: int, columns: int, sheet_mm: Floats) -> list[tuple[int, int]]:
+def _list_used_sheets(
+    points_mm: Floats, rows: int, columns: int, sheet_mm: Floats
+) -> list[tuple[int, int]]:
     """Return row and column of every sheet that has a point on it, from the top left."""
     cells = np.clip(np.floor(points_mm / sheet_mm).astype(int), 0, (columns - 1, rows - 1))
     numbers = np.unique((rows - 1 - cells[:, 1]) * columns + cells[:, 0]).tolist()
@@ -136,7 +161,10 @@ def _list_used_sheets(points_mm: Floats, rows: int, columns: int, sheet_mm: Floa
 
 def _turn_flat(robot: RobotFile, pose: ShapePose) -> Drawing:
     """Return a shape, turned so that it is as low as possible."""
-    drawings = [draw_shape(robot, pose, float(turn)) for turn in np.arange(-math.pi / 2, math.pi / 2, TURN_STEP_RAD)]
+    drawings = [
+        draw_shape(robot, pose, float(turn))
+        for turn in np.arange(-math.pi / 2, math.pi / 2, TURN_STEP_RAD)
+    ]
     return min(drawings, key=lambda drawing: float(np.diff(drawing.bounds_mm, axis=0)[0, 1]))
 
 
@@ -145,7 +173,9 @@ def _describe_shape(robot: RobotFile, pose: ShapePose, mark: str) -> str:
     return f"{robot.name}, shape {pose.name}: {side}. Drawing {mark}"
 
 
-def _make_sheet(robot: RobotFile, shape: TiledShape, number: int, mark: str, paper_mm: Floats) -> Page:
+def _make_sheet(
+    robot: RobotFile, shape: TiledShape, number: int, mark: str, paper_mm: Floats
+) -> Page:
     """Return one sheet: its part of the shape, a frame to cut along, and what to do with it."""
     row, column = shape.sheets[number]
     corner_mm = shape.sheet_mm * (column, shape.row_count - 1 - row)
@@ -155,7 +185,10 @@ def _make_sheet(robot: RobotFile, shape: TiledShape, number: int, mark: str, pap
         f"row {row + 1}, column {column + 1}. Cut along the frame."
     )
     margin = Drawing(
-        strokes=[_make_frame(MARGIN_MM, MARGIN_MM, width_mm, height_mm), *_draw_scale_bar(width_mm)],
+        strokes=[
+            _make_frame(MARGIN_MM, MARGIN_MM, width_mm, height_mm),
+            *_draw_scale_bar(width_mm),
+        ],
         labels=[
             Label(text, (MARGIN_MM, MARGIN_MM - 5.0), TEXT_HEIGHT_MM),
             Label(SCALE_TEXT, (MARGIN_MM, MARGIN_MM - 9.5), TEXT_HEIGHT_MM),
@@ -168,7 +201,9 @@ def _make_sheet(robot: RobotFile, shape: TiledShape, number: int, mark: str, pap
 
 def _make_frame(left_mm: float, bottom_mm: float, width_mm: float, height_mm: float) -> Stroke:
     corners = ((0.0, 0.0), (width_mm, 0.0), (width_mm, height_mm), (0.0, height_mm))
-    return Stroke(np.array(corners) + np.array((left_mm, bottom_mm)), width_mm=0.1, gray=GRAY, closed=True)
+    return Stroke(
+        np.array(corners) + np.array((left_mm, bottom_mm)), width_mm=0.1, gray=GRAY, closed=True
+    )
 
 
 def _draw_scale_bar(width_mm: float) -> list[Stroke]:
@@ -177,10 +212,16 @@ def _draw_scale_bar(width_mm: float) -> list[Stroke]:
     y_mm = MARGIN_MM - 8.5
     bar = np.array(((right_mm - SCALE_BAR_MM, y_mm), (right_mm, y_mm)))
     tick = np.array(((0.0, -1.0), (0.0, 1.0)))
-    return [Stroke(bar, width_mm=0.2), Stroke(bar[0] + tick, width_mm=0.2), Stroke(bar[1] + tick, width_mm=0.2)]
+    return [
+        Stroke(bar, width_mm=0.2),
+        Stroke(bar[0] + tick, width_mm=0.2),
+        Stroke(bar[1] + tick, width_mm=0.2),
+    ]
 
 
-def _make_overview(robot: RobotFile, shapes: Sequence[TiledShape], mark: str, paper_mm: Floats) -> Page:
+def _make_overview(
+    robot: RobotFile, shapes: Sequence[TiledShape], mark: str, paper_mm: Floats
+) -> Page:
     """Return a page with all shapes in small, and the number of every sheet in its place."""
     width_mm, height_mm = paper_mm.tolist()
     slot_mm = (height_mm - 2 * MARGIN_MM - OVERVIEW_GAP_MM) / len(shapes)
@@ -194,12 +235,19 @@ def _make_overview(robot: RobotFile, shapes: Sequence[TiledShape], mark: str, pa
     )
     for index, shape in enumerate(shapes):
         bottom_mm = height_mm - MARGIN_MM - OVERVIEW_GAP_MM - (index + 1) * slot_mm
-        content += _draw_small_shape(robot, shape, mark, np.array((MARGIN_MM, bottom_mm)), width_mm, slot_mm)
+        content += _draw_small_shape(
+            robot, shape, mark, np.array((MARGIN_MM, bottom_mm)), width_mm, slot_mm
+        )
     return Page(width_mm, height_mm, content)
 
 
 def _draw_small_shape(
-    robot: RobotFile, shape: TiledShape, mark: str, corner_mm: Floats, paper_width_mm: float, slot_mm: float
+    robot: RobotFile,
+    shape: TiledShape,
+    mark: str,
+    corner_mm: Floats,
+    paper_width_mm: float,
+    slot_mm: float,
 ) -> Drawing:
     """Return a shape with its grid of sheets in small.
 
@@ -219,8 +267,17 @@ def _draw_small_shape(
     title = (corner_mm[0], corner_mm[1] + scale * grid_mm[1] + 1.5)
     labels = [Label(_describe_shape(robot, shape.pose, mark), title, TEXT_HEIGHT_MM)]
     for number, (row, column) in enumerate(shape.sheets):
-        left_mm, bottom_mm = (corner_mm + scale * shape.sheet_mm * (column, shape.row_count - 1 - row)).tolist()
+        left_mm, bottom_mm = (
+            corner_mm + scale * shape.sheet_mm * (column, shape.row_count - 1 - row)
+        ).tolist()
         width_mm, height_mm = (scale * shape.sheet_mm).tolist()
         strokes.append(_make_frame(left_mm, bottom_mm, width_mm, height_mm))
-        labels.append(Label(f"{shape.pose.name}{number + 1}", (left_mm + 1.0, bottom_mm + 1.0), TEXT_HEIGHT_MM, GRAY))
+        labels.append(
+            Label(
+                f"{shape.pose.name}{number + 1}",
+                (left_mm + 1.0, bottom_mm + 1.0),
+                TEXT_HEIGHT_MM,
+                GRAY,
+            )
+        )
     return Drawing(strokes, labels)

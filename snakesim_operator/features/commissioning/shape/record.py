@@ -16,7 +16,10 @@ from snakesim_hal.model.files import decode_table, read_table_with_base
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.robot import RobotFile
 from snakesim_hal.wire.messages import RobotDescription
-from snakesim_operator.features.commissioning.robot_edit import make_check_record, write_check_record
+from snakesim_operator.features.commissioning.robot_edit import (
+    make_check_record,
+    write_check_record,
+)
 from snakesim_operator.features.commissioning.shape.decide import SHAPE_PROPERTIES
 
 
@@ -36,7 +39,10 @@ def write_shape_record(path: Path, joints: Sequence[Joint], robot: RobotDescript
     if robot.emulated:
         print_line(f"{path}: nothing was written: the drives are emulated, and need no check")
         return
-    confirmed: set[JointProperty] = {*SHAPE_PROPERTIES, *_read_confirmed_properties(path, joints, robot)}
+    confirmed: set[JointProperty] = {
+        *SHAPE_PROPERTIES,
+        *_read_confirmed_properties(path, joints, robot),
+    }
     record = msgspec.structs.replace(
         make_check_record(joints, robot, [name for name in PROPERTIES if name in confirmed]),
         by_shape=list(SHAPE_PROPERTIES),
@@ -52,7 +58,9 @@ def write_shape_record(path: Path, joints: Sequence[Joint], robot: RobotDescript
         print_line(f"{path}: checked by {record.by} on {record.on}; restart the host with it")
 
 
-def read_shape_properties(path: Path, joints: Sequence[Joint], robot: RobotDescription) -> list[JointProperty]:
+def read_shape_properties(
+    path: Path, joints: Sequence[Joint], robot: RobotDescription
+) -> list[JointProperty]:
     """Return the properties that drawn shapes confirmed, if neither the mounting nor a drive has changed since.
 
     Args:
@@ -67,12 +75,16 @@ def read_shape_properties(path: Path, joints: Sequence[Joint], robot: RobotDescr
     return list(record.by_shape) if record is not None else []
 
 
-def _read_confirmed_properties(path: Path, joints: Sequence[Joint], robot: RobotDescription) -> list[JointProperty]:
+def _read_confirmed_properties(
+    path: Path, joints: Sequence[Joint], robot: RobotDescription
+) -> list[JointProperty]:
     record = _read_valid_record(path, joints, robot)
     return list(record.confirmed) if record is not None else []
 
 
-def _read_valid_record(path: Path, joints: Sequence[Joint], robot: RobotDescription) -> StartCheckRecord | None:
+def _read_valid_record(
+    path: Path, joints: Sequence[Joint], robot: RobotDescription
+) -> StartCheckRecord | None:
     """Return the record of the last check, unless the mounting of a joint or a drive has changed since."""
     record = decode_table(read_table_with_base(str(path), "robots"), RobotFile).checked
     if record is None or find_change_since_check(record, joints, robot):

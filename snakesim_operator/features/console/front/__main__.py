@@ -10,12 +10,20 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from snakesim_hal.base.process import call_on_stop_signals, raise_open_file_limit, set_parent_death_signal
+from snakesim_hal.base.process import (
+    call_on_stop_signals,
+    raise_open_file_limit,
+    set_parent_death_signal,
+)
 from snakesim_hal.base.terminal import print_line, run_tool
 from snakesim_hal.base.workers import start_restarting_thread
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
 from snakesim_hal.network.session import ConnectionSettings, open_session
-from snakesim_hal.programs.arguments import add_network_arguments, add_parent_argument, read_session_option
+from snakesim_hal.programs.arguments import (
+    add_network_arguments,
+    add_parent_argument,
+    read_session_option,
+)
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_operator.base.console_port import TOKEN_VARIABLE
 from snakesim_operator.base.robot_selection import RobotSelection
@@ -31,9 +39,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="snakesim_operator.features.console.front",
         description="Accept browsers, and stop the robot.",
     )
-    parser.add_argument("--browsers", type=int, required=True, help="inherited descriptor of the listening socket")
+    parser.add_argument(
+        "--browsers", type=int, required=True, help="inherited descriptor of the listening socket"
+    )
     parser.add_argument("--pages", type=Path, required=True, help="Unix socket of the page server")
-    parser.add_argument("--recording", action="store_true", help="there is no robot that can be stopped")
+    parser.add_argument(
+        "--recording", action="store_true", help="there is no robot that can be stopped"
+    )
     add_network_arguments(parser, "")
     add_parent_argument(parser)
     return run_tool("snakesim console", partial(_run, parser.parse_args(argv)))
@@ -67,9 +79,13 @@ def _prepare_stop(arguments: argparse.Namespace) -> PreparedStop:
     if session is not None:
         link = ConnectionSettings.from_session_file(session, arguments.namespace)
     else:
-        link = ConnectionSettings(arguments.router or arguments.endpoint or DEFAULT_ENDPOINT, arguments.namespace)
+        link = ConnectionSettings(
+            arguments.router or arguments.endpoint or DEFAULT_ENDPOINT, arguments.namespace
+        )
     selection = RobotSelection(link.endpoint, link.namespace, link.session)
-    stop = PreparedStop(selection, link, lambda requester, result: print_line(f"{requester}: {result}"))
+    stop = PreparedStop(
+        selection, link, lambda requester, result: print_line(f"{requester}: {result}")
+    )
     start_restarting_thread("stop session", partial(_keep_session, stop, link))
     return stop
 

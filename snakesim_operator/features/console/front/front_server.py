@@ -29,12 +29,13 @@ REQUESTER = "a page's second stop"
 # Limits. Together they need some 750 open files: a page needs two, and a closed connection is freed a little later.
 MAX_WAITING = 256  # connections whose request is not complete; a browser opens some ahead of need
 MAX_PAGES = 160  # connections to the page server; each page has one, and a few more while it loads
-MAX_AT_STOP = 64  # connections that have shown the token, and request a stop or ask whether it is ready
+# Connections that have shown the token, and request a stop or ask whether it is ready.
+MAX_AT_STOP = 64
 HEAD_TIMEOUT_S = 10.0  # from the connection to the end of its request's head
-KEEP_ALIVE_TIMEOUT_S = (
-    90.0  # between two requests for the stop; a page sends one a second, in the background one a minute
-)
-BACKLOG = 1024  # connections that the kernel keeps until they are accepted; it may have a lower limit
+# Between two requests for the stop; a page sends one a second, in the background one a minute.
+KEEP_ALIVE_TIMEOUT_S = 90.0
+# Connections that the kernel keeps until they are accepted; it may have a lower limit.
+BACKLOG = 1024
 MAX_ACCEPTED_AT_ONCE = 32  # then the requests that have arrived are read
 POLL_S = 0.1  # how often old requests are closed, and the stop's self-test is started if it is due
 
@@ -119,7 +120,9 @@ class FrontServer:
         loop = asyncio.get_running_loop()
         # asyncio uses its `backlog` also as the number of connections that it accepts at once.
         server = await loop.create_server(
-            self._waiting_connections.create, sock=self._listening_socket, backlog=MAX_ACCEPTED_AT_ONCE
+            self._waiting_connections.create,
+            sock=self._listening_socket,
+            backlog=MAX_ACCEPTED_AT_ONCE,
         )
         self._listening_socket.listen(BACKLOG)
         try:
@@ -138,7 +141,9 @@ class FrontServer:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _serve_connection(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve_connection(
+        self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         """Serve one connection to its end. `head` is the head of its first request."""
         try:
             while await self._answer_request(head, reader, writer):
@@ -151,7 +156,9 @@ class FrontServer:
             self._stop_connections.discard(writer)
             writer.close()
 
-    async def _answer_request(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+    async def _answer_request(
+        self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> bool:
         """Answer a request, and return whether another one may follow over the same connection."""
         request = parse_and_authorize_head(head, self._token)
         if isinstance(request, BadRequest):
@@ -160,7 +167,9 @@ class FrontServer:
             return False
         if request.path == STOP_PATH:
             return await self._answer_stop_request(request.method, writer)
-        if not request.path and not request.is_websocket:  # relative addresses in the page need the slash
+        if (
+            not request.path and not request.is_websocket
+        ):  # relative addresses in the page need the slash
             _write_response(writer, 308, "", f"Location: /{self._token}/\r\n")
             return False
         await self._relay_request(request, reader, writer)
@@ -191,7 +200,11 @@ class FrontServer:
             # Requested before connections are counted: their number limits only the answers.
             stop_result = self._stop.request_stop(REQUESTER)
             if not self._keep_stop_connection(writer):
-                _write_response(writer, 503, "the robot is being stopped; too many ask at once to wait for the result")
+                _write_response(
+                    writer,
+                    503,
+                    "the robot is being stopped; too many ask at once to wait for the result",
+                )
                 return False
             status, text = await _wait_for_result(stop_result)
         elif method == "GET":
@@ -228,13 +241,17 @@ class FrontServer:
         finally:
             self._open_page_count -= 1
 
-    async def _relay_to_pages(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _relay_to_pages(
+        self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         """Pass the head of a request to the page server, and copy bytes until either side ends the connection."""
         try:
             pages_reader, pages_writer = await asyncio.open_unix_connection(str(self._pages_path))
         except OSError as error:
             _write_response(
-                writer, 503, f"the console's pages do not answer: {error.strerror}; use snakesim estop to stop"
+                writer,
+                503,
+                f"the console's pages do not answer: {error.strerror}; use snakesim estop to stop",
             )
             return
         try:
@@ -253,7 +270,12 @@ async def _wait_for_result(stopped: "Future[str]") -> tuple[int, str]:
 
 
 def _write_response(
-    writer: asyncio.StreamWriter, status: int, text: str, more_headers: str = "", *, is_kept: bool = False
+    writer: asyncio.StreamWriter,
+    status: int,
+    text: str,
+    more_headers: str = "",
+    *,
+    is_kept: bool = False,
 ) -> None:
     """Answer a request. Does not wait: the answer is far shorter than what a connection can buffer."""
     body = text.encode()

@@ -74,7 +74,9 @@ def parse_and_authorize_head(head: bytes, token: str) -> FrontRequest | BadReque
     if not secrets.compare_digest(requested_token.encode(), token.encode()):
         return BadRequest(403, "wrong token", WRONG_TOKEN)
     path_and_query = token_and_rest[token_length:]
-    target_without_token = path_and_query if path_and_query.startswith("/") else f"/{path_and_query}"
+    target_without_token = (
+        path_and_query if path_and_query.startswith("/") else f"/{path_and_query}"
+    )
     new_request_line = f"{method} {target_without_token} {version}".encode("latin-1")
     return FrontRequest(
         method=method,

@@ -49,12 +49,16 @@ class WaitingConnections:
         protocol.connection_made(connection.transport)
         reader.feed_data(rest)
         loop = asyncio.get_running_loop()
-        self._on_head(head, (reader, asyncio.StreamWriter(connection.transport, protocol, reader, loop)))
+        self._on_head(
+            head, (reader, asyncio.StreamWriter(connection.transport, protocol, reader, loop))
+        )
 
     def abort_older_than(self, age_s: float) -> None:
         """Close the connections that have waited for longer."""
         before_s = asyncio.get_running_loop().time() - age_s
-        for connection in [connection for connection, since_s in self._since_s.items() if since_s < before_s]:
+        for connection in [
+            connection for connection, since_s in self._since_s.items() if since_s < before_s
+        ]:
             self._abort_connection(connection)
 
     def _abort_connection(self, connection: "WaitingConnection") -> None:

@@ -9,7 +9,9 @@ Picture = NDArray[np.uint8]  # (height, width, 3)
 
 # Colors from near to far, bright to dark, that people with color blindness can distinguish too.
 # Source: the color map "viridis".
-COLOR_STOPS = np.array([[253, 231, 37], [94, 201, 98], [33, 145, 140], [59, 82, 139], [68, 1, 84]], dtype=np.float64)
+COLOR_STOPS = np.array(
+    [[253, 231, 37], [94, 201, 98], [33, 145, 140], [59, 82, 139], [68, 1, 84]], dtype=np.float64
+)
 NO_DEPTH_COLOR = (24, 26, 30)  # of pixels without an object within range
 
 

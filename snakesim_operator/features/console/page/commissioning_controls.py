@@ -7,9 +7,16 @@ import viser
 
 from snakesim_hal.wire.quantities import MAX_JOINTS
 from snakesim_operator.features.console.joint_step import BACKWARDS, ENTER, FORWARDS
-from snakesim_operator.features.console.page.commissioning_tab import DESCRIPTION_BY_STEP, CommissioningTab
+from snakesim_operator.features.console.page.commissioning_tab import (
+    DESCRIPTION_BY_STEP,
+    CommissioningTab,
+)
 from snakesim_operator.features.console.page.page_html import escape_text
-from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, MAX_PRESS_AGE_S, ControlAdmission
+from snakesim_operator.features.console.web.admission import (
+    MAX_HOLD_AGE_S,
+    MAX_PRESS_AGE_S,
+    ControlAdmission,
+)
 from snakesim_operator.features.console.web.message_age import PageAction
 
 HOLD_REPEAT_HZ = 20.0  # `snakesim robot jog` counts a key as held for 0.15 s
@@ -55,7 +62,9 @@ class CommissioningControls:
         self._show_chosen_step()
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
-        self._step_dropdown = gui.add_dropdown("Step", tuple(DESCRIPTION_BY_STEP), initial_value="direction")
+        self._step_dropdown = gui.add_dropdown(
+            "Step", tuple(DESCRIPTION_BY_STEP), initial_value="direction"
+        )
         self._description = gui.add_html("")
         self._joint_input = gui.add_number("Joint (0: all)", 0, min=0, max=MAX_JOINTS, step=1)
         # Limits of a jog.
@@ -69,7 +78,9 @@ class CommissioningControls:
         self._backwards_button = gui.add_button("Hold: backwards (-)", color="green")
         self._end_button = gui.add_button("End step", color="gray")
 
-    def _admit_controls(self, admission: ControlAdmission, on_late_press: Callable[[float], None]) -> None:
+    def _admit_controls(
+        self, admission: ControlAdmission, on_late_press: Callable[[float], None]
+    ) -> None:
         """Let this viewer's page use the controls. A step ends at any age of the press; other presses may not be old.
 
         Args:
@@ -81,7 +92,11 @@ class CommissioningControls:
             admission.admit_control(control, self._viewer, self._is_in_control)
         for button in (self._start_button, self._enter_button):
             admission.admit_control(
-                button, self._viewer, self._is_in_control, max_age_s=MAX_PRESS_AGE_S, on_late=on_late_press
+                button,
+                self._viewer,
+                self._is_in_control,
+                max_age_s=MAX_PRESS_AGE_S,
+                on_late=on_late_press,
             )
         for button, key in ((self._forwards_button, FORWARDS), (self._backwards_button, BACKWARDS)):
             # The page repeats that a button is held only if viser has a callback for it.
@@ -103,7 +118,9 @@ class CommissioningControls:
         """Describe the chosen step, and show only the inputs that it has."""
         step_name = self._step_dropdown.value
         description = escape_text(DESCRIPTION_BY_STEP[step_name])
-        self._description.content = f"<div style='padding:.2em .6em;font-size:.85em'>{description}</div>"
+        self._description.content = (
+            f"<div style='padding:.2em .6em;font-size:.85em'>{description}</div>"
+        )
         self._joint_input.visible = step_name != "zero"
         self._enter_button.visible = step_name != "jog"
         jog_limits = (self._speed_rad_s, self._travel_rad, self._torque_fraction)
@@ -125,7 +142,10 @@ class CommissioningControls:
             options += ["--torque", f"{self._torque_fraction.value:g}"]
         if self._is_in_control():
             self._run_operation(
-                "Joints", lambda: self._commissioning.start_step(self._viewer, step_name, joint_name, options)
+                "Joints",
+                lambda: self._commissioning.start_step(
+                    self._viewer, step_name, joint_name, options
+                ),
             )
 
     def _end_step(self) -> None:

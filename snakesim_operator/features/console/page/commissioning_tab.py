@@ -24,7 +24,8 @@ from snakesim_operator.features.console.page.joint_table import AngleRange, form
 from snakesim_operator.features.console.page.page_html import escape_text
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
-MAX_IDLE_JOG_S = 60.0  # a jog leaves the robot armed, so it ends when no button is held for this long
+# A jog leaves the robot armed, so it ends when no button is held for this long.
+MAX_IDLE_JOG_S = 60.0
 NO_VIEWER_ID = -1  # viewer of a step that is being ended already
 DESCRIPTION_BY_STEP = {
     "direction": "turn joints by hand, as it asks; Enter skips one",
@@ -79,7 +80,9 @@ class CommissioningTab:
             self._step_output = gui.add_html("", order=1)
             self._terminal_commands = gui.add_html("", order=3)
 
-    def start_step(self, viewer_id: int, step_name: str, joint_name: str | None, options: list[str]) -> str:
+    def start_step(
+        self, viewer_id: int, step_name: str, joint_name: str | None, options: list[str]
+    ) -> str:
         """Start a commissioning step as a command in a process of its own, whose output the page shows.
 
         Args:
@@ -95,19 +98,30 @@ class CommissioningTab:
             RefusedError: A step runs already, or the step cannot be started from this page.
         """
         if self.robot_file is None:
-            raise RefusedError("the console was started without --commission FILE", code="commissioning/not-possible")
+            raise RefusedError(
+                "the console was started without --commission FILE",
+                code="commissioning/not-possible",
+            )
         if step_name == "jog" and joint_name is None:
-            raise RefusedError("jog moves one joint: give its number", code="commissioning/not-possible")
+            raise RefusedError(
+                "jog moves one joint: give its number", code="commissioning/not-possible"
+            )
         joint_names: list[str] = []
-        if joint_name is not None and step_name != "zero":  # the zeros of all joints are calibrated together
+        if (
+            joint_name is not None and step_name != "zero"
+        ):  # the zeros of all joints are calibrated together
             joint_names.append(joint_name)
         with self._lock:
             if self._step is not None and self._step.is_running:
                 raise RefusedError(
-                    f"{self._step.step_name} is under way: end it first", code="commissioning/not-possible"
+                    f"{self._step.step_name} is under way: end it first",
+                    code="commissioning/not-possible",
                 )
-            robot_flags = shlex.split(make_robot_flags(self._connection, None))  # None: without the robot's name
-            self._step = JointStep([step_name, str(self.robot_file), *joint_names, *options, *robot_flags])
+            # None: without the robot's name.
+            robot_flags = shlex.split(make_robot_flags(self._connection, None))
+            self._step = JointStep(
+                [step_name, str(self.robot_file), *joint_names, *options, *robot_flags]
+            )
             self._viewer = viewer_id
             self._last_keypress_time_s = time.monotonic()
             self._measured_ranges = []
@@ -142,7 +156,10 @@ class CommissioningTab:
         """End a step whose viewer has lost control, and a jog in which no button was held for a long time."""
         if self._viewer == NO_VIEWER_ID:
             return
-        is_idle_jog = step.step_name == "jog" and time.monotonic() - self._last_keypress_time_s > MAX_IDLE_JOG_S
+        is_idle_jog = (
+            step.step_name == "jog"
+            and time.monotonic() - self._last_keypress_time_s > MAX_IDLE_JOG_S
+        )
         has_control = self._token.holder == self._viewer
         if is_idle_jog:
             reason = f"nothing was held for {MAX_IDLE_JOG_S:g} s"
@@ -192,7 +209,10 @@ class CommissioningTab:
                     f"snakesim {format_command_name(step_name)} FILE{joint_argument}{connection_flags}"
                 )
             html_parts = [
-                _format_commands("Where the robot's FILE is, with which the host was started, type:", step_commands),
+                _format_commands(
+                    "Where the robot's FILE is, with which the host was started, type:",
+                    step_commands,
+                ),
                 _format_commands(
                     "or do these from a page, with a console on that computer:",
                     [f"snakesim console --commission FILE{connection_flags}"],
@@ -234,7 +254,10 @@ def _format_step(step: JointStep) -> str:
 
 def _format_commands(introduction: str, commands: Sequence[str]) -> str:
     """Return commands for a terminal, below a line that introduces them."""
-    lines = [f"<pre style='margin:.2em 0;white-space:pre-wrap'>{escape_text(command)}</pre>" for command in commands]
+    lines = [
+        f"<pre style='margin:.2em 0;white-space:pre-wrap'>{escape_text(command)}</pre>"
+        for command in commands
+    ]
     return f"<div style='padding:.3em .6em;font-size:.82em'>{escape_text(introduction)}{''.join(lines)}</div>"
 
 

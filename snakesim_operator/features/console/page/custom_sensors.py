@@ -54,7 +54,9 @@ def format_sensor_table(snapshot: RobotSnapshot) -> str:
             rows.append((escape_text(key), "nothing yet"))
             continue
         message_type = escape_text(kind.message.__name__)
-        rows.append((escape_text(key), f"{message_type} on link {sample.link}{_format_age(snapshot, key)}"))
+        rows.append(
+            (escape_text(key), f"{message_type} on link {sample.link}{_format_age(snapshot, key)}")
+        )
         for name, value in kind.extract_numeric_values(sample).items():
             rows.append((escape_text(name), _format_value(kind, name, value)))
     return format_table(rows)
@@ -112,9 +114,13 @@ class CustomSensorCharts:
         chart = self._charts.get(quantity)
         if chart is None or chart.line_names != line_names:
             chart = self._replace_chart(quantity, line_names)
-        samples = [(time_s, numbers) for time_s, numbers in history if time_s >= newest_s - HISTORY_S]
+        samples = [
+            (time_s, numbers) for time_s, numbers in history if time_s >= newest_s - HISTORY_S
+        ]
         times_s = np.array([time_s for time_s, _ in samples])
-        columns = [np.array([numbers.get(name, math.nan) for _, numbers in samples]) for name in line_names]
+        columns = [
+            np.array([numbers.get(name, math.nan) for _, numbers in samples]) for name in line_names
+        ]
         chart.handle.data = (times_s, *columns)
 
     def _replace_chart(self, quantity: SensorQuantity, line_names: Sequence[str]) -> _QuantityChart:

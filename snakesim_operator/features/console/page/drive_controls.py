@@ -12,7 +12,10 @@ from snakesim_operator.features.console.operations import BUTTON_VALIDITY_NS, KE
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, ControlAdmission
 from snakesim_operator.features.console.web.message_age import PageAction
-from snakesim_operator.robot_commands.teleop.steering import HEADING_STEP_RAD, compute_limited_heading
+from snakesim_operator.robot_commands.teleop.steering import (
+    HEADING_STEP_RAD,
+    compute_limited_heading,
+)
 
 HOLD_REPEAT_HZ = 10.0  # how often a page repeats that the button is held
 MAX_SPEED_M_S = 0.5  # end of the speed slider
@@ -119,7 +122,9 @@ class DriveControls:
                 if not is_driving:
                     return
         self._key_drive_time_s = now_s
-        self._send_drive_intent(self._key_direction * self._speed_slider.value, KEY_VALIDITY_NS, action)
+        self._send_drive_intent(
+            self._key_direction * self._speed_slider.value, KEY_VALIDITY_NS, action
+        )
 
     def _send_drive_intent(self, speed_m_s: float, valid_ns: int, action: PageAction) -> None:
         """Send the robot an intent, valid from the last moment at which the viewer is known to have acted.
@@ -132,7 +137,9 @@ class DriveControls:
 
     def _change_heading(self, step_rad: float) -> None:
         """Change the heading by a step."""
-        heading_w_rad = compute_limited_heading(self._heading_w_rad, step_rad, self._find_body_yaw_w_rad())
+        heading_w_rad = compute_limited_heading(
+            self._heading_w_rad, step_rad, self._find_body_yaw_w_rad()
+        )
         self._heading_slider.value = _round_to_slider_deg(heading_w_rad)
 
     @property

@@ -19,20 +19,16 @@ from snakesim_operator.results.page import svg
 WIDTH_PX = 380.0
 HEIGHT_PX = 250.0
 MARGIN_PX = 34.0
-SCALE_HEIGHTS_N = (
-    5.0,
-    10.0,
-    20.0,
-    50.0,
-    100.0,
-    200.0,
-)  # that the height stands for: few, so that the scale seldom jumps
+# That the height stands for: few, so that the scale seldom jumps.
+SCALE_HEIGHTS_N = 5.0, 10.0, 20.0, 50.0, 100.0, 200.0
 MIN_LABELED_PX = 26.0  # shorter arrows have no number
 MIN_ARROW_PX = 1.0  # shorter arrows are not drawn
 ARROW_HEAD_PX = 11.0
 LABEL_DISTANCE_PX = 20.0  # of a label from the middle of its arrow
 FONT_PX = 11
-NO_FORCES = "<div style='padding:.3em .6em;opacity:.7'>no contact force is measured on the body now</div>"
+NO_FORCES = (
+    "<div style='padding:.3em .6em;opacity:.7'>no contact force is measured on the body now</div>"
+)
 
 
 def draw_force_polygon(snapshot: RobotSnapshot) -> str:
@@ -44,7 +40,9 @@ def draw_force_polygon(snapshot: RobotSnapshot) -> str:
     px_per_n, span_n = _choose_scale(corners_n)
     corners_px = _convert_to_pixels(corners_n, px_per_n)
     resultant_n = float(np.linalg.norm(corners_n[-1]))
-    arrows = [_draw_arrow(start, end, MEASURED_FORCE, px_per_n) for start, end in pairwise(corners_px)]
+    arrows = [
+        _draw_arrow(start, end, MEASURED_FORCE, px_per_n) for start, end in pairwise(corners_px)
+    ]
     arrows.append(_draw_arrow(corners_px[0], corners_px[-1], RESULTANT, px_per_n))
     scale_bar = _draw_scale_bar(span_n / 5, px_per_n)
     label = f"Force polygon of the contact forces on the body; resultant {resultant_n:.1f} N"
@@ -127,4 +125,6 @@ def _draw_arrow(start: Floats, end: Floats, color: Color, px_per_n: float) -> st
     side = np.array([-along[1], along[0]])
     x, y = (start + end) / 2 + LABEL_DISTANCE_PX * side
     label = f"{length_px / px_per_n:.1f} N"
-    return arrow + svg.draw_text(x, y + 4, label, anchor="middle", fill=color_text, font_size=FONT_PX)
+    return arrow + svg.draw_text(
+        x, y + 4, label, anchor="middle", fill=color_text, font_size=FONT_PX
+    )

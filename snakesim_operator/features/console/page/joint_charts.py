@@ -49,18 +49,29 @@ class JointCharts:
         self._joint_names = [joint.name for joint in robot.joints]
         self._joint_numbers = np.arange(1.0, len(robot.joints) + 1)
         self._torque_limits_nm = np.array([joint.torque_limit_nm for joint in robot.joints])
-        self._history: deque[tuple[float, Floats, Floats]] = deque(maxlen=MAX_SAMPLES)  # time, angles, torques
+        # Time, angles, torques.
+        self._history: deque[tuple[float, Floats, Floats]] = deque(maxlen=MAX_SAMPLES)
 
-        max_angles_rad = np.array([max(-joint.angle_min_rad, joint.angle_max_rad) for joint in robot.joints])
+        max_angles_rad = np.array(
+            [max(-joint.angle_min_rad, joint.angle_max_rad) for joint in robot.joints]
+        )
         angle_scale = _make_fixed_scale(max_angles_rad)
         torque_scale = _make_fixed_scale(self._torque_limits_nm)
         self._angle_chart = self._add_angle_chart(gui, angle_scale)
         self._torque_chart = self._add_torque_chart(gui, torque_scale)
         self._angle_history_chart = add_history_chart(
-            gui, self._joint_names, "Angle of all joints, last 10 s, rad", angle_scale, legend={"show": False}
+            gui,
+            self._joint_names,
+            "Angle of all joints, last 10 s, rad",
+            angle_scale,
+            legend={"show": False},
         )
         self._torque_history_chart = add_history_chart(
-            gui, self._joint_names, "Torque of all joints, last 10 s, N·m", torque_scale, legend={"show": False}
+            gui,
+            self._joint_names,
+            "Torque of all joints, last 10 s, N·m",
+            torque_scale,
+            legend={"show": False},
         )
 
     def _add_angle_chart(self, gui: viser.GuiApi, scale: dict[str, Any]) -> viser.GuiUplotHandle:
@@ -88,7 +99,13 @@ class JointCharts:
             make_chart_line("propulsion", PROPULSION_COLOR, dots=True, dot_size_px=12),
         )
         return gui.add_uplot(
-            (self._joint_numbers, unknown, self._torque_limits_nm, -self._torque_limits_nm, unknown),
+            (
+                self._joint_numbers,
+                unknown,
+                self._torque_limits_nm,
+                -self._torque_limits_nm,
+                unknown,
+            ),
             lines,  # pyright: ignore[reportArgumentType] - dictionaries of uPlot's options
             title="Torque of each joint, N·m",
             height=CHART_HEIGHT_PX,
@@ -107,7 +124,9 @@ class JointCharts:
         joints = snapshot.joints
         if joints is None or snapshot.time_s is None:
             return
-        append_sample(self._history, (snapshot.time_s, np.array(joints.angle_rad), np.array(joints.torque_nm)))
+        append_sample(
+            self._history, (snapshot.time_s, np.array(joints.angle_rad), np.array(joints.torque_nm))
+        )
 
     def redraw(self, snapshot: RobotSnapshot) -> None:
         """Redraw all charts; called a few times a second."""
@@ -120,7 +139,13 @@ class JointCharts:
         limits_nm = self._find_torque_limits_nm(snapshot)
         is_propulsion = np.arange(len(torques_nm)) == find_propulsion_joint(snapshot)
         propulsion_nm = np.where(is_propulsion, torques_nm, np.nan)
-        self._torque_chart.data = (self._joint_numbers, torques_nm, limits_nm, -limits_nm, propulsion_nm)
+        self._torque_chart.data = (
+            self._joint_numbers,
+            torques_nm,
+            limits_nm,
+            -limits_nm,
+            propulsion_nm,
+        )
         if len(self._history) > 1:
             self._show_history()
 
@@ -162,7 +187,11 @@ def _make_fixed_scale(limits: Floats) -> dict[str, Any]:
 
 
 def add_history_chart(
-    gui: viser.GuiApi, names: Sequence[str], title: str, scale: dict[str, Any] | None = None, **options: Any
+    gui: viser.GuiApi,
+    names: Sequence[str],
+    title: str,
+    scale: dict[str, Any] | None = None,
+    **options: Any,
 ) -> viser.GuiUplotHandle:
     """Add a chart over time in seconds, with an empty line for each name.
 
@@ -190,9 +219,16 @@ def add_history_chart(
     )
 
 
-def make_chart_line(label: str, color: str, *, dash: bool = False, dots: bool = False, dot_size_px: int = 5) -> Any:
+def make_chart_line(
+    label: str, color: str, *, dash: bool = False, dots: bool = False, dot_size_px: int = 5
+) -> Any:
     """Return the options of one line of a chart."""
-    line: dict[str, Any] = {"label": label, "stroke": color, "width": 1.5, "points": {"show": False}}
+    line: dict[str, Any] = {
+        "label": label,
+        "stroke": color,
+        "width": 1.5,
+        "points": {"show": False},
+    }
     if dash:
         line["dash"] = [5, 4]
     if dots:

@@ -31,7 +31,9 @@ def format_joint_table(
         configured_joint = None if config is None else config.robot.joint_table[joint_index]
         moved_range = moved_ranges[joint_index] if moved_ranges else None
         rows.append(_format_joint_rows(snapshot, joint_index, configured_joint, moved_range))
-    header_cells = "".join(f"<th style='text-align:left;padding-right:.8em'>{heading}</th>" for heading in HEADINGS)
+    header_cells = "".join(
+        f"<th style='text-align:left;padding-right:.8em'>{heading}</th>" for heading in HEADINGS
+    )
     return (
         f"<div style='padding:0 .6em .4em;font-size:.85em'>{_format_check_line(snapshot, config)}"
         f"<table style='border-spacing:0;width:100%'><tr style='opacity:.7'>{header_cells}</tr>{''.join(rows)}"
@@ -65,7 +67,10 @@ def _format_check_line(snapshot: RobotSnapshot, config: RunConfig | None) -> str
 
 
 def _format_joint_rows(
-    snapshot: RobotSnapshot, joint_index: int, configured_joint: Joint | None, moved_range: AngleRange | None
+    snapshot: RobotSnapshot,
+    joint_index: int,
+    configured_joint: Joint | None,
+    moved_range: AngleRange | None,
 ) -> str:
     """Format two rows of the table for a joint as HTML: its values, and its drive below them.
 
@@ -82,13 +87,17 @@ def _format_joint_rows(
     cell_texts = (_format_angle(snapshot, joint_index), limits, sign, zero)
     cells = "".join(f"<td style='padding-right:.8em'>{text}</td>" for text in cell_texts)
     joint_name = escape_text(described_joint.name)
-    name_cell = f"<td style='padding-right:.8em;white-space:nowrap;font-weight:600'>{joint_name}</td>"
+    name_cell = (
+        f"<td style='padding-right:.8em;white-space:nowrap;font-weight:600'>{joint_name}</td>"
+    )
     drive = escape_text(_describe_drive(described_joint, configured_joint))
     moved = ""
     if moved_range is not None:
         lower_rad, upper_rad = moved_range
         moved = f"<div>moved from {lower_rad:+.3f} to {upper_rad:+.3f} rad</div>"
-    drive_cells = f"<td></td><td colspan='4' style='opacity:.7;padding-bottom:.25em'>{drive}{moved}</td>"
+    drive_cells = (
+        f"<td></td><td colspan='4' style='opacity:.7;padding-bottom:.25em'>{drive}{moved}</td>"
+    )
     return f"<tr>{name_cell}{cells}</tr><tr>{drive_cells}</tr>"
 
 

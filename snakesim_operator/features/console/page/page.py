@@ -19,7 +19,11 @@ import viser
 from snakesim_operator.features.console.control_token import ControlToken
 from snakesim_operator.features.console.operations import PageLog, RobotOperations
 from snakesim_operator.features.console.page import page_html
-from snakesim_operator.features.console.page.appearance import add_appearance, aim_phone_camera, set_appearance
+from snakesim_operator.features.console.page.appearance import (
+    add_appearance,
+    aim_phone_camera,
+    set_appearance,
+)
 from snakesim_operator.features.console.page.commissioning_tab import CommissioningTab
 from snakesim_operator.features.console.page.drive_controls import HOTKEY_BY_DRIVE_KEY
 from snakesim_operator.features.console.page.robot_display import RobotDisplay, RobotTabs
@@ -34,7 +38,8 @@ from snakesim_operator.features.console.web.viser_server import PageServer
 TEXT_DECIMATION = 6
 CHART_DECIMATION = 5
 IMAGE_DECIMATION = 6
-AGE_REQUEST_DECIMATION = 3  # ten questions a second to the page in control, by which the age of its messages is known
+# Ten questions a second to the page in control, by which the age of its messages is known.
+AGE_REQUEST_DECIMATION = 3
 
 PANEL_WIDTH_PX = 490  # wide enough for all tabs in one line
 
@@ -114,7 +119,9 @@ class ConsolePage:
         with tabs.add_tab("Cameras"):
             cameras = gui.add_folder(None)
             with cameras:
-                no_camera = gui.add_html("<div style='padding:.3em .6em;opacity:.7'>no image yet</div>")
+                no_camera = gui.add_html(
+                    "<div style='padding:.3em .6em;opacity:.7'>no image yet</div>"
+                )
         with tabs.add_tab("Sensors"):
             sensors = gui.add_folder(None)
         return RobotTabs(joints, forces, cameras, no_camera, sensors)
@@ -159,7 +166,9 @@ class ConsolePage:
         """Add the stop button and the drive keys; the thread that receives messages handles their events."""
         gui = self._server.gui
         admit = self._server.admission.admit_control
-        button = gui.add_button("EMERGENCY STOP  (Esc)", color="red", icon=viser.Icon.HAND_STOP, order=1)
+        button = gui.add_button(
+            "EMERGENCY STOP  (Esc)", color="red", icon=viser.Icon.HAND_STOP, order=1
+        )
         admit(button, handler=viewers.stop_robot)
         admit(gui.add_command("Emergency stop", hotkey="escape"), handler=viewers.stop_robot)
         for key_name, hotkey in HOTKEY_BY_DRIVE_KEY.items():
@@ -217,7 +226,9 @@ class ConsolePage:
             self._commissioning.update(snapshot)
         if snapshot is not None:
             self._show_robot(previous, snapshot)
-        if self._is_due(TEXT_DECIMATION) or _get_urgent_state(previous) != _get_urgent_state(snapshot):
+        if self._is_due(TEXT_DECIMATION) or _get_urgent_state(previous) != _get_urgent_state(
+            snapshot
+        ):
             self._show_texts(snapshot)
 
     def reset_for_jump(self, earlier: Iterable[RobotSnapshot]) -> None:
@@ -263,7 +274,9 @@ class ConsolePage:
         if self._viewers is None:
             self._header.content = page_html.format_header(snapshot, recorded=self._recorded)
         else:
-            self._header.content = page_html.format_header(snapshot, control=self._describe_viewers())
+            self._header.content = page_html.format_header(
+                snapshot, control=self._describe_viewers()
+            )
 
     def _describe_viewers(self) -> str:
         """Return which viewer has control, how many viewers there are, and how many of their messages were dropped."""

@@ -12,7 +12,12 @@ MAX_BACKEND_CHARACTERS = 12  # of a backend's name, so that it cannot fill the b
 
 # Colors that can be read on a light and on a dark page.
 BAD = "#d64541"  # of text about a fault or an alarm
-LIFECYCLE_COLORS = {"disarmed": "#6b7683", "armed": "#1a7f4b", "fault": "#b3261e", "estop": "#b3261e"}
+LIFECYCLE_COLORS = {
+    "disarmed": "#6b7683",
+    "armed": "#1a7f4b",
+    "fault": "#b3261e",
+    "estop": "#b3261e",
+}
 CONTROL_STATE_COLORS = {
     "Locomoting": "#1a7f4b",
     "NotLocomoting": "#b26a00",
@@ -55,22 +60,32 @@ def format_header(snapshot: RobotSnapshot | None, *, recorded: str = "", control
         control: Text that names the viewer in control; empty to leave it out.
     """
     if snapshot is None:
-        return _format_bar("WAITING FOR THE ROBOT", RECORDED_COLOR, "no host has described itself yet")
+        return _format_bar(
+            "WAITING FOR THE ROBOT", RECORDED_COLOR, "no host has described itself yet"
+        )
     if snapshot.expected:
         name = escape_text(snapshot.robot.robot)
-        return _format_bar("WAITING FOR THE ROBOT", RECORDED_COLOR, f"{name}, drawn as its scenario places it")
+        return _format_bar(
+            "WAITING FOR THE ROBOT", RECORDED_COLOR, f"{name}, drawn as its scenario places it"
+        )
     html_lines = [_format_backend_bar(snapshot.robot, recorded), *_list_alarms(snapshot)]
     status = snapshot.status
     if status is not None:
         html_lines.append(
-            _format_state(status.lifecycle.upper(), LIFECYCLE_COLORS[status.lifecycle], status.reason, ".45em")
+            _format_state(
+                status.lifecycle.upper(), LIFECYCLE_COLORS[status.lifecycle], status.reason, ".45em"
+            )
         )
     control_state = snapshot.control
     if control_state is not None:
         state_color = CONTROL_STATE_COLORS[control_state.state]
-        html_lines.append(_format_state(control_state.state, state_color, control_state.reason, ".35em"))
+        html_lines.append(
+            _format_state(control_state.state, state_color, control_state.reason, ".35em")
+        )
     if control:
-        html_lines.append(f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{escape_text(control)}</div>")
+        html_lines.append(
+            f"<div style='opacity:.75;font-size:.85em;margin-top:.35em'>{escape_text(control)}</div>"
+        )
     return f"<div data-robot style='padding:0 .6em .2em;font-size:.9em;line-height:1.35'>{''.join(html_lines)}</div>"
 
 
@@ -92,13 +107,25 @@ def _list_alarms(snapshot: RobotSnapshot) -> list[str]:
     lines: list[str] = []
     status = snapshot.status
     if status is not None and status.paused_by is not None:
-        lines.append(_format_bar("PAUSED", RECORDED_COLOR, f"by {escape_text(status.paused_by)}; robot time is paused"))
+        lines.append(
+            _format_bar(
+                "PAUSED",
+                RECORDED_COLOR,
+                f"by {escape_text(status.paused_by)}; robot time is paused",
+            )
+        )
     if len(snapshot.hosts) > 1:
         lines.append(
-            _format_warning("IMPOSTOR: more than one host publishes a status under this name. Trust none of them.")
+            _format_warning(
+                "IMPOSTOR: more than one host publishes a status under this name. Trust none of them."
+            )
         )
     if snapshot.time_since_status_s > MAX_SILENCE_S:
-        lines.append(_format_warning(f"NO ANSWER for {snapshot.time_since_status_s:.0f} s. What is shown is old."))
+        lines.append(
+            _format_warning(
+                f"NO ANSWER for {snapshot.time_since_status_s:.0f} s. What is shown is old."
+            )
+        )
     return lines
 
 
@@ -141,10 +168,16 @@ def _list_status_rows(status: RobotStatus, time_s: float | None) -> list[tuple[s
     """Return the rows that every status has."""
     robot_time = "" if time_s is None else f"{time_s:.2f} s · "
     return [
-        ("robot time", f"{robot_time}tick {status.tick}, {status.clock_mode} at {status.rate_hz:g} Hz"),
+        (
+            "robot time",
+            f"{robot_time}tick {status.tick}, {status.clock_mode} at {status.rate_hz:g} Hz",
+        ),
         ("lease", f"{escape_text(status.lease_holder or 'free')} (epoch {status.lease_epoch})"),
         ("alive", escape_text(", ".join(status.alive) or "none")),
-        ("commands", f"{status.commands_accepted} accepted, {status.commands_standby} while disarmed"),
+        (
+            "commands",
+            f"{status.commands_accepted} accepted, {status.commands_standby} while disarmed",
+        ),
         ("rejected", _format_counts(status.commands_rejected)),
         ("limited", _format_counts(status.commands_limited)),
         ("overruns", f"{status.overruns}"),
@@ -182,7 +215,9 @@ def format_faults(status: RobotStatus | None) -> str:
     for fault in status.faults:
         place = f" at {escape_text(fault.joint)}" if fault.joint else ""
         cause = escape_text(fault.cause)
-        items.append(f"<li><b>{escape_text(fault.what)}</b>{place}, tick {fault.tick}: {cause}</li>")
+        items.append(
+            f"<li><b>{escape_text(fault.what)}</b>{place}, tick {fault.tick}: {cause}</li>"
+        )
     if status.faults_left_out:
         items.append(f"<li>and {status.faults_left_out} more</li>")
     style = f"padding:0 .6em;font-size:.85em;color:{BAD}"
@@ -221,7 +256,9 @@ def format_stream_table(snapshot: RobotSnapshot) -> str:
 def format_log(lines: Iterable[str]) -> str:
     """Return the lines of the log as HTML, in the order given."""
     items = "".join(f"<div style='padding:.1em 0'>{escape_text(line)}</div>" for line in lines)
-    return f"<div style='padding:0 .6em;font-size:.82em;max-height:22em;overflow-y:auto'>{items}</div>"
+    return (
+        f"<div style='padding:0 .6em;font-size:.82em;max-height:22em;overflow-y:auto'>{items}</div>"
+    )
 
 
 def format_legend(entries: Iterable[tuple[str, tuple[int, int, int]]]) -> str:

@@ -45,7 +45,9 @@ def _make_field(parameter: RobotParameter) -> InputField | None:
     if isinstance(value, bool):
         return InputField(parameter.name, value, hint=parameter.description)
     if isinstance(value, str) and value in parameter.choices:
-        return InputField(parameter.name, value, choices=parameter.choices, hint=parameter.description)
+        return InputField(
+            parameter.name, value, choices=parameter.choices, hint=parameter.description
+        )
     if isinstance(value, int | float) and math.isfinite(value):
         return _make_number_field(parameter, value)
     return None
@@ -97,7 +99,9 @@ def _describe_number(parameter: RobotParameter) -> str:
 class ParameterForm:
     """The inputs of one viewer for the parameters of one controller."""
 
-    def __init__(self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, in_force: ControlParameters) -> None:
+    def __init__(
+        self, gui: viser.GuiApi, folder: viser.GuiFolderHandle, in_force: ControlParameters
+    ) -> None:
         self.controller = in_force.controller
         self._values = _decode_values(in_force)
         self._inputs: dict[str, Any] = {}  # handles of viser, by the parameter's name
@@ -149,8 +153,14 @@ def _add_input(gui: viser.GuiApi, field: InputField) -> Any:
         case bool():
             return gui.add_checkbox(label, field.value, hint=field.hint)
         case str():
-            return gui.add_dropdown(label, field.choices, initial_value=field.value, hint=field.hint)
+            return gui.add_dropdown(
+                label, field.choices, initial_value=field.value, hint=field.hint
+            )
         case int():
-            return gui.add_number(label, field.value, min=math.ceil(field.low), step=1, hint=field.hint)
+            return gui.add_number(
+                label, field.value, min=math.ceil(field.low), step=1, hint=field.hint
+            )
         case _:
-            return gui.add_slider(label, field.low, field.high, field.step, field.value, hint=field.hint)
+            return gui.add_slider(
+                label, field.low, field.high, field.step, field.value, hint=field.hint
+            )

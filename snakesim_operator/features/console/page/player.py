@@ -16,7 +16,9 @@ class RecordingPlayer:
     The display loop calls `advance`; the threads of viser and of the web server move the time.
     """
 
-    def __init__(self, server: PageServer, span_s: tuple[float, float], start_s: float = 0.0) -> None:
+    def __init__(
+        self, server: PageServer, span_s: tuple[float, float], start_s: float = 0.0
+    ) -> None:
         """Add the player to the page, paused.
 
         Args:

@@ -9,7 +9,10 @@ from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.features.console.page.appearance import aim_initial_camera, aim_phone_camera
 from snakesim_operator.features.console.page.camera_tab import draw_picture
 from snakesim_operator.features.console.page.custom_sensors import CustomSensorCharts
-from snakesim_operator.features.console.page.force_polygon import draw_force_polygon, format_push_point_table
+from snakesim_operator.features.console.page.force_polygon import (
+    draw_force_polygon,
+    format_push_point_table,
+)
 from snakesim_operator.features.console.page.joint_charts import JointCharts
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import TrueSurroundings, draw
@@ -31,7 +34,9 @@ class RobotTabs:
 class RobotDisplay:
     """The scene, charts and images of a robot. They start over when another robot appears."""
 
-    def __init__(self, server: PageServer, surroundings: TrueSurroundings | None, tabs: RobotTabs) -> None:
+    def __init__(
+        self, server: PageServer, surroundings: TrueSurroundings | None, tabs: RobotTabs
+    ) -> None:
         """Show nothing yet.
 
         Args:
@@ -55,7 +60,7 @@ class RobotDisplay:
         drawing = draw(snapshot, self._surroundings)
         if drawing is not None:
             with self._server.atomic():
-                self._scene.show(drawing)
+                self._scene.update_nodes(drawing)
 
     def add_samples(self, snapshots: Iterable[RobotSnapshot]) -> None:
         """Keep samples for the charts. The charts start over when time goes back."""
@@ -70,7 +75,9 @@ class RobotDisplay:
         """Draw the charts anew, from the samples that were added."""
         assert self._joint_charts is not None
         self._joint_charts.redraw(snapshot)
-        self._tabs.forces.content = draw_force_polygon(snapshot) + format_push_point_table(snapshot.control)
+        self._tabs.forces.content = draw_force_polygon(snapshot) + format_push_point_table(
+            snapshot.control
+        )
         if self._sensor_charts is not None:
             self._sensor_charts.redraw(snapshot)
 

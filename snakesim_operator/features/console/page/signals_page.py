@@ -26,7 +26,12 @@ from websockets.http11 import Request, Response
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.features.console.robot_data.signals import SignalSource
 from snakesim_operator.results.page.charts import LIBRARY, round_values, select_rows_to_draw
-from snakesim_operator.results.page.palette import DARK, LIGHT, format_css_variables, make_joint_colors
+from snakesim_operator.results.page.palette import (
+    DARK,
+    LIGHT,
+    format_css_variables,
+    make_joint_colors,
+)
 
 PAGE_FOLDER = Path(__file__).parent
 SIGNALS_PATH = "/signals"
@@ -58,7 +63,8 @@ class SignalsPage:
         self._second_stop = second_stop
         self._policy = CONTENT_SECURITY_POLICY.format(_hash_script(second_stop))
         # Set by the display loop.
-        self.now_s: Callable[[], float | None] = lambda: None  # the time that is shown, since the first tick
+        # The time that is shown, since the first tick.
+        self.now_s: Callable[[], float | None] = lambda: None
         self.jump_to: Callable[[float], None] | None = None  # None: a live robot
 
     def answer_request(self, request: Request) -> Response | None:
@@ -71,7 +77,9 @@ class SignalsPage:
         try:
             content_type, body = self._make_response_content(path, query, request)
         except KeyError as error:
-            return self._make_response(HTTPStatus.NOT_FOUND, "text/plain", f"there is no {error}\n".encode())
+            return self._make_response(
+                HTTPStatus.NOT_FOUND, "text/plain", f"there is no {error}\n".encode()
+            )
         except ValueError as error:
             return self._make_response(HTTPStatus.BAD_REQUEST, "text/plain", f"{error}\n".encode())
         return self._make_response(HTTPStatus.OK, content_type, body)
@@ -89,7 +97,9 @@ class SignalsPage:
         )
         return Response(status.value, status.phrase, headers, body)
 
-    def _make_response_content(self, path: str, query: Query, request: Request) -> tuple[str, bytes]:
+    def _make_response_content(
+        self, path: str, query: Query, request: Request
+    ) -> tuple[str, bytes]:
         """Make content type and body of the response to a request for the signals page, its scripts or its data.
 
         Args:
@@ -109,7 +119,9 @@ class SignalsPage:
             case "/plotly.js":
                 return "text/javascript", LIBRARY.read_bytes()
             case "/names":
-                return _encode_json({"recorded": self._signals.recorded, "units": self._signals.get_units()})
+                return _encode_json(
+                    {"recorded": self._signals.recorded, "units": self._signals.get_units()}
+                )
             case "/now":
                 return _encode_json({"time_s": self.now_s()})
             case "/go":
@@ -117,9 +129,13 @@ class SignalsPage:
                 return _encode_json({})
             case "/values":
                 series = self._read_series(query)
-                return _encode_json({name: _thin_for_chart(*one_series) for name, one_series in series.items()})
+                return _encode_json(
+                    {name: _thin_for_chart(*one_series) for name, one_series in series.items()}
+                )
             case "/values.csv":
-                return "text/csv", _format_csv(self._read_series(query), self._signals.get_units()).encode()
+                return "text/csv", _format_csv(
+                    self._read_series(query), self._signals.get_units()
+                ).encode()
             case _:
                 raise KeyError(path)
 

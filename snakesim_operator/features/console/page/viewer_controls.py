@@ -21,7 +21,11 @@ from snakesim_operator.features.console.page.drive_controls import DriveControls
 from snakesim_operator.features.console.page.page_html import BAD, escape_text
 from snakesim_operator.features.console.page.parameter_form import ParameterForm
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
-from snakesim_operator.features.console.web.admission import MAX_PRESS_AGE_S, ControlAdmission, format_age
+from snakesim_operator.features.console.web.admission import (
+    MAX_PRESS_AGE_S,
+    ControlAdmission,
+    format_age,
+)
 from snakesim_operator.robot_commands.fault import FaultOrder
 from snakesim_operator.robot_commands.simulator_order import SimulatorOrder
 
@@ -29,7 +33,9 @@ NOTIFICATION_DURATION_S = 6.0  # long enough to read a refusal
 MAX_CONCURRENT_OPERATIONS = 4  # of one viewer, so that the threads of viser are left for the others
 
 FAULT_KIND_BY_LABEL: dict[str, tuple[str, TargetType]] = {
-    f"{kind} ({target_type})": (kind, target_type) for target_type, kinds in FAULT_KINDS.items() for kind in kinds
+    f"{kind} ({target_type})": (kind, target_type)
+    for target_type, kinds in FAULT_KINDS.items()
+    for kind in kinds
 }
 EXAMPLE_TARGET_BY_TYPE: dict[TargetType, str] = {
     "process": "control",
@@ -37,7 +43,8 @@ EXAMPLE_TARGET_BY_TYPE: dict[TargetType, str] = {
     "joint": "joint_3",
     "bus": "bus_1",
 }
-SIMULATOR_SPEEDS: tuple[str, ...] = ("0.1", "0.25", "0.5", "1", "2", "5", "10")  # multiples of real time
+# Multiples of real time.
+SIMULATOR_SPEEDS: tuple[str, ...] = "0.1", "0.25", "0.5", "1", "2", "5", "10"
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,8 @@ class ControlContext:
     operations: RobotOperations  # sends commands to the robot
     admission: ControlAdmission  # decides which messages of a page count
     commissioning: CommissioningTab  # runs steps; all viewers share one
-    get_snapshot: Callable[[], RobotSnapshot | None]  # returns the newest snapshot; None while there is no robot
+    # Returns the newest snapshot; None while there is no robot.
+    get_snapshot: Callable[[], RobotSnapshot | None]
     on_control_changed: Callable[[], None]  # called when a viewer took or released control
     control_folder: viser.GuiFolderHandle
     parameters_tab: viser.GuiFolderHandle
@@ -79,7 +87,8 @@ class ViewerControls:
         self._admission = context.admission
         # What this viewer has done.
         self._operation_slots = threading.Semaphore(MAX_CONCURRENT_OPERATIONS)
-        self._can_offer_unchecked = False  # the host refused to arm because the joints were not checked
+        # The host refused to arm because the joints were not checked.
+        self._can_offer_unchecked = False
         self._error_report = ErrorReporter(f"console, {self.name}")
         # The controls.
         self._parameters_tab = context.parameters_tab
@@ -112,7 +121,9 @@ class ViewerControls:
 
     def _add_control_buttons(self) -> None:
         gui = self.client.gui
-        self._take_control_button = gui.add_button("Take control", icon=viser.Icon.HAND_STOP, color="blue")
+        self._take_control_button = gui.add_button(
+            "Take control", icon=viser.Icon.HAND_STOP, color="blue"
+        )
         self._lifecycle_buttons = gui.add_button_group("Robot", ("Arm", "Disarm", "Reset fault"))
         self._unchecked_reason = gui.add_html("", visible=False)
         self._arm_unchecked_button = gui.add_button("Arm it unchecked", color="red", visible=False)
@@ -151,7 +162,10 @@ class ViewerControls:
         self._admit_if_recent(self._apply_button)
 
     def _admit_if_recent(
-        self, control: Any, is_allowed: Callable[[], bool] | None = None, at_any_age: Collection[str] = ()
+        self,
+        control: Any,
+        is_allowed: Callable[[], bool] | None = None,
+        at_any_age: Collection[str] = (),
     ) -> None:
         """Admit a control whose press may move the robot, now or later: an old press does not count.
 
@@ -173,10 +187,14 @@ class ViewerControls:
         self._take_control_button.on_click(lambda _: self._take_or_release_control())
         self._lifecycle_buttons.on_click(lambda event: self._change_lifecycle(event.target.value))
         self._arm_unchecked_button.on_click(lambda _: self._arm(unchecked=True))
-        self._time_buttons.on_click(lambda event: self._control_simulator(event.target.value.lower()))
+        self._time_buttons.on_click(
+            lambda event: self._control_simulator(event.target.value.lower())
+        )
         self._speed_dropdown.on_update(lambda _: self._control_simulator("speed"))
         self._fault_kind_dropdown.on_update(lambda _: self._suggest_fault_target())
-        self._fault_buttons.on_click(lambda event: self._inject_or_end_fault(end=event.target.value == "End it"))
+        self._fault_buttons.on_click(
+            lambda event: self._inject_or_end_fault(end=event.target.value == "End it")
+        )
         self._apply_button.on_click(lambda _: self._apply_parameters())
 
     @property
@@ -228,7 +246,8 @@ class ViewerControls:
         if not reason:
             self._can_offer_unchecked = False
         self._unchecked_reason.content = (
-            f"<div style='padding:.3em .6em;font-size:.85em;color:{BAD}'>{escape_text(reason)}</div>"
+            "<div "
+            f"style='padding:.3em .6em;font-size:.85em;color:{BAD}'>{escape_text(reason)}</div>"
         )
         self._unchecked_reason.visible = self._can_offer_unchecked
         self._arm_unchecked_button.visible = self._can_offer_unchecked
@@ -254,7 +273,9 @@ class ViewerControls:
     def notify(self, title: str, text: str, *, bad: bool = False) -> None:
         """Show a notification to this viewer."""
         color = "red" if bad else "green"
-        self.client.add_notification(title, text, auto_close_seconds=NOTIFICATION_DURATION_S, color=color)
+        self.client.add_notification(
+            title, text, auto_close_seconds=NOTIFICATION_DURATION_S, color=color
+        )
 
     # --- control ---------------------------------------------------------------------------------------------
 
@@ -274,7 +295,11 @@ class ViewerControls:
             if self._control_token.acquire(self.viewer):
                 self.drive_controls.steer_straight_on()
             else:
-                self.notify("Not in control", f"{format_viewer(self._control_token.holder)} has it", bad=True)
+                self.notify(
+                    "Not in control",
+                    f"{format_viewer(self._control_token.holder)} has it",
+                    bad=True,
+                )
         self._on_control_changed()
 
     def _on_late_press(self, age_s: float) -> None:
@@ -299,7 +324,9 @@ class ViewerControls:
         if snapshot is None or not self._is_in_control():
             return
         robot = snapshot.robot
-        is_armed = self.run_operation("Arm", lambda: self._operations.arm(self.name, robot, unchecked=unchecked))
+        is_armed = self.run_operation(
+            "Arm", lambda: self._operations.arm(self.name, robot, unchecked=unchecked)
+        )
         self._can_offer_unchecked = not is_armed
         self.refresh()
 
@@ -309,7 +336,9 @@ class ViewerControls:
             return
         speed = float(self._speed_dropdown.value)
         order = SimulatorOrder(action, speed=speed, requester=self.name)
-        self.run_operation("Simulator", lambda: self._operations.control_simulator(self.name, order))
+        self.run_operation(
+            "Simulator", lambda: self._operations.control_simulator(self.name, order)
+        )
 
     def _suggest_fault_target(self) -> None:
         """Enter an example of a target for the chosen kind of fault; simulator and clock are their own target."""
@@ -331,7 +360,9 @@ class ViewerControls:
             return
         self.run_operation(
             "Parameters",
-            lambda: self._operations.change_parameters(self.name, form.controller, form.encode_parameters()),
+            lambda: self._operations.change_parameters(
+                self.name, form.controller, form.encode_parameters()
+            ),
         )
 
     def run_operation(self, title: str, operation: Callable[[], str]) -> bool:
@@ -357,7 +388,9 @@ class ViewerControls:
             return False
         except Exception as error:  # noqa: BLE001 - outermost in a thread of viser's, which reports to no viewer
             self._error_report.print_error(error)
-            self.notify(title, f"not done: unexpected error: {type(error).__name__}: {error}", bad=True)
+            self.notify(
+                title, f"not done: unexpected error: {type(error).__name__}: {error}", bad=True
+            )
             return False
         finally:
             self._operation_slots.release()

@@ -13,7 +13,11 @@ from functools import partial
 import viser
 
 from snakesim_hal.wire.messages import ControlParameters
-from snakesim_operator.features.console.page.viewer_controls import ControlContext, ViewerControls, format_viewer
+from snakesim_operator.features.console.page.viewer_controls import (
+    ControlContext,
+    ViewerControls,
+    format_viewer,
+)
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.web.message_age import PageAction
 from snakesim_operator.features.console.web.viser_server import PageServer
@@ -32,7 +36,8 @@ class Viewers:
         self._server = server
         self._context = context
         self._controls: dict[int, ViewerControls] = {}  # by viewer
-        self._lock = threading.Lock()  # of `_controls`; viser fills a folder from one thread at a time
+        # Of `_controls`; viser fills a folder from one thread at a time.
+        self._lock = threading.Lock()
 
     def add(self, client: viser.ClientHandle) -> None:
         """Give a viewer its controls."""
@@ -79,7 +84,8 @@ class Viewers:
         A page that cannot draw the scene has no controls, but may stop the robot.
         """
         stopped = self._context.operations.stop.request_stop(format_viewer(viewer_id))
-        controls = self._controls.get(viewer_id)  # without the lock: the thread that holds it may wait for this one
+        # Without the lock: the thread that holds it may wait for this one.
+        controls = self._controls.get(viewer_id)
         if controls is not None:
             stopped.add_done_callback(partial(self._show_stop_result, controls))
 

@@ -35,9 +35,11 @@ MAX_ARRIVALS = 64
 MAX_IMAGE_ARRIVALS = 2  # images are large
 
 MAX_CAMERAS = 16
-MAX_JOINT_STATES = 128  # enough to find the joint state of the instant of a pose, which arrives later
+# Enough to find the joint state of the instant of a pose, which arrives later.
+MAX_JOINT_STATES = 128
 RATE_PERIOD_S = 1.0  # over which the rates of messages are measured
-MAX_STATUS_AGE_S = 2.0  # a host that is silent for longer has ended; it does not count as a second host
+# A host that is silent for longer has ended; it does not count as a second host.
+MAX_STATUS_AGE_S = 2.0
 
 LATCHED_MESSAGE_KEYS = (keys.DESCRIPTION, keys.STATUS, keys.PARAMETERS_IN_FORCE, keys.CONFIG)
 STREAM_KEYS = (
@@ -132,9 +134,13 @@ class LiveRobot:
         the robot describes it.
         """
         buffer = self._buffer_by_key.get(arrival.key)
-        has_room = len(self._buffer_by_key) < len(LATCHED_MESSAGE_KEYS) + len(STREAM_KEYS) + MAX_CAMERAS
+        has_room = (
+            len(self._buffer_by_key) < len(LATCHED_MESSAGE_KEYS) + len(STREAM_KEYS) + MAX_CAMERAS
+        )
         if buffer is None and has_room and keys.find_row_key(arrival.key) in IMAGE_ROWS:
-            buffer = self._add_buffer(arrival.key, keys.find_message(arrival.key), MAX_IMAGE_ARRIVALS)
+            buffer = self._add_buffer(
+                arrival.key, keys.find_message(arrival.key), MAX_IMAGE_ARRIVALS
+            )
         if buffer is not None:
             buffer.store(arrival)
 
@@ -177,9 +183,15 @@ class LiveRobot:
             power=get_newest(keys.POWER),
             imu=get_newest(keys.IMU),
             images={
-                key: image for key, image in self._newest_by_key.items() if isinstance(image, DepthImage | ColorImage)
+                key: image
+                for key, image in self._newest_by_key.items()
+                if isinstance(image, DepthImage | ColorImage)
             },
-            custom={key: sample for key, sample in self._newest_by_key.items() if isinstance(sample, CustomSample)},
+            custom={
+                key: sample
+                for key, sample in self._newest_by_key.items()
+                if isinstance(sample, CustomSample)
+            },
             # What guidance and control publish.
             world=world,
             trajectory=get_newest(keys.TRAJECTORY),
@@ -219,7 +231,9 @@ class LiveRobot:
         former = self.robot
         if former is not None and former.host != robot.host:
             # The configuration has a hash, by which `_find_configuration` knows whether it is of this host.
-            self._newest_by_key = {key: message for key, message in self._newest_by_key.items() if key == keys.CONFIG}
+            self._newest_by_key = {
+                key: message for key, message in self._newest_by_key.items() if key == keys.CONFIG
+            }
             self._joint_states.clear()
             self._last_status_time_by_host_s.clear()
         if former is None or former.custom != robot.custom:
@@ -228,7 +242,9 @@ class LiveRobot:
 
     def _replace_sensor_buffers(self, robot: RobotDescription) -> None:
         """Add a buffer for each custom sensor that the robot describes, in the place of the former ones."""
-        former_keys = [key for key in self._buffer_by_key if keys.find_row_key(key) == keys.CUSTOM_ALL]
+        former_keys = [
+            key for key in self._buffer_by_key if keys.find_row_key(key) == keys.CUSTOM_ALL
+        ]
         for key in former_keys:
             del self._buffer_by_key[key]
             self._newest_by_key.pop(key, None)
@@ -247,7 +263,9 @@ class LiveRobot:
     def _list_hosts(self, now_s: float) -> frozenset[str]:
         """Return the ids of all hosts that have published a status lately."""
         return frozenset(
-            host for host, time_s in self._last_status_time_by_host_s.items() if now_s - time_s < MAX_STATUS_AGE_S
+            host
+            for host, time_s in self._last_status_time_by_host_s.items()
+            if now_s - time_s < MAX_STATUS_AGE_S
         )
 
     def _find_body_and_base(
@@ -267,7 +285,9 @@ class LiveRobot:
         else:
             newest = self._joint_states[-1] if self._joint_states else None
             return newest, None
-        body = min(self._joint_states, key=lambda joints: abs(joints.timestamp_ns - pose_ns), default=None)
+        body = min(
+            self._joint_states, key=lambda joints: abs(joints.timestamp_ns - pose_ns), default=None
+        )
         return body, base
 
     def _measure_rates(self) -> None:
@@ -278,7 +298,8 @@ class LiveRobot:
             return
         counts = {key: buffer.count for key, buffer in list(self._buffer_by_key.items())}
         self._rate_by_key_hz = {
-            key: (count - self._count_by_key.get(key, 0)) / elapsed_s for key, count in counts.items()
+            key: (count - self._count_by_key.get(key, 0)) / elapsed_s
+            for key, count in counts.items()
         }
         self._last_count_time_s = now_s
         self._count_by_key = counts
@@ -289,7 +310,9 @@ class LiveRobot:
         for key in list(self._buffer_by_key):
             message = self._newest_by_key.get(key)
             if message is not None and key not in LATCHED_MESSAGE_KEYS:
-                streams[key] = MessageStream(self._rate_by_key_hz.get(key, 0.0), _find_age_s(message, clock))
+                streams[key] = MessageStream(
+                    self._rate_by_key_hz.get(key, 0.0), _find_age_s(message, clock)
+                )
         return streams
 
 

@@ -17,7 +17,9 @@ from snakesim_operator.recording.message import RecordedMessage
 IMAGE_ROWS = (keys.DEPTH_ALL, keys.COLOR_ALL)
 
 # Rows of the key space whose messages are kept, because the rows of a run's record do not have them.
-KEPT_ROWS = frozenset({keys.STATUS, keys.POWER, keys.IMU, keys.PARAMETERS_IN_FORCE, keys.CUSTOM_ALL, *IMAGE_ROWS})
+KEPT_ROWS = frozenset(
+    {keys.STATUS, keys.POWER, keys.IMU, keys.PARAMETERS_IN_FORCE, keys.CUSTOM_ALL, *IMAGE_ROWS}
+)
 
 # Rows of which only the times are kept, to show their rates and ages.
 TIMED_ROWS = frozenset(
@@ -43,7 +45,8 @@ class _KeyMessages:
     """The messages of one key, in the order of the file."""
 
     times_s: list[float] = field(default_factory=list[float])
-    kept: list[RecordedMessage] = field(default_factory=list[RecordedMessage])  # empty for a key of TIMED_ROWS
+    # Empty for a key of TIMED_ROWS.
+    kept: list[RecordedMessage] = field(default_factory=list[RecordedMessage])
 
 
 class MessageHistory:
@@ -63,7 +66,8 @@ class MessageHistory:
             return
         messages = self._messages.setdefault(message.key, _KeyMessages())
         previous_s = messages.times_s[-1] if messages.times_s else 0.0
-        messages.times_s.append(max(message.robot_time_ns * 1e-9, previous_s))  # times are sorted, to be searched
+        # Times are sorted, to be searched.
+        messages.times_s.append(max(message.robot_time_ns * 1e-9, previous_s))
         if row in KEPT_ROWS:
             messages.kept.append(message)
         if row in IMAGE_ROWS:

@@ -27,12 +27,16 @@ class PlaybackSignals:
         self._begin_s, _ = run.span_s
         # Signals that are columns of the record.
         self._column_times_s = record.time_s - self._begin_s
-        self._columns = {name: column for name, column in make_signal_columns(record).items() if name != "time_s"}
+        self._columns = {
+            name: column for name, column in make_signal_columns(record).items() if name != "time_s"
+        }
         self._units = {name: find_unit(name, record) for name in self._columns}
         # Signals from other messages; those of one message share a list.
         self._message_numbers: dict[str, TimedNumbers] = {}
         self._add_messages(
-            run, keys.CONTROL_STATE, [(get_timestamp_s(state), state) for state in record.control_states]
+            run,
+            keys.CONTROL_STATE,
+            [(get_timestamp_s(state), state) for state in record.control_states],
         )
         self._add_messages(run, keys.POWER, list(run.history.iterate_messages(keys.POWER)))
         self._add_messages(run, keys.IMU, list(run.history.iterate_messages(keys.IMU)))
@@ -40,7 +44,9 @@ class PlaybackSignals:
     def _add_messages(self, run: RunPlayback, key: str, messages: list[tuple[float, Any]]) -> None:
         """Add the signals of the messages of one key."""
         robot = run.record.description
-        timed_numbers = [(time_s, list_message_numbers(message, robot)) for time_s, message in messages]
+        timed_numbers = [
+            (time_s, list_message_numbers(message, robot)) for time_s, message in messages
+        ]
         for _, numbers in timed_numbers:
             for name in numbers:
                 if name not in self._message_numbers:

@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import AppliedCommand, ControlState, JointMode, JointState, Trajectory, WorldModel
+from snakesim_hal.wire.messages import (
+    AppliedCommand,
+    ControlState,
+    JointMode,
+    JointState,
+    Trajectory,
+    WorldModel,
+)
 from snakesim_hal.wire.quantities import Quaternion, Vector
 from snakesim_operator.features.console.operations import MAX_LOG_LINES
 from snakesim_operator.features.console.page_log import StateChangeLog

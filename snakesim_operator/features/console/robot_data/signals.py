@@ -20,7 +20,15 @@ from snakesim_hal.model.field_words import find_unit_in_name
 from snakesim_hal.run_log.black_box import summarize_contacts
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.custom_sample import find_custom_messages
-from snakesim_hal.wire.messages import AppliedCommand, ControlState, Imu, JointState, Message, Power, RobotDescription
+from snakesim_hal.wire.messages import (
+    AppliedCommand,
+    ControlState,
+    Imu,
+    JointState,
+    Message,
+    Power,
+    RobotDescription,
+)
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
 LIVE_HISTORY_S = 60.0
@@ -32,7 +40,13 @@ JOINT_FIELDS: dict[type[Message], tuple[str, ...]] = {
     AppliedCommand: ("mode", "target", "torque_limit_nm"),
 }
 # Units of signals whose message does not have a unit for them.
-OTHER_UNITS = {"mode": "1", "position_w_m": "m", "orientation_wxyz": "1", "contact_peak_n": "N", "contact_count": "1"}
+OTHER_UNITS = {
+    "mode": "1",
+    "position_w_m": "m",
+    "orientation_wxyz": "1",
+    "contact_peak_n": "N",
+    "contact_count": "1",
+}
 # Messages whose signals have the name of the message in front.
 PREFIXED_MESSAGES: dict[str, type[Message]] = {
     keys.CONTROL_STATE: ControlState,
@@ -91,7 +105,9 @@ class LiveSignals:
         numbers = collect_signal_values(snapshot)
         values = np.fromiter(numbers.values.values(), dtype=float, count=len(numbers.values))
         with self._lock:
-            if self._samples and time_s < self._samples[-1].time_s:  # the robot was reset, or is another one
+            if (
+                self._samples and time_s < self._samples[-1].time_s
+            ):  # the robot was reset, or is another one
                 self._samples.clear()
                 self._units.clear()
             self._units |= numbers.units
@@ -158,7 +174,9 @@ def _find_first_unit(schemas: Iterable[Any]) -> str | None:
     return None
 
 
-def _flatten_fields(name: str, value: Any, robot: RobotDescription, numbers: dict[str, float]) -> None:
+def _flatten_fields(
+    name: str, value: Any, robot: RobotDescription, numbers: dict[str, float]
+) -> None:
     """Add each number of a field to `numbers`, under the field's name and the name of each part."""
     if isinstance(value, dict):
         parts = list(value.items())

@@ -46,7 +46,8 @@ class RobotSnapshot:
     time_since_status_s: float = 0.0  # since the newest status of the host arrived
     status: RobotStatus | None = None
     configuration: RunConfiguration | None = None
-    hosts: frozenset[str] = frozenset()  # ids of all hosts that publish a status; more than one: an impostor
+    # Ids of all hosts that publish a status; more than one: an impostor.
+    hosts: frozenset[str] = frozenset()
 
     # Robot.
     joints: JointState | None = None  # the newest
@@ -57,7 +58,8 @@ class RobotSnapshot:
     power: Power | None = None
     imu: Imu | None = None
     images: dict[str, DepthImage | ColorImage] = field(default_factory=dict)  # by key
-    custom: dict[str, CustomSample] = field(default_factory=dict[str, CustomSample])  # of custom sensors, by key
+    # Of custom sensors, by key.
+    custom: dict[str, CustomSample] = field(default_factory=dict[str, CustomSample])
 
     # Controller.
     world: WorldModel | None = None

@@ -11,11 +11,21 @@ from functools import cached_property
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_link_frames, quaternions_from_rotations, rotation_from_quaternion
+from snakesim_hal.model.kinematics import (
+    compute_link_frames,
+    quaternions_from_rotations,
+    rotation_from_quaternion,
+)
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
 from snakesim_hal.model.terrain import Pipe
 from snakesim_hal.physics.hills import make_heights
-from snakesim_hal.wire.messages import ColorImage, DepthImage, KnownObstacle, WorldContact, WorldModel
+from snakesim_hal.wire.messages import (
+    ColorImage,
+    DepthImage,
+    KnownObstacle,
+    WorldContact,
+    WorldModel,
+)
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.results.metrics.force_tracking import is_contact_measured
 
@@ -96,9 +106,12 @@ class ForceArrows:
     normals: Floats = field(default_factory=_make_no_arrows)
     tangents: Floats = field(default_factory=_make_no_arrows)
     measured_forces: Floats = field(default_factory=_make_no_arrows)  # on the body
-    resultant: Floats = field(default_factory=_make_no_arrows)  # of the measured forces, at the body's center
-    desired_forces: Floats = field(default_factory=_make_no_arrows)  # of the controller, at push-points with contact
-    forces_without_contact: Floats = field(default_factory=_make_no_arrows)  # likewise, at push-points without contact
+    # Of the measured forces, at the body's center.
+    resultant: Floats = field(default_factory=_make_no_arrows)
+    # Of the controller, at push-points with contact.
+    desired_forces: Floats = field(default_factory=_make_no_arrows)
+    # Likewise, at push-points without contact.
+    forces_without_contact: Floats = field(default_factory=_make_no_arrows)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,7 +131,8 @@ class SnapshotDrawing(ForceArrows):
     path_w: Floats = field(default_factory=_make_no_points)
     perceived: tuple[KnownObstacle, ...] = ()  # by guidance
     pushed_obstacles: frozenset[str] = frozenset()  # names; the body pushes off these
-    obstacles_ahead: frozenset[str] = frozenset()  # names; navigation expects push-points there along the path
+    # Names; navigation expects push-points there along the path.
+    obstacles_ahead: frozenset[str] = frozenset()
     cameras: tuple[CameraFrustum, ...] = ()
 
 
@@ -143,7 +157,9 @@ def draw(snapshot: RobotSnapshot, surroundings: TrueSurroundings | None) -> Snap
     base_rotation = rotation_from_quaternion(orientation_wxyz)
     axes = [joint.axis for joint in robot.joints]
     lengths_m = [link.length_m for link in robot.links]
-    origins_w, rotations = compute_link_frames(position_w, base_rotation, body.angle_rad, axes, lengths_m)
+    origins_w, rotations = compute_link_frames(
+        position_w, base_rotation, body.angle_rad, axes, lengths_m
+    )
     middles_w = origins_w + rotations[:, :, 0] * (np.array(lengths_m)[:, None] / 2)
     center_w = middles_w.mean(axis=0)
     path_w = _make_no_points()
@@ -151,7 +167,10 @@ def draw(snapshot: RobotSnapshot, surroundings: TrueSurroundings | None) -> Snap
     if snapshot.trajectory is not None:
         path_w = _lay_on_ground(np.array(snapshot.trajectory.path_w), surroundings)
         obstacles_ahead = frozenset(snapshot.trajectory.push_points)
-    cameras = [_make_camera_frustum(key, image, origins_w, rotations) for key, image in snapshot.images.items()]
+    cameras = [
+        _make_camera_frustum(key, image, origins_w, rotations)
+        for key, image in snapshot.images.items()
+    ]
     return SnapshotDrawing(
         # The snake.
         center_w=center_w,
@@ -188,7 +207,9 @@ def _find_failed_joints(snapshot: RobotSnapshot) -> frozenset[int]:
     if status is None:
         return frozenset()
     failed_names = {*status.isolated, *(fault.joint for fault in status.faults)}
-    return frozenset(i for i, joint in enumerate(snapshot.robot.joints) if joint.name in failed_names)
+    return frozenset(
+        i for i, joint in enumerate(snapshot.robot.joints) if joint.name in failed_names
+    )
 
 
 def find_propulsion_joint(snapshot: RobotSnapshot) -> int | None:
@@ -208,7 +229,11 @@ def _list_perceived(world: WorldModel | None) -> tuple[KnownObstacle, ...]:
     """
     if world is None:
         return ()
-    return tuple(obstacle for obstacle in world.obstacles if obstacle.last_seen_ns is not None or obstacle.touched)
+    return tuple(
+        obstacle
+        for obstacle in world.obstacles
+        if obstacle.last_seen_ns is not None or obstacle.touched
+    )
 
 
 def _list_contacts(snapshot: RobotSnapshot) -> list[WorldContact]:
@@ -251,7 +276,9 @@ def _make_contact_arrows(snapshot: RobotSnapshot, center_w: Floats) -> dict[str,
         "contacts_w": positions_w,
         "normals": _arrows(positions_w, NORMAL_ARROW_M * normals_w),
         "tangents": _arrows(positions_w, TANGENT_ARROW_M * tangents_w),
-        "measured_forces": _make_force_arrows(snapshot, positions_w[is_strong], forces_n[is_strong]),
+        "measured_forces": _make_force_arrows(
+            snapshot, positions_w[is_strong], forces_n[is_strong]
+        ),
     }
     total_n = forces_n.sum(axis=0)
     if np.linalg.norm(total_n) > MIN_FORCE_N:
@@ -262,7 +289,11 @@ def _make_contact_arrows(snapshot: RobotSnapshot, center_w: Floats) -> dict[str,
 def _make_desired_force_arrows(snapshot: RobotSnapshot) -> dict[str, Floats]:
     """Return the controller's desired forces, with and without contact, as fields of ForceArrows."""
     control = snapshot.control
-    if control is None or not control.push_points or len(control.push_points) != len(control.desired_force_n):
+    if (
+        control is None
+        or not control.push_points
+        or len(control.push_points) != len(control.desired_force_n)
+    ):
         return {}
     contacts = _list_contacts(snapshot)
     positions_w = np.array([point.position_w for point in control.push_points])
@@ -293,10 +324,14 @@ def _lay_on_ground(points_w: Floats, surroundings: TrueSurroundings | None) -> F
     return np.column_stack([points_w, heights_m + PATH_ABOVE_M])
 
 
-def _make_camera_frustum(key: str, image: DepthImage | ColorImage, origins: Floats, rotations: Floats) -> CameraFrustum:
+def _make_camera_frustum(
+    key: str, image: DepthImage | ColorImage, origins: Floats, rotations: Floats
+) -> CameraFrustum:
     """Return where a camera of the robot is, from the pose of its link and the mounting in its image."""
     link_rotation = rotations[image.link]
-    rotation = link_rotation @ rotation_from_quaternion(image.orientation_l_wxyz) @ LINK_FROM_FRUSTUM
+    rotation = (
+        link_rotation @ rotation_from_quaternion(image.orientation_l_wxyz) @ LINK_FROM_FRUSTUM
+    )
     return CameraFrustum(
         key=key,
         position_w=origins[image.link] + link_rotation @ np.array(image.position_l),

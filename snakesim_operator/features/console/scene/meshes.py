@@ -17,7 +17,9 @@ ROUND_SIDES = 32  # sides of the polygon that is drawn for a circle
 def make_capsule(length_m: float, radius_m: float) -> Mesh:
     """Make a capsule along x about the origin. `length_m` is the distance between the centers of its two spheres."""
     angles_rad = np.linspace(0.0, np.pi / 2, ROUND_SIDES // 4)
-    upper_cap = np.column_stack([radius_m * np.sin(angles_rad), length_m / 2 + radius_m * np.cos(angles_rad)])
+    upper_cap = np.column_stack(
+        [radius_m * np.sin(angles_rad), length_m / 2 + radius_m * np.cos(angles_rad)]
+    )
     lower_cap = upper_cap * [1.0, -1.0]
     profile = np.vstack([lower_cap, upper_cap[::-1]])
     vertices, faces = _revolve_profile(profile)

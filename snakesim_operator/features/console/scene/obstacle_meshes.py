@@ -28,7 +28,11 @@ from snakesim_operator.features.console.scene.scene_colors import (
 )
 
 SQUARE = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-TRUE_SHAPES: dict[str, Mesh] = {"cylinder": make_cylinder(1.0, 1.0), "box": make_box(1.0), "sphere": make_sphere(1.0)}
+TRUE_SHAPES: dict[str, Mesh] = {
+    "cylinder": make_cylinder(1.0, 1.0),
+    "box": make_box(1.0),
+    "sphere": make_sphere(1.0),
+}
 # Perceived obstacles are hoops about the believed place, so that the true obstacle stays visible within them.
 PERCEIVED_SHAPES: dict[str, Mesh] = {
     "cylinder": make_hoops(make_circle(), 0.5, 0.13),
@@ -43,7 +47,14 @@ MIN_HEIGHT_M = 0.01  # of a cylinder whose perceived height is unknown: it is dr
 class ObstacleMeshes:
     """Draws the obstacles of one kind: the true ones, or those that guidance perceives."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, shapes: dict[str, Mesh], color: Color, **options: Any) -> None:
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        name: str,
+        shapes: dict[str, Mesh],
+        color: Color,
+        **options: Any,
+    ) -> None:
         """Prepare to draw; nothing is added to the scene yet.
 
         Args:
@@ -60,10 +71,12 @@ class ObstacleMeshes:
         self._options = options
         self.batches: dict[str, viser.BatchedMeshHandle] = {}  # by shape
 
-    def show(self, obstacles: Sequence[KnownObstacle], scale: float = 1.0) -> None:
+    def draw_obstacles(self, obstacles: Sequence[KnownObstacle], scale: float = 1.0) -> None:
         """Draw these obstacles, and hide shapes of which there is none."""
         for shape in self._shapes:
-            self._show_shape(shape, [obstacle for obstacle in obstacles if obstacle.shape == shape], scale)
+            self._show_shape(
+                shape, [obstacle for obstacle in obstacles if obstacle.shape == shape], scale
+            )
 
     def _show_shape(self, shape: str, obstacles: Sequence[KnownObstacle], scale: float) -> None:
         batch = self.batches.get(shape)
@@ -74,11 +87,15 @@ class ObstacleMeshes:
         count = len(obstacles)
         if batch is None:
             name = f"{self._name}/{shape}"
-            batch = add_batch(self._scene, name, self._shapes[shape], count, self._color, **self._options)
+            batch = add_batch(
+                self._scene, name, self._shapes[shape], count, self._color, **self._options
+            )
             self.batches[shape] = batch
         sizes = np.array([_compute_mesh_scale(obstacle) for obstacle in obstacles])
         batch.batched_positions = to_float32([obstacle.position_w for obstacle in obstacles])
-        batch.batched_wxyzs = to_float32([quaternion_from_yaw(obstacle.yaw_rad) for obstacle in obstacles])
+        batch.batched_wxyzs = to_float32(
+            [quaternion_from_yaw(obstacle.yaw_rad) for obstacle in obstacles]
+        )
         batch.batched_scales = to_float32(scale * sizes)
         if len(batch.batched_colors) != count:
             batch.batched_colors = convert_to_linear_colors([self._color] * count)
@@ -102,14 +119,16 @@ class TrueObstacles:
     def __init__(self, scene: viser.SceneApi, obstacles: Sequence[KnownObstacle]) -> None:
         self._obstacles = obstacles
         self._meshes = ObstacleMeshes(scene, "true", TRUE_SHAPES, OBSTACLE, opacity=TRUE_OPACITY)
-        self._meshes.show(obstacles)
+        self._meshes.draw_obstacles(obstacles)
 
-    def show(self, drawing: SnapshotDrawing) -> None:
+    def update_nodes(self, drawing: SnapshotDrawing) -> None:
         """Mark the obstacles that the body pushes off, and those that navigation expects it to push off."""
         for shape in TRUE_SHAPES:
             names = [obstacle.name for obstacle in self._obstacles if obstacle.shape == shape]
             if names:
-                self._meshes.set_colors(shape, [_choose_obstacle_color(name, drawing) for name in names])
+                self._meshes.set_colors(
+                    shape, [_choose_obstacle_color(name, drawing) for name in names]
+                )
 
 
 class PerceivedObstacles:
@@ -117,14 +136,22 @@ class PerceivedObstacles:
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self.meshes = ObstacleMeshes(
-            scene, "perceived", PERCEIVED_SHAPES, PERCEIVED, opacity=1.0, side="double", cast_shadow=False
+            scene,
+            "perceived",
+            PERCEIVED_SHAPES,
+            PERCEIVED,
+            opacity=1.0,
+            side="double",
+            cast_shadow=False,
         )
 
-    def show(self, obstacles: Sequence[KnownObstacle]) -> None:
+    def draw_obstacles(self, obstacles: Sequence[KnownObstacle]) -> None:
         """Draw these obstacles, and hide those of the frame before."""
-        self.meshes.show(obstacles, PERCEIVED_SCALE)
+        self.meshes.draw_obstacles(obstacles, PERCEIVED_SCALE)
         for shape in PERCEIVED_SHAPES:
-            opacities = [0.4 + 0.6 * obstacle.confidence for obstacle in obstacles if obstacle.shape == shape]
+            opacities = [
+                0.4 + 0.6 * obstacle.confidence for obstacle in obstacles if obstacle.shape == shape
+            ]
             if opacities:
                 self.meshes.set_opacities(shape, opacities)
 

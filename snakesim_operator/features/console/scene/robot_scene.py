@@ -15,26 +15,37 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.features.console.scene import scene_colors
 from snakesim_operator.features.console.scene.batches import add_batch, to_float32
-from snakesim_operator.features.console.scene.drawing import CameraFrustum, SnapshotDrawing, TrueSurroundings
+from snakesim_operator.features.console.scene.drawing import (
+    CameraFrustum,
+    SnapshotDrawing,
+    TrueSurroundings,
+)
 from snakesim_operator.features.console.scene.meshes import make_capsule, make_cylinder
-from snakesim_operator.features.console.scene.obstacle_meshes import PerceivedObstacles, TrueObstacles
+from snakesim_operator.features.console.scene.obstacle_meshes import (
+    PerceivedObstacles,
+    TrueObstacles,
+)
 from snakesim_operator.features.console.scene.pipe_meshes import add_pipes
 from snakesim_operator.features.console.scene.scene_colors import Color, convert_to_linear_colors
 
 TRAIL_STEP_M = 0.02
 TRAIL_MAX_POINTS = 1000
 FOLLOW_FRACTION = 0.08  # of the way to the snake's center that the view moves in one frame
-MAX_VIEW_OFFSET_M = 0.5  # a snake further than this from the view's middle has jumped: the view jumps too
+# A snake further than this from the view's middle has jumped: the view jumps too.
+MAX_VIEW_OFFSET_M = 0.5
 MAX_HEIGHTFIELD_ROWS = 200  # along an edge; a finer heightfield is thinned
 HEIGHTFIELD_DROP_M = 0.003  # below the true ground, so that what lies on the ground is not hidden
-DASHES = np.arange(10.0).reshape(5, 2) / 9  # (5, 2): start and end of each dash, as fractions of the line
+# (5, 2): start and end of each dash, as fractions of the line.
+DASHES = np.arange(10.0).reshape(5, 2) / 9
 NO_SEGMENTS = np.zeros((1, 2, 3))  # placeholder: viser accepts no empty line
 
 
 class RobotScene:
     """The 3-D scene of one robot."""
 
-    def __init__(self, scene: viser.SceneApi, robot: RobotDescription, surroundings: TrueSurroundings | None) -> None:
+    def __init__(
+        self, scene: viser.SceneApi, robot: RobotDescription, surroundings: TrueSurroundings | None
+    ) -> None:
         """Add everything to the 3-D scene that does not depend on a snapshot: links, hinges, ground and obstacles.
 
         Args:
@@ -52,7 +63,9 @@ class RobotScene:
         # Nodes that exist from the start.
         self._links = self._add_links()
         hinge = make_cylinder(0.5 * self._body_radius_m, 2.12 * self._body_radius_m)
-        self._hinges = add_batch(scene, "snake/hinges", hinge, len(robot.joints), scene_colors.HINGE)
+        self._hinges = add_batch(
+            scene, "snake/hinges", hinge, len(robot.joints), scene_colors.HINGE
+        )
         self._contacts = self._add_contact_points()
         self._trail_line = scene.add_line_segments(
             "/world/trail",
@@ -97,9 +110,13 @@ class RobotScene:
         batches: list[tuple[viser.BatchedMeshHandle, list[int]]] = []
         for (length_m, radius_m), indices in links_by_size.items():
             name = f"snake/links_{len(batches)}"
-            batch = add_batch(self._scene, name, make_capsule(length_m, radius_m), len(indices), scene_colors.LINK)
+            batch = add_batch(
+                self._scene, name, make_capsule(length_m, radius_m), len(indices), scene_colors.LINK
+            )
             batch.batched_scales = to_float32([_compute_link_scale(i) for i in indices])
-            batch.batched_colors = convert_to_linear_colors([self._choose_link_color(i) for i in indices])
+            batch.batched_colors = convert_to_linear_colors(
+                [self._choose_link_color(i) for i in indices]
+            )
             batches.append((batch, indices))
         return batches
 
@@ -160,7 +177,9 @@ class RobotScene:
         column = np.arange(row_length - 1)[None, :]
         corner = (row * row_length + column).ravel()
         lower_triangles = np.stack([corner, corner + 1, corner + row_length], axis=1)
-        upper_triangles = np.stack([corner + 1, corner + row_length + 1, corner + row_length], axis=1)
+        upper_triangles = np.stack(
+            [corner + 1, corner + row_length + 1, corner + row_length], axis=1
+        )
         self._scene.add_mesh_simple(
             "/world/hills",
             vertices,
@@ -173,15 +192,15 @@ class RobotScene:
 
     # --- each frame ------------------------------------------------------------------------------------------
 
-    def show(self, drawing: SnapshotDrawing) -> None:
+    def update_nodes(self, drawing: SnapshotDrawing) -> None:
         """Update all nodes from the drawing of one snapshot."""
         self._show_snake(drawing)
         self._show_contacts(drawing)
         self._show_forces(drawing)
         self._show_path(drawing.path_w)
-        self._perceived_obstacles.show(drawing.perceived)
+        self._perceived_obstacles.draw_obstacles(drawing.perceived)
         if self._true_obstacles is not None:
-            self._true_obstacles.show(drawing)
+            self._true_obstacles.update_nodes(drawing)
         self._show_cameras(drawing.cameras)
         self._extend_trail(drawing.center_w)
         self._move_view(drawing.center_w)
@@ -222,12 +241,18 @@ class RobotScene:
         self._show_arrows("contacts/tangents", drawing.tangents, scene_colors.CONTACT_TANGENT, 0.08)
 
     def _show_forces(self, drawing: SnapshotDrawing) -> None:
-        self._show_arrows("forces/measured", drawing.measured_forces, scene_colors.MEASURED_FORCE, 0.22)
-        self._show_arrows("forces/desired", drawing.desired_forces, scene_colors.DESIRED_FORCE, 0.16)
+        self._show_arrows(
+            "forces/measured", drawing.measured_forces, scene_colors.MEASURED_FORCE, 0.22
+        )
+        self._show_arrows(
+            "forces/desired", drawing.desired_forces, scene_colors.DESIRED_FORCE, 0.16
+        )
         self._show_dashed_forces(drawing.forces_without_contact)
         self._show_arrows("forces/resultant", drawing.resultant, scene_colors.RESULTANT, 0.30)
 
-    def _show_arrows(self, name: str, arrows_w: Floats, color: Color, relative_radius: float) -> None:
+    def _show_arrows(
+        self, name: str, arrows_w: Floats, color: Color, relative_radius: float
+    ) -> None:
         """Show arrows (n, 2, 3) as one node. `relative_radius` is the radius of a shaft divided by that of the body."""
         handle = self._arrows.get(name)
         if handle is not None:

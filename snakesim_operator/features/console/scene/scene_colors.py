@@ -22,7 +22,8 @@ LINK_ALTERNATE = (70, 112, 160)  # every second link
 HEAD = (22, 46, 84)
 HINGE = (52, 58, 66)
 FAILED_JOINT = palette_color("bad")
-PROPULSION_JOINT = (64, 190, 255)  # against PUSHED_OBSTACLE: blue and orange, for any kind of color vision
+# Against PUSHED_OBSTACLE: blue and orange, for any kind of color vision.
+PROPULSION_JOINT = 64, 190, 255
 
 # Obstacles.
 OBSTACLE = (176, 152, 112)

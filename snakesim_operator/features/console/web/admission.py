@@ -32,11 +32,14 @@ Vector = tuple[Number, Number, Number]
 HandleT = TypeVar("HandleT")
 
 MAX_REPORTED_CHARACTERS = 200  # of a dropped message, so that a browser cannot fill the log
-MAX_PRESS_AGE_S = 5.0  # of a press that may move the robot: an older one was meant for another moment
+# Of a press that may move the robot: an older one was meant for another moment.
+MAX_PRESS_AGE_S = 5.0
 MAX_HOLD_AGE_S = 0.5  # of a message that a button or key is held: the finger may be up by now
 
 
-class _ViewerMessage(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"):
+class _ViewerMessage(
+    Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="type"
+):
     pass
 
 
@@ -183,9 +186,15 @@ class ControlAdmission:
     def remove_viewer(self, viewer_id: int) -> None:
         """Forget all controls of a viewer whose page is closed."""
         with self._lock:
-            self._controls = {uuid: control for uuid, control in self._controls.items() if control.viewer != viewer_id}
+            self._controls = {
+                uuid: control
+                for uuid, control in self._controls.items()
+                if control.viewer != viewer_id
+            }
 
-    def filter_message(self, viewer_id: int | None, data: bytes | str, age: MessageAge) -> bytes | None:
+    def filter_message(
+        self, viewer_id: int | None, data: bytes | str, age: MessageAge
+    ) -> bytes | None:
         """Check a message of a browser, and handle it here if its control has a handler.
 
         A message is dropped and counted if it cannot be decoded, if its control does not allow it, or if it is too old.
@@ -215,7 +224,9 @@ class ControlAdmission:
             action = age.date_action(time.monotonic())
             if control.is_late(message, action):
                 control.on_late(action.age_s)
-                self.count_dropped_message(viewer_id, "too old", f"{control.name}: {format_age(action.age_s)}")
+                self.count_dropped_message(
+                    viewer_id, "too old", f"{control.name}: {format_age(action.age_s)}"
+                )
                 return None
             if control.handler is not None:
                 control.handler(viewer_id, action)
@@ -227,13 +238,17 @@ class ControlAdmission:
         with self._lock:
             control = self._controls.get(message.uuid)
         if control is None or control.viewer not in (None, viewer_id):
-            self.count_dropped_message(viewer_id, "no control of this viewer", type(message).__name__)
+            self.count_dropped_message(
+                viewer_id, "no control of this viewer", type(message).__name__
+            )
             return None
         if not control.is_allowed():
             self.count_dropped_message(viewer_id, "without control of the robot", control.name)
             return None
         if not control.accepts(message):
-            self.count_dropped_message(viewer_id, "not what the control is for", f"{control.name}: {message}")
+            self.count_dropped_message(
+                viewer_id, "not what the control is for", f"{control.name}: {message}"
+            )
             return None
         return control
 
@@ -281,7 +296,9 @@ def _make_message_validator(control: Any, hold_hz: float) -> Callable[[ControlMe
             number_types = (int,) if isinstance(control.value, int) else (int, float)
             min_value = control.min
             max_value = control.max
-            return _make_value_validator(lambda value: _is_number_within(value, number_types, min_value, max_value))
+            return _make_value_validator(
+                lambda value: _is_number_within(value, number_types, min_value, max_value)
+            )
     raise TypeError(f"{type(control).__name__}: which values viewers may give it is not known")
 
 

@@ -21,7 +21,8 @@ MAX_UNANSWERED = 20  # questions; a page that hangs gets no more until it answer
 class PageAction:
     """The time at which an operator acted on a page, as far as it is known."""
 
-    age_s: float  # the operator acted at most this long ago; infinite: the page has not answered yet
+    # The operator acted at most this long ago; infinite: the page has not answered yet.
+    age_s: float
     robot_ns: int | None = None  # the robot's time then, at the earliest; None: not known
 
 
@@ -67,7 +68,9 @@ class MessageAge:
             if answered is None:
                 return
             # Answers come in order, so those to earlier questions are not expected any more.
-            earlier = [name for name, other in self._unanswered.items() if other.asked_s < answered.asked_s]
+            earlier = [
+                name for name, other in self._unanswered.items() if other.asked_s < answered.asked_s
+            ]
             for name in earlier:
                 del self._unanswered[name]
             if answered.asked_s > self._answered.asked_s:

@@ -13,7 +13,9 @@ from collections.abc import AsyncGenerator, Sequence
 from typing import Any
 
 import viser
-from viser import _messages as wire  # the request is not public in a form that needs no thread for each viewer
+
+# The request is not public in a form that needs no thread for each viewer.
+from viser import _messages as wire
 
 ANSWER_LIMIT_S = 10.0  # a page that does not answer gets one batch in this time
 STORAGE_KEY = "snakesim"  # never written, only read: viser's page answers such a request after all earlier messages

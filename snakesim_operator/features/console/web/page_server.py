@@ -36,7 +36,11 @@ class BrowserRelay:
     """Serves browsers in a thread of its own, for as long as its context lasts."""
 
     def __init__(
-        self, listening_socket: socket.socket, page_server: PageServer, page_html: bytes, answer_first: AnswerRequest
+        self,
+        listening_socket: socket.socket,
+        page_server: PageServer,
+        page_html: bytes,
+        answer_first: AnswerRequest,
     ) -> None:
         """Prepare the relay between browsers and viser, whose thread starts with the context.
 
@@ -59,7 +63,10 @@ class BrowserRelay:
         self._loop = asyncio.new_event_loop()
         self._stop_event = asyncio.Event()
         self._thread = threading.Thread(
-            target=self._loop.run_until_complete, args=(self._serve_browsers(),), name="page server", daemon=True
+            target=self._loop.run_until_complete,
+            args=(self._serve_browsers(),),
+            name="page server",
+            daemon=True,
         )
 
     def __enter__(self) -> "BrowserRelay":
@@ -128,16 +135,25 @@ class BrowserRelay:
             await self._connect_to_viser(connection, browser)
         except (OSError, TimeoutError, WebSocketException) as error:
             browser.drop("no answer of viser", str(error))
-            await connection.close(TRY_AGAIN_LATER, "the console does not answer; load the page again")
+            await connection.close(
+                TRY_AGAIN_LATER, "the console does not answer; load the page again"
+            )
         finally:
             self._open_browsers.discard(browser)
 
-    async def _connect_to_viser(self, connection: ServerConnection, browser: BrowserConnection) -> None:
+    async def _connect_to_viser(
+        self, connection: ServerConnection, browser: BrowserConnection
+    ) -> None:
         """Open a connection to viser for a browser, and relay messages in both directions until either side ends."""
         protocols = None if connection.subprotocol is None else [connection.subprotocol]
         with self._page_server.expect_browser(browser) as address:
             opening = connect(
-                address, subprotocols=protocols, compression=None, max_size=None, ping_interval=None, proxy=None
+                address,
+                subprotocols=protocols,
+                compression=None,
+                max_size=None,
+                ping_interval=None,
+                proxy=None,
             )
             async with opening as to_viser:
                 await _relay_messages(browser, connection, to_viser)
@@ -145,14 +161,18 @@ class BrowserRelay:
             await connection.close(to_viser.close_code, to_viser.close_reason or "")
 
 
-async def _relay_messages(browser: BrowserConnection, connection: ServerConnection, to_viser: ClientConnection) -> None:
+async def _relay_messages(
+    browser: BrowserConnection, connection: ServerConnection, to_viser: ClientConnection
+) -> None:
     """Relay messages in both directions until either side ends."""
     to_viser_direction = _relay_to_viser(browser, connection, to_viser)
     to_browser_direction = _relay_to_browser(to_viser, connection)
     await run_until_one_ends(to_viser_direction, to_browser_direction)
 
 
-async def _relay_to_viser(browser: BrowserConnection, connection: ServerConnection, to_viser: ClientConnection) -> None:
+async def _relay_to_viser(
+    browser: BrowserConnection, connection: ServerConnection, to_viser: ClientConnection
+) -> None:
     """Pass each message of a browser that is admitted on to viser, until a connection is closed."""
     await browser.wait_for_number()
     try:
@@ -163,7 +183,9 @@ async def _relay_to_viser(browser: BrowserConnection, connection: ServerConnecti
                 await to_viser.send(checked)
     except ConnectionClosed as closed:
         if closed.sent is not None and closed.sent.code == MESSAGE_TOO_BIG:
-            browser.drop("too long", f"more than {MAX_MESSAGE_BYTES} bytes; its connection was closed")
+            browser.drop(
+                "too long", f"more than {MAX_MESSAGE_BYTES} bytes; its connection was closed"
+            )
 
 
 async def _relay_to_browser(to_viser: ClientConnection, connection: ServerConnection) -> None:
@@ -173,7 +195,9 @@ async def _relay_to_browser(to_viser: ClientConnection, connection: ServerConnec
             await connection.send(data)
 
 
-def _select_viser_protocol(_connection: ServerConnection, offered: list[Subprotocol]) -> Subprotocol | None:
+def _select_viser_protocol(
+    _connection: ServerConnection, offered: list[Subprotocol]
+) -> Subprotocol | None:
     """Return the protocol of viser's page. viser itself compares its version."""
     for protocol in offered:
         if protocol.startswith(VISER_PROTOCOL):

@@ -33,9 +33,8 @@ class PageServer(viser.ViserServer):
         """Start to listen."""
         super().__init__(LOOPBACK, ANY_FREE_PORT, label="SnakeSIM", verbose=False)
         self.admission = admission
-        self._expected: dict[
-            str, BrowserConnection
-        ] = {}  # by the path of the connection that the page server opens for it
+        # By the path of the connection that the page server opens for it.
+        self._expected: dict[str, BrowserConnection] = {}
         self._browsers: dict[int, BrowserConnection] = {}  # by viewer
         self._websock_server.on_client_connect(self._check_connection)
         self._websock_server.on_client_disconnect(self._on_viewer_gone)

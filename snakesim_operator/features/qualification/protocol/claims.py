@@ -24,7 +24,11 @@ CLAIMS = (
         "concepts/safety.md",
         "An armed robot stays within its limits of angle, speed, acceleration, torque and rate.",
     ),
-    Claim("si-units", "hardware/write-a-driver.md", "All values are those at the drive's shaft, in SI units."),
+    Claim(
+        "si-units",
+        "hardware/write-a-driver.md",
+        "All values are those at the drive's shaft, in SI units.",
+    ),
     Claim(
         "stops-without-host",
         "hardware/README.md",
@@ -44,8 +48,14 @@ CLAIMS = (
         ("dynamixel",),
     ),
     Claim("stop-is-a-fault", "concepts/stop-modes.md", "**Each such stop is a fault.**"),
-    Claim("stays-off", "concepts/stop-modes.md", "**No drive is enabled before `reset` and `arm`.**"),
-    Claim("never-arms-itself", "concepts/safety.md", "The robot never arms by itself, also not after a restart."),
+    Claim(
+        "stays-off", "concepts/stop-modes.md", "**No drive is enabled before `reset` and `arm`.**"
+    ),
+    Claim(
+        "never-arms-itself",
+        "concepts/safety.md",
+        "The robot never arms by itself, also not after a restart.",
+    ),
     Claim("estop-off-at-once", "concepts/safety.md", "off, at once, on every drive"),
     Claim(
         "estop-without-zenoh",
@@ -53,8 +63,18 @@ CLAIMS = (
         "An emergency stop reaches the host without a lease, and without Zenoh if necessary.",
     ),
     Claim("bus-cut-odrive", "hardware/odrive.md", "The axes stop by their watchdog", ("odrive",)),
-    Claim("bus-cut-moteus", "hardware/moteus.md", "The controllers stop by their watchdog", ("moteus",)),
-    Claim("bus-cut-dynamixel", "hardware/dynamixel.md", "The servos stop by their watchdog", ("dynamixel",)),
+    Claim(
+        "bus-cut-moteus",
+        "hardware/moteus.md",
+        "The controllers stop by their watchdog",
+        ("moteus",),
+    ),
+    Claim(
+        "bus-cut-dynamixel",
+        "hardware/dynamixel.md",
+        "The servos stop by their watchdog",
+        ("dynamixel",),
+    ),
     Claim("bus-cut-can", "hardware/joint-modules.md", "driver: fault. Modules: watchdog", ("can",)),
     Claim(
         "bus-cut-cia402",
@@ -62,11 +82,18 @@ CLAIMS = (
         "`watchdog_s` counts from the last heartbeat of the host, which it sends with the setpoints of the bus.",
         ("cia402",),
     ),
-    Claim("bus-cut-feetech", "hardware/feetech.md", "switches the torque off once the bus is back", ("feetech",)),
+    Claim(
+        "bus-cut-feetech",
+        "hardware/feetech.md",
+        "switches the torque off once the bus is back",
+        ("feetech",),
+    ),
 )
 CLAIM_BY_ID = {claim.id: claim for claim in CLAIMS}
 
 
 def list_claims(driver_type: str) -> list[Claim]:
     """Return the claims that a qualification of a driver type tests."""
-    return [claim for claim in CLAIMS if not claim.driver_types or driver_type in claim.driver_types]
+    return [
+        claim for claim in CLAIMS if not claim.driver_types or driver_type in claim.driver_types
+    ]

@@ -7,7 +7,12 @@ import msgspec
 
 from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.features.qualification.protocol.checks import Check, Verdict, combine_verdicts, judge_check
+from snakesim_operator.features.qualification.protocol.checks import (
+    Check,
+    Verdict,
+    combine_verdicts,
+    judge_check,
+)
 from snakesim_operator.features.qualification.protocol.claims import list_claims
 
 FORMAT = "snakesim drive qualification"
@@ -130,12 +135,19 @@ def judge_claims(driver_type: str, steps: tuple[StepResult, ...]) -> tuple[Claim
     for claim in list_claims(driver_type):
         verdicts: list[Verdict] = []
         for step in steps:
-            tested: list[Verdict] = [judge_check(check) for check in step.checks if claim.id in check.claims]
+            tested: list[Verdict] = [
+                judge_check(check) for check in step.checks if claim.id in check.claims
+            ]
             if step.problem and tested:
                 tested.append("unknown")
             verdicts += tested
         results.append(
-            ClaimResult(id=claim.id, page=claim.page, sentence=claim.sentence, verdict=combine_verdicts(verdicts))
+            ClaimResult(
+                id=claim.id,
+                page=claim.page,
+                sentence=claim.sentence,
+                verdict=combine_verdicts(verdicts),
+            )
         )
     return tuple(results)
 

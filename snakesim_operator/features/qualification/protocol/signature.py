@@ -32,7 +32,9 @@ def load_or_create_key(path: Path) -> Ed25519PrivateKey:
     try:
         key = serialization.load_pem_private_key(path.read_bytes(), password=None)
     except (OSError, ValueError, TypeError) as error:
-        raise ConfigError(f"--key {path}: cannot be read: {error}", code="file/not-readable") from error
+        raise ConfigError(
+            f"--key {path}: cannot be read: {error}", code="file/not-readable"
+        ) from error
     if not isinstance(key, Ed25519PrivateKey):
         raise ConfigError(
             f"--key {path}: a record is signed with Ed25519; make a key with `openssl genpkey -algorithm ed25519`, or "
@@ -44,20 +46,26 @@ def load_or_create_key(path: Path) -> Ed25519PrivateKey:
 
 def _create_key(path: Path) -> Ed25519PrivateKey:
     key = Ed25519PrivateKey.generate()
-    pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    pem = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         with os.fdopen(descriptor, "wb") as file:
             file.write(pem)
     except OSError as error:
-        raise ConfigError(f"--key {path}: cannot be written: {error.strerror}", code="file/not-writable") from error
+        raise ConfigError(
+            f"--key {path}: cannot be written: {error.strerror}", code="file/not-writable"
+        ) from error
     return key
 
 
 def sign_record(record: Record, key: Ed25519PrivateKey) -> Record:
     """Return a record with the signature of all its other fields."""
-    public_key = key.public_key().public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw)
+    public_key = key.public_key().public_bytes(
+        serialization.Encoding.Raw, serialization.PublicFormat.Raw
+    )
     signature = Signature(
         algorithm="ed25519",
         public_key=base64.b64encode(public_key).decode(),
@@ -79,8 +87,12 @@ def find_signature_problem(record: Record, expected_public_key: str | None = Non
     if expected_public_key is not None and signature.public_key != expected_public_key:
         return f"it was signed by another key, {compute_fingerprint(signature.public_key)}"
     try:
-        public_key = Ed25519PublicKey.from_public_bytes(base64.b64decode(signature.public_key, validate=True))
-        public_key.verify(base64.b64decode(signature.value, validate=True), _make_signed_bytes(record))
+        public_key = Ed25519PublicKey.from_public_bytes(
+            base64.b64decode(signature.public_key, validate=True)
+        )
+        public_key.verify(
+            base64.b64decode(signature.value, validate=True), _make_signed_bytes(record)
+        )
     except (ValueError, InvalidSignature):
         return "its signature does not fit its content: it was changed after it was signed"
     return ""

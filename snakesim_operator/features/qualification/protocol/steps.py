@@ -30,7 +30,8 @@ POSITION_TOLERANCE_RAD = 0.015
 SPEED_TOLERANCE = 1.25  # of the limit: a drive measures speed from few encoder counts
 TORQUE_TOLERANCE = 1.2  # of the limit
 TORQUE_NOISE_NM = 0.05
-MIN_TORQUE_FRACTION = 0.5  # of the limit, that a blocked joint must reach, so that the limit was tested
+# Of the limit, that a blocked joint must reach, so that the limit was tested.
+MIN_TORQUE_FRACTION = 0.5
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,9 @@ from collections.abc import Iterator
 from snakesim_operator.features.qualification.protocol.checks import describe_check
 from snakesim_operator.features.qualification.protocol.record import Record
 
-EMULATED_BANNER = "**EMULATED. No hardware was there. This record confirms nothing about a real drive.**"
+EMULATED_BANNER = (
+    "**EMULATED. No hardware was there. This record confirms nothing about a real drive.**"
+)
 
 
 def make_summary(record: Record) -> str:

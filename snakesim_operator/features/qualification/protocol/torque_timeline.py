@@ -52,7 +52,9 @@ class TorqueTimeline:
         return enabled if inside else None
 
 
-def make_timeline(readings: Iterable[TorqueReading], source: Source, *, lists_changes: bool) -> TorqueTimeline:
+def make_timeline(
+    readings: Iterable[TorqueReading], source: Source, *, lists_changes: bool
+) -> TorqueTimeline:
     """Return a timeline of readings in any order."""
     ordered = sorted(readings, key=lambda reading: reading.monotonic_ns)
     return TorqueTimeline(tuple(ordered), source, lists_changes)

@@ -20,10 +20,16 @@ from snakesim_operator.features.reproduce.experiment import (
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion, GroundFriction
 from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
-from snakesim_operator.features.reproduce.trials import ExperimentTrials, GaitRun, make_serpenoid_run, set_skin
+from snakesim_operator.features.reproduce.trials import (
+    ExperimentTrials,
+    GaitRun,
+    make_serpenoid_run,
+    set_skin,
+)
 
 RATIOS = (20.0, 40.0, 80.0, 160.0)  # of transverse to forward friction
-FACTORS = (0.64, 0.8, 1.0, 1.25, 1.5)  # of the amplitudes that are tried, around the expected optimum
+# Of the amplitudes that are tried, around the expected optimum.
+FACTORS = 0.64, 0.8, 1.0, 1.25, 1.5
 SIDEWAYS = 1.0
 PUBLISHED_EXPONENT = -0.25
 WAVELENGTH = 0.5
@@ -47,7 +53,8 @@ class AlbenAmplitude(Experiment):
         "deflection decays as the power -1/4 of the coefficient of transverse friction."
     )
     published_conditions = (
-        "A slender body whose curvature is prescribed, with dry friction in the plane, for large coefficients."
+        "A slender body whose curvature is prescribed, with dry friction in the plane, "
+        "for large coefficients."
     )
     our_conditions = (
         "31 links of planar13, and two waves of a serpenoid curve with a period of 3 s. The coefficient is 1 across "
@@ -64,14 +71,19 @@ class AlbenAmplitude(Experiment):
         ratios = RATIOS[1:3] if trials.is_quick else RATIOS
         cases = [(ratio, angle_rad) for ratio in ratios for angle_rad in _tried_angles_rad(ratio)]
         motions = trials.measure([_make_run(ratio, angle_rad) for ratio, angle_rad in cases])
-        costs = [_find_cost(motion, ratio) for motion, (ratio, _) in zip(motions, cases, strict=True)]
+        costs = [
+            _find_cost(motion, ratio) for motion, (ratio, _) in zip(motions, cases, strict=True)
+        ]
         ours = _find_optima(ratios, costs)
         endless_costs = [_find_endless_cost(ratio, angle_rad) for ratio, angle_rad in cases]
         endless = _find_optima(ratios, endless_costs)
         exponent = fit_exponent(ratios, ours)
         steps = [
             ("", PUBLISHED_EXPONENT),
-            ("The coefficients are not infinite, and the curve is a serpenoid.", fit_exponent(ratios, endless)),
+            (
+                "The coefficients are not infinite, and the curve is a serpenoid.",
+                fit_exponent(ratios, endless),
+            ),
         ]
         if not trials.is_quick:
             chain_costs = trials.call(find_chain_cost, cases)
@@ -97,14 +109,19 @@ class AlbenAmplitude(Experiment):
                 PictureCurve(
                     label="power -1/4, from our derivation",
                     x=ratios,
-                    y=[WAVELENGTH / (2.0 * math.pi) * _expect_optimum_rad(ratio) for ratio in ratios],
+                    y=[
+                        WAVELENGTH / (2.0 * math.pi) * _expect_optimum_rad(ratio)
+                        for ratio in ratios
+                    ],
                 ),
                 PictureCurve(label="endless body", x=ratios, y=endless),
                 PictureCurve(label="simulator", x=ratios, y=ours, is_ours=True),
             ),
             is_logarithmic=True,
         )
-        reasons = explain_by_steps(steps, unit="1", rest="servos, contacts, and the fit of the minima")
+        reasons = explain_by_steps(
+            steps, unit="1", rest="servos, contacts, and the fit of the minima"
+        )
         return ExperimentFindings(comparisons=(comparison,), reasons=reasons, picture=picture)
 
 
@@ -140,7 +157,9 @@ def _tried_angles_rad(ratio: float) -> list[float]:
 
 def _make_run(ratio: float, winding_angle_rad: float) -> GaitRun:
     along = SIDEWAYS / ratio
-    return make_serpenoid_run(winding_angle_rad, WAVELENGTH, PERIOD_S, set_skin(along, along, SIDEWAYS))
+    return make_serpenoid_run(
+        winding_angle_rad, WAVELENGTH, PERIOD_S, set_skin(along, along, SIDEWAYS)
+    )
 
 
 def _find_cost(motion: GaitMotion, ratio: float) -> float:

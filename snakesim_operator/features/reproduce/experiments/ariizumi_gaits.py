@@ -59,7 +59,8 @@ class AriizumiGaits(Experiment):
         "sidewinding is. Both are generally more efficient than lateral undulation."
     )
     published_conditions = (
-        "Planar models of a robot, eight settings of friction, and the trade-off between speed and energy."
+        "Planar models of a robot, eight settings of friction, and the trade-off "
+        "between speed and energy."
     )
     our_conditions = (
         "Mamba with 18 joints on flat ground with a friction of 0.6 sideways. Friction is the same forward and "
@@ -77,7 +78,9 @@ class AriizumiGaits(Experiment):
         seeds = range(1, (1 if trials.is_quick else trials.seeds) + 1)
         cases = [GaitOnGround(gait, ratio) for gait in CONTROLLERS for ratio in ratios]
         cases.append(GaitOnGround("sinus-lifting", ratios[-1], NO_TORQUE_LIMIT_NM))
-        energies: list[GaitEnergy] = trials.call(run_trial, [(case, seed) for case in cases for seed in seeds])
+        energies: list[GaitEnergy] = trials.call(
+            run_trial, [(case, seed) for case in cases for seed in seeds]
+        )
         found: dict[GaitOnGround, list[GaitEnergy]] = {}
         for i, case in enumerate(cases):
             found[case] = energies[i * len(seeds) : (i + 1) * len(seeds)]
@@ -89,7 +92,9 @@ class AriizumiGaits(Experiment):
                 unit="",
                 published=published,
                 basis="printed",
-                ours=_find_cheapest({gait: means[GaitOnGround(gait, ratio)] for gait in CONTROLLERS}),
+                ours=_find_cheapest(
+                    {gait: means[GaitOnGround(gait, ratio)] for gait in CONTROLLERS}
+                ),
                 runs=len(CONTROLLERS) * len(seeds),
             )
             for text, published, ratio in (
@@ -102,13 +107,22 @@ class AriizumiGaits(Experiment):
             known = [(ratio, means[GaitOnGround(gait, ratio)]) for ratio in ratios]
             pairs = [(ratio, value) for ratio, value in known if value is not None]
             curves.append(
-                PictureCurve(label=gait, x=[ratio for ratio, _ in pairs], y=[value for _, value in pairs], is_ours=True)
+                PictureCurve(
+                    label=gait,
+                    x=[ratio for ratio, _ in pairs],
+                    y=[value for _, value in pairs],
+                    is_ours=True,
+                )
             )
         picture = ExperimentPicture(
-            x_label="sideways over forward friction", y_label="energy [J/m]", curves=curves, is_logarithmic=True
+            x_label="sideways over forward friction",
+            y_label="energy [J/m]",
+            curves=curves,
+            is_logarithmic=True,
         )
         notes = tuple(
-            _describe(gait, {ratio: means[GaitOnGround(gait, ratio)] for ratio in ratios}) for gait in CONTROLLERS
+            _describe(gait, {ratio: means[GaitOnGround(gait, ratio)] for ratio in ratios})
+            for gait in CONTROLLERS
         )
         return ExperimentFindings(
             comparisons=comparisons,
@@ -158,7 +172,9 @@ def _describe(gait: str, energies: dict[float, float | None]) -> str:
 
 
 def _find_reasons(
-    found: dict[GaitOnGround, list[GaitEnergy]], means: dict[GaitOnGround, float | None], ratio: float
+    found: dict[GaitOnGround, list[GaitEnergy]],
+    means: dict[GaitOnGround, float | None],
+    ratio: float,
 ) -> tuple[DifferenceReason, ...]:
     """Return why the order differs at a large anisotropy."""
     shipped_case = GaitOnGround("sinus-lifting", ratio)
@@ -178,6 +194,10 @@ def _find_reasons(
             cause="The paper studies the trade-off between speed and energy. Our gaits have one set of parameters "
             "each, and different speeds."
         ),
-        DifferenceReason(cause="The abstract does not print how large the anisotropy has to be. Ten is our choice."),
-        DifferenceReason(cause="We have not read the masses, lengths and motors of the paper's robot."),
+        DifferenceReason(
+            cause="The abstract does not print how large the anisotropy has to be. Ten is our choice."
+        ),
+        DifferenceReason(
+            cause="We have not read the masses, lengths and motors of the paper's robot."
+        ),
     )

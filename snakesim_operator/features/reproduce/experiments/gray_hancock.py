@@ -14,7 +14,12 @@ from snakesim_operator.features.reproduce.experiment import (
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion
 from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
-from snakesim_operator.features.reproduce.trials import ExperimentTrials, GaitRun, make_serpenoid_run, set_viscous
+from snakesim_operator.features.reproduce.trials import (
+    ExperimentTrials,
+    GaitRun,
+    make_serpenoid_run,
+    set_viscous,
+)
 
 WINDING_ANGLES_RAD = (0.15, 0.3, 0.45, 0.6)
 COMPARED_RAD = 0.3
@@ -55,16 +60,26 @@ class GrayHancock(Experiment):
         "amplitude, k the wave number, c the speed of the wave, and r the ratio of normal to tangential drag."
     )
     published_conditions = "An endless filament, small bends, no inertia, and a ratio of 2."
-    our_conditions = "31 links of planar13, three waves on the body, and viscous ground with a ratio of 2."
-    method = "Speed of the center of mass along the body over two periods, after two that do not count."
+    our_conditions = (
+        "31 links of planar13, three waves on the body, and viscous ground with a ratio of 2."
+    )
+    method = (
+        "Speed of the center of mass along the body over two periods, after two that do not count."
+    )
 
     def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Measure the speed at several amplitudes."""
         angles_rad = (COMPARED_RAD,) if trials.is_quick else WINDING_ANGLES_RAD
         friction = set_viscous(ACROSS_S_PER_M / DRAG_RATIO, ACROSS_S_PER_M)
-        runs = [make_serpenoid_run(angle_rad, WAVELENGTH, PERIOD_S, friction) for angle_rad in angles_rad]
+        runs = [
+            make_serpenoid_run(angle_rad, WAVELENGTH, PERIOD_S, friction)
+            for angle_rad in angles_rad
+        ]
         motions = trials.measure(runs)
-        ours = [_find_speed_ratio(motion, angle_rad) for motion, angle_rad in zip(motions, angles_rad, strict=True)]
+        ours = [
+            _find_speed_ratio(motion, angle_rad)
+            for motion, angle_rad in zip(motions, angles_rad, strict=True)
+        ]
         compared = angles_rad.index(COMPARED_RAD)
         published = find_published_ratio(COMPARED_RAD, DRAG_RATIO)
         steps = _find_steps(runs[compared], motions[compared])

@@ -12,7 +12,11 @@ from snakesim_operator.features.reproduce.experiment import (
 )
 from snakesim_operator.features.reproduce.gait_motion import GaitMotion
 from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
-from snakesim_operator.features.reproduce.trials import ExperimentTrials, GaitRun, make_serpenoid_run
+from snakesim_operator.features.reproduce.trials import (
+    ExperimentTrials,
+    GaitRun,
+    make_serpenoid_run,
+)
 
 WINDING_ANGLES_RAD = (0.3, 0.6, 0.9, 1.2)
 COMPARED_RAD = 0.6
@@ -50,12 +54,16 @@ class HiroseSerpenoid(Experiment):
         "31 links of planar13, two waves on the body, wheels with a tire friction of 0.6, and bearings that brake "
         "with 1 % of the weight."
     )
-    method = "Speed of the center of mass along the body over two periods, after two that do not count."
+    method = (
+        "Speed of the center of mass along the body over two periods, after two that do not count."
+    )
 
     def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Measure the speed at several winding angles."""
         angles_rad = (COMPARED_RAD,) if trials.is_quick else WINDING_ANGLES_RAD
-        runs = [make_serpenoid_run(angle_rad, WAVELENGTH, PERIOD_S, WHEELS) for angle_rad in angles_rad]
+        runs = [
+            make_serpenoid_run(angle_rad, WAVELENGTH, PERIOD_S, WHEELS) for angle_rad in angles_rad
+        ]
         motions = trials.measure(runs)
         ours = [motion.speed_m_s for motion in motions]
         compared = angles_rad.index(COMPARED_RAD)
@@ -82,7 +90,10 @@ class HiroseSerpenoid(Experiment):
                 PictureCurve(
                     label="endless body that slips",
                     x=dense_rad,
-                    y=[wave_m_s * find_endless_motion(angle_rad, runs[0].friction).speed for angle_rad in dense_rad],
+                    y=[
+                        wave_m_s * find_endless_motion(angle_rad, runs[0].friction).speed
+                        for angle_rad in dense_rad
+                    ],
                 ),
                 PictureCurve(label="simulator", x=angles_rad, y=ours, is_ours=True),
             ),
@@ -107,10 +118,16 @@ def _find_steps(run: GaitRun, motion: GaitMotion, wave_m_s: float) -> list[tuple
     commanded = JointWaves.from_serpenoid(robot, COMPARED_RAD, WAVELENGTH, PERIOD_S)
     measured = JointWaves(motion.angle_harmonics, PERIOD_S)
     return [
-        ("The wheels brake, and slip sideways.", wave_m_s * find_endless_motion(COMPARED_RAD, run.friction).speed),
+        (
+            "The wheels brake, and slip sideways.",
+            wave_m_s * find_endless_motion(COMPARED_RAD, run.friction).speed,
+        ),
         (
             "The body ends, and has 31 straight links and mass.",
             find_chain_motion(robot, commanded, run.friction).speed_m_s,
         ),
-        ("The servos do not follow exactly.", find_chain_motion(robot, measured, run.friction).speed_m_s),
+        (
+            "The servos do not follow exactly.",
+            find_chain_motion(robot, measured, run.friction).speed_m_s,
+        ),
     ]

@@ -10,7 +10,12 @@ from snakesim_operator.features.reproduce.experiment import (
     explain_by_steps,
 )
 from snakesim_operator.features.reproduce.planar_chain import JointWaves, find_chain_motion
-from snakesim_operator.features.reproduce.trials import ExperimentTrials, GaitRun, make_serpenoid_run, set_skin
+from snakesim_operator.features.reproduce.trials import (
+    ExperimentTrials,
+    GaitRun,
+    make_serpenoid_run,
+    set_skin,
+)
 
 FORWARD = 0.11
 BACKWARD = 0.14
@@ -40,7 +45,9 @@ class HuSlithering(Experiment):
         "Each piece of the body is braked by its weight times 0.11 forward, 0.14 backward and 0.19 sideways, against "
         "its direction of sliding. With the shape prescribed, Newton's law gives the motion of the body."
     )
-    published_conditions = "A snake of evenly distributed weight, whose shape is prescribed, on cloth."
+    published_conditions = (
+        "A snake of evenly distributed weight, whose shape is prescribed, on cloth."
+    )
     our_conditions = (
         "31 links of planar13, two waves of a serpenoid curve with a winding angle of 0.9 rad, and a period of 2 s. "
         "We have not read the curve of the paper, so its equations are solved for our curve."
@@ -60,7 +67,10 @@ class HuSlithering(Experiment):
         compared = coefficients.index(SIDEWAYS)
         measured_waves = JointWaves(motions[compared].angle_harmonics, PERIOD_S)
         robot = runs[compared].robot
-        with_measured = find_chain_motion(robot, measured_waves, runs[compared].friction).speed_m_s / robot.length_m
+        with_measured = (
+            find_chain_motion(robot, measured_waves, runs[compared].friction).speed_m_s
+            / robot.length_m
+        )
         unit = "body lengths/s"
         comparison = PublishedComparison(
             quantity="speed with 0.11 forward, 0.14 backward and 0.19 sideways",
@@ -92,7 +102,9 @@ class HuSlithering(Experiment):
 
 
 def _make_run(sideways: float) -> GaitRun:
-    return make_serpenoid_run(WINDING_ANGLE_RAD, WAVELENGTH, PERIOD_S, set_skin(FORWARD, BACKWARD, sideways))
+    return make_serpenoid_run(
+        WINDING_ANGLE_RAD, WAVELENGTH, PERIOD_S, set_skin(FORWARD, BACKWARD, sideways)
+    )
 
 
 def solve_model(run: GaitRun) -> float:

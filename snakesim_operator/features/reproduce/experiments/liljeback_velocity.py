@@ -74,7 +74,9 @@ class LiljebackVelocity(Experiment):
         chain = trials.call(find_chain_speed, list(zip(runs, motions, strict=True)))
         chain_amplitude = fit_exponent(amplitudes_rad, chain[: len(amplitudes_rad)])
         chain_frequency = fit_exponent(frequencies_hz, chain[len(amplitudes_rad) :])
-        endless = fit_exponent(amplitudes_rad, [_find_saturating_speed(amplitude) for amplitude in amplitudes_rad])
+        endless = fit_exponent(
+            amplitudes_rad, [_find_saturating_speed(amplitude) for amplitude in amplitudes_rad]
+        )
         comparisons = (
             PublishedComparison(
                 quantity="exponent of the amplitude, 5 to 20 degrees",
@@ -122,7 +124,9 @@ class LiljebackVelocity(Experiment):
             ),
         )
         return ExperimentFindings(
-            comparisons=comparisons, reasons=reasons, picture=_make_picture(amplitudes_rad, by_amplitude)
+            comparisons=comparisons,
+            reasons=reasons,
+            picture=_make_picture(amplitudes_rad, by_amplitude),
         )
 
 
@@ -141,7 +145,9 @@ def _make_run(amplitude_rad: float, period_s: float) -> GaitRun:
 
 def find_chain_speed(run: GaitRun, motion: GaitMotion) -> float:
     """Return the speed by the momentum balance, for the measured angles of the joints. Runs in a worker."""
-    return find_chain_motion(run.robot, JointWaves(motion.angle_harmonics, run.period_s), run.friction).speed_m_s
+    return find_chain_motion(
+        run.robot, JointWaves(motion.angle_harmonics, run.period_s), run.friction
+    ).speed_m_s
 
 
 def _find_saturating_speed(amplitude_rad: float) -> float:
@@ -156,7 +162,9 @@ def _find_saturating_speed(amplitude_rad: float) -> float:
     return half_square / (1.0 + half_square)
 
 
-def _make_picture(amplitudes_rad: Sequence[float], speeds_m_s: Sequence[float]) -> ExperimentPicture:
+def _make_picture(
+    amplitudes_rad: Sequence[float], speeds_m_s: Sequence[float]
+) -> ExperimentPicture:
     """Return the picture of the speed by amplitude, with a line of slope 2 through the first point."""
     degrees = [math.degrees(amplitude_rad) for amplitude_rad in amplitudes_rad]
     square = [speeds_m_s[0] * (amplitude / degrees[0]) ** 2 for amplitude in degrees]

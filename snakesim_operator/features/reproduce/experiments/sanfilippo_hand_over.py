@@ -98,7 +98,9 @@ class SanfilippoHandOver(Experiment):
             f"When propulsion ends, the obstacle is {1000 * tail_m:.0f} mm ahead of the tail end on average: there the "
             "tail can no longer press on it.",
         )
-        return ExperimentFindings(comparisons=comparisons, reasons=reasons, picture=_make_picture(found), notes=notes)
+        return ExperimentFindings(
+            comparisons=comparisons, reasons=reasons, picture=_make_picture(found), notes=notes
+        )
 
 
 def run_trial(seed: int) -> HandOverTrial:

@@ -7,7 +7,13 @@ import can
 import pytest
 
 from snakesim_can_backend.driver.backend import CanBackend
-from snakesim_can_backend.protocol.definitions import FROM_HOST, CanFrame, CommandAction, LastStop, Opcode
+from snakesim_can_backend.protocol.definitions import (
+    FROM_HOST,
+    CanFrame,
+    CommandAction,
+    LastStop,
+    Opcode,
+)
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire import keys
@@ -27,7 +33,9 @@ def test_closing_disarms_and_twice_is_harmless() -> None:
         run.backend.close()
         assert words(wire.sent)[-1] == "disarm"
         assert wire.closed == 1
-        assert module.state == DISARMED and module.last_stop == LastStop.DISARM, "and they have heard it"
+        assert module.state == DISARMED and module.last_stop == LastStop.DISARM, (
+            "and they have heard it"
+        )
         sent = len(wire.sent)
         run.backend.close()
         assert wire.closed == 1
@@ -63,7 +71,9 @@ def test_closing_goes_on_when_a_bus_is_broken(monkeypatch: pytest.MonkeyPatch) -
 def test_poses_need_a_delay_that_somebody_has_stated() -> None:
     with raises_error(ConfigError, code="config/missing-key"):
         CanBackend.check(config(), CanSettings(pose_listen="127.0.0.1:0"))
-    CanBackend.check(config(robot__sensors__pose__delay_s=0.02), CanSettings(pose_listen="127.0.0.1:0"))
+    CanBackend.check(
+        config(robot__sensors__pose__delay_s=0.02), CanSettings(pose_listen="127.0.0.1:0")
+    )
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.03])
@@ -95,7 +105,9 @@ def test_closing_reports_errors_even_when_stop_cannot_be_sent() -> None:
             return False
 
         wire.refuses = breaks
-        with raises_error(BackendError, code="backend/failed"):  # by the next tick, which tries again
+        with raises_error(
+            BackendError, code="backend/failed"
+        ):  # by the next tick, which tries again
             run.run(3, run.waving)
         reported = {fault.what: fault.cause for fault in run.faults}
         assert "leak" in reported["module_leak"]
@@ -112,7 +124,9 @@ def test_the_log_holds_everything_that_went_over_the_bus(tmp_path: Path) -> None
             backend.advance()
         assert backend.faults() == []
     lines = [line.split() for line in path.read_text().splitlines()]
-    assert [line[2] for line in lines] == [f"{f.id:03X}#{f.data.hex().upper()}" for f in WIRES[0].all]
+    assert [line[2] for line in lines] == [
+        f"{f.id:03X}#{f.data.hex().upper()}" for f in WIRES[0].all
+    ]
     assert {line[1] for line in lines} == {WIRES[0].channel}
     opcodes = {int(line[2][:3], 16) >> 6 for line in lines}
     assert opcodes > {*FROM_HOST} - {Opcode.EMERGENCY}

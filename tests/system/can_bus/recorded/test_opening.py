@@ -50,14 +50,20 @@ from snakesim_testing.messages import raises_error
 def test_bring_up_enables_nothing() -> None:
     with loop() as run:
         sent = WIRES[0].sent
-        assert {parse_opcode(frame.id) for frame in sent} == {Opcode.COMMAND, Opcode.PARAMETER_REQUEST, Opcode.SYNC}
+        assert {parse_opcode(frame.id) for frame in sent} == {
+            Opcode.COMMAND,
+            Opcode.PARAMETER_REQUEST,
+            Opcode.SYNC,
+        }
         assert all(
             is_action(f, CommandAction.IDENTIFY, CommandAction.DISARM)
             for f in sent
             if parse_opcode(f.id) == Opcode.COMMAND
         )
         disarm = next(i for i, frame in enumerate(sent) if is_action(frame, CommandAction.DISARM))
-        written = next(i for i, frame in enumerate(sent) if parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST)
+        written = next(
+            i for i, frame in enumerate(sent) if parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST
+        )
         assert disarm < written
         assert parse_node(sent[disarm].id) == BROADCAST
         assert run.states() == [DISARMED] * JOINTS
@@ -66,11 +72,15 @@ def test_bring_up_enables_nothing() -> None:
         assert run.true_speed_rad_s == [0.0] * 30
 
 
-def test_opening_silent_module_is_reported_and_everything_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opening_silent_module_is_reported_and_everything_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class Deaf(RecordedWire):
         def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
             super().__init__(channel, peer)
-            self.deaf_to = lambda frame: parse_opcode(frame.id) == Opcode.JOINT_STATE and parse_node(frame.id) == 2
+            self.deaf_to = lambda frame: (
+                parse_opcode(frame.id) == Opcode.JOINT_STATE and parse_node(frame.id) == 2
+            )
 
     monkeypatch.setattr(modules, "VirtualWire", Deaf)
     with raises_error(BackendError, code="drive/silent", field="joint_2"), loop():
@@ -81,7 +91,9 @@ def test_opening_silent_module_is_reported_and_everything_closed(monkeypatch: py
     assert not any(map(is_setpoint, wire.sent))
 
 
-def found_as(monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[ModuleFirmware], None]) -> None:
+def found_as(
+    monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[ModuleFirmware], None]
+) -> None:
     """When a driver opens its bus, one of the emulators is not as new."""
 
     def emulators(*given: Any, **more: Any) -> InProcessEmulators:
@@ -108,7 +120,12 @@ def left_behind(module: ModuleFirmware, kind: str) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "state"),
-    [("watchdog", DISARMED), ("stream", DISARMED), ("leak", ModuleState.FAULT), ("emergency", EMERGENCY)],
+    [
+        ("watchdog", DISARMED),
+        ("stream", DISARMED),
+        ("leak", ModuleState.FAULT),
+        ("emergency", EMERGENCY),
+    ],
 )
 def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
     kind: str, state: ModuleState, monkeypatch: pytest.MonkeyPatch
@@ -129,14 +146,19 @@ def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -
         pass
 
 
-def test_paces_and_what_is_checked_before_anything_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paces_and_what_is_checked_before_anything_is_opened(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert CanBackend.check(config(), CanSettings()) == ("lockstep", "realtime")
     with raises_error(ConfigError, code="bus/not-available", field="nocan7"):
         CanBackend.check(config(), CanSettings(channels=["nocan7"]))
     asked: list[str] = []
     monkeypatch.setattr("snakesim_can_backend.bus.adapter.validate_interface", asked.append)
     assert CanBackend.check(config(), CanSettings(channels=["can0", "can1"])) == ("realtime",)
-    assert CanBackend.check(config(), CanSettings(channels=["vcan0"], emulators="process")) == ("lockstep", "realtime")
+    assert CanBackend.check(config(), CanSettings(channels=["vcan0"], emulators="process")) == (
+        "lockstep",
+        "realtime",
+    )
     assert asked == ["can0", "can1", "vcan0"]
     with raises_error(ConfigError, code="bus/not-virtual"):
         CanBackend.check(config(), CanSettings(emulators="none"))
@@ -155,7 +177,9 @@ def test_opening_describes_joints_with_serials_and_firmware() -> None:
 
 def test_opening_waits_for_answers_as_long_as_fullest_bus() -> None:
     triplet = load_scenario("triplet", [parse_set_option("clock_mode=realtime")]).config
-    assert compute_response_timeout_s(triplet, CanSettings()) == pytest.approx(1.25 * 27 * 135e-6 + 0.002)
+    assert compute_response_timeout_s(triplet, CanSettings()) == pytest.approx(
+        1.25 * 27 * 135e-6 + 0.002
+    )
     two = CanSettings(channels=["can0", "can1"])
     assert compute_response_timeout_s(triplet, two) == pytest.approx(1.25 * 15 * 135e-6 + 0.002)
 
@@ -173,7 +197,9 @@ def test_opened_command_acts_one_period_after_its_state() -> None:
 
             def wish(tick: int, torque_nm: float = torque_nm) -> SafeSetpoints:
                 return SafeSetpoints(
-                    [JointMode.TORQUE] * JOINTS, [torque_nm * (tick == change_at)] * JOINTS, [4.0] * JOINTS
+                    [JointMode.TORQUE] * JOINTS,
+                    [torque_nm * (tick == change_at)] * JOINTS,
+                    [4.0] * JOINTS,
                 )
 
             run.run(change_at + 5 - run.tick, wish)
@@ -188,7 +214,10 @@ def test_opened_period_has_one_sync_and_one_setpoint_per_module() -> None:
         run.arm()
         for _ in range(20):
             sent = go(run, "armed")
-            assert [parse_opcode(frame.id) for frame in sent] == [Opcode.SYNC, *[Opcode.SET_POINT] * JOINTS]
+            assert [parse_opcode(frame.id) for frame in sent] == [
+                Opcode.SYNC,
+                *[Opcode.SET_POINT] * JOINTS,
+            ]
             assert [parse_node(frame.id) for frame in sent[1:]] == [1, 2, 3, 4]
         counts = [read(f)["count"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC]
         assert counts == [i % 256 for i in range(len(counts))]

@@ -12,13 +12,26 @@ from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.server import EmulatorServer, InProcessEmulators
 from snakesim_can_backend.protocol.commands import make_query
-from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, Opcode, parse_node, parse_opcode
+from snakesim_can_backend.protocol.definitions import (
+    CanFrame,
+    CommandAction,
+    Opcode,
+    parse_node,
+    parse_opcode,
+)
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_testing.can.driver_loop import DriverLoop, config
-from snakesim_testing.can.recorded_wire import WIRES, RecordedWire, go, is_action, is_setpoint, words
+from snakesim_testing.can.recorded_wire import (
+    WIRES,
+    RecordedWire,
+    go,
+    is_action,
+    is_setpoint,
+    words,
+)
 from snakesim_testing.messages import raises_error
 
 # --- several buses -----------------------------------------------------------------------------------------
@@ -31,7 +44,9 @@ class NoProcess:
     stopped = 0
     ended: str | None = None
 
-    def __init__(self, run: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool) -> None:
+    def __init__(
+        self, run: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool
+    ) -> None:
         self.started.append((settings.channels, pose, stepped))
 
     def describe_exit(self) -> str | None:
@@ -45,16 +60,24 @@ class NoProcess:
 def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]], DriverLoop]]:
     """Opens a driver for two buses with so many joints each, on emulators with three and one."""
     run, channels = config(robot__sensors__pose__rate_hz=100.0), ["bus_a", "bus_b"]
-    real = CanSettings(channels=channels, joints_per_channel=[3, 1], emulators="process", physics_model="inertia")
+    real = CanSettings(
+        channels=channels, joints_per_channel=[3, 1], emulators="process", physics_model="inertia"
+    )
     chain = ModuleChain(run, real, InertiaModel(run, InertiaSettings()), stepped=True)
-    end = InProcessEmulators(EmulatorServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns)
-    monkeypatch.setattr("snakesim_can_backend.bus.adapter.validate_interface", lambda _channel: None)
+    end = InProcessEmulators(
+        EmulatorServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns
+    )
+    monkeypatch.setattr(
+        "snakesim_can_backend.bus.adapter.validate_interface", lambda _channel: None
+    )
     monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
     monkeypatch.setattr(modules, "EmulatorProcess", NoProcess)
     opened: list[CanBackend] = []
 
     def open_with(joints: list[int], **settings: Any) -> DriverLoop:
-        asked = CanSettings(channels=channels, joints_per_channel=joints, emulators="process", **settings)
+        asked = CanSettings(
+            channels=channels, joints_per_channel=joints, emulators="process", **settings
+        )
         opened.append(CanBackend(run, asked))
         return DriverLoop(opened[-1], run)
 
@@ -99,19 +122,25 @@ def test_two_buses_in_lockstep_have_no_frames_left_in_flight(
         wire.sent.clear()
     run.run(20)
     for wire, node in zip(WIRES, (1, 4), strict=True):
-        asked = [parse_opcode(f.id) for f in wire.sent if f == make_query(node) or parse_opcode(f.id) == Opcode.SYNC]
+        asked = [
+            parse_opcode(f.id)
+            for f in wire.sent
+            if f == make_query(node) or parse_opcode(f.id) == Opcode.SYNC
+        ]
         assert asked == [Opcode.SYNC, Opcode.PARAMETER_REQUEST] * 20
     assert run.backend.modules.module_reports.answers_missing == 0
     run.backend.close()
 
 
-def test_two_buses_module_on_wrong_bus_is_detected_before_enabling(two_buses: Callable[..., DriverLoop]) -> None:
+def test_two_buses_module_on_wrong_bus_is_detected_before_enabling(
+    two_buses: Callable[..., DriverLoop],
+) -> None:
     with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
         two_buses([2, 2], bring_up_limit_s=0.3)
     assert [wire.closed for wire in WIRES] == [1, 1]
-    assert not any(is_action(frame, CommandAction.DISARM) for wire in WIRES for frame in wire.sent), (
-        "they are another's"
-    )
+    assert not any(
+        is_action(frame, CommandAction.DISARM) for wire in WIRES for frame in wire.sent
+    ), "they are another's"
 
 
 def test_a_driver_whose_twins_have_died_ends(
@@ -124,7 +153,9 @@ def test_a_driver_whose_twins_have_died_ends(
         run.run(1)
 
 
-def test_two_buses_failure_of_one_does_not_block_the_other(two_buses: Callable[..., DriverLoop]) -> None:
+def test_two_buses_failure_of_one_does_not_block_the_other(
+    two_buses: Callable[..., DriverLoop],
+) -> None:
     run = two_buses([3, 1])
     run.arm()
 

@@ -75,7 +75,8 @@ def test_clearing_and_arming_between_two_ticks_works(latched: LifecycleState) ->
 def test_lost_arming_and_stop_frames_are_sent_again() -> None:
     with loop() as run:
         WIRES[0].loses = lambda frame: (
-            is_action(frame, CommandAction.ARM, CommandAction.STOP) and parse_node(frame.id) == BROADCAST
+            is_action(frame, CommandAction.ARM, CommandAction.STOP)
+            and parse_node(frame.id) == BROADCAST
         )
         sent = go(run, "armed", 6)
         assert words(sent)[:5] == ["arm", "arm 1", "arm 2", "arm 3", "arm 4"]
@@ -95,7 +96,9 @@ def test_module_that_disarmed_itself_is_not_armed_again_automatically() -> None:
         run.run(5)
         assert words(WIRES[0].sent[before:]) == ["stop"]
         assert module_of(run, 2).state == DISARMED
-        assert [(fault.what, fault.joint) for fault in run.faults] == [("module_not_armed", "joint_2")]
+        assert [(fault.what, fault.joint) for fault in run.faults] == [
+            ("module_not_armed", "joint_2")
+        ]
 
 
 def test_lost_emergency_frame_is_repeated_until_all_modules_confirm() -> None:
@@ -121,18 +124,27 @@ def test_setpoint_rejected_by_bus_is_replaced_and_never_sent_late() -> None:
         run.arm()
         start = run.tick
         refused = (start + 4, start + 5, start + 9)
-        WIRES[0].refuses = lambda frame: is_setpoint(frame) and parse_node(frame.id) == 2 and run.tick in refused
+        WIRES[0].refuses = lambda frame: (
+            is_setpoint(frame) and parse_node(frame.id) == 2 and run.tick in refused
+        )
         by_tick: dict[int, list[dict[str, float]]] = {}
         for _ in range(30):
             tick = run.tick
             before = len(WIRES[0].sent)
-            run.run(1, lambda tick: SafeSetpoints([JointMode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4))
+            run.run(
+                1,
+                lambda tick: SafeSetpoints(
+                    [JointMode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4
+                ),
+            )
             mine = [f for f in WIRES[0].sent[before:] if is_setpoint(f) and parse_node(f.id) == 2]
             by_tick[tick] = [read(frame) for frame in mine]
         assert [tick for tick, frames in by_tick.items() if not frames] == list(refused)
         assert all(len(frames) == 1 for tick, frames in by_tick.items() if tick not in refused)
         sent = {tick: frames[0] for tick, frames in by_tick.items() if frames}
-        assert all(f["position"] == pytest.approx(0.001 * (tick - start)) for tick, f in sent.items()), "the newest"
+        assert all(
+            f["position"] == pytest.approx(0.001 * (tick - start)) for tick, f in sent.items()
+        ), "the newest"
         counts = [int(frame["count"]) for frame in sent.values()]
         assert all((b - a) % 16 == 1 for a, b in pairwise(counts)), "a count is of what was sent"
         assert run.faults == []
@@ -144,7 +156,9 @@ def test_bus_without_sync_is_reported_even_when_disarmed() -> None:
         run.run(2)
         WIRES[0].refuses = lambda frame: parse_opcode(frame.id) == Opcode.SYNC
         run.run(8)
-        assert [fault.what for fault in run.faults] == ["bus_stuck"], "and no module is blamed for it"
+        assert [fault.what for fault in run.faults] == ["bus_stuck"], (
+            "and no module is blamed for it"
+        )
         assert run.samples[-1].joints.valid == [False] * JOINTS
 
 
@@ -179,7 +193,9 @@ def test_robot_is_not_armed_while_module_rejects_parameters() -> None:
         sent = go(run, "armed", 1) + go(run, "fault", 3)
         assert "clear" in words(sent)
         assert "arm" not in words(sent)
-        assert [(fault.what, fault.joint) for fault in run.faults[before:]] == [("module_not_configured", "joint_2")]
+        assert [(fault.what, fault.joint) for fault in run.faults[before:]] == [
+            ("module_not_configured", "joint_2")
+        ]
         assert ARMED not in run.states()
         WIRES[0].loses = none
         before = len(run.faults)

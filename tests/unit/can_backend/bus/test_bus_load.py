@@ -86,7 +86,11 @@ def test_no_frame_is_ever_longer_than_the_worst_case(identifier: int, data: byte
 
 
 def test_bus_load_worst_case_is_nearly_reached() -> None:
-    frames = [(i, bytes([b]) * 8) for i in range(0, 0x800, 8) for b in (0, 255, 0x0F, 0xF0, 0x87, 0x78, 0x3C, 0xC3)]
+    frames = [
+        (i, bytes([b]) * 8)
+        for i in range(0, 0x800, 8)
+        for b in (0, 255, 0x0F, 0xF0, 0x87, 0x78, 0x3C, 0xC3)
+    ]
     assert max(frame_bits(*frame) for frame in frames) >= WORST_OF_8 - 4
 
 
@@ -95,20 +99,34 @@ def test_bus_load_worst_case_is_nearly_reached() -> None:
 
 def test_bus_load_of_absent_reports_is_zero() -> None:
     kinds = {s.opcode for s in list_streams(13, ReportSchedule(100.0, 0, 0)) if s.frames_per_s}
-    assert kinds == {Opcode.SYNC, Opcode.SET_POINT, Opcode.JOINT_STATE, Opcode.HEARTBEAT, Opcode.HEALTH}
+    assert kinds == {
+        Opcode.SYNC,
+        Opcode.SET_POINT,
+        Opcode.JOINT_STATE,
+        Opcode.HEARTBEAT,
+        Opcode.HEALTH,
+    }
     without_tail = compute_bus_load(13, ReportSchedule(100.0, tail=False))
-    assert compute_bus_load(13, ReportSchedule(100.0)) - without_tail == pytest.approx(100 * 135 / 1e6)
+    assert compute_bus_load(13, ReportSchedule(100.0)) - without_tail == pytest.approx(
+        100 * 135 / 1e6
+    )
 
 
 def test_the_busiest_period_is_one_with_forces() -> None:
     expected_us = 105 + 13 * (115 + 135 + 135) + 135
     for contact_every in (1, 2, 7):
-        assert busiest_period_s(13, ReportSchedule(100.0, contact_every)) == pytest.approx(expected_us * 1e-6)
-    assert busiest_period_s(13, ReportSchedule(100.0, 0)) == pytest.approx((105 + 13 * (115 + 135)) * 1e-6)
+        assert busiest_period_s(13, ReportSchedule(100.0, contact_every)) == pytest.approx(
+            expected_us * 1e-6
+        )
+    assert busiest_period_s(13, ReportSchedule(100.0, 0)) == pytest.approx(
+        (105 + 13 * (115 + 135)) * 1e-6
+    )
 
 
 @given(st.floats(20, 5000), st.floats(0.001, 1e4))
-def test_reports_come_as_nearly_as_wanted_as_whole_syncs_allow(rate_hz: float, wanted_hz: float) -> None:
+def test_reports_come_as_nearly_as_wanted_as_whole_syncs_allow(
+    rate_hz: float, wanted_hz: float
+) -> None:
     apart = syncs_per_report(rate_hz, wanted_hz)
     assert 1 <= apart <= MAX_SYNCS_PER_REPORT
     if 1 < apart < MAX_SYNCS_PER_REPORT:
@@ -118,13 +136,16 @@ def test_reports_come_as_nearly_as_wanted_as_whole_syncs_allow(rate_hz: float, w
 
 def test_reports_are_those_of_the_robot_and_of_the_settings() -> None:
     assert plan_reports(run_of(13), CanSettings()) == ReportSchedule(100.0, 1, 20)
-    assert plan_reports(run_of(13, 200.0), CanSettings(contact_rate_hz=50.0, imu_rate_hz=0.0)) == ReportSchedule(
-        200.0, 4, 0
-    )
+    assert plan_reports(
+        run_of(13, 200.0), CanSettings(contact_rate_hz=50.0, imu_rate_hz=0.0)
+    ) == ReportSchedule(200.0, 4, 0)
     blind = msgspec.structs.replace(
-        TRIPLET.robot, sensors=msgspec.structs.replace(TRIPLET.robot.sensors, contacts=None, imu=None)
+        TRIPLET.robot,
+        sensors=msgspec.structs.replace(TRIPLET.robot.sensors, contacts=None, imu=None),
     )
-    assert plan_reports(msgspec.structs.replace(TRIPLET, robot=blind), CanSettings()) == ReportSchedule(100.0, 0, 0)
+    assert plan_reports(
+        msgspec.structs.replace(TRIPLET, robot=blind), CanSettings()
+    ) == ReportSchedule(100.0, 0, 0)
 
 
 # --- shares ------------------------------------------------------------------------------------------------
@@ -142,7 +163,9 @@ def test_joints_are_shared_out_evenly_tail_first(joints: int, buses: int) -> Non
 
 
 def test_given_shares_are_kept() -> None:
-    assert count_joints_per_bus(run_of(13), CanSettings(channels=channels(2), joints_per_channel=[3, 10])) == [3, 10]
+    assert count_joints_per_bus(
+        run_of(13), CanSettings(channels=channels(2), joints_per_channel=[3, 10])
+    ) == [3, 10]
 
 
 @pytest.mark.parametrize(
@@ -171,7 +194,9 @@ def refusal(config: RunConfig, settings: CanSettings) -> str | None:
     return None
 
 
-def ways_out(text: str, config: RunConfig, settings: CanSettings) -> list[tuple[RunConfig, CanSettings]]:
+def ways_out(
+    text: str, config: RunConfig, settings: CanSettings
+) -> list[tuple[RunConfig, CanSettings]]:
     """The configurations that a refusal suggests."""
     advice = text.rpartition("What would fit: ")[2].rstrip(".")
     if advice == "nothing on classic CAN":
@@ -185,7 +210,9 @@ def ways_out(text: str, config: RunConfig, settings: CanSettings) -> list[tuple[
             continue
         if more := re.fullmatch(r"(\d+) channels with up to (\d+) joints each", way):
             changes = {"channels": channels(int(more[1])), "joints_per_channel": []}
-            assert max(count_joints_per_bus(config, CanSettings(channels=channels(int(more[1]))))) == int(more[2])
+            assert max(
+                count_joints_per_bus(config, CanSettings(channels=channels(int(more[1]))))
+            ) == int(more[2])
         elif fewer := re.fullmatch(r"backends\.can\.contact_rate_hz = (\S+)", way):
             changes = {"contact_rate_hz": float(fewer[1])}
         assert changes, way
@@ -209,16 +236,28 @@ def test_fewer_forces_are_suggested_when_that_is_enough() -> None:
     data=st.data(),
 )
 def test_bus_load_suggestions_all_fit(
-    joints: int, rate_hz: float, contact_hz: float | None, imu_hz: float, buses: int, data: st.DataObject
+    joints: int,
+    rate_hz: float,
+    contact_hz: float | None,
+    imu_hz: float,
+    buses: int,
+    data: st.DataObject,
 ) -> None:
     buses = min(buses, joints)
     split: list[int] = []
     if buses > 1 and data.draw(st.booleans()):
-        cuts = data.draw(st.lists(st.integers(1, joints - 1), min_size=buses - 1, max_size=buses - 1, unique=True))
+        cuts = data.draw(
+            st.lists(
+                st.integers(1, joints - 1), min_size=buses - 1, max_size=buses - 1, unique=True
+            )
+        )
         ends = [0, *sorted(cuts), joints]
         split = [b - a for a, b in pairwise(ends)]
     settings = CanSettings(
-        channels=channels(buses), joints_per_channel=split, contact_rate_hz=contact_hz, imu_rate_hz=imu_hz
+        channels=channels(buses),
+        joints_per_channel=split,
+        contact_rate_hz=contact_hz,
+        imu_rate_hz=imu_hz,
     )
     config = run_of(joints, rate_hz)
     text = refusal(config, settings)
@@ -235,7 +274,10 @@ def test_the_rate_that_is_suggested_is_the_highest_whole_one() -> None:
     assert best is not None
     for rate in range(best + 1, 201):
         assert refusal(run_of(18, float(rate)), settings) is not None
-    assert max_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), CanSettings(imu_rate_hz=5.0)) in (None, 20)
+    assert max_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), CanSettings(imu_rate_hz=5.0)) in (
+        None,
+        20,
+    )
 
 
 def test_bus_load_beyond_all_settings_suggests_a_lower_rate() -> None:

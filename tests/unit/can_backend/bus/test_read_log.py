@@ -58,7 +58,10 @@ def test_a_log_is_read_as_python_can_reads_it(tmp_path: Path) -> None:
     log = log_of(tmp_path, COMPACT)
     with can.LogReader(log.path) as theirs:
         for ours, other in zip(log, theirs, strict=True):
-            assert ours.equals(other, timestamp_delta=0.0, check_channel=not ours.is_error_frame), (ours, other)
+            assert ours.equals(other, timestamp_delta=0.0, check_channel=not ours.is_error_frame), (
+                ours,
+                other,
+            )
     assert list(log.report()) == []
     packed = log_of(tmp_path, gzip.compress(COMPACT.encode()), "bus.log.gz")
     assert len(list(packed)) == 6
@@ -90,15 +93,29 @@ def test_what_candump_prints_is_read_with_its_times(tmp_path: Path, option: str)
 @pytest.mark.parametrize(
     ("cut", "frames", "report"),
     [
-        (COMPACT + "(1700000000.000600) can0 105#00112233", 6, "line 7: '(1700000000.000600) can0 105#00112233'"),
-        (COMPACT + "(1700000000.000600) can0 105#0011223 ", 6, "line 7: '(1700000000.000600) can0 105#0011223 '"),
+        (
+            COMPACT + "(1700000000.000600) can0 105#00112233",
+            6,
+            "line 7: '(1700000000.000600) can0 105#00112233'",
+        ),
+        (
+            COMPACT + "(1700000000.000600) can0 105#0011223 ",
+            6,
+            "line 7: '(1700000000.000600) can0 105#0011223 '",
+        ),
         (COMPACT + "(17000000", 6, "line 7: '(17000000'"),
         (COMPACT + "\0" * 5000, 6, "line 7: '\\x00"),
-        (PRINTED[""] + "  can0  105   [8]  00 11 22 3", 3, "line 4: '  can0  105   [8]  00 11 22 3'"),
+        (
+            PRINTED[""] + "  can0  105   [8]  00 11 22 3",
+            3,
+            "line 4: '  can0  105   [8]  00 11 22 3'",
+        ),
         (COMPACT[:70] + "\0\0\0\n" + COMPACT, 7, "line 2: "),
     ],
 )
-def test_read_log_of_cut_file_names_the_dropped_line(tmp_path: Path, cut: str, frames: int, report: str) -> None:
+def test_read_log_of_cut_file_names_the_dropped_line(
+    tmp_path: Path, cut: str, frames: int, report: str
+) -> None:
     log = log_of(tmp_path, cut)
     assert len(list(log)) == frames
     line = next(iter(log.report()))

@@ -10,7 +10,13 @@ import pytest
 from snakesim_can_backend.bus.bus import VirtualWire, make_virtual_channel
 from snakesim_can_backend.cia402.backend import Cia402Backend
 from snakesim_can_backend.cia402.eds import BUNDLED
-from snakesim_can_backend.cia402.frames import EmergencyMessage, FunctionCode, NmtCommand, NmtState, encode_emergency
+from snakesim_can_backend.cia402.frames import (
+    EmergencyMessage,
+    FunctionCode,
+    NmtCommand,
+    NmtState,
+    encode_emergency,
+)
 from snakesim_can_backend.cia402.objects import MODE_PDO, POSITION_PDO, TORQUE_PDO
 from snakesim_can_backend.cia402.scan import make_scan_row, read_nodes
 from snakesim_can_backend.cia402.settings import MountedCia402
@@ -24,7 +30,9 @@ from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
 from snakesim_testing.messages import raises_error
 
 JOINTS = 2
-HEARTBEAT_TIME = "ParameterName=Producer heartbeat time\nObjectType=0x7\nDataType=0x0006\nAccessType="
+HEARTBEAT_TIME = (
+    "ParameterName=Producer heartbeat time\nObjectType=0x7\nDataType=0x0006\nAccessType="
+)
 CONFIG = config(JOINTS, backend="cia402")
 
 
@@ -79,13 +87,16 @@ def test_drive_is_enabled_step_by_step_and_only_in_its_mode(robot: Robot) -> Non
     robot.sent.clear()
     robot.mode, robot.target = JointMode.TORQUE, 0.0
     assert robot.run(10, "armed") == []
-    assert [frame.data for frame in robot.sent if frame.id == MODE_PDO.base | 1][:1] == [bytes([10])]
+    assert [frame.data for frame in robot.sent if frame.id == MODE_PDO.base | 1][:1] == [
+        bytes([10])
+    ]
     assert [drive.state for drive in robot.drives] == [PowerState.ENABLED] * JOINTS
 
 
 def test_drive_that_leaves_operation_enabled_by_itself_stays_off(robot: Robot) -> None:
     robot.run(40, "armed")
-    robot.drives[0].state = PowerState.SWITCH_ON_DISABLED  # as a drive whose safe torque off was requested
+    # As a drive whose safe torque off was requested.
+    robot.drives[0].state = PowerState.SWITCH_ON_DISABLED
     robot.sent.clear()
     [fault] = robot.run(30, "armed")
     assert (fault.what, fault.joint) == ("drive_not_armed", "joint_1")
@@ -104,13 +115,18 @@ def test_drive_that_leaves_operation_enabled_at_once_gets_no_second_chance(robot
     assert ControlwordCommand.SHUTDOWN not in robot.controls(0)
 
 
-def test_fault_is_reset_by_the_operator_alone(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+def test_fault_is_reset_by_the_operator_alone(
+    robot: Robot, caplog: pytest.LogCaptureFixture
+) -> None:
     robot.run(20, "armed")
     robot.driver._emulator._fail(0, EmergencyMessage(0x3210, 0x05))
     with caplog.at_level(logging.WARNING):
         faults = robot.run(20, "armed")
     assert [fault.what for fault in faults] == ["drive_fault"]
-    assert "error 0x3210, voltage: see its manual (error register 0x05: generic, voltage)" in faults[0].cause
+    assert (
+        "error 0x3210, voltage: see its manual (error register 0x05: generic, voltage)"
+        in faults[0].cause
+    )
     assert "0x3210" in caplog.text
     robot.run(20, "fault")
     assert robot.drives[0].state == PowerState.FAULT
@@ -124,7 +140,8 @@ def test_fault_is_reset_by_the_operator_alone(robot: Robot, caplog: pytest.LogCa
 def test_emergency_stop_is_a_quick_stop_that_ends_in_time() -> None:
     robot = Robot(quick_stop="ramp")
     robot.run(30, "armed")
-    robot.drives[0].objects.values[0x605A, 0] = 6  # stay in quick stop, whatever the driver has written
+    # Stay in quick stop, whatever the driver has written.
+    robot.drives[0].objects.values[0x605A, 0] = 6
     robot.sent.clear()
     robot.run(3, "estop")
     assert robot.controls(0)[0] == ControlwordCommand.QUICK_STOP
@@ -184,7 +201,9 @@ def test_end_of_the_driver_ends_the_watch_of_its_heartbeat() -> None:
         ({"max_position": 1000}, "607Dh"),
     ],
 )
-def test_drive_with_unfitting_limits_is_refused_at_the_start(mounted: dict[str, Any], field: str) -> None:
+def test_drive_with_unfitting_limits_is_refused_at_the_start(
+    mounted: dict[str, Any], field: str
+) -> None:
     with raises_error(BackendError, code="drive/not-complete", field=field):
         Robot(mounted={"joint_2": MountedCia402(**mounted)})
 
@@ -211,7 +230,9 @@ def test_drive_that_cannot_be_configured_is_refused_at_the_start(
 
 def test_watchdog_that_cannot_be_verified_may_be_allowed(tmp_path: Path) -> None:
     path = tmp_path / "drive.eds"
-    path.write_text(BUNDLED.read_text(encoding="utf-8").replace("[6007]\n", "[2007]\n", 1), encoding="utf-8")
+    path.write_text(
+        BUNDLED.read_text(encoding="utf-8").replace("[6007]\n", "[2007]\n", 1), encoding="utf-8"
+    )
     robot = Robot(eds=[str(path)], allow_unverified_watchdog=True)
     assert robot.run(20, "armed") == []
     robot.backend.close()
@@ -229,7 +250,9 @@ def test_own_master_on_the_bus_is_recognized_by_what_it_sends(robot: Robot) -> N
     assert sender(CanFrame(0x201, bytes(8))) == -1
     assert sender(CanFrame(0x601, bytes([0x2B, 0x40, 0x60, 0, 6, 0, 0, 0]))) == -1
     assert sender(CanFrame(0x77F, b"\x05")) == -1
-    assert sender(CanFrame(0x601, bytes([0x40, 0x41, 0x60, 0, 0, 0, 0, 0]))) is None, "it only reads"
+    assert sender(CanFrame(0x601, bytes([0x40, 0x41, 0x60, 0, 0, 0, 0, 0]))) is None, (
+        "it only reads"
+    )
     assert sender(CanFrame(0x100, bytes(6))) is None
     assert sender(CanFrame(0x7E5, bytes(8))) is None
     assert sender(encode_emergency(9, EmergencyMessage(0x1000, 1))) == 9
@@ -241,7 +264,9 @@ def test_scan_lists_identity_modes_and_state_of_every_node() -> None:
     channel = make_virtual_channel()
     settings = Cia402Backend.Settings(physics_model="inertia")
     clock = DriverClock(CONFIG)
-    emulator: Any = Cia402Backend.make_emulator(CONFIG, settings, [VirtualWire(channel)], clock, None)
+    emulator: Any = Cia402Backend.make_emulator(
+        CONFIG, settings, [VirtualWire(channel)], clock, None
+    )
     wire = VirtualWire(channel, emulator)
     found = read_nodes(wire)
     wire.close()

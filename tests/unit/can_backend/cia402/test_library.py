@@ -17,7 +17,11 @@ from snakesim_can_backend.cia402.backend import Cia402Backend
 from snakesim_can_backend.cia402.drives import Cia402Drives
 from snakesim_can_backend.cia402.eds import BUNDLED, SIZES, read_eds
 from snakesim_can_backend.cia402.frames import ABORTS, SYNC_ID, describe_error
-from snakesim_can_backend.cia402.state_machine import ControlwordCommand, PowerState, decode_statusword
+from snakesim_can_backend.cia402.state_machine import (
+    ControlwordCommand,
+    PowerState,
+    decode_statusword,
+)
 from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drives import BusCommand
@@ -91,7 +95,9 @@ class Master:
         self.wire = LibraryWire()
         self.clock = DriverClock(CONFIG)
         settings = Cia402Backend.Settings(physics_model="inertia")
-        self.emulator: Any = Cia402Backend.make_emulator(CONFIG, settings, [self.wire], self.clock, None)
+        self.emulator: Any = Cia402Backend.make_emulator(
+            CONFIG, settings, [self.wire], self.clock, None
+        )
         self.wire.when_arrived = self.emulator
         self.node: Any = BaseNode402(1, EDS)
         self.wire.network.add_node(self.node)
@@ -122,7 +128,9 @@ def test_states_and_commands_are_those_of_the_library() -> None:
         ours = decode_statusword(bits)
         assert ours.value.upper().removesuffix(" ACTIVE") == name.removesuffix(" ACTIVE"), name
         assert decode_statusword(bits | 0xFF90) == ours, "bits that do not belong to the state"
-    assert {ControlwordCommand(word) for word in State402.CW_CODE_COMMANDS} == set(ControlwordCommand)
+    assert {ControlwordCommand(word) for word in State402.CW_CODE_COMMANDS} == set(
+        ControlwordCommand
+    )
 
 
 def test_abort_codes_and_errors_are_those_of_the_library() -> None:
@@ -287,7 +295,9 @@ def test_our_driver_configures_drives_of_the_library() -> None:
         assert node.sdo[0x1016][1].raw == 127 << 16 | 100
         assert node.sdo["Producer heartbeat time"].raw == 100
         node.rpdo.read()
-        mapped = {pdo.cob_id - node.id: [variable.name for variable in pdo] for pdo in node.rpdo.values()}
+        mapped = {
+            pdo.cob_id - node.id: [variable.name for variable in pdo] for pdo in node.rpdo.values()
+        }
         assert mapped == {
             0x200: ["Controlword", "Target position", "Max torque"],
             0x300: ["Controlword", "Target velocity", "Max torque"],
@@ -313,7 +323,9 @@ def test_our_setpoints_are_decoded_by_drives_of_the_library() -> None:
     everybody = frozenset(range(JOINTS))
     targets = drives.readings.angle_rad * 0 + 3.14159265
     limits = drives.readings.angle_rad * 0 + 2.0
-    command = BusCommand(everybody, [JointMode.POSITION] * JOINTS, targets, limits, may_enable=True, emergency=False)
+    command = BusCommand(
+        everybody, [JointMode.POSITION] * JOINTS, targets, limits, may_enable=True, emergency=False
+    )
     for word in (0x0040, 0x0021, 0x0023, 0x0027):
         drives.words = [word] * JOINTS
         drives.readings.start_request()

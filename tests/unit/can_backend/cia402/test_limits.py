@@ -44,7 +44,9 @@ def joint(**dotted: Any) -> Joint:
     return config(1, backend="cia402", **dotted).robot.joint_table[0]
 
 
-def objections(changed: dict[ObjectEntry, int], one: Joint | None = None, **settings: Any) -> list[str]:
+def objections(
+    changed: dict[ObjectEntry, int], one: Joint | None = None, **settings: Any
+) -> list[str]:
     values = FITTING | changed
     used = Cia402Settings(**settings)
     scaling = determine_scaling(values, used, one or joint())
@@ -54,7 +56,9 @@ def objections(changed: dict[ObjectEntry, int], one: Joint | None = None, **sett
 
 def test_drive_with_fitting_limits_has_no_objections() -> None:
     assert objections({}) == []
-    assert objections({MIN_POSITION: 0, MAX_POSITION: 0}) == [], "equal limits mean that there are none"
+    assert objections({MIN_POSITION: 0, MAX_POSITION: 0}) == [], (
+        "equal limits mean that there are none"
+    )
     without_speed = dict(FITTING)
     del without_speed[MAX_SPEED]
     scaling = determine_scaling(without_speed, Cia402Settings(), joint())
@@ -65,14 +69,30 @@ def test_drive_with_fitting_limits_has_no_objections() -> None:
 @pytest.mark.parametrize(
     ("changed", "settings", "words"),
     [
-        ({MAX_TORQUE: 1_900}, {}, "torque limit (6072h) of 3.8 N·m, and its joint may command 4 N·m"),
-        ({MAX_SPEED: 40}, {}, "speed limit (6080h) of 4.189 rad/s, and its joint may turn at 5 rad/s"),
+        (
+            {MAX_TORQUE: 1_900},
+            {},
+            "torque limit (6072h) of 3.8 N·m, and its joint may command 4 N·m",
+        ),
+        (
+            {MAX_SPEED: 40},
+            {},
+            "speed limit (6080h) of 4.189 rad/s, and its joint may turn at 5 rad/s",
+        ),
         ({MAX_POSITION: 2_000}, {}, "position limits (607Dh) of -1.508 to 1.257 rad"),
         ({SUPPORTED_MODES: 0x300}, {}, "mode 8, cyclic synchronous position (CSP) (6502h)"),
         ({SUPPORTED_MODES: 0x180}, {}, "mode 10, cyclic synchronous torque (CST) (6502h)"),
         ({DEVICE_TYPE: 0x191}, {}, "device profile 401"),
-        ({}, {"counts_per_turn": 4096}, "10000 a turn, and `backends.cia402.counts_per_turn` = 4096"),
-        ({}, {"rated_torque_nm": 1.5}, "rated torque (6076h) of 2 N·m, and `backends.cia402.rated_torque_nm` = 1.5"),
+        (
+            {},
+            {"counts_per_turn": 4096},
+            "10000 a turn, and `backends.cia402.counts_per_turn` = 4096",
+        ),
+        (
+            {},
+            {"rated_torque_nm": 1.5},
+            "rated torque (6076h) of 2 N·m, and `backends.cia402.rated_torque_nm` = 1.5",
+        ),
     ],
 )
 def test_limit_or_unit_that_does_not_suit_the_joint_is_named(
@@ -103,8 +123,12 @@ def test_units_of_a_drive_convert_both_ways() -> None:
 
 
 def test_rated_torque_comes_from_rated_current_if_the_drive_has_no_other() -> None:
-    values = {entry: value for entry, value in FITTING.items() if entry != RATED_TORQUE} | {RATED_CURRENT: 8_000}
-    of_current = determine_scaling(values, Cia402Settings(), joint(robot__motor__torque_constant_nm_per_a=0.25))
+    values = {entry: value for entry, value in FITTING.items() if entry != RATED_TORQUE} | {
+        RATED_CURRENT: 8_000
+    }
+    of_current = determine_scaling(
+        values, Cia402Settings(), joint(robot__motor__torque_constant_nm_per_a=0.25)
+    )
     assert not isinstance(of_current, str)
     assert of_current.rated_torque_nm == pytest.approx(2.0)
     unknown = determine_scaling(values, Cia402Settings(), joint())
@@ -116,7 +140,11 @@ def test_rated_torque_comes_from_rated_current_if_the_drive_has_no_other() -> No
 
 def test_each_mapping_is_written_while_off_and_read_back() -> None:
     steps = list_configuration_steps(5, Cia402Settings(), 0.01)
-    writes = [step for step in steps if isinstance(step, WriteStep) and step.entry.index in (0x1400, 0x1600)]
+    writes = [
+        step
+        for step in steps
+        if isinstance(step, WriteStep) and step.entry.index in (0x1400, 0x1600)
+    ]
     assert [(step.entry.index, step.entry.sub, step.value) for step in writes] == [
         (0x1400, 1, 0x8000_0205),
         (0x1600, 0, 0),
@@ -128,7 +156,11 @@ def test_each_mapping_is_written_while_off_and_read_back() -> None:
         (0x1400, 1, 0x205),
     ]
     checked = {step.entry: step.expected for step in steps if isinstance(step, ReadStep)}
-    last_written = {step.entry: step.value for step in steps if isinstance(step, WriteStep) and not step.optional}
+    last_written = {
+        step.entry: step.value
+        for step in steps
+        if isinstance(step, WriteStep) and not step.optional
+    }
     assert {entry: checked[entry] for entry in last_written} == last_written
 
 
@@ -136,7 +168,9 @@ def test_each_mapping_is_written_while_off_and_read_back() -> None:
     ("period_s", "encoded"),
     [(0.01, (10, -3)), (0.02, (20, -3)), (0.0025, (25, -4)), (1 / 30, (33, -3)), (0.5, (50, -2))],
 )
-def test_control_period_is_encoded_as_value_and_exponent(period_s: float, encoded: tuple[int, int]) -> None:
+def test_control_period_is_encoded_as_value_and_exponent(
+    period_s: float, encoded: tuple[int, int]
+) -> None:
     assert encode_cycle_period(period_s) == encoded
 
 
@@ -152,20 +186,30 @@ def test_bundled_eds_has_all_that_the_driver_needs() -> None:
     ("old", "new"),
     [
         ("[6072]\n", "[2072]\n"),
-        ("ParameterName=Target velocity\nObjectType=0x7\nDataType=0x0004", "ParameterName=V\nDataType=0x0003"),
-        ("ParameterName=Max torque\nObjectType=0x7\nDataType=0x0006\nAccessType=rww\nPDOMapping=1", "DataType=0x0006"),
+        (
+            "ParameterName=Target velocity\nObjectType=0x7\nDataType=0x0004",
+            "ParameterName=V\nDataType=0x0003",
+        ),
+        (
+            "ParameterName=Max torque\nObjectType=0x7\nDataType=0x0006\nAccessType=rww\nPDOMapping=1",
+            "DataType=0x0006",
+        ),
         ("[1016sub1]", "[1016sub9]"),
         ("[6041]\nParameterName=Statusword\nObjectType=0x7", "[6041]\nObjectType=seven"),
         ("[FileInfo]", "nothing before a section"),
     ],
     ids=["missing", "other size", "not mappable", "no consumer", "no number", "syntax"],
 )
-def test_eds_of_a_drive_that_cannot_be_driven_is_refused(tmp_path: Path, old: str, new: str) -> None:
+def test_eds_of_a_drive_that_cannot_be_driven_is_refused(
+    tmp_path: Path, old: str, new: str
+) -> None:
     text = BUNDLED.read_text(encoding="utf-8")
     assert old in text
     path = tmp_path / "drive.eds"
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
-    with raises_error(ConfigError, code=("drive/unsupported-setting", "file/not-readable"), field="drive.eds"):
+    with raises_error(
+        ConfigError, code=("drive/unsupported-setting", "file/not-readable"), field="drive.eds"
+    ):
         read_all_eds([str(path)])
 
 

@@ -106,7 +106,9 @@ def test_bring_up_finds_every_module_with_identity_requests_only(modules: Module
     assert [i.node for i in found] == [1, 2, 3, 4]
     assert {i.channel for i in found} == {modules.channel}
     assert [i.serial for i in found] == [slot.module.serial for slot in modules.chain.slots]
-    assert {(i.firmware, i.protocol, i.emulated, i.stepped) for i in found} == {("1.0", 1, True, True)}
+    assert {(i.firmware, i.protocol, i.emulated, i.stepped) for i in found} == {
+        ("1.0", 1, True, True)
+    }
     assert set(actions(modules.heard)) == {CommandAction.IDENTIFY}
     assert {parse_opcode(frame.id) for frame in modules.heard} == {Opcode.COMMAND}
     assert find_discovery_errors([modules.bus], found, NAMES, lockstep=True) == []
@@ -142,7 +144,9 @@ def test_bring_up_ends_when_all_answered_or_at_timeout(modules: Modules) -> None
 
 
 def test_bring_up_lost_identity_answer_is_requested_again(modules: Modules) -> None:
-    modules.to_host = losing(1, lambda frame: parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 3)
+    modules.to_host = losing(
+        1, lambda frame: parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 3
+    )
     assert [i.node for i in find_modules([modules.bus], 5.0)] == [1, 2, 3, 4]
     assert len(actions(modules.heard)) > 1, "asked again"
 
@@ -161,7 +165,9 @@ def test_bring_up_foreign_frames_are_forwarded_and_truncated_ones_ignored(module
 # --- what is wrong with them -------------------------------------------------------------------------------
 
 A, B = "can_a", "can_b"
-GOOD = [ModuleIdentity(n, A if n < 3 else B, 0x1000 + n, "1.0", 1, False, False) for n in (1, 2, 3, 4)]
+GOOD = [
+    ModuleIdentity(n, A if n < 3 else B, 0x1000 + n, "1.0", 1, False, False) for n in (1, 2, 3, 4)
+]
 
 
 class Named(VirtualWire):
@@ -188,12 +194,18 @@ def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[s
             [*GOOD, replace(GOOD[1], serial=0xBEEF)],
             "joint_2 (node 2 on can_a) answers 2 times, serials 00001002 and 0000BEEF: give each module its own",
         ),
-        ([*GOOD, replace(GOOD[0], node=9)], "node 9 with serial 00001001 on can_a is not a joint of this robot"),
+        (
+            [*GOOD, replace(GOOD[0], node=9)],
+            "node 9 with serial 00001001 on can_a is not a joint of this robot",
+        ),
         (
             [*GOOD[:2], replace(GOOD[2], channel=A), GOOD[3]],
             "joint_3 (node 3 on can_b) does not answer; a node 3 answers on can_a",
         ),
-        ([*GOOD, replace(GOOD[2], channel=A, serial=0xF)], "joint_3 (node 3 on can_b) is duplicated on can_a, serial"),
+        (
+            [*GOOD, replace(GOOD[2], channel=A, serial=0xF)],
+            "joint_3 (node 3 on can_b) is duplicated on can_a, serial",
+        ),
         (
             [replace(GOOD[0], protocol=2), *GOOD[1:]],
             "joint_1 (node 1 on can_a) has protocol version 2, this driver 1",
@@ -211,7 +223,9 @@ def test_bring_up_error_names_joint_node_and_bus(found: list[ModuleIdentity], wo
 
 def test_modules_that_cannot_wait_are_no_good_for_lockstep() -> None:
     reported = wrong_with([replace(i, stepped=i.node > 1) for i in GOOD], lockstep=True)
-    assert reported == ["joint_1 (node 1 on can_a) does not support lockstep: use --clock-mode realtime"]
+    assert reported == [
+        "joint_1 (node 1 on can_a) does not support lockstep: use --clock-mode realtime"
+    ]
 
 
 def test_bring_up_lists_all_problems_in_one_error() -> None:
@@ -224,7 +238,14 @@ def test_bring_up_lists_all_problems_in_one_error() -> None:
     ]
     reported = wrong_with(found)
     assert len(reported) == 7
-    for words in ("answers 2 times", "version 3", "joint_2 .*does not answer$", "answers on can_a", "--stepped", "62"):
+    for words in (
+        "answers 2 times",
+        "version 3",
+        "joint_2 .*does not answer$",
+        "answers on can_a",
+        "--stepped",
+        "62",
+    ):
         assert any(re.search(words, line) for line in reported), words
 
 
@@ -303,7 +324,9 @@ def test_bring_up_unknown_result_code_counts_as_refusal(modules: Modules) -> Non
     def oddly(frame: CanFrame) -> list[CanFrame]:
         if parse_opcode(frame.id) != Opcode.PARAMETER_ANSWER:
             return [frame]
-        return [CanFrame(frame.id, frame.data[:1] + bytes((frame.data[1] | 0xF0,)) + frame.data[2:])]
+        return [
+            CanFrame(frame.id, frame.data[:1] + bytes((frame.data[1] | 0xF0,)) + frame.data[2:])
+        ]
 
     modules.to_host = oddly
     with raises_error(BackendError, code="drive/parameter-refused"):

@@ -14,8 +14,12 @@ START_TICK = 60
 AT_REST_RAD_S = 0.05
 
 
-@pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])
-def test_module_fault_names_its_joint_and_stops_the_robot(kind: str, what: str, within: int) -> None:
+@pytest.mark.parametrize(
+    ("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS]
+)
+def test_module_fault_names_its_joint_and_stops_the_robot(
+    kind: str, what: str, within: int
+) -> None:
     with loop(faults=[f"{kind}:joint_3@{START_TICK / 100}"]) as run:
         run.arm()
         run.run(START_TICK - run.tick, run.waving)
@@ -24,7 +28,14 @@ def test_module_fault_names_its_joint_and_stops_the_robot(kind: str, what: str, 
         assert run.faults, f"{kind} was not seen within {within} periods"
         fault = run.faults[0]
         run.run(30)
-        stopped = max(tick for tick in range(START_TICK, run.tick) if run.true_speed_rad_s[tick] > AT_REST_RAD_S) + 1
+        stopped = (
+            max(
+                tick
+                for tick in range(START_TICK, run.tick)
+                if run.true_speed_rad_s[tick] > AT_REST_RAD_S
+            )
+            + 1
+        )
         healthy = [i for i in range(4) if i != 2]
         assert fault.what in (what, "module_silent" if kind == "reboot" else what)
         assert fault.joint == "joint_3"
@@ -40,7 +51,10 @@ def test_module_fault_names_its_joint_and_stops_the_robot(kind: str, what: str, 
 
 
 def test_duplicate_module_is_detected_before_any_drive_is_enabled() -> None:
-    with raises_error(BackendError, code="drive/not-complete"), loop(faults=["duplicate:joint_3@0"]):
+    with (
+        raises_error(BackendError, code="drive/not-complete"),
+        loop(faults=["duplicate:joint_3@0"]),
+    ):
         pass
 
 

@@ -39,7 +39,9 @@ def hot_robot(backend: str, curve: str, celsius: float) -> Iterator[BackendRig]:
         robot__heat__time_constant_s=1e5,
         robot__heat__rise_at_rated_k=1e-3,
     )
-    opened = SimBackend(config, SimSettings()) if backend == "sim" else CanBackend(config, CanSettings())
+    opened = (
+        SimBackend(config, SimSettings()) if backend == "sim" else CanBackend(config, CanSettings())
+    )
     try:
         windings(opened).winding_temperature_c[0] = celsius
         yield BackendRig(opened, "lockstep", config.period_ns)
@@ -66,13 +68,17 @@ def until_told(rig: BackendRig, celsius: float) -> None:
 def pushes_nm(rig: BackendRig, limit_nm: float) -> float:
     """What the joint gives at its stop when that much is allowed."""
     limits = [limit_nm, *[RATED_NM] * (rig.joint_count - 1)]
-    record = rig.command_without_limiter({0: (JointMode.TORQUE, 2 * RATED_NM)}, AT_STOP_TICKS, torque_limit_nm=limits)
+    record = rig.command_without_limiter(
+        {0: (JointMode.TORQUE, 2 * RATED_NM)}, AT_STOP_TICKS, torque_limit_nm=limits
+    )
     assert np.abs(record.velocity_rad_s[-5:, 0]).max() < 0.05, "it is at its stop"
     return float(record.torque_nm[-5:, 0].mean())
 
 
 @pytest.mark.parametrize("curve", CURVES)
-@pytest.mark.parametrize("over", [0.48, *(pytest.param(at, marks=pytest.mark.slow) for at in (-0.2, 0.96))])
+@pytest.mark.parametrize(
+    "over", [0.48, *(pytest.param(at, marks=pytest.mark.slow) for at in (-0.2, 0.96))]
+)
 @pytest.mark.parametrize("backend", ["sim", "can"])
 def test_heat_derates_once(backend: str, curve: str, over: float) -> None:
     """over: how far the winding is from `derate_from_c` to `stop_at_c`."""
@@ -82,13 +88,21 @@ def test_heat_derates_once(backend: str, curve: str, over: float) -> None:
     with hot_robot(backend, curve, celsius) as rig:
         until_told(rig, celsius)
         rig.arm()
-        assert rig.authority.derated_joints.get("joint_1", 1.0) == pytest.approx(share, abs=1e-4), "in the status"
+        assert rig.authority.derated_joints.get("joint_1", 1.0) == pytest.approx(share, abs=1e-4), (
+            "in the status"
+        )
         from_gate_nm = rig.authority.compute_setpoints().setpoints.torque_limit_nm[0]
         assert from_gate_nm == pytest.approx(share * RATED_NM, abs=1e-3)
-        assert pushes_nm(rig, from_gate_nm) == pytest.approx(share * RATED_NM, abs=STEP_NM), "at the joint"
-        assert pushes_nm(rig, RATED_NM) == pytest.approx(share * RATED_NM, abs=STEP_NM), "by the motor's own protection"
+        assert pushes_nm(rig, from_gate_nm) == pytest.approx(share * RATED_NM, abs=STEP_NM), (
+            "at the joint"
+        )
+        assert pushes_nm(rig, RATED_NM) == pytest.approx(share * RATED_NM, abs=STEP_NM), (
+            "by the motor's own protection"
+        )
         small_nm = 0.1 * RATED_NM
-        assert pushes_nm(rig, small_nm) == pytest.approx(small_nm, abs=STEP_NM), "what is little is not made less"
+        assert pushes_nm(rig, small_nm) == pytest.approx(small_nm, abs=STEP_NM), (
+            "what is little is not made less"
+        )
 
 
 @pytest.mark.parametrize("curve", CURVES)

@@ -14,7 +14,12 @@ from snakesim_can_backend.driver.backend import CanBackend
 from snakesim_can_backend.driver.module_monitor import ROBOT_FAULT_KINDS
 from snakesim_can_backend.emulator.firmware import PASSIVE
 from snakesim_can_backend.protocol.commands import make_command, make_emergency
-from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, ModuleFault, ModuleState
+from snakesim_can_backend.protocol.definitions import (
+    CanFrame,
+    CommandAction,
+    ModuleFault,
+    ModuleState,
+)
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire.messages import JointMode, LifecycleRequest
@@ -42,7 +47,9 @@ class Lame(BackendRig):
         assert self.can.inject(parse_injection(f"{text}@0"), begins=begins)
 
     def ask(self, action: Literal["disarm", "reset"]) -> None:
-        answer = self.authority.handle_lifecycle_request(LifecycleRequest(action=action), self._now_ns)
+        answer = self.authority.handle_lifecycle_request(
+            LifecycleRequest(action=action), self._now_ns
+        )
         assert answer.ok, answer.reason
 
     def wave(self, periods: int) -> None:
@@ -69,7 +76,9 @@ def lame_robot(max_isolated: int = 1) -> Iterator[Lame]:
         backend.close()
 
 
-@pytest.mark.parametrize(("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS])
+@pytest.mark.parametrize(
+    ("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS]
+)
 def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within: int) -> None:
     with lame_robot() as robot:
         assert robot.states() == [ModuleState.ARMED] * JOINTS
@@ -174,7 +183,9 @@ def test_isolated_joint_reset_within_one_period_still_clears(
 
 
 @pytest.mark.parametrize("then", ["reset", "estop", "fault"])
-def test_what_stops_the_motors_waits_for_nothing(monkeypatch: pytest.MonkeyPatch, then: str) -> None:
+def test_what_stops_the_motors_waits_for_nothing(
+    monkeypatch: pytest.MonkeyPatch, then: str
+) -> None:
     """A module that is lost needs its parameters again and does not take them: that takes a second."""
     sent: list[CanFrame] = []
     send = VirtualWire.send

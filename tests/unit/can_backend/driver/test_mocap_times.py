@@ -4,7 +4,11 @@ import random
 
 import pytest
 
-from snakesim_drivers.motion_capture.mocap_times import MAX_LATENESS_NS, MIN_CONSISTENT_READINGS, CaptureTimes
+from snakesim_drivers.motion_capture.mocap_times import (
+    MAX_LATENESS_NS,
+    MIN_CONSISTENT_READINGS,
+    CaptureTimes,
+)
 
 MS = 1_000_000
 AHEAD_NS = 5_000_000_000_000  # what the other clock shows when ours shows 0
@@ -39,7 +43,9 @@ def running(readings: int = 20) -> Camera:
 
 def test_the_first_samples_may_be_the_slowest_of_all() -> None:
     camera = Camera()
-    assert camera.read(40.0) == [None] and camera.late_ms(camera.stamp(40.0)) == 0.0, "nothing faster is known yet"
+    assert camera.read(40.0) == [None] and camera.late_ms(camera.stamp(40.0)) == 0.0, (
+        "nothing faster is known yet"
+    )
     assert camera.read(0.0) == [None]
     assert camera.late_ms(camera.stamp(40.0)) == pytest.approx(40.0)
 
@@ -51,7 +57,9 @@ def test_mocap_reader_after_a_pause_uses_newest_pose_without_jump() -> None:
     assert camera.times.jump_count == 0
 
 
-@pytest.mark.parametrize(("late_ms", "why"), [(10.0, "duplicate"), (9.5, "duplicate"), (12.0, "reordered")])
+@pytest.mark.parametrize(
+    ("late_ms", "why"), [(10.0, "duplicate"), (9.5, "duplicate"), (12.0, "reordered")]
+)
 def test_mocap_pose_that_is_not_newer_is_refused(late_ms: float, why: str) -> None:
     camera = running()
     assert camera.read(late_ms) == [why]

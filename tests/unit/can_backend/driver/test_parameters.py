@@ -13,7 +13,12 @@ from snakesim_can_backend.driver.parameters import (
     validate_ratings,
 )
 from snakesim_can_backend.protocol.codec import load_layouts
-from snakesim_can_backend.protocol.definitions import PARAMETERS, ModuleParameter, Opcode, SafeMotion
+from snakesim_can_backend.protocol.definitions import (
+    PARAMETERS,
+    ModuleParameter,
+    Opcode,
+    SafeMotion,
+)
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import MountedDrive, validate_mounting_overrides
 from snakesim_hal.base.errors import BackendError, ConfigError
@@ -49,16 +54,24 @@ def test_parameters_of_every_module_exclude_ratings_and_stay_in_range(name: str)
 
 
 def test_parameters_of_a_geared_module_describe_its_own_shaft() -> None:
-    own = JointExceptions(sign=-1, gear=2.0, zero_rad=0.5, angle_min_rad=-0.4, angle_max_rad=1.2, torque_nm=6.0)
+    own = JointExceptions(
+        sign=-1, gear=2.0, zero_rad=0.5, angle_min_rad=-0.4, angle_max_rad=1.2, torque_nm=6.0
+    )
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
-    first, second = (plan_parameters(robot, CanSettings(), ReportSchedule(100.0))[node] for node in (1, 2))
+    first, second = (
+        plan_parameters(robot, CanSettings(), ReportSchedule(100.0))[node] for node in (1, 2)
+    )
     assert first[ModuleParameter.TORQUE_LIMIT] == 7.0
     assert first[ModuleParameter.ANGLE_LIMIT] == 1.5708
     assert second[ModuleParameter.STIFFNESS] == first[ModuleParameter.STIFFNESS] / 4
     assert second[ModuleParameter.TORQUE_LIMIT] == 3.0
     assert second[ModuleParameter.SPEED_LIMIT] == 15.0
-    assert second[ModuleParameter.ANGLE_LIMIT] == pytest.approx(1.9), "from 0.5 - 2.4 to 0.5 + 0.8 rad"
-    validate_ratings(robot, {2: {ModuleParameter.RATED_TORQUE: 3.0, ModuleParameter.RATED_SPEED: 15.0}})
+    assert second[ModuleParameter.ANGLE_LIMIT] == pytest.approx(1.9), (
+        "from 0.5 - 2.4 to 0.5 + 0.8 rad"
+    )
+    validate_ratings(
+        robot, {2: {ModuleParameter.RATED_TORQUE: 3.0, ModuleParameter.RATED_SPEED: 15.0}}
+    )
 
 
 MISPLACED = {
@@ -78,7 +91,9 @@ def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
     own, given = MISPLACED[wrong]
     settings = CanSettings(**given)
     robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
-    with raises_error(ConfigError, code=("bus/invalid-channel", "config/conflict", "drive/unsupported-setting")):
+    with raises_error(
+        ConfigError, code=("bus/invalid-channel", "config/conflict", "drive/unsupported-setting")
+    ):
         validate_joint_drives(robot, settings)
         validate_mounting_overrides(
             robot, "backends.can", settings.mounted, are_emulated=settings.emulators_run != "none"
@@ -89,11 +104,17 @@ def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
 @pytest.mark.parametrize("tail", [True, False])
 def test_only_the_first_module_reports_the_tail_link(tail: bool) -> None:
     wanted = plan_parameters(ROBOT, CanSettings(), ReportSchedule(100.0, tail=tail))
-    assert [values[ModuleParameter.TAIL] for values in wanted.values()] == [float(tail)] + [0.0] * 12
+    assert [values[ModuleParameter.TAIL] for values in wanted.values()] == [float(tail)] + [
+        0.0
+    ] * 12
 
 
-@pytest.mark.parametrize(("action", "motion"), [("damp", SafeMotion.DAMP), ("passive", SafeMotion.PASSIVE)])
-def test_parameters_take_stop_mode_from_robot_and_watchdog_from_settings(action: str, motion: SafeMotion) -> None:
+@pytest.mark.parametrize(
+    ("action", "motion"), [("damp", SafeMotion.DAMP), ("passive", SafeMotion.PASSIVE)]
+)
+def test_parameters_take_stop_mode_from_robot_and_watchdog_from_settings(
+    action: str, motion: SafeMotion
+) -> None:
     robot = changed("safety", action=action)
     told = plan_parameters(robot, CanSettings(watchdog_s=0.05), ReportSchedule(100.0, 3, 17))[1]
     names = (
@@ -120,7 +141,9 @@ def test_stiff_holding_is_nothing_a_module_does_by_itself() -> None:
         ("stop_at_c", Opcode.HEALTH, "motor_temperature", 1.0),
     ],
 )
-def test_limits_end_where_the_bus_ends(field: str, opcode: Opcode, signal: str, room: float) -> None:
+def test_limits_end_where_the_bus_ends(
+    field: str, opcode: Opcode, signal: str, room: float
+) -> None:
     most = load_layouts()[opcode].signals[signal].high / room
     if field != "angle_rad" or most <= 3.1:
         validate_ratings(changed("limits", **{field: most * 0.999}))

@@ -51,7 +51,9 @@ def test_reading_two_answers_to_one_sync_count_once() -> None:
 def test_an_unknown_state_is_a_fault() -> None:
     made = reading()
     begin(made)
-    write = load_layouts()[Opcode.JOINT_STATE].make_writer("angle", "velocity", "torque", "count", "state", "derated")
+    write = load_layouts()[Opcode.JOINT_STATE].make_writer(
+        "angle", "velocity", "torque", "count", "state", "derated"
+    )
     made.process_frame(write(2, (0, 0, 0, made.sync, 7, 0)))
     assert made.modules[1].state == ModuleState.FAULT
     beat = load_layouts()[Opcode.HEARTBEAT].make_writer("state", "last_stop", "uptime")

@@ -19,7 +19,16 @@ from snakesim_can_backend.protocol.definitions import (
     parse_node,
     parse_opcode,
 )
-from snakesim_testing.can.frames import accelerometer, begin, contact, gyro, health, heartbeat, joint_state, syncs
+from snakesim_testing.can.frames import (
+    accelerometer,
+    begin,
+    contact,
+    gyro,
+    health,
+    heartbeat,
+    joint_state,
+    syncs,
+)
 from snakesim_testing.can.readings import JOINTS, angles, reading
 
 # --- forces, IMUs, health ----------------------------------------------------------------------------------
@@ -57,18 +66,34 @@ def test_an_imus_halves_are_of_one_sync() -> None:
 MAX_UPTIME_S = 4294967.295  # the end of the signal's range
 
 UPTIMES = {  # s, and how many restarts they are by then
-    "back, and on from there: a restart": [(5.0, 0), (5.1, 0), (5.1, 0), (0.1, 0), (0.2, 1), (0.3, 1)],
+    "back, and on from there: a restart": [
+        (5.0, 0),
+        (5.1, 0),
+        (5.1, 0),
+        (0.1, 0),
+        (0.2, 1),
+        (0.3, 1),
+    ],
     "and the next restart": [(5.0, 0), (0.1, 0), (0.2, 1), (0.3, 1), (0.1, 1), (0.1, 2), (0.2, 2)],
-    "two clocks in turn: two modules": [(start_s + 0.1 * i, 0) for i in range(20) for start_s in (50.0, 0.0)],
+    "two clocks in turn: two modules": [
+        (start_s + 0.1 * i, 0) for i in range(20) for start_s in (50.0, 0.0)
+    ],
     "one that comes late": [(5.0, 0), (5.2, 0), (5.1, 0), (5.3, 0), (5.4, 0)],
     "49.7 days, at the end of the range": [(MAX_UPTIME_S - 0.05, 0), *[(MAX_UPTIME_S, 0)] * 4],
     "49.7 days, and a restart": [*[(MAX_UPTIME_S, 0)] * 2, (0.1, 0), (0.2, 1), (0.3, 1)],
-    "49.7 days, in firmware that wraps": [(MAX_UPTIME_S - 0.05, 0), (0.05, 0), (0.15, 0), (0.25, 0)],
+    "49.7 days, in firmware that wraps": [
+        (MAX_UPTIME_S - 0.05, 0),
+        (0.05, 0),
+        (0.15, 0),
+        (0.25, 0),
+    ],
 }
 
 
 @pytest.mark.parametrize("uptimes", UPTIMES.values(), ids=list(UPTIMES))
-def test_uptime_that_restarts_and_continues_means_module_restart(uptimes: list[tuple[float, int]]) -> None:
+def test_uptime_that_restarts_and_continues_means_module_restart(
+    uptimes: list[tuple[float, int]],
+) -> None:
     made = reading()
     for uptime_s, restarts in uptimes:
         made.process_frame(heartbeat(2, uptime_s))
@@ -79,7 +104,9 @@ def test_uptime_that_restarts_and_continues_means_module_restart(uptimes: list[t
 
 def test_a_heartbeat_tells_state_faults_and_reason() -> None:
     made = reading()
-    made.process_frame(heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.LEAK, fault_leak=1, fault_voltage=1))
+    made.process_frame(
+        heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.LEAK, fault_leak=1, fault_voltage=1)
+    )
     module = made.modules[1]
     assert module.state == ModuleState.FAULT
     assert module.last_stop == LastStop.LEAK
@@ -129,7 +156,9 @@ def test_strangers_are_counted_by_node() -> None:
 
 any_frame = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))
 ours = st.builds(
-    lambda opcode, node, data: CanFrame(frame_id(opcode, node), data[: load_layouts()[opcode].length]),
+    lambda opcode, node, data: CanFrame(
+        frame_id(opcode, node), data[: load_layouts()[opcode].length]
+    ),
     st.sampled_from(list(Opcode)),
     st.integers(1, JOINTS),
     st.binary(min_size=8, max_size=8),
@@ -147,7 +176,11 @@ def test_reader_of_arbitrary_frames_never_raises_or_moves_a_joint(
             begin(made, contacts=True, tail=True)
         before = made.shaft_values()
         made.process_frame(frame)
-        is_state = parse_opcode(frame.id) == Opcode.JOINT_STATE and len(frame.data) == 8 and has_valid_checksum(frame)
+        is_state = (
+            parse_opcode(frame.id) == Opcode.JOINT_STATE
+            and len(frame.data) == 8
+            and has_valid_checksum(frame)
+        )
         changed = np.flatnonzero((made.shaft_values() != before).any(axis=0)).tolist()
         assert changed in ([], [parse_node(frame.id) - 1] if is_state else [])
         assert made.is_complete in (True, False)

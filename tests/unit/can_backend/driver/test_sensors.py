@@ -39,7 +39,9 @@ EVERYTHING: dict[str, Any] = {
 }
 
 
-def sensors_of(run: RunConfig, reports: ReportSchedule | None = None) -> tuple[ModuleReports, SampleBuilder]:
+def sensors_of(
+    run: RunConfig, reports: ReportSchedule | None = None
+) -> tuple[ModuleReports, SampleBuilder]:
     reading = ModuleReports(run.robot.chain.modules)
     return reading, SampleBuilder(run, reports or plan_reports(run, CanSettings()), reading, None)
 
@@ -98,8 +100,12 @@ def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
         sync = begin(reading, contacts=are_contacts_due(reports, reading.sync + 1))
         answer(reading)
         assert are_contacts_due(reports, sync) is (sync % 256 % 3 == 0)
-        assert (keys.CONTACTS in sensors.make_samples(tick, 0).by_key) is are_contacts_due(reports, sync)
-    assert not any(are_contacts_due(ReportSchedule(100.0, contact_every=0), sync) for sync in range(300))
+        assert (keys.CONTACTS in sensors.make_samples(tick, 0).by_key) is are_contacts_due(
+            reports, sync
+        )
+    assert not any(
+        are_contacts_due(ReportSchedule(100.0, contact_every=0), sync) for sync in range(300)
+    )
 
 
 def test_contacts_without_touch_are_an_empty_list() -> None:
@@ -115,7 +121,9 @@ def test_contact_is_in_the_frame_of_its_link() -> None:
     run = config(**EVERYTHING)
     reading, sensors = sensors_of(run)
     begin(reading, contacts=True)
-    reading.process_frame(contact(2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2))
+    reading.process_frame(
+        contact(2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2)
+    )
     (found,) = contacts_of(sensors.make_samples(3, 30)).contacts
     radius_m = run.robot.module.radius_m
     assert found.link == 2
@@ -140,11 +148,17 @@ def test_contact_below_threshold_of_robot_is_omitted() -> None:
 # The place of a touch, from the physics model through emulator and bus to the HAL.
 
 
-def capsule_point(along_m: float, polar: float, bearing: float, length_m: float, radius_m: float) -> Vector:
+def capsule_point(
+    along_m: float, polar: float, bearing: float, length_m: float, radius_m: float
+) -> Vector:
     """A point of a capsule: on the cylinder for polar 0, on the ball at the nearer end otherwise."""
     base_m = along_m if polar == 0 else (length_m if polar > 0 else 0.0)
     across = radius_m * math.cos(polar)
-    return (base_m + radius_m * math.sin(polar), across * math.cos(bearing), across * math.sin(bearing))
+    return (
+        base_m + radius_m * math.sin(polar),
+        across * math.cos(bearing),
+        across * math.sin(bearing),
+    )
 
 
 @given(
@@ -162,7 +176,9 @@ def test_contact_anywhere_on_a_capsule_is_reported_within_bus_resolution(
     reading, sensors = sensors_of(run)
     sync = begin(reading, contacts=True)
     numbers = (*encode_contact(LinkLoad(link, point, (1.0, 2.0, 3.0))), sync)
-    reading.process_frame(write_tail_contact(1, numbers) if link == 0 else write_contact(link, numbers))
+    reading.process_frame(
+        write_tail_contact(1, numbers) if link == 0 else write_contact(link, numbers)
+    )
     (found,) = contacts_of(sensors.make_samples(0, 0)).contacts
     assert found.link == link
     base = (min(max(point[0], 0.0), length_m), 0.0, 0.0)
@@ -170,14 +186,18 @@ def test_contact_anywhere_on_a_capsule_is_reported_within_bus_resolution(
     cosine = -float(np.dot(outward, found.normal_l))
     # a step along the link turns the normal most where the ball ends: by step / (radius x cos(polar))
     turned = load_layouts()[Opcode.CONTACT].signals["bearing"].scale / 2
-    leaned = load_layouts()[Opcode.CONTACT].signals["along"].scale / 2 / (radius_m * math.cos(polar))
+    leaned = (
+        load_layouts()[Opcode.CONTACT].signals["along"].scale / 2 / (radius_m * math.cos(polar))
+    )
     allowed = 1.5 * (turned * math.cos(polar) + leaned) + 1e-9
     assert math.acos(min(cosine, 1.0)) <= allowed
     assert math.dist(point, found.position_l) <= radius_m * allowed + 0.00025
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-4, 4), st.floats(0.01, 0.2), st.floats(0.005, 0.1))
-def test_contact_position_is_on_the_capsule(along_m: float, bearing: float, length_m: float, radius_m: float) -> None:
+def test_contact_position_is_on_the_capsule(
+    along_m: float, bearing: float, length_m: float, radius_m: float
+) -> None:
     outward, point = locate_on_capsule(along_m, bearing, length_m, radius_m)
     assert math.hypot(*outward) == pytest.approx(1.0)
     axis_m = min(max(point[0], 0.0), length_m)
@@ -209,14 +229,18 @@ def test_imu_sample_has_only_new_and_complete_reports() -> None:
 def test_power_sample_is_made_every_half_second() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1)
-    ticks_with_power = [tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).by_key]
+    ticks_with_power = [
+        tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).by_key
+    ]
     assert ticks_with_power == [0, 50, 100]  # at 100 Hz
 
 
 def test_power_sample_of_modules_without_report_is_invalid() -> None:
     reading, sensors = sensors_of(config())
     syncs(reading, 1)
-    reading.process_frame(health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1))
+    reading.process_frame(
+        health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1)
+    )
     reading.process_frame(health(4, voltage=24.0))
     power = sensors.make_samples(50, 7).by_key[keys.POWER]
     assert isinstance(power, Power)
@@ -256,7 +280,13 @@ def test_sensors_are_described_with_their_rates() -> None:
     run = config(**EVERYTHING)
     sensors = describe_sensors(run, ReportSchedule(100.0, 4, 20), pose_delay_s=0.02)
     found = {s.key: s.rate_hz for s in sensors}
-    assert found == {keys.JOINTS: 100.0, keys.CONTACTS: 25.0, keys.IMU: 5.0, keys.POWER: 2.0, keys.POSE: 100.0}
+    assert found == {
+        keys.JOINTS: 100.0,
+        keys.CONTACTS: 25.0,
+        keys.IMU: 5.0,
+        keys.POWER: 2.0,
+        keys.POSE: 100.0,
+    }
     assert {s.key: s.delay_s for s in sensors if s.delay_s} == {keys.POSE: 0.02}
     bare = {s.key for s in describe_sensors(run, ReportSchedule(100.0, 0, 0), pose_delay_s=None)}
     assert bare == {keys.JOINTS, keys.POWER}

@@ -56,18 +56,39 @@ def babbling(reading: ModuleReports) -> None:
 WRONGS = [
     (quiet, 3, "module_silent", "is silent: no state for 30 ms"),
     (frozen, 3, "module_frozen", "is frozen: it repeats its answer number 2 to every Sync"),
-    (miscounting, 3, "wrong_counter", "answers Syncs that were not sent: 3 wrong counters in a row"),
+    (
+        miscounting,
+        3,
+        "wrong_counter",
+        "answers Syncs that were not sent: 3 wrong counters in a row",
+    ),
     (corrupt, 3, "bad_checksum", "sends corrupt states: 3 wrong checksums in a row"),
-    (doubled, 3, "duplicate_node", "is duplicated: every Sync is answered twice; give each module its own node id"),
-    (babbling, 1, "module_babbling", f"floods the bus: {MAX_FRAMES_PER_CYCLE + 1} frames within one period"),
+    (
+        doubled,
+        3,
+        "duplicate_node",
+        "is duplicated: every Sync is answered twice; give each module its own node id",
+    ),
+    (
+        babbling,
+        1,
+        "module_babbling",
+        f"floods the bus: {MAX_FRAMES_PER_CYCLE + 1} frames within one period",
+    ),
 ]
 
 
-@pytest.mark.parametrize(("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS])
-def test_watch_fault_is_reported_once_and_again_after_clearing(speak: Speak, after: int, what: str, cause: str) -> None:
+@pytest.mark.parametrize(
+    ("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS]
+)
+def test_watch_fault_is_reported_once_and_again_after_clearing(
+    speak: Speak, after: int, what: str, cause: str
+) -> None:
     bench = MonitorRig()
     assert bench.ticks(after - 1, speak) == [], "a glitch is nothing to stop for"
-    assert bench.tick(speak) == [FaultFinding(what, WHO + cause, 1, affects_only_joint=what not in ROBOT_FAULT_KINDS)]
+    assert bench.tick(speak) == [
+        FaultFinding(what, WHO + cause, 1, affects_only_joint=what not in ROBOT_FAULT_KINDS)
+    ]
     assert bench.ticks(40, speak) == []
     bench.reset()
     assert (what, 1) in list_findings(bench.ticks(CLEAR_GRACE_SYNCS + 1, speak))
@@ -93,7 +114,9 @@ def test_watch_module_with_invalid_frames_is_not_silent(bad: Speak) -> None:
 
 def test_watch_module_never_received_is_reported_only_as_silent() -> None:
     reading, watch = ModuleReports(1), ModuleMonitor(["joint_1"], ["can0"], PERIOD_S)
-    found = [f for _ in range(4) for f in (begin(reading), watch.find_faults(reading, "disarmed"))[1]]
+    found = [
+        f for _ in range(4) for f in (begin(reading), watch.find_faults(reading, "disarmed"))[1]
+    ]
     assert list_findings(found) == [("module_silent", 0)]
     assert found[0].cause.endswith("ms")
 
@@ -129,13 +152,17 @@ def test_watch_restart_is_reported_once_with_joint_and_lost_settings() -> None:
     assert bench.watch.pop_changed_joints() == set()
     bench.reset()
     assert bench.ticks(10) == []
-    assert list_findings(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], "the next one is another"
+    assert list_findings(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], (
+        "the next one is another"
+    )
 
 
 def test_watch_missing_parameters_at_arming_are_reported_once() -> None:
     bench = MonitorRig()
     assert bench.watch.find_faults(bench.reading, "disarmed", unconfigured={1}) == []
-    assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], "set aside"
+    assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], (
+        "set aside"
+    )
     (found,) = bench.watch.find_faults(bench.reading, "armed", unconfigured={1})
     assert list_findings([found]) == [("module_not_configured", 1)]
     assert not found.affects_only_joint
@@ -184,7 +211,9 @@ def test_water_after_heat_is_told_again_with_all_reasons() -> None:
     (found,) = bench.ticks(9, HOT)
     assert found.affects_only_joint
     reasons = "reports overheat, leak; it stopped because of overheat"
-    assert bench.ticks(9, HOT_AND_WET) == [FaultFinding("module_overheat", WHO + reasons, 1, affects_only_joint=False)]
+    assert bench.ticks(9, HOT_AND_WET) == [
+        FaultFinding("module_overheat", WHO + reasons, 1, affects_only_joint=False)
+    ]
 
 
 def test_watch_fault_without_heartbeat_is_reported_from_state() -> None:
@@ -202,10 +231,14 @@ def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
     assert bench.ticks(10) == []
     bench.reset()
     assert bench.ticks(CLEAR_GRACE_SYNCS - 1, HOT_AND_WET) == []
-    assert list_findings(bench.tick(HOT_AND_WET)) == [("module_overheat", 1)], "and is told again when it stays"
+    assert list_findings(bench.tick(HOT_AND_WET)) == [("module_overheat", 1)], (
+        "and is told again when it stays"
+    )
 
 
-@pytest.mark.parametrize(("lifecycle", "reported"), [("estop", []), ("disarmed", [("module_emergency", 1)])])
+@pytest.mark.parametrize(
+    ("lifecycle", "reported"), [("estop", []), ("disarmed", [("module_emergency", 1)])]
+)
 def test_an_emergency_is_as_it_should_be_only_in_one(
     lifecycle: LifecycleState, reported: list[tuple[str, int]]
 ) -> None:
@@ -241,7 +274,12 @@ def test_watch_module_that_disarms_itself_is_reported_at_once() -> None:
     assert bench.ticks(2) == [], "within the grace"
     found = bench.tick(answering(ModuleState.DISARMED))
     assert found == [
-        FaultFinding("module_not_armed", WHO + "is not armed any more: it is disarmed", 1, affects_only_joint=True)
+        FaultFinding(
+            "module_not_armed",
+            WHO + "is not armed any more: it is disarmed",
+            1,
+            affects_only_joint=True,
+        )
     ]
 
 

@@ -7,7 +7,13 @@ from snakesim_can_backend.driver.module_monitor import FaultFinding
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_command
-from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, ModuleState, Opcode, frame_id
+from snakesim_can_backend.protocol.definitions import (
+    CanFrame,
+    CommandAction,
+    ModuleState,
+    Opcode,
+    frame_id,
+)
 from snakesim_testing.can.frames import answer, joint_state
 from snakesim_testing.can.monitor_rig import MonitorRig, answering, list_findings, quiet
 
@@ -33,12 +39,16 @@ def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> Non
     assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ")
     assert advice in found.cause
     assert bench.tick(errors=[error]) == []
-    assert [f.cause[:5] for f in bench.tick(errors=[BusError(kind, "can1", "")])] == ["can1:"], "the other bus is new"
+    assert [f.cause[:5] for f in bench.tick(errors=[BusError(kind, "can1", "")])] == ["can1:"], (
+        "the other bus is new"
+    )
     bench.reset()
     assert list_findings(bench.tick(errors=[error])) == [(kind, None)]
 
 
-@pytest.mark.parametrize("kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"])
+@pytest.mark.parametrize(
+    "kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"]
+)
 def test_lesser_errors_are_only_counted(kind: Kind) -> None:
     bench = MonitorRig()
     for _ in range(2):
@@ -53,7 +63,12 @@ def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
     (found,) = bench.tick(unsent="can1")
     assert found.what == "bus_stuck"
     assert found.joint is None
-    for words in ("can1: ", "no frames sent for 30 ms", "no node acknowledges", "txqueuelen is below 64"):
+    for words in (
+        "can1: ",
+        "no frames sent for 30 ms",
+        "no node acknowledges",
+        "txqueuelen is below 64",
+    ):
         assert words in found.cause
     assert bench.tick(unsent="can1") == []
 
@@ -70,18 +85,32 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
     bench = MonitorRig()
     assert bench.ticks(2, stranger) == []
     (found,) = bench.tick(stranger)
-    assert found == FaultFinding("unknown_node", "node 9 is on the bus, but is not a joint of this robot")
+    assert found == FaultFinding(
+        "unknown_node", "node 9 is on the bus, but is not a joint of this robot"
+    )
     assert bench.ticks(5, stranger) == []
 
 
 @pytest.mark.parametrize(
     ("frame", "what", "words"),
     [
-        (load_layouts()[Opcode.SYNC].encode(0), "second_host", "another program commands the modules"),
+        (
+            load_layouts()[Opcode.SYNC].encode(0),
+            "second_host",
+            "another program commands the modules",
+        ),
         (load_layouts()[Opcode.SET_POINT].encode(2), "second_host", "end one of the two"),
         (load_layouts()[Opcode.SET_POINT].encode(40), "second_host", "end one of the two"),
-        (load_layouts()[Opcode.COMMAND].encode(2, action=CommandAction.STOP), "second_host", "another program"),
-        (CanFrame(frame_id(Opcode.EMERGENCY, 0), b"\x01"), "emergency", "a node on the bus sent an Emergency"),
+        (
+            load_layouts()[Opcode.COMMAND].encode(2, action=CommandAction.STOP),
+            "second_host",
+            "another program",
+        ),
+        (
+            CanFrame(frame_id(Opcode.EMERGENCY, 0), b"\x01"),
+            "emergency",
+            "a node on the bus sent an Emergency",
+        ),
     ],
 )
 def test_bus_watch_reports_a_second_host(frame: CanFrame, what: str, words: str) -> None:
@@ -98,7 +127,9 @@ def test_bus_watch_reports_a_second_host(frame: CanFrame, what: str, words: str)
 
 def test_what_another_host_may_have_changed_is_written_anew() -> None:
     bench = MonitorRig()
-    bench.reading.process_frame(load_layouts()[Opcode.PARAMETER_REQUEST].encode(2, index=1, operation=1))
+    bench.reading.process_frame(
+        load_layouts()[Opcode.PARAMETER_REQUEST].encode(2, index=1, operation=1)
+    )
     assert list_findings(bench.tick()) == [("second_host", None)]
     assert bench.watch.pop_changed_joints() == {0, 1, 2}
 
@@ -113,7 +144,9 @@ def test_bus_watch_identity_request_is_no_second_host() -> None:
 def test_a_module_is_not_silent_that_was_not_asked() -> None:
     bench = MonitorRig()
     for i in range(10):
-        assert list_findings(bench.tick(quiet, unsent="can0")) == ([("bus_stuck", None)] if i == 2 else [])
+        assert list_findings(bench.tick(quiet, unsent="can0")) == (
+            [("bus_stuck", None)] if i == 2 else []
+        )
     assert bench.ticks(2, quiet) == []
     assert list_findings(bench.tick(quiet)) == [("module_silent", 1)]
 

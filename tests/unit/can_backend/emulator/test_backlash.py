@@ -14,7 +14,9 @@ def test_backlash_drive_turns_through_gap_before_its_link_moves() -> None:
     run = config(3)
     joints = run.robot.joint_table
     backlash_rad = {"joint_2": BACKLASH_RAD}
-    links = InertiaModel(move_rotor_inertia_to_motor_side(run, joints, backlash_rad), InertiaSettings(drag_nm=0.02))
+    links = InertiaModel(
+        move_rotor_inertia_to_motor_side(run, joints, backlash_rad), InertiaSettings(drag_nm=0.02)
+    )
     physics_model = BacklashModel(links, joints, backlash_rad, seed=1)
     sound = InertiaModel(run, InertiaSettings(drag_nm=0.02))
     apart: list[float] = []

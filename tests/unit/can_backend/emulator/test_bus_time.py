@@ -13,7 +13,9 @@ FULL = compute_max_frame_bits(8)
 
 
 def frame(opcode: Opcode, node: int, mark: int = 0) -> CanFrame:
-    return CanFrame(frame_id(opcode, node), bytes((mark,)) + bytes(load_layouts()[opcode].length - 1))
+    return CanFrame(
+        frame_id(opcode, node), bytes((mark,)) + bytes(load_layouts()[opcode].length - 1)
+    )
 
 
 def test_a_frame_is_there_when_its_last_bit_is():
@@ -30,7 +32,9 @@ def test_the_lowest_id_wins_but_nobody_is_interrupted():
     for node in (3, 2, 1):
         bus.enqueue(node, frame(Opcode.JOINT_STATE, node), 10.0)
     order = [f.id for f in bus.pop_sent_frames(1e6)]
-    assert order == [frame_id(Opcode.HEARTBEAT, 9)] + [frame_id(Opcode.JOINT_STATE, n) for n in (1, 2, 3)]
+    assert order == [frame_id(Opcode.HEARTBEAT, 9)] + [
+        frame_id(Opcode.JOINT_STATE, n) for n in (1, 2, 3)
+    ]
 
 
 def test_a_module_keeps_its_own_order():
@@ -60,7 +64,9 @@ def test_bus_newer_setpoint_replaces_unsent_one_but_answers_are_kept():
         bus.enqueue(1, frame(Opcode.PARAMETER_ANSWER, 1, mark), 1.0 + mark)
     sent = bus.pop_sent_frames(1e6)
     assert [f.data[0] for f in sent if parse_opcode(f.id) == Opcode.JOINT_STATE] == [4]
-    assert [f.data[0] for f in sent if parse_opcode(f.id) == Opcode.PARAMETER_ANSWER] == list(range(5))
+    assert [f.data[0] for f in sent if parse_opcode(f.id) == Opcode.PARAMETER_ANSWER] == list(
+        range(5)
+    )
     assert bus.traffic(1e6).replaced == 4
 
 
@@ -71,7 +77,9 @@ def test_a_babbler_fills_what_the_others_leave():
         bus.enqueue(1, frame(Opcode.JOINT_STATE, 1, k), 1000.0 * k)
         bus.enqueue(2, frame(Opcode.GYRO, 2, k), 1000.0 * k)
     sent = bus.pop_sent_frames(100_000.0)
-    assert sum(parse_opcode(f.id) == Opcode.JOINT_STATE for f in sent) == 100, "a lower id still gets through"
+    assert sum(parse_opcode(f.id) == Opcode.JOINT_STATE for f in sent) == 100, (
+        "a lower id still gets through"
+    )
     assert sum(parse_opcode(f.id) == Opcode.GYRO for f in sent) == 0
     assert bus.traffic(100_000.0).load_since(BusTime().traffic(0.0)) == pytest.approx(1.0, abs=0.01)
     bus.set_babbling(5, None, 100_000.0)
@@ -82,7 +90,9 @@ def test_a_babbler_fills_what_the_others_leave():
 @pytest.mark.parametrize(("joints", "rate_hz"), [(13, 50), (18, 100), (30, 50)])
 def test_bus_measured_load_equals_computed_and_no_answer_is_late(joints: int, rate_hz: int):
     late, before, after, _ = measure_bus_traffic(joints, rate_hz)
-    assert after.load_since(before) == pytest.approx(compute_bus_load(joints, ReportSchedule(rate_hz)), rel=0.05)
+    assert after.load_since(before) == pytest.approx(
+        compute_bus_load(joints, ReportSchedule(rate_hz)), rel=0.05
+    )
     assert set(late) == {0}
     assert after.replaced == 0
 

@@ -9,7 +9,12 @@ import pytest
 from snakesim_can_backend.emulator.chain import MAX_AT_ONCE_US
 from snakesim_can_backend.emulator.frames import ALONG, ANGLE, FORCE
 from snakesim_can_backend.protocol.commands import make_command, make_sync
-from snakesim_can_backend.protocol.definitions import CommandAction, ModuleParameter, ModuleState, Opcode
+from snakesim_can_backend.protocol.definitions import (
+    CommandAction,
+    ModuleParameter,
+    ModuleState,
+    Opcode,
+)
 from snakesim_drivers.motion_capture.mocap_sample import MocapSample
 from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire.messages import Imu, JointMode
@@ -18,7 +23,9 @@ from snakesim_testing.can.module_rig import RigHost, chain, only, setpoint
 from snakesim_testing.hal.small_robots import make_pose
 
 G = 9.81
-POSE = make_pose(position_w=(1.0, 2.0, 0.1), velocity_w=(0.1, 0.0, 0.0), angular_velocity_w=(0.0, 0.0, 0.5))
+POSE = make_pose(
+    position_w=(1.0, 2.0, 0.1), velocity_w=(0.1, 0.0, 0.0), angular_velocity_w=(0.0, 0.0, 0.5)
+)
 
 
 class Pushed:
@@ -37,7 +44,10 @@ class Pushed:
         return np.full(len(self.angle_rad), 0.25)
 
     def loads(self):
-        return [LinkLoad(0, (0.02, 0.03, 0.0), (0.0, -5.0, 0.0)), LinkLoad(2, (0.05, -0.03, 0.0), (1.0, 12.0, 999.0))]
+        return [
+            LinkLoad(0, (0.02, 0.03, 0.0), (0.0, -5.0, 0.0)),
+            LinkLoad(2, (0.05, -0.03, 0.0), (1.0, 12.0, 999.0)),
+        ]
 
     def imu(self):
         links = list(range(len(self.angle_rad) + 1))
@@ -53,7 +63,9 @@ class Pushed:
         return POSE
 
 
-SENSORS: dict[str, Any] = {"robot__sensors": {"contacts": {"threshold_n": 0.1}, "imu": {}, "pose": {}}}
+SENSORS: dict[str, Any] = {
+    "robot__sensors": {"contacts": {"threshold_n": 0.1}, "imu": {}, "pose": {}}
+}
 
 
 ROUND = 1 << 32
@@ -118,9 +130,9 @@ def test_chain_contact_force_is_measured_by_neighbor_links():
     assert [c["touched"] for c in contacts] == [0, 1, 0, 0]
     assert contacts[1]["force_y"] == pytest.approx(12.0)
     assert contacts[1]["force_z"] == pytest.approx(204.75)
-    assert contacts[1]["along"] == pytest.approx(0.05) and contacts[1]["bearing"] == pytest.approx(-np.pi), (
-        "half a turn"
-    )
+    assert contacts[1]["along"] == pytest.approx(0.05) and contacts[1]["bearing"] == pytest.approx(
+        -np.pi
+    ), "half a turn"
     [tail] = only(frames, Opcode.TAIL_CONTACT)
     assert tail["force_y"] == pytest.approx(-5.0)
     assert tail["bearing"] == 0.0
@@ -143,7 +155,9 @@ def test_neighbours_take_turns_with_their_imus():
 
 def test_the_pose_is_sent_once_a_sync_before_the_answers():
     sent: list[bytes] = []
-    made = chain(config(6, **SENSORS), physics_model=Pushed(6), channels=["a", "b"], send_pose=sent.append)
+    made = chain(
+        config(6, **SENSORS), physics_model=Pushed(6), channels=["a", "b"], send_pose=sent.append
+    )
     for tick in range(3):
         for channel in (0, 1):
             made.receive(channel, make_sync(tick, tick * 10_000))

@@ -18,7 +18,9 @@ def test_emulator_typed_fault_starts_or_ends_immediately():
         assert parse_typed_fault(format_typed_fault(fault, begins=begins)) == (fault, begins)
 
 
-@pytest.mark.parametrize("text", ["mute", "mute joint_2 on", "boil joint_1", "mute joint_2=1", "x" * 400])
+@pytest.mark.parametrize(
+    "text", ["mute", "mute joint_2 on", "boil joint_1", "mute joint_2=1", "x" * 400]
+)
 def test_typed_fault_of_another_form_is_refused(text: str):
     with raises_error(ConfigError, code="injection/unknown-fault"):
         parse_typed_fault(text)

@@ -72,10 +72,15 @@ def test_position_targets_end_at_the_angle_limit():
     assert module.demand.target == -0.5
 
 
-@pytest.mark.parametrize(("sensed", "fault"), [("leak", ModuleFault.LEAK), ("hot", ModuleFault.OVERHEAT)])
+@pytest.mark.parametrize(
+    ("sensed", "fault"), [("leak", ModuleFault.LEAK), ("hot", ModuleFault.OVERHEAT)]
+)
 def test_firmware_fault_remains_until_cause_is_gone_and_cleared(sensed: str, fault: ModuleFault):
     module = armed()
-    module.health.leak, module.health.winding_c = sensed == "leak", 110.0 if sensed == "hot" else 20.0
+    module.health.leak, module.health.winding_c = (
+        sensed == "leak",
+        110.0 if sensed == "hot" else 20.0,
+    )
     module.poll(BOOTED + MS)
     [beat] = only(module.frames, Opcode.HEARTBEAT)
     assert beat[f"fault_{fault.name.lower()}"] == 1
@@ -103,7 +108,9 @@ def test_firmware_fault_remains_until_cause_is_gone_and_cleared(sensed: str, fau
         (0, 15, False),  # of before
     ],
 )
-def test_firmware_out_of_sequence_setpoint_is_dropped_and_counting_continues(first: int, count: int, taken: bool):
+def test_firmware_out_of_sequence_setpoint_is_dropped_and_counting_continues(
+    first: int, count: int, taken: bool
+):
     module = armed()
     drive(module, first, BOOTED, target=1.0)
     drive(module, count, BOOTED, target=2.0)
@@ -190,9 +197,12 @@ def test_firmware_uptime_saturates_at_end_of_range() -> None:
     module = booted()
     module._boot_start_us = -(2**32 - 50) * MS
     beats = [
-        load_layouts()[Opcode.HEARTBEAT].decode(module.heartbeat(at_us).data) for at_us in (0.0, 100 * MS, 500 * MS)
+        load_layouts()[Opcode.HEARTBEAT].decode(module.heartbeat(at_us).data)
+        for at_us in (0.0, 100 * MS, 500 * MS)
     ]
-    assert [beat["uptime"] for beat in beats] == pytest.approx([4294967.246, 4294967.295, 4294967.295], abs=1e-6)
+    assert [beat["uptime"] for beat in beats] == pytest.approx(
+        [4294967.246, 4294967.295, 4294967.295], abs=1e-6
+    )
 
 
 def test_every_sync_is_answered_with_its_own_count():
@@ -258,7 +268,11 @@ def test_firmware_drives_only_when_armed_with_valid_setpoints(sent):
         module.poll(now_us)
         before, state, refused = module._watchdog_fed_us, module.state, module.rejected_frame_count
         give(module, frame, now_us)
-        if module._watchdog_fed_us != before and state == ModuleState.ARMED and module.state == ModuleState.ARMED:
+        if (
+            module._watchdog_fed_us != before
+            and state == ModuleState.ARMED
+            and module.state == ModuleState.ARMED
+        ):
             assert frame.id >> 6 == Opcode.SET_POINT
             assert module.rejected_frame_count == refused
         if module.state not in (ModuleState.ARMED, ModuleState.STOPPING):

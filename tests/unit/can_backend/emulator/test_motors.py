@@ -30,7 +30,9 @@ def test_torque_mode_follows_as_a_first_order_lag():
     motors, _ = motor()
     drive(motors, JointMode.TORQUE, 2.0)
     for k in range(1, 40):
-        assert motors.compute_torques(REST, REST)[0] == pytest.approx(2.0 * (1 - np.exp(-k * STEP_S / RESPONSE_S)))
+        assert motors.compute_torques(REST, REST)[0] == pytest.approx(
+            2.0 * (1 - np.exp(-k * STEP_S / RESPONSE_S))
+        )
 
 
 def test_a_motor_without_response_time_answers_at_once():
@@ -55,7 +57,9 @@ def test_motor_mode_change_moves_torque_at_motor_response(mode):
     drive(motors, JointMode.TORQUE, 3.0)
     motors.torque_nm[:] = 3.0
     drive(motors, JointMode.PASSIVE, 0.0)
-    assert motors.compute_torques(REST, REST)[0] == pytest.approx(3.0 * np.exp(-STEP_S / RESPONSE_S))
+    assert motors.compute_torques(REST, REST)[0] == pytest.approx(
+        3.0 * np.exp(-STEP_S / RESPONSE_S)
+    )
 
 
 def test_motor_torque_stays_within_rating_and_setpoint_limit():
@@ -87,9 +91,13 @@ def test_motor_position_mode_at_1_ms_is_stable_and_arrives():
     physics_model = InertiaModel(run, InertiaSettings())
     motors, m = PowerStages(run.robot, physics_model.step_s), run.robot.motor
     for i in range(13):
-        motors.set_demand(i, JointMode.POSITION, 0.4, 7.0, m.stiffness_nm_per_rad, m.damping_nm_s_per_rad, 7.5)
+        motors.set_demand(
+            i, JointMode.POSITION, 0.4, 7.0, m.stiffness_nm_per_rad, m.damping_nm_s_per_rad, 7.5
+        )
     for _ in range(1000):
-        physics_model.advance(motors.compute_torques(physics_model.angle_rad, physics_model.velocity_rad_s))
+        physics_model.advance(
+            motors.compute_torques(physics_model.angle_rad, physics_model.velocity_rad_s)
+        )
     assert physics_model.angle_rad == pytest.approx([0.4] * 13, abs=0.1 / 60 + 1e-4)
     assert np.abs(physics_model.velocity_rad_s).max() < 1e-3
 
@@ -142,15 +150,23 @@ def test_the_simulator_s_motors_do_the_same():
         (JointMode.VELOCITY, 3 * swing),
         (JointMode.TORQUE, 5 * swing),
     ):
-        damping = motor.damping_nm_s_per_rad if mode == JointMode.POSITION else motor.velocity_gain_nm_s_per_rad
+        damping = (
+            motor.damping_nm_s_per_rad
+            if mode == JointMode.POSITION
+            else motor.velocity_gain_nm_s_per_rad
+        )
         for i in range(count):
             gains = (motor.stiffness_nm_per_rad, damping, limits.speed_rad_s)
             motors.set_demand(i, mode, float(target[i]), limits.torque_nm, *gains)
         for _ in range(4):
-            sim.enact(SafeSetpoints([mode] * count, target.tolist(), [limits.torque_nm] * count), "armed")
+            sim.enact(
+                SafeSetpoints([mode] * count, target.tolist(), [limits.torque_nm] * count), "armed"
+            )
             sim.advance()
             for _ in range(round(run.period_ns * 1e-9 / physics_model.step_s)):
-                physics_model.advance(motors.compute_torques(physics_model.angle_rad, physics_model.velocity_rad_s))
+                physics_model.advance(
+                    motors.compute_torques(physics_model.angle_rad, physics_model.velocity_rad_s)
+                )
         truth = sim.true_state()
         assert physics_model.angle_rad == pytest.approx(truth.angles_rad, abs=1e-3)
         assert motors.torque_nm == pytest.approx(truth.torques_nm, abs=0.05)

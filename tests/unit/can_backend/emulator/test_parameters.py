@@ -59,6 +59,12 @@ def test_nan_is_refused():
 def test_an_armed_module_may_be_read_and_not_written():
     module = armed()
     assert ask(module, ModuleParameter.DAMPING, 1.0)[0] == ParameterResult.NOT_WHILE_ARMED
-    assert ask(module, ModuleParameter.DAMPING, operation=ParameterOperation.SAVE)[0] == ParameterResult.NOT_WHILE_ARMED
-    assert ask(module, ModuleParameter.DAMPING, operation=ParameterOperation.READ)[0] == ParameterResult.DONE
+    assert (
+        ask(module, ModuleParameter.DAMPING, operation=ParameterOperation.SAVE)[0]
+        == ParameterResult.NOT_WHILE_ARMED
+    )
+    assert (
+        ask(module, ModuleParameter.DAMPING, operation=ParameterOperation.READ)[0]
+        == ParameterResult.DONE
+    )
     assert ask(module, ModuleParameter.DAMPING, operation=3)[0] == ParameterResult.UNKNOWN_OPERATION

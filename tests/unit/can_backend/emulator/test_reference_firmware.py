@@ -5,7 +5,10 @@ from typing import Any
 
 import pytest
 
-from snakesim_can_backend.emulator.reference_firmware import describe_modules, validate_firmware_settings
+from snakesim_can_backend.emulator.reference_firmware import (
+    describe_modules,
+    validate_firmware_settings,
+)
 from snakesim_can_backend.settings import CanSettings, MountedModule
 from snakesim_hal.base.errors import ConfigError
 from snakesim_native.libraries import PACKAGE
@@ -22,7 +25,9 @@ def read_modules(settings: CanSettings | None = None, **dotted: Any) -> dict[str
     modules: dict[str, dict[str, float]] = {}
     for line in describe_modules(config(**dotted), settings or CanSettings()).splitlines():
         name, *words = line.split()
-        modules[name] = {key: float(value) for key, value in zip(words[::2], words[1::2], strict=True)}
+        modules[name] = {
+            key: float(value) for key, value in zip(words[::2], words[1::2], strict=True)
+        }
     return modules
 
 

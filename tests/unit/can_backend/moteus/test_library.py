@@ -38,7 +38,10 @@ def theirs(number: int = 1, **options: Any) -> moteus.Controller:
 
 
 def as_frame(command: Any, number: int = 1) -> CanFrame:
-    return CanFrame((0x8000 if command.reply_required else 0) | command.source << 8 | number, bytes(command.data))
+    return CanFrame(
+        (0x8000 if command.reply_required else 0) | command.source << 8 | number,
+        bytes(command.data),
+    )
 
 
 def test_registers_modes_and_faults_have_their_numbers() -> None:
@@ -58,14 +61,34 @@ def test_registers_modes_and_faults_have_their_numbers() -> None:
 @pytest.mark.parametrize(
     "law",
     [
-        {"position": 0.25, "velocity": 0.0, "feedforward_torque": 0.0, "kp_scale": 0.5, "kd_scale": 0.75},
-        {"position": math.nan, "velocity": -1.5, "feedforward_torque": 0.0, "kp_scale": 0.0, "kd_scale": 1.0},
-        {"position": math.nan, "velocity": 0.0, "feedforward_torque": -2.5, "kp_scale": 0.0, "kd_scale": 0.0},
+        {
+            "position": 0.25,
+            "velocity": 0.0,
+            "feedforward_torque": 0.0,
+            "kp_scale": 0.5,
+            "kd_scale": 0.75,
+        },
+        {
+            "position": math.nan,
+            "velocity": -1.5,
+            "feedforward_torque": 0.0,
+            "kp_scale": 0.0,
+            "kd_scale": 1.0,
+        },
+        {
+            "position": math.nan,
+            "velocity": 0.0,
+            "feedforward_torque": -2.5,
+            "kp_scale": 0.0,
+            "kd_scale": 0.0,
+        },
     ],
     ids=["position", "velocity", "torque"],
 )
 def test_moteus_command_frame_equals_that_of_its_library(law: dict[str, float]) -> None:
-    floats = dict.fromkeys((*law, "maximum_torque", "watchdog_timeout", "velocity_limit", "accel_limit"), moteus.F32)
+    floats = dict.fromkeys(
+        (*law, "maximum_torque", "watchdog_timeout", "velocity_limit", "accel_limit"), moteus.F32
+    )
     resolution = moteus.PositionResolution()
     for name, kind in floats.items():
         setattr(resolution, name, kind)
@@ -79,20 +102,32 @@ def test_moteus_command_frame_equals_that_of_its_library(law: dict[str, float]) 
     ours = protocol.make_frame(
         0,
         5,
-        protocol.encode_subframe(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.POSITION),
-        protocol.encode_subframe(protocol.WRITE, protocol.FLOAT, protocol.Register.COMMAND, *law.values(), 3.0),
-        protocol.encode_subframe(protocol.WRITE, protocol.FLOAT, protocol.Register.WATCHDOG, 0.125, -1.0, -1.0),
+        protocol.encode_subframe(
+            protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.POSITION
+        ),
+        protocol.encode_subframe(
+            protocol.WRITE, protocol.FLOAT, protocol.Register.COMMAND, *law.values(), 3.0
+        ),
+        protocol.encode_subframe(
+            protocol.WRITE, protocol.FLOAT, protocol.Register.WATCHDOG, 0.125, -1.0, -1.0
+        ),
     )
-    assert parse_registers(ours.data).command == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
+    assert parse_registers(ours.data).command == pytest.approx(
+        parse_registers(sent.data).command, nan_ok=True
+    )
     assert as_frame(sent, 5).id == ours.id
     assert len(ours.data) == 48
-    read = [one for one in protocol.decode_subframes(bytes(sent.data)) if one.kind == protocol.WRITE]
+    read = [
+        one for one in protocol.decode_subframes(bytes(sent.data)) if one.kind == protocol.WRITE
+    ]
     values = {one.register + k: value for one in read for k, value in enumerate(one.values)}
     assert values == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
 
 
 def test_moteus_stop_frame_and_extended_ids_equal_its_library() -> None:
-    stop = protocol.encode_subframe(protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.STOPPED)
+    stop = protocol.encode_subframe(
+        protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.STOPPED
+    )
     assert protocol.make_frame(0, 1, stop) == as_frame(theirs().make_stop())
     asked = protocol.make_frame(0, 1, *MOTION_REQUESTS, reply=True)
     assert asked.id == as_frame(theirs().make_query()).id == 0x8001
@@ -110,8 +145,12 @@ def test_moteus_stop_frame_and_extended_ids_equal_its_library() -> None:
 def bus() -> Any:
     """Emulated controllers of a robot, and their bus."""
     wire, clock = VirtualWire("moteus-theirs", fd=True), DriverClock(CONFIG)
-    emulator = MoteusBackend.make_emulator(CONFIG, MoteusSettings(physics_model="inertia"), [wire], clock, None)
-    with can.Bus(interface="virtual", channel="moteus-theirs", protocol=can.CanProtocol.CAN_FD) as ours:
+    emulator = MoteusBackend.make_emulator(
+        CONFIG, MoteusSettings(physics_model="inertia"), [wire], clock, None
+    )
+    with can.Bus(
+        interface="virtual", channel="moteus-theirs", protocol=can.CanProtocol.CAN_FD
+    ) as ours:
         yield ours, emulator, clock
     emulator.close()
 
@@ -141,19 +180,25 @@ def test_moteus_library_client_drives_and_reads_our_emulator(bus: Any) -> None:
         assert said[moteus.Register.MODE] == moteus.Mode.POSITION
         assert said[moteus.Register.FAULT] == 0
         assert said[moteus.Register.POSITION] == pytest.approx(0.05, abs=max(close, 0.003))
-        assert said[moteus.Register.VOLTAGE] == pytest.approx(emulator.body.read_supply(2)[0], abs=0.3)
+        assert said[moteus.Register.VOLTAGE] == pytest.approx(
+            emulator.body.read_supply(2)[0], abs=0.3
+        )
     clock.robot_time_ns += 150_000_000
     emulator()
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT
     ask(client.make_position(position=0.1, velocity=0.0))
-    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT, "only a stop ends it"
+    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT, (
+        "only a stop ends it"
+    )
     ask(client.make_stop())
     assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
     ask(client.make_position(position=0.1, velocity=0.0))
     everybody = theirs(127)
     ours.send(to_python_can(as_frame(everybody.make_stop(), 127), fd=True))
     emulator()
-    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED, "127 is the broadcast address"
+    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED, (
+        "127 is the broadcast address"
+    )
 
 
 def test_moteus_library_reads_every_frame_of_a_run() -> None:
@@ -166,7 +211,10 @@ def test_moteus_library_reads_every_frame_of_a_run() -> None:
     for tick in range(1, 20):
         joints = backend.sample(tick, tick * CONFIG.period_ns).joints
         backend.enact(
-            SafeSetpoints([JointMode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()), "armed"
+            SafeSetpoints(
+                [JointMode.POSITION] * JOINTS, [0.2] * JOINTS, [1.5] * JOINTS, frozenset()
+            ),
+            "armed",
         )
         backend.advance()
     backend.close()
@@ -175,7 +223,10 @@ def test_moteus_library_reads_every_frame_of_a_run() -> None:
     assert not any(one.errors for one in read)
     command = next(one.command for one in read if len(one.command) > 2)
     motor = CONFIG.robot.joint_table[0].motor
-    kp = command[moteus.Register.COMMAND_KP_SCALE] * get_configured_gains(CONFIG.robot.joint_table, MoteusSettings())[0]
+    kp = (
+        command[moteus.Register.COMMAND_KP_SCALE]
+        * get_configured_gains(CONFIG.robot.joint_table, MoteusSettings())[0]
+    )
     assert command[moteus.Register.COMMAND_POSITION] == pytest.approx(0.2 / (2 * math.pi))
     assert kp == pytest.approx(motor.stiffness_nm_per_rad * 2 * math.pi)
     assert command[moteus.Register.COMMAND_POSITION_MAX_TORQUE] == 1.5
@@ -188,7 +239,9 @@ def test_moteus_ids_of_host_and_broadcast_are_no_controllers(number: int) -> Non
     wrong = config(backend="moteus", robot__joints={"joint_2": {"id": number}})
     with raises_error(ConfigError, code="drive/unsupported-setting"):
         MoteusBackend.check(wrong, MoteusSettings())
-    MoteusBackend.check(config(backend="moteus", robot__joints={"joint_2": {"id": 126}}), MoteusSettings())
+    MoteusBackend.check(
+        config(backend="moteus", robot__joints={"joint_2": {"id": 126}}), MoteusSettings()
+    )
 
 
 def test_moteus_real_controllers_need_configuration_and_reference() -> None:

@@ -29,7 +29,10 @@ SAME = {
     MessageId.SET_STATE: ("Set_Axis_State", {"Axis_Requested_State": 8}),
     MessageId.MOTION: ("Get_Encoder_Estimates", {"Pos_Estimate": 1.5, "Vel_Estimate": -0.25}),
     MessageId.SET_MODE: ("Set_Controller_Mode", {"Control_Mode": 3, "Input_Mode": 1}),
-    MessageId.SET_POSITION: ("Set_Input_Pos", {"Input_Pos": -2.5, "Vel_FF": 0.125, "Torque_FF": -0.5}),
+    MessageId.SET_POSITION: (
+        "Set_Input_Pos",
+        {"Input_Pos": -2.5, "Vel_FF": 0.125, "Torque_FF": -0.5},
+    ),
     MessageId.SET_VELOCITY: ("Set_Input_Vel", {"Input_Vel": 3.0, "Input_Torque_FF": -0.75}),
     MessageId.SET_TORQUE: ("Set_Input_Torque", {"Input_Torque": -1.25}),
     MessageId.SET_LIMITS: ("Set_Limits", {"Velocity_Limit": 2.0, "Current_Limit": 7.5}),
@@ -52,22 +55,40 @@ def test_odrive_database_and_our_codec_read_each_other(message: MessageId) -> No
     assert frame.id == theirs.frame_id
     assert {key: read[key] for key in values} == pytest.approx(values)
     data = theirs.encode({signal.name: 0 for signal in theirs.signals} | values)
-    assert PAYLOADS[message].unpack(data[: PAYLOADS[message].size])[: len(ours)] == pytest.approx(ours)
+    assert PAYLOADS[message].unpack(data[: PAYLOADS[message].size])[: len(ours)] == pytest.approx(
+        ours
+    )
 
 
 def test_messages_without_data_and_ids_of_other_axes_are_theirs() -> None:
-    assert DATABASE.get_message_by_name("Axis0_Clear_Errors").frame_id == encode_message(0, MessageId.CLEAR_ERRORS).id
+    assert (
+        DATABASE.get_message_by_name("Axis0_Clear_Errors").frame_id
+        == encode_message(0, MessageId.CLEAR_ERRORS).id
+    )
     assert encode_message(0, MessageId.CLEAR_ERRORS) == CanFrame(24, b"")
     assert encode_request(3, MessageId.MOTION) == CanFrame(3 << 5 | 9, b"")
     assert split_id(CanFrame(62 << 5 | 0x1B, b"")) == (62, MessageId.SET_VELOCITY_GAINS)
 
 
 def test_states_modes_and_senders_are_theirs() -> None:
-    states = DATABASE.get_message_by_name("Axis0_Heartbeat").get_signal_by_name("Axis_State").choices
+    states = (
+        DATABASE.get_message_by_name("Axis0_Heartbeat").get_signal_by_name("Axis_State").choices
+    )
     assert states[AxisState.IDLE].name == "IDLE"
     assert states[AxisState.CLOSED_LOOP].name == "CLOSED_LOOP_CONTROL"
-    modes = DATABASE.get_message_by_name("Axis0_Set_Controller_Mode").get_signal_by_name("Control_Mode").choices
-    assert [modes[one].name for one in ControlMode] == ["TORQUE_CONTROL", "VELOCITY_CONTROL", "POSITION_CONTROL"]
-    theirs = {message: DATABASE.get_message_by_name(f"Axis0_{name}") for message, (name, _) in SAME.items()}
+    modes = (
+        DATABASE.get_message_by_name("Axis0_Set_Controller_Mode")
+        .get_signal_by_name("Control_Mode")
+        .choices
+    )
+    assert [modes[one].name for one in ControlMode] == [
+        "TORQUE_CONTROL",
+        "VELOCITY_CONTROL",
+        "POSITION_CONTROL",
+    ]
+    theirs = {
+        message: DATABASE.get_message_by_name(f"Axis0_{name}")
+        for message, (name, _) in SAME.items()
+    }
     of_hosts = {message for message, described in theirs.items() if "Master" in described.senders}
     assert of_hosts == FROM_HOST - {MessageId.ESTOP, MessageId.CLEAR_ERRORS}

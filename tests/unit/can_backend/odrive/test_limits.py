@@ -12,7 +12,12 @@ import pytest
 from snakesim_can_backend.can_drives.drives import CanDrives, CanDrivesContext
 from snakesim_can_backend.odrive.backend import OdriveBackend
 from snakesim_can_backend.odrive.endpoints import EMULATED, AxisSetting, read_endpoints
-from snakesim_can_backend.odrive.protocol import MessageId, decode_setting_answer, encode_setting_request, split_id
+from snakesim_can_backend.odrive.protocol import (
+    MessageId,
+    decode_setting_answer,
+    encode_setting_request,
+    split_id,
+)
 from snakesim_can_backend.odrive.settings import MountedAxis, OdriveSettings
 from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_hal.base.errors import BackendError, ConfigError
@@ -54,7 +59,9 @@ class Robot(DriveRig):
 
     def currents_a(self, joint: int) -> list[float]:
         """Current limits that the driver has sent to an axis."""
-        limits = [frame for frame in self.sent if split_id(frame) == (joint + 1, MessageId.SET_LIMITS)]
+        limits = [
+            frame for frame in self.sent if split_id(frame) == (joint + 1, MessageId.SET_LIMITS)
+        ]
         return [struct.unpack("<ff", frame.data)[1] for frame in limits]
 
 
@@ -69,7 +76,8 @@ def endpoints_file(path: Path, **changed: Any) -> str:
     """A file as ODrive publishes one, of the emulated axes' firmware, with ids of its own."""
     types = {AxisSetting.WATCHDOG_ENABLED: "bool"}
     endpoints: dict[str, Any] = {
-        setting: {"id": 300 + i, "type": types.get(setting, "float")} for i, setting in enumerate(AxisSetting)
+        setting: {"id": 300 + i, "type": types.get(setting, "float")}
+        for i, setting in enumerate(AxisSetting)
     }
     content = {
         "fw_version": "0.6.11-1",
@@ -88,8 +96,11 @@ def test_odrive_arming_never_raises_configured_current_limit(robot: Robot) -> No
     assert axis.current_soft_max_a == pytest.approx(NEEDED_A)
     robot.run(5, "disarmed")
     robot.run(30, "armed")
-    assert robot.currents_a(1) and max(robot.currents_a(1)) == pytest.approx(1.0 / CONSTANT), "the setpoint's 1 N·m"
-    axis.current_soft_max_a = 10.0  # configured anew, behind the driver's back: the next start reads it
+    assert robot.currents_a(1) and max(robot.currents_a(1)) == pytest.approx(1.0 / CONSTANT), (
+        "the setpoint's 1 N·m"
+    )
+    # Configured anew, behind the driver's back: the next start reads it.
+    axis.current_soft_max_a = 10.0
     with raises_error(BackendError, code="drive/not-complete", field="joint_2"):
         robot.backend._drives.bring_up()
 
@@ -111,7 +122,8 @@ def test_odrive_lowered_limit_is_restored_when_idle_or_named(
     robot.run(30, "disarmed")
     assert axes[0].current_soft_max_a == pytest.approx(NEEDED_A)
     robot.run(30, "armed")
-    robot.backend._clock.robot_time_ns += 190_000_000  # the driver is gone, and the watchdogs stop the axes
+    # The driver is gone, and the watchdogs stop the axes.
+    robot.backend._clock.robot_time_ns += 190_000_000
     with raises_error(BackendError, code="drive/not-complete", field="joint_1"):
         robot.backend._drives.bring_up()
     for i in range(JOINTS):
@@ -124,14 +136,19 @@ def test_odrive_joint_torque_above_driver_limit_is_refused_before_start() -> Non
     config = Robot.configuration()
     with raises_error(ConfigError, code="drive/unsupported-setting"):
         OdriveBackend.check(config, OdriveSettings(channels=REAL))
-    with raises_error(ConfigError, code="drive/unsupported-setting", field="backends.odrive.max_current_a"):
+    with raises_error(
+        ConfigError, code="drive/unsupported-setting", field="backends.odrive.max_current_a"
+    ):
         OdriveBackend.check(config, OdriveSettings(max_current_a=200.0))
     OdriveBackend.check(config, OdriveSettings(channels=REAL, max_current_a=240.0))
 
 
 @pytest.mark.parametrize(("max_current_a", "max_a"), [(None, 1.0), (200.0, 200.0)])
 def test_odrive_unread_axis_is_capped_and_logged_as_unknown(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, max_current_a: float | None, max_a: float
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    max_current_a: float | None,
+    max_a: float,
 ) -> None:
     made = CanDrives.__init__
 
@@ -145,7 +162,9 @@ def test_odrive_unread_axis_is_capped_and_logged_as_unknown(
     robot.run(20, "armed")
     robot.backend.close()
     assert max(robot.currents_a(0)) == pytest.approx(max_a)
-    assert f"limits of these axes are unknown: the driver sets no more than {max_a:g} A" in caplog.text
+    assert (
+        f"limits of these axes are unknown: the driver sets no more than {max_a:g} A" in caplog.text
+    )
 
 
 # --- watchdog and speed --------------------------------------------------------------------------------------
@@ -191,18 +210,25 @@ def test_a_file_of_another_firmware_is_refused(tmp_path: Path) -> None:
         {"fw_version": 6},
     ],
 )
-def test_odrive_file_of_another_kind_is_refused_before_start(tmp_path: Path, changed: dict[str, Any]) -> None:
+def test_odrive_file_of_another_kind_is_refused_before_start(
+    tmp_path: Path, changed: dict[str, Any]
+) -> None:
     path = endpoints_file(tmp_path / "flat_endpoints.json", **changed)
     with raises_error(ConfigError, code="file/not-readable"):
         OdriveBackend.check(make_run_config(backend="odrive"), OdriveSettings(endpoints=[path]))
     with raises_error(ConfigError, code="file/not-readable", field="backends.odrive.endpoints"):
         OdriveBackend.check(
-            make_run_config(backend="odrive"), OdriveSettings(endpoints=[str(tmp_path / "nothing.json")])
+            make_run_config(backend="odrive"),
+            OdriveSettings(endpoints=[str(tmp_path / "nothing.json")]),
         )
 
 
-def test_odrive_axis_without_readable_configuration_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("snakesim_can_backend.odrive.emulator.EmulatedOdrive._answer_setting", lambda *_: None)
+def test_odrive_axis_without_readable_configuration_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        "snakesim_can_backend.odrive.emulator.EmulatedOdrive._answer_setting", lambda *_: None
+    )
     with raises_error(BackendError, code="drive/not-complete", field="joint_1"):
         Robot()
 
@@ -210,6 +236,9 @@ def test_odrive_axis_without_readable_configuration_is_refused(monkeypatch: pyte
 def test_questions_and_answers_are_those_of_odrives_examples() -> None:
     """Their form is `<BHB` and the value: opcode, endpoint, reserved; `can_param_access.py` of ODriveResources."""
     assert encode_setting_request(3, 271) == CanFrame(3 << 5 | 0x04, struct.pack("<BHB", 0, 271, 0))
-    assert decode_setting_answer(struct.pack("<BHBf", 0, 271, 0, 12.5)) == (271, struct.pack("<f", 12.5))
+    assert decode_setting_answer(struct.pack("<BHBf", 0, 271, 0, 12.5)) == (
+        271,
+        struct.pack("<f", 12.5),
+    )
     with pytest.raises(struct.error):
         decode_setting_answer(b"\0\1")

@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_can_backend.protocol.codec import CodecError, FrameSignal, MessageLayout, load_database, load_layouts
+from snakesim_can_backend.protocol.codec import (
+    CodecError,
+    FrameSignal,
+    MessageLayout,
+    load_database,
+    load_layouts,
+)
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
     WITH_CHECKSUM,
@@ -45,9 +51,12 @@ def slack(signal: FrameSignal, value: float) -> float:
 
 def raw_numbers(signal: FrameSignal) -> st.SearchStrategy[int]:
     if signal.is_float:
-        return st.floats(-(2.0**127), 2.0**127, width=32).map(lambda v: FrameSignal.encode(signal, v))
+        return st.floats(-(2.0**127), 2.0**127, width=32).map(
+            lambda v: FrameSignal.encode(signal, v)
+        )
     return st.integers(
-        round((signal.low - signal.offset) / signal.scale), round((signal.high - signal.offset) / signal.scale)
+        round((signal.low - signal.offset) / signal.scale),
+        round((signal.high - signal.offset) / signal.scale),
     )
 
 
@@ -58,7 +67,11 @@ def contents(draw: st.DrawFn, layout: MessageLayout) -> dict[str, int]:
     numbers = {name: draw(raw_numbers(layout.signals[name])) for name in names}
     if layout.opcode == Opcode.SET_POINT:
         carried = ("", *TARGETS)[numbers["mode"]]
-        numbers = {name: number for name, number in numbers.items() if name not in TARGETS or name == carried}
+        numbers = {
+            name: number
+            for name, number in numbers.items()
+            if name not in TARGETS or name == carried
+        }
     return numbers
 
 
@@ -90,9 +103,15 @@ def test_both_ends_of_a_range_fit_and_come_back(layout: MessageLayout, signal: F
 
 @each_signal
 @pytest.mark.parametrize("wrong", ["above", "below", math.nan, math.inf, -math.inf])
-def test_codec_value_out_of_range_is_refused(layout: MessageLayout, signal: FrameSignal, wrong: float | str) -> None:
+def test_codec_value_out_of_range_is_refused(
+    layout: MessageLayout, signal: FrameSignal, wrong: float | str
+) -> None:
     step = 1e32 if signal.is_float else signal.scale
-    value = {"above": signal.high + step, "below": signal.low - step}[wrong] if isinstance(wrong, str) else wrong
+    value = (
+        {"above": signal.high + step, "below": signal.low - step}[wrong]
+        if isinstance(wrong, str)
+        else wrong
+    )
     with pytest.raises(CodecError) as caught:
         layout.encode(1, **{signal.name: value})
     assert isinstance(caught.value, ValueError)
@@ -106,9 +125,15 @@ def test_codec_value_out_of_range_is_refused(layout: MessageLayout, signal: Fram
 @pytest.mark.slow
 @given(any_layout, st.data(), nodes)
 @often
-def test_cantools_writes_the_same_bytes(layout: MessageLayout, data: st.DataObject, node: int) -> None:
+def test_cantools_writes_the_same_bytes(
+    layout: MessageLayout, data: st.DataObject, node: int
+) -> None:
     numbers = data.draw(contents(layout))
-    values = {n: min(max(s.decode(numbers[n]), s.low), s.high) for n, s in layout.signals.items() if n in numbers}
+    values = {
+        n: min(max(s.decode(numbers[n]), s.low), s.high)
+        for n, s in layout.signals.items()
+        if n in numbers
+    }
     frame = layout.encode(node, **values)
     theirs: dict[str, Any] = dict(values)
     if layout.opcode in WITH_CHECKSUM:
@@ -118,11 +143,17 @@ def test_cantools_writes_the_same_bytes(layout: MessageLayout, data: st.DataObje
 
 @given(any_layout, st.data())
 @often
-def test_any_bytes_are_read_as_cantools_reads_them(layout: MessageLayout, data: st.DataObject) -> None:
+def test_any_bytes_are_read_as_cantools_reads_them(
+    layout: MessageLayout, data: st.DataObject
+) -> None:
     content = data.draw(st.binary(min_size=layout.length, max_size=layout.length))
     if layout.opcode == Opcode.SET_POINT:
-        content = bytes((content[0] & 0xF0 | content[0] & 0x03,)) + content[1:]  # cantools knows no other mode
-    ours, theirs = layout.decode(content), DATABASE.decode_message(layout.name, content, decode_choices=False)
+        # Cantools knows no other mode.
+        content = bytes((content[0] & 0xF0 | content[0] & 0x03,)) + content[1:]
+    ours, theirs = (
+        layout.decode(content),
+        DATABASE.decode_message(layout.name, content, decode_choices=False),
+    )
     assert isinstance(theirs, dict)
     for name, value in theirs.items():
         assert ours[name] == pytest.approx(value, rel=1e-12, abs=1e-15, nan_ok=True), name
@@ -133,7 +164,9 @@ def test_any_bytes_are_read_as_cantools_reads_them(layout: MessageLayout, data: 
 
 @given(any_layout, st.data(), nodes)
 @often
-def test_a_writer_writes_what_a_reader_reads(layout: MessageLayout, data: st.DataObject, node: int) -> None:
+def test_a_writer_writes_what_a_reader_reads(
+    layout: MessageLayout, data: st.DataObject, node: int
+) -> None:
     numbers = data.draw(contents(layout))
     names = data.draw(st.permutations(list(numbers)))
     frame = layout.make_writer(*names)(node, [numbers[name] for name in names])

@@ -20,7 +20,11 @@ from snakesim_hal.wire.messages import JointMode, LifecycleState
 from snakesim_testing.can.frames import read
 
 LIFECYCLES: tuple[LifecycleState, ...] = get_args(LifecycleState)
-TARGET = {JointMode.POSITION: "position", JointMode.VELOCITY: "velocity", JointMode.TORQUE: "torque"}
+TARGET = {
+    JointMode.POSITION: "position",
+    JointMode.VELOCITY: "velocity",
+    JointMode.TORQUE: "torque",
+}
 
 
 def one(mode: JointMode, target: float, limit_nm: float = 4.0) -> CanFrame:
@@ -32,7 +36,9 @@ def one(mode: JointMode, target: float, limit_nm: float = 4.0) -> CanFrame:
 
 
 @given(st.sampled_from(list(TARGET)), st.floats(-3.2767, 3.2767), st.floats(0, 65.535))
-def test_targets_and_limits_are_rounded_to_the_nearest_step(mode: JointMode, target: float, limit_nm: float) -> None:
+def test_targets_and_limits_are_rounded_to_the_nearest_step(
+    mode: JointMode, target: float, limit_nm: float
+) -> None:
     said = read(one(mode, target, limit_nm))
     step = load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
     assert abs(said[TARGET[mode]] - target) <= step / 2 * (1 + 1e-9)
@@ -40,7 +46,9 @@ def test_targets_and_limits_are_rounded_to_the_nearest_step(mode: JointMode, tar
 
 
 @given(st.sampled_from(list(TARGET)), st.floats(33, 1e9) | st.just(math.inf), st.booleans())
-def test_what_is_beyond_the_range_is_sent_as_its_end(mode: JointMode, beyond: float, negative: bool) -> None:
+def test_what_is_beyond_the_range_is_sent_as_its_end(
+    mode: JointMode, beyond: float, negative: bool
+) -> None:
     said = read(one(mode, -beyond if negative else beyond, 65.6 + beyond))
     most = 32767 * load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
     assert said[TARGET[mode]] == pytest.approx(-most if negative else most)
@@ -62,7 +70,8 @@ def test_joints_and_set_points_must_be_as_many() -> None:
 # --- changes of the robot's lifecycle ----------------------------------------------------------------------
 
 CLEAR, ARM, STOP, DISARM = (
-    commands.make_command(a) for a in (CommandAction.CLEAR, CommandAction.ARM, CommandAction.STOP, CommandAction.DISARM)
+    commands.make_command(a)
+    for a in (CommandAction.CLEAR, CommandAction.ARM, CommandAction.STOP, CommandAction.DISARM)
 )
 EMERGENCY = commands.make_emergency()
 TOLD: dict[tuple[LifecycleState, LifecycleState], list[CanFrame]] = {
@@ -83,14 +92,18 @@ TOLD: dict[tuple[LifecycleState, LifecycleState], list[CanFrame]] = {
 
 @pytest.mark.parametrize("before", LIFECYCLES)
 @pytest.mark.parametrize("now", LIFECYCLES)
-def test_commands_on_state_change_address_all_modules(before: LifecycleState, now: LifecycleState) -> None:
+def test_commands_on_state_change_address_all_modules(
+    before: LifecycleState, now: LifecycleState
+) -> None:
     assert commands.make_transition_frames(before, now) == TOLD.get((before, now), [])
     assert before == now or (before, now) in TOLD
 
 
 @pytest.mark.parametrize("lifecycle", LIFECYCLES)
 @pytest.mark.parametrize("state", list(ModuleState))
-def test_commands_repeat_state_to_a_module_that_differs(lifecycle: LifecycleState, state: ModuleState) -> None:
+def test_commands_repeat_state_to_a_module_that_differs(
+    lifecycle: LifecycleState, state: ModuleState
+) -> None:
     expected: CanFrame | None = None
     if (lifecycle, state) == ("armed", ModuleState.DISARMED):
         expected = commands.make_command(CommandAction.ARM, 3)

@@ -61,7 +61,13 @@ def message_row(opcode: Opcode) -> list[str]:
     to_one = opcode not in (Opcode.EMERGENCY, Opcode.SYNC)
     low, high = (first if to_all else first + FIRST_NODE), (first + LAST_NODE if to_one else first)
     ids = f"{low:03X}" if low == high else f"{low:03X}–{high:03X}"
-    return [layout.name, str(int(opcode)), ids, "host" if opcode in FROM_HOST else "module", str(layout.length)]
+    return [
+        layout.name,
+        str(int(opcode)),
+        ids,
+        "host" if opcode in FROM_HOST else "module",
+        str(layout.length),
+    ]
 
 
 def signal_rows(opcode: Opcode) -> list[list[str]]:
@@ -74,7 +80,13 @@ def signal_rows(opcode: Opcode) -> list[list[str]]:
         zero = f", raw 0 is {number(signal.offset)}" if signal.offset else ""
         found.append(
             [
-                *(signal.name, bits, kind, step + zero, f"{number(signal.low)} to {number(signal.high)}"),
+                *(
+                    signal.name,
+                    bits,
+                    kind,
+                    step + zero,
+                    f"{number(signal.low)} to {number(signal.high)}",
+                ),
                 signal.unit.replace("N.m", "N·m").replace("m/s^2", "m/s²").replace("degC", "°C"),
             ]
         )
@@ -94,14 +106,20 @@ def test_every_number_that_has_a_name_is_listed() -> None:
     for message in load_database().messages:
         for signal in message.signals:
             if signal.choices and signal.name != "index":  # those are the parameters
-                listed = ", ".join(f"{value} {name}" for value, name in sorted(signal.choices.items()))
+                listed = ", ".join(
+                    f"{value} {name}" for value, name in sorted(signal.choices.items())
+                )
                 assert f"`{signal.name}`: {listed}" in TEXT, signal.name
 
 
 def test_the_table_of_parameters() -> None:
     expected = [
         [
-            *(str(int(parameter)), parameter.name.lower(), f"{number(allowed.low)} to {number(allowed.high)}"),
+            *(
+                str(int(parameter)),
+                parameter.name.lower(),
+                f"{number(allowed.low)} to {number(allowed.high)}",
+            ),
             *(allowed.unit, "yes" if allowed.writable else "no"),
         ]
         for parameter, allowed in PARAMETERS.items()
@@ -124,7 +142,9 @@ def test_the_worked_example_of_the_checksum() -> None:
             crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
         assert f"`{crc:04X}`" in text
     assert crc & 0xFF == frame.data[-1]
-    setpoint = load_layouts()[Opcode.SET_POINT].encode(NODE, mode=1, count=3, position=-0.5, torque_limit=7.0)
+    setpoint = load_layouts()[Opcode.SET_POINT].encode(
+        NODE, mode=1, count=3, position=-0.5, torque_limit=7.0
+    )
     assert f"`{setpoint.data.hex(' ').upper()}`" in section("SetPoint")
 
 
@@ -140,7 +160,8 @@ def test_the_table_of_loads() -> None:
     assert [row[0] for row in found] == ["13", "18", "30"]
     for row in found:
         loads = [
-            100 * compute_bus_load(int(row[0]), plan_reports_at(rate, config, CanSettings())) for rate in (50, 100, 200)
+            100 * compute_bus_load(int(row[0]), plan_reports_at(rate, config, CanSettings()))
+            for rate in (50, 100, 200)
         ]
         assert row[1:] == [f"{share:.1f} %" + (" refused" if share > 80 else "") for share in loads]
 
@@ -150,7 +171,9 @@ def test_the_table_of_loads() -> None:
 
 def module_in(state: ModuleState) -> ModuleFirmware:
     """A module that has just come to be in a state, at 1 s."""
-    module = ModuleFirmware(NODE, 1, ParameterStore(make_factory_defaults(7.0, 7.5)), HeatLimits(80.0, 105.0))
+    module = ModuleFirmware(
+        NODE, 1, ParameterStore(make_factory_defaults(7.0, 7.5)), HeatLimits(80.0, 105.0)
+    )
     if state == ModuleState.BOOT:
         module.poll(BOOT_US / 2)
         return module

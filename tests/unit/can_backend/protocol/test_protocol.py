@@ -51,7 +51,9 @@ def test_every_opcode_is_a_message_of_the_same_name() -> None:
 
 
 def test_every_enumeration_is_a_value_table() -> None:
-    tables = {(m.name, s.name): s.choices for m in DATABASE.messages for s in m.signals if s.choices}
+    tables = {
+        (m.name, s.name): s.choices for m in DATABASE.messages for s in m.signals if s.choices
+    }
     assert {signal for _, signal in tables} == set(NAMED)
     for (message, signal), table in tables.items():
         ours = {int(member): member.name.lower() for member in NAMED[signal]}
@@ -64,13 +66,18 @@ def test_signal_with_a_table_has_no_narrower_range() -> None:
             if signal.name in NAMED:
                 assert signal.choices, (message.name, signal.name)
                 most = max(NAMED[signal.name])
-                assert float(signal.maximum or 0) >= most and most < 1 << signal.length, (message.name, signal.name)
+                assert float(signal.maximum or 0) >= most and most < 1 << signal.length, (
+                    message.name,
+                    signal.name,
+                )
 
 
 def test_fault_bits_stand_in_the_heartbeat_in_their_order() -> None:
     signals = load_layouts()[Opcode.HEARTBEAT].signals
     first = signals["fault_watchdog"].shift
-    found = {name: signal.shift - first for name, signal in signals.items() if name.startswith("fault_")}
+    found = {
+        name: signal.shift - first for name, signal in signals.items() if name.startswith("fault_")
+    }
     assert found == {f"fault_{fault.name.lower()}": int(fault) for fault in ModuleFault}
 
 
@@ -94,7 +101,11 @@ def test_signals_of_a_message_overlap_only_for_setpoint_targets() -> None:
     for opcode, layout in load_layouts().items():
         for a, b in combinations(layout.signals.values(), 2):
             shared = (a.mask << a.shift) & (b.mask << b.shift)
-            targets = opcode == Opcode.SET_POINT and {a.name, b.name} <= {"position", "velocity", "torque"}
+            targets = opcode == Opcode.SET_POINT and {a.name, b.name} <= {
+                "position",
+                "velocity",
+                "torque",
+            }
             assert bool(shared) == targets, (opcode, a.name, b.name)
             assert (a.mask << a.shift).bit_length() <= 8 * layout.length
 
@@ -110,7 +121,9 @@ def checked(opcode: Opcode, node: int, payload: bytes) -> CanFrame:
 
 @pytest.mark.parametrize("opcode", sorted(WITH_CHECKSUM))
 @given(node=st.integers(FIRST_NODE, LAST_NODE), payload=st.binary(min_size=7, max_size=7))
-def test_checksum_detects_every_single_bit_error_and_wrong_node(opcode: Opcode, node: int, payload: bytes) -> None:
+def test_checksum_detects_every_single_bit_error_and_wrong_node(
+    opcode: Opcode, node: int, payload: bytes
+) -> None:
     frame = checked(opcode, node, payload)
     assert has_valid_checksum(frame)
     number = int.from_bytes(frame.data, "little")

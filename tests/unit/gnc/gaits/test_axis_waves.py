@@ -28,7 +28,9 @@ def moved_m(record: RunRecord) -> np.ndarray:
     return (last - first).mean(axis=0)[:2]
 
 
-@pytest.mark.parametrize(("pitch_rad", "side"), [(0.2, -1.0), pytest.param(-0.2, 1.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("pitch_rad", "side"), [(0.2, -1.0), pytest.param(-0.2, 1.0, marks=pytest.mark.slow)]
+)
 def test_sidewinding_travels_sideways_to_the_requested_side(pitch_rad: float, side: float) -> None:
     along, across = moved_m(on_flat_ground("duration_s=5", f"control.pitch_rad={pitch_rad}").record)
     assert side * across > 0.8
@@ -62,6 +64,8 @@ def test_gait_of_bent_robot_keeps_shape_and_states_reason(gait: type[Controller[
     controller = gait(stage.robot, gait.Parameters())
     commands = [controller.update(stage.make_observation(tick, 0.3)) for tick in range(200)]
     targets = [command.setpoints.target for command in commands]
-    assert all("no joints that turn up and down" in command.telemetry.reason for command in commands)
+    assert all(
+        "no joints that turn up and down" in command.telemetry.reason for command in commands
+    )
     assert np.abs(targets[0]).max() > 0.2
     assert np.abs(np.array(targets) - targets[0]).max() < 1e-9

@@ -9,7 +9,11 @@ from snakesim_gnc.control.gaits.body_curve import BodyCurve
 from snakesim_gnc.control.gaits.concertina import Concertina, ConcertinaParameters
 from snakesim_gnc.control.gaits.cpg import Cpg, CpgParameters
 from snakesim_gnc.control.gaits.rectilinear import Rectilinear, RectilinearParameters
-from snakesim_gnc.control.gaits.serpenoid import Serpenoid, SerpenoidParameters, compute_serpenoid_headings
+from snakesim_gnc.control.gaits.serpenoid import (
+    Serpenoid,
+    SerpenoidParameters,
+    compute_serpenoid_headings,
+)
 from snakesim_gnc.control.gaits.sinus_lifting import SinusLifting, SinusLiftingParameters
 from snakesim_gnc.geometry.body_on_path import compute_chain_points
 from snakesim_hal.base.arrays import Floats
@@ -22,11 +26,15 @@ MAX_DISTANCES = {8: 0.02, 13: 0.008, 20: 0.004}
 PHASES = (0.0, 1.0, 2.5, 4.0)
 
 
-def find_continuous_nodes(phase_rad: float, parameters: SerpenoidParameters, places: Floats) -> Floats:
+def find_continuous_nodes(
+    phase_rad: float, parameters: SerpenoidParameters, places: Floats
+) -> Floats:
     """Return points (2, n) of the serpenoid curve at fractions of the body from the tail, by numerical integration."""
     s = np.linspace(0.0, 1.0, 4001)
     middles = 0.5 * (s[1:] + s[:-1])
-    headings = compute_serpenoid_headings(1.0 - middles, phase_rad, parameters.winding_angle_rad, parameters.wavelength)
+    headings = compute_serpenoid_headings(
+        1.0 - middles, phase_rad, parameters.winding_angle_rad, parameters.wavelength
+    )
     steps = np.diff(s) * np.array([np.cos(headings), np.sin(headings)])
     curve = np.concatenate([np.zeros((2, 1)), steps.cumsum(axis=1)], axis=1)
     return np.array([np.interp(places, s, row) for row in curve])
@@ -36,7 +44,9 @@ def find_robot_nodes(modules: int, angles_rad: Floats) -> tuple[Floats, Floats]:
     """Return the nodes of a planar robot (2, n) in body lengths, and their fractions of the body from the tail."""
     lengths = [link.length_m for link in make_robot(modules).links]
     total_m = sum(lengths)
-    nodes = compute_chain_points((0.0, 0.0), 0.0, angles_rad.tolist(), [length / total_m for length in lengths])
+    nodes = compute_chain_points(
+        (0.0, 0.0), 0.0, angles_rad.tolist(), [length / total_m for length in lengths]
+    )
     return nodes, np.concatenate(([0.0], np.cumsum(lengths) / total_m))
 
 
@@ -52,12 +62,17 @@ def measure_distance(nodes: Floats, curve: Floats) -> float:
 
 @pytest.mark.parametrize("modules", [8, 13, 20])
 @pytest.mark.parametrize("phase_rad", PHASES)
-def test_the_same_parameters_give_the_same_curve_on_any_planar_robot(modules: int, phase_rad: float) -> None:
+def test_the_same_parameters_give_the_same_curve_on_any_planar_robot(
+    modules: int, phase_rad: float
+) -> None:
     parameters = SerpenoidParameters()
     robot = make_robot(modules)
     curve = BodyCurve(robot, "yaw")
     headings = compute_serpenoid_headings(
-        curve.head_distance_fractions, phase_rad, parameters.winding_angle_rad, parameters.wavelength
+        curve.head_distance_fractions,
+        phase_rad,
+        parameters.winding_angle_rad,
+        parameters.wavelength,
     )
     nodes, places = find_robot_nodes(modules, curve.compute_joint_angles_rad(headings))
     distance = measure_distance(nodes, find_continuous_nodes(phase_rad, parameters, places))
@@ -70,7 +85,9 @@ def test_joint_angles_depend_on_the_spacing_and_the_curve_does_not() -> None:
     for modules in (8, 20):
         curve = BodyCurve(make_robot(modules), "yaw")
         angles = [
-            curve.compute_joint_angles_rad(compute_serpenoid_headings(curve.head_distance_fractions, u, 0.7, 0.67))
+            curve.compute_joint_angles_rad(
+                compute_serpenoid_headings(curve.head_distance_fractions, u, 0.7, 0.67)
+            )
             for u in PHASES
         ]
         peaks[modules] = float(np.abs(angles).max())
@@ -81,7 +98,11 @@ def test_equal_links_have_the_discrete_form_of_the_serpenoid_curve() -> None:
     """phi_i = A sin(...) with A = 2 alpha sin(delta / 2) and a lag of delta = 2 pi l / lambda from joint to joint."""
     alpha, wavelength = 0.6, 0.5
     curve = BodyCurve(make_robot(20), "yaw")
-    delta = math.tau * (curve.head_distance_fractions[3] - curve.head_distance_fractions[4]) / wavelength
+    delta = (
+        math.tau
+        * (curve.head_distance_fractions[3] - curve.head_distance_fractions[4])
+        / wavelength
+    )
     shapes = np.array(
         [
             curve.compute_joint_angles_rad(
@@ -100,7 +121,8 @@ def test_a_bend_is_shared_by_the_joints_whatever_their_number() -> None:
     for modules in (8, 20):
         curve = BodyCurve(make_robot(modules), "yaw")
         turned = curve.compute_joint_angles_rad(curve.make_bend_headings_rad(1.0)).sum()
-        assert turned == pytest.approx(1.0, abs=1.2 / modules)  # the middles of both end pieces are not at the ends
+        # The middles of both end pieces are not at the ends.
+        assert turned == pytest.approx(1.0, abs=1.2 / modules)
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,9 @@ def measure_length_m(robot: RobotDescription) -> float:
 
 def fit_helix(robot: RobotDescription, phases: int = 16) -> KeyframeWaves:
     places, length_m = compute_node_fractions(robot), measure_length_m(robot)
-    waves = KeyframeWaves(robot, lambda phase: compute_helix(places, length_m, PARAMETERS, phase), phases)
+    waves = KeyframeWaves(
+        robot, lambda phase: compute_helix(places, length_m, PARAMETERS, phase), phases
+    )
     assert waves.advance_fit()
     return waves
 
@@ -54,12 +56,18 @@ def test_a_chain_that_lies_on_a_curve_already_is_found() -> None:
     origins, rotations = compute_link_frames(np.zeros(3), np.eye(3), angles, axes, lengths_m)
     nodes = np.vstack([origins, origins[-1] + lengths_m[-1] * rotations[-1][:, 0]])
     chain = ChainFit(robot)
-    for _ in chain.fit_first(BackboneCurve(nodes, np.cross(rotations[5][:, 0], rotations[5][:, 1]))):
+    for _ in chain.fit_first(
+        BackboneCurve(nodes, np.cross(rotations[5][:, 0], rotations[5][:, 1]))
+    ):
         pass
-    assert np.linalg.norm(chain.compute_node_positions() - nodes, axis=1).max() < 0.02 * measure_length_m(robot)
+    assert np.linalg.norm(
+        chain.compute_node_positions() - nodes, axis=1
+    ).max() < 0.02 * measure_length_m(robot)
 
 
-def test_overlapping_groups_are_better_than_one_link_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overlapping_groups_are_better_than_one_link_at_a_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Every second link cannot follow the curve if links are laid one by one."""
     robot = make_alternating_robot()
     places, length_m = compute_node_fractions(robot), measure_length_m(robot)
@@ -72,7 +80,11 @@ def test_overlapping_groups_are_better_than_one_link_at_a_time(monkeypatch: pyte
         for _ in chain.fit_first(backbone):
             pass
         distances_m.append(
-            float(np.linalg.norm(chain.compute_node_positions() - backbone.node_positions, axis=1).max())
+            float(
+                np.linalg.norm(
+                    chain.compute_node_positions() - backbone.node_positions, axis=1
+                ).max()
+            )
         )
     together_m, one_by_one_m = distances_m
     assert together_m < 0.7 * one_by_one_m
@@ -83,8 +95,12 @@ def test_the_waves_pass_through_the_keyframes_and_close() -> None:
     phases = 2.0 * np.pi * np.arange(16) / 16
     passed = np.array([waves.compute_joint_angles_rad(phase) for phase in phases])
     assert passed == pytest.approx(waves.keyframes_rad, abs=1e-9)
-    assert waves.compute_joint_angles_rad(2.0 * np.pi) == pytest.approx(waves.compute_joint_angles_rad(0.0))
-    between = np.array([waves.compute_joint_angles_rad(phase) for phase in np.linspace(0.0, 2.0 * np.pi, 200)])
+    assert waves.compute_joint_angles_rad(2.0 * np.pi) == pytest.approx(
+        waves.compute_joint_angles_rad(0.0)
+    )
+    between = np.array(
+        [waves.compute_joint_angles_rad(phase) for phase in np.linspace(0.0, 2.0 * np.pi, 200)]
+    )
     assert np.abs(np.diff(between, axis=0)).max() < 0.1
 
 
@@ -137,7 +153,9 @@ def test_a_helix_that_the_joints_cannot_form_is_refused(gait, parameters) -> Non
         gait.check(make_alternating_robot(), parameters)
 
 
-@pytest.mark.parametrize("robot", [make_alternating_robot(), make_robot(13)], ids=["alternating", "planar"])
+@pytest.mark.parametrize(
+    "robot", [make_alternating_robot(), make_robot(13)], ids=["alternating", "planar"]
+)
 def test_the_default_parameters_are_accepted(robot: RobotDescription) -> None:
     """A planar robot is not refused: it holds its pose and reports the reason."""
     BackboneSidewinding.check(robot, PARAMETERS)

@@ -23,7 +23,9 @@ def advance(oscillators: OscillatorChains, seconds: float, feedback_rad_s: Any =
 
 def test_disturbed_oscillators_return_to_the_traveling_wave() -> None:
     oscillators = OscillatorChains(PHASES, coupling=30.0, amplitude_rate=10.0)
-    oscillators.theta_rad = oscillators.theta_rad + np.array([[0.8, -0.5, 0.3, 0.0], [0.0, 0.6, -0.9, 0.2]])
+    oscillators.theta_rad = oscillators.theta_rad + np.array(
+        [[0.8, -0.5, 0.3, 0.0], [0.0, 0.6, -0.9, 0.2]]
+    )
     advance(oscillators, 5.0)
     assert np.diff(oscillators.theta_rad[0]) == pytest.approx(np.diff(PHASES), abs=1e-3)
     across = np.remainder(oscillators.theta_rad[1] - oscillators.theta_rad[0], math.tau)

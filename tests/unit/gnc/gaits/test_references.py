@@ -64,7 +64,9 @@ def test_a_gait_starts_at_the_pose_and_never_jumps(gait: type[Controller[Any]]) 
 
 @pytest.mark.parametrize("gait", PLANAR + SPATIAL)
 @pytest.mark.parametrize("without", ["world", "trajectory"])
-def test_a_gait_that_stops_holds_and_continues_at_the_same_phase(gait: type[Controller[Any]], without: str) -> None:
+def test_a_gait_that_stops_holds_and_continues_at_the_same_phase(
+    gait: type[Controller[Any]], without: str
+) -> None:
     stage = make_stage_for(gait)
     interrupted = gait(stage.robot, gait.Parameters())
     before = drive(interrupted, stage, range(250))
@@ -75,7 +77,9 @@ def test_a_gait_that_stops_holds_and_continues_at_the_same_phase(gait: type[Cont
     references = list_references(held)
     assert (references == list_references(before)[-1]).all()
     whole = gait(stage.robot, gait.Parameters())
-    assert list_references(after) == pytest.approx(list_references(drive(whole, stage, range(300)))[250:])
+    assert list_references(after) == pytest.approx(
+        list_references(drive(whole, stage, range(300)))[250:]
+    )
 
 
 @pytest.mark.parametrize("gait", PLANAR + SPATIAL)
@@ -106,15 +110,21 @@ def test_a_planar_robot_holds_and_states_the_missing_joints(gait: type[Controlle
     controller = gait(stage.robot, gait.Parameters())
     commands = drive(controller, stage, range(50))
     targets = list_targets(commands)
-    assert {command.telemetry.reason for command in commands} == {"this robot has no joints that turn up and down"}
+    assert {command.telemetry.reason for command in commands} == {
+        "this robot has no joints that turn up and down"
+    }
     assert np.abs(targets - targets[0]).max() < 1e-9
 
 
 @pytest.mark.parametrize("gait", PLANAR)
-def test_a_robot_of_pitch_joints_holds_and_states_the_missing_joints(gait: type[Controller[Any]]) -> None:
+def test_a_robot_of_pitch_joints_holds_and_states_the_missing_joints(
+    gait: type[Controller[Any]],
+) -> None:
     stage = make_stage(6, ("pitch",))
     commands = drive(gait(stage.robot, gait.Parameters()), stage, range(20))
-    assert {command.telemetry.reason for command in commands} == {"this robot has no joints that turn left and right"}
+    assert {command.telemetry.reason for command in commands} == {
+        "this robot has no joints that turn left and right"
+    }
 
 
 @pytest.mark.parametrize("gait", PLANAR)
@@ -156,7 +166,9 @@ def test_another_path_does_not_jerk_the_joints(gait: type[Controller[Any]]) -> N
     controller = gait(stage.robot, gait.Parameters())
     observation = stage.make_observation(0, 2.0)
     assert observation.trajectory is not None
-    aside = msgspec.structs.replace(observation.trajectory, path_id=1, path_w=[(2.0, 0.0), (1.0, 4.0)])
+    aside = msgspec.structs.replace(
+        observation.trajectory, path_id=1, path_w=[(2.0, 0.0), (1.0, 4.0)]
+    )
     replanned = dataclasses.replace(observation, trajectory=aside)
     references = list_references([controller.update(observation) for _ in range(480)])
     wave_step = np.abs(np.diff(references[160:], axis=0)).max()
@@ -184,9 +196,16 @@ def test_sinus_lifting_lifts_where_the_body_bends_most() -> None:
 
 
 def test_concertina_folds_one_half_while_the_other_holds() -> None:
-    thirds = [compute_fold_fractions(phase) for phase in (0.0, 2.0 * np.pi / 3.0 - 1e-9, 4.0 * np.pi / 3.0 - 1e-9)]
-    assert np.array(thirds) == pytest.approx(np.array([[0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]), abs=1e-6)
-    fractions = np.array([compute_fold_fractions(phase) for phase in np.linspace(0.0, 4.0 * np.pi, 400)])
+    thirds = [
+        compute_fold_fractions(phase)
+        for phase in (0.0, 2.0 * np.pi / 3.0 - 1e-9, 4.0 * np.pi / 3.0 - 1e-9)
+    ]
+    assert np.array(thirds) == pytest.approx(
+        np.array([[0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]), abs=1e-6
+    )
+    fractions = np.array(
+        [compute_fold_fractions(phase) for phase in np.linspace(0.0, 4.0 * np.pi, 400)]
+    )
     assert np.abs(np.diff(fractions, axis=0)).max() < 0.05
 
 

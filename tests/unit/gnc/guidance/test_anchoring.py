@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.anchoring import ESTIMATED_CONTACT_TRUST, MEASURED_CONTACT_TRUST, ObstacleAnchors
+from snakesim_gnc.guidance.anchoring import (
+    ESTIMATED_CONTACT_TRUST,
+    MEASURED_CONTACT_TRUST,
+    ObstacleAnchors,
+)
 from snakesim_gnc.guidance.body_history import BasePose
 from snakesim_gnc.guidance.localization import PoseLocalizer, PoseNoise
 from snakesim_hal.model.kinematics import compute_link_frames
@@ -26,13 +30,23 @@ def base_at(planar_w) -> BasePose:
 def pegs(apart_m: float = 0.0) -> list[KnownObstacle]:
     """At the middles of the links of a body that lies where it is in truth."""
     base = base_at(TRUE_W)
-    rear, frames = compute_link_frames(base.position_w, base.rotation, SHAPE, ["yaw"] * len(SHAPE), LENGTHS)
+    rear, frames = compute_link_frames(
+        base.position_w, base.rotation, SHAPE, ["yaw"] * len(SHAPE), LENGTHS
+    )
     found: list[KnownObstacle] = []
     for link, side in TOUCHED:
         away_m = side * (BODY_RADIUS_M + PEG_M + apart_m)
-        x, y, _ = (rear[link] + 0.5 * LENGTHS[link] * frames[link][:, 0] + away_m * frames[link][:, 1]).tolist()
+        x, y, _ = (
+            rear[link] + 0.5 * LENGTHS[link] * frames[link][:, 0] + away_m * frames[link][:, 1]
+        ).tolist()
         found.append(
-            KnownObstacle(name=f"{link}", shape="cylinder", position_w=(x, y, 0.1), radius_m=PEG_M, height_m=0.2)
+            KnownObstacle(
+                name=f"{link}",
+                shape="cylinder",
+                position_w=(x, y, 0.1),
+                radius_m=PEG_M,
+                height_m=0.2,
+            )
         )
     return found
 
@@ -42,7 +56,11 @@ def pushes(side: int = 1, force_n: float = 10.0) -> list[Contact]:
     return [
         make_link_contact(
             link,
-            position_l=(0.07, s * side * BODY_RADIUS_M, 0.0),  # 15 mm off along the link, as estimates are
+            position_l=(
+                0.07,
+                s * side * BODY_RADIUS_M,
+                0.0,
+            ),  # 15 mm off along the link, as estimates are
             normal_l=(0.0, -float(s * side), 0.0),
             tangent_2_l=(0.0, 0.0, float(s * side)),
             force_l=(0.0, -s * side * force_n, 0.0),
@@ -51,7 +69,9 @@ def pushes(side: int = 1, force_n: float = 10.0) -> list[Contact]:
     ]
 
 
-def held(off_w, obstacles, contacts, trust=ESTIMATED_CONTACT_TRUST, turns: int = 20) -> PoseLocalizer:
+def held(
+    off_w, obstacles, contacts, trust=ESTIMATED_CONTACT_TRUST, turns: int = 20
+) -> PoseLocalizer:
     """A localizer that begins off the truth, and what is known after some turns."""
     localizer = PoseLocalizer(ROBOT, base_at(TRUE_W + off_w), PoseNoise())
     localizer.covariance = np.diag([0.02, 0.02, 0.03]) ** 2
@@ -61,7 +81,9 @@ def held(off_w, obstacles, contacts, trust=ESTIMATED_CONTACT_TRUST, turns: int =
     return localizer
 
 
-@pytest.mark.parametrize(("trust", "turns"), [(ESTIMATED_CONTACT_TRUST, 20), (MEASURED_CONTACT_TRUST, 1000)])
+@pytest.mark.parametrize(
+    ("trust", "turns"), [(ESTIMATED_CONTACT_TRUST, 20), (MEASURED_CONTACT_TRUST, 1000)]
+)
 @pytest.mark.parametrize("off_w", [(0.0, 0.02, 0.0), (0.015, -0.01, 0.02)])
 def test_three_contacts_on_known_pegs_bring_the_pose_back(trust, turns, off_w):
     localizer = held(np.array(off_w), pegs(), pushes(), trust, turns)
@@ -75,7 +97,9 @@ def test_anchoring_body_never_overlaps_a_peg():
     assert np.linalg.norm((after - TRUE_W)[:2]) < 0.7 * np.linalg.norm((before - TRUE_W)[:2])
 
 
-@pytest.mark.parametrize("contacts", [[], pushes(side=-1), pushes(force_n=0.1)], ids=["none", "other side", "weak"])
+@pytest.mark.parametrize(
+    "contacts", [[], pushes(side=-1), pushes(force_n=0.1)], ids=["none", "other side", "weak"]
+)
 def test_pegs_that_are_not_felt_move_nothing(contacts):
     start = held(np.zeros(3), pegs(apart_m=0.02), contacts, turns=0)
     later = held(np.zeros(3), pegs(apart_m=0.02), contacts)

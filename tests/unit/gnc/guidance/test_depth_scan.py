@@ -36,7 +36,9 @@ def look(obstacles, rotation, *, ground=flat_ground, eye=None, at=(0.0, 0.0)) ->
     position = np.array([*at, z])
     image = render_depth_image(obstacles, position, rotation, ground=ground, sensor_errors=eye)
     scanner = DepthScanner(INTRINSICS, RangeNoise(0.002, 0.003))
-    return scanner.make_scan(decode_depth_m(image), 0, position, rotation, np.array([z - EYE_M, 0.0, 0.0]))
+    return scanner.make_scan(
+        decode_depth_m(image), 0, position, rotation, np.array([z - EYE_M, 0.0, 0.0])
+    )
 
 
 def errors_m(scan, obstacles) -> np.ndarray:
@@ -46,7 +48,10 @@ def errors_m(scan, obstacles) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("ground", "eye", "median_m", "max_m"),
-    [(flat_ground, None, 0.001, 0.006), (make_hills(0.02, 1.5), SensorErrors(0.002, 0.003, 0.01), 0.004, 0.02)],
+    [
+        (flat_ground, None, 0.001, 0.006),
+        (make_hills(0.02, 1.5), SensorErrors(0.002, 0.003, 0.01), 0.004, 0.02),
+    ],
     ids=["flat", "hills and noise"],
 )
 def test_points_lie_on_what_stands_there(ground, eye, median_m, max_m):
@@ -90,7 +95,8 @@ def test_depth_scan_hills_are_ground(seed):
 
 def test_free_space_ends_at_the_first_obstacle():
     scan = look(SCENE, make_rotation(0.0))
-    bins, ranges = scan.find_bins(np.array([[0.5, 0.083], [2.0, 0.333]]))  # before and behind the near one
+    # Before and behind the near one.
+    bins, ranges = scan.find_bins(np.array([[0.5, 0.083], [2.0, 0.333]]))
     assert bins[0] == bins[1] >= 0
     assert ranges[0] < scan.compute_clear_distances_m()[bins[0]] < ranges[1]
     assert scan.find_bins(np.array([-1.0, 0.0]))[0] == -1
@@ -105,7 +111,9 @@ def test_nothing_seen_is_nothing_known():
 def test_a_lidar_sees_the_same_shapes_all_around():
     position, rotation = np.array([0.0, 0.0, 0.05]), make_rotation(0.3)
     around = [*SCENE, make_cylinder("left", 0.1, 0.5)]
-    scan = make_scan(render_lidar_scan(around, position, rotation), position, rotation, 0.0, RangeNoise())
+    scan = make_scan(
+        render_lidar_scan(around, position, rotation), position, rotation, 0.0, RangeNoise()
+    )
     off = errors_m(scan, around)
     assert len(off) > 30
     assert off.max() < 1e-6
@@ -125,7 +133,9 @@ def test_a_beam_into_the_ground_is_no_obstacle():
 
 
 def test_depth_scan_ground_plane_follows_slope_but_not_objects():
-    bottoms = np.column_stack([np.linspace(-1.4, 0, 14), np.zeros(14), 0.05 * np.linspace(-1.4, 0, 14)])
+    bottoms = np.column_stack(
+        [np.linspace(-1.4, 0, 14), np.zeros(14), 0.05 * np.linspace(-1.4, 0, 14)]
+    )
     plane = fit_plane_under_body(bottoms, np.zeros(2))
     assert plane == pytest.approx([0.0, 0.05, 0.0], abs=0.01)
     random = np.random.default_rng(0)

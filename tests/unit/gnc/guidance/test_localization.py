@@ -30,7 +30,10 @@ def test_dead_reckoning_knows_how_wrong_it_is():
     assert off[-1] < 0.15
     assert off[-1] < 3 * sd  # of 1 m that it has gone
     assert drive.world.localizer.position_sd_m > 0.02
-    assert abs(drive.world.localizer.base.planar_w[2] - drive.compute_pose(drive.turn - 1).base_w[2]) < 0.02
+    assert (
+        abs(drive.world.localizer.base.planar_w[2] - drive.compute_pose(drive.turn - 1).base_w[2])
+        < 0.02
+    )
 
 
 def test_a_snake_that_does_not_move_its_joints_stays():
@@ -71,7 +74,12 @@ def test_a_late_pose_corrects_what_has_happened_since():
         late.append(drive.make_pose(here))
         if len(late) > 10:  # 0.2 s, in which it goes 4 cm
             drive.world.add_pose(late.pop(0))
-    assert math.dist(drive.world.localizer.base.planar_w[:2], drive.compute_pose(drive.turn - 1).base_w[:2]) < 0.012
+    assert (
+        math.dist(
+            drive.world.localizer.base.planar_w[:2], drive.compute_pose(drive.turn - 1).base_w[:2]
+        )
+        < 0.012
+    )
 
 
 def test_localization_history_returns_body_only_at_stored_timestamps():
@@ -79,7 +87,9 @@ def test_localization_history_returns_body_only_at_stored_timestamps():
     history = BodyHistory(drive.robot)
     places = [drive.compute_pose(k) for k in range(60)]
     for k, here in enumerate(places):
-        history.add(k * STEP_NS, BasePose(np.array(here.base_w), 0.04, np.eye(3)), here.angles_rad.tolist())
+        history.add(
+            k * STEP_NS, BasePose(np.array(here.base_w), 0.04, np.eye(3)), here.angles_rad.tolist()
+        )
     assert history.interpolate_body(0) is None  # longer ago than it remembers
     half = history.interpolate_body(int(40.5 * STEP_NS))
     assert half is not None
@@ -95,4 +105,6 @@ def test_localization_history_returns_body_only_at_stored_timestamps():
 def test_quaternions_go_there_and_back():
     for angles in ((0.3, 0.2, -0.1), (3.1, 0.0, 0.0), (-2.0, 1.2, 3.0), (0.0, -1.5, 1.0)):
         rotation = make_rotation(*angles)
-        assert rotation_from_quaternion(quaternion_from_rotation(rotation)) == pytest.approx(rotation)
+        assert rotation_from_quaternion(quaternion_from_rotation(rotation)) == pytest.approx(
+            rotation
+        )

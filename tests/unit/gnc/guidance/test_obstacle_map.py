@@ -36,7 +36,10 @@ def only(map_, now_ns=0) -> KnownObstacle:
 
 
 def test_map_obstacle_seen_repeatedly_gains_confidence():
-    once, often = mapped(make_cylinder("a", 0.8, 0.0), looks=1), mapped(make_cylinder("a", 0.8, 0.0), looks=6)
+    once, often = (
+        mapped(make_cylinder("a", 0.8, 0.0), looks=1),
+        mapped(make_cylinder("a", 0.8, 0.0), looks=6),
+    )
     reported = only(often)
     assert only(once).confidence < 0.65
     assert reported.confidence > 0.9
@@ -76,7 +79,11 @@ def test_map_obstacle_seen_through_is_dropped():
     map_ = mapped(make_cylinder("ghost", 0.6, 0.0), make_cylinder("real", 0.8, 0.4))
     for k in range(8):
         map_.add_scan(
-            make_lidar_scan(make_cylinder("real", 0.8, 0.4), make_box("behind", 2.0, 0.0, (0.1, 1.5)), timestamp_ns=k)
+            make_lidar_scan(
+                make_cylinder("real", 0.8, 0.4),
+                make_box("behind", 2.0, 0.0, (0.1, 1.5)),
+                timestamp_ns=k,
+            )
         )
     assert all(math.dist(o.position_w[:2], (0.6, 0.0)) > 0.3 for o in map_.list_obstacles(0, 0.0))
     assert any(math.dist(o.position_w[:2], (0.8, 0.4)) < 0.01 for o in map_.list_obstacles(0, 0.0))
@@ -136,7 +143,9 @@ def test_far_things_are_forgotten_and_their_number_is_bounded(monkeypatch):
     assert len(map_.tracks) == 1
     map_.drop_distant_tracks(np.array([[FORGET_DISTANCE_M + 1.0, 0.0]]))
     assert not map_.tracks
-    map_.add_touches([(np.array([0.2 * (k % 10), 0.2 * (k // 10)]), np.array([1.0, 0.0])) for k in range(100)], 0)
+    map_.add_touches(
+        [(np.array([0.2 * (k % 10), 0.2 * (k // 10)]), np.array([1.0, 0.0])) for k in range(100)], 0
+    )
     assert len(map_.tracks) == 100
     map_.drop_distant_tracks(np.zeros((1, 2)))
     assert len(map_.tracks) == 64

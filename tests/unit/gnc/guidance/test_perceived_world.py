@@ -26,7 +26,9 @@ def scored(drive: SlidingSnake, turns: int, *, pose: bool = True) -> MapScore:
         if drive.turn % 25 == 0 and drive.turn > 25:
             obstacles = reported(drive).obstacles
             if not pose:
-                obstacles = align_map(obstacles, drive.world.localizer.base.planar_w.tolist(), here.base_w)
+                obstacles = align_map(
+                    obstacles, drive.world.localizer.base.planar_w.tolist(), here.base_w
+                )
             total.add(score_map(obstacles, drive.obstacles, here.head_w, here.headings_rad[-1]))
     return total
 
@@ -70,10 +72,11 @@ def test_perceived_samples_without_body_pose_are_counted_and_ignored():
     drive = SlidingSnake(make_random_obstacles(1))
     *_, here = drive.run_cycles(30)
     image, before = drive.make_depth_image(here, 30 * STEP_NS), reported(drive)
+    # Older than what is in the map.
+    drive.world.add_ranging_sample(msgspec.structs.replace(image, timestamp_ns=STEP_NS), NOISE)
     drive.world.add_ranging_sample(
-        msgspec.structs.replace(image, timestamp_ns=STEP_NS), NOISE
-    )  # older than what is in the map
-    drive.world.add_ranging_sample(msgspec.structs.replace(image, timestamp_ns=900 * STEP_NS), NOISE)  # of the future
+        msgspec.structs.replace(image, timestamp_ns=900 * STEP_NS), NOISE
+    )  # of the future
     joints = drive.make_joint_state(here, here)
     broken = msgspec.structs.replace(
         joints, timestamp_ns=joints.timestamp_ns + STEP_NS, valid=[False] * len(joints.valid)
@@ -109,11 +112,16 @@ def test_perceived_world_after_streams_end_grows_uncertain():
 def test_perceived_contact_has_the_name_used_in_the_map():
     """Of a peg, unseen, at the left side of the middle link."""
     touch = make_link_contact(
-        7, obstacle="a name from the simulator", position_l=(0.05, 0.04, 0.0), force_l=(0.0, -3.0, 0.0)
+        7,
+        obstacle="a name from the simulator",
+        position_l=(0.05, 0.04, 0.0),
+        force_l=(0.0, -3.0, 0.0),
     )
     drive = SlidingSnake([])
     for _ in drive.run_cycles(10, images=False):
-        drive.world.add_contacts(Contacts(tick=drive.turn, timestamp_ns=drive.turn * STEP_NS, contacts=[touch]))
+        drive.world.add_contacts(
+            Contacts(tick=drive.turn, timestamp_ns=drive.turn * STEP_NS, contacts=[touch])
+        )
     world = drive.world.make_world(9, 9 * STEP_NS)
     assert world is not None
     assert world.contacts
@@ -127,10 +135,17 @@ def test_a_lidar_maps_as_a_camera_does():
     here = drive.compute_pose(0)
     for here in drive.run_cycles(60, images=False):
         beams = render_lidar_scan(
-            drive.obstacles, here.origins_w[-1], here.rotations[-1], timestamp_ns=drive.turn * STEP_NS
+            drive.obstacles,
+            here.origins_w[-1],
+            here.rotations[-1],
+            timestamp_ns=drive.turn * STEP_NS,
         )
-        drive.world.add_ranging_sample(msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE)
-    total = score_map(reported(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1])
+        drive.world.add_ranging_sample(
+            msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE
+        )
+    total = score_map(
+        reported(drive).obstacles, drive.obstacles, here.head_w, here.headings_rad[-1]
+    )
     assert len(total.position_errors_m) == 2
     assert max(total.position_errors_m) < 0.005
     assert not total.ghost_count

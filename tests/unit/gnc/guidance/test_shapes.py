@@ -43,7 +43,10 @@ def test_shapes_of_separate_objects_are_separate_clusters():
     scan = make_lidar_scan(*things)
     clusters = find_clusters(scan)
     owners = [
-        {min(things, key=lambda o: abs(compute_outline_distance_m(o, scan.points_w[i]))).name for i in c}
+        {
+            min(things, key=lambda o: abs(compute_outline_distance_m(o, scan.points_w[i]))).name
+            for i in c
+        }
         for c in clusters
     ]
     assert all(len(names) == 1 for names in owners)
@@ -71,7 +74,9 @@ def test_a_cylinder_is_found_as_well_as_its_covariance_says(radius, x, y, seed):
 @settings(max_examples=60)
 def test_a_box_seen_at_two_faces_is_found_whole(length, width, yaw, seed):
     truth = make_box("it", 0.8, 0.1, (length, width), yaw)
-    track = track_shape(truth, random=np.random.default_rng(seed), views=((0.0, 0.0), (0.0, 0.5), (0.0, -0.3)))
+    track = track_shape(
+        truth, random=np.random.default_rng(seed), views=((0.0, 0.0), (0.0, 0.5), (0.0, -0.3))
+    )
     assert track.shape == "box"
     assert math.dist(track.center_w, (0.8, 0.1)) < 0.025
     assert sorted(2 * track.half_size_m) == pytest.approx(sorted((length, width)), abs=0.04)
@@ -86,7 +91,9 @@ def test_shape_with_single_visible_face_marks_depth_as_guess():
     face = one.center_w[0] - min(one.half_size_m)
     assert abs(one.center_w[1]) < 0.01
     assert abs(face - 0.75) < 0.01 or abs(one.center_w[0] - max(one.half_size_m) - 0.75) < 0.01
-    around = track_shape(make_box("it", 0.8, 0.0, (0.1, 0.16)), views=((0.0, 0.0), (0.3, 0.6), (0.3, -0.6)))
+    around = track_shape(
+        make_box("it", 0.8, 0.0, (0.1, 0.16)), views=((0.0, 0.0), (0.3, 0.6), (0.3, -0.6))
+    )
     assert around.position_sd_m < 0.01
     assert math.dist(around.center_w, (0.8, 0.0)) < 0.01
 
@@ -101,7 +108,9 @@ def test_a_long_face_is_a_thin_wall():
 def test_a_short_arc_leaves_the_line_of_sight_uncertain():
     whole, part = track_shape(make_cylinder("it", 0.8, 0.0)), ObstacleTrack(2, "part")
     few = slice(len(whole.surface) // 2 - 2, len(whole.surface) // 2 + 2)
-    part.surface.add(whole.surface.points_w[few], np.full(4, NOISE_M), whole.surface.outward_directions_w[few])
+    part.surface.add(
+        whole.surface.points_w[few], np.full(4, NOISE_M), whole.surface.outward_directions_w[few]
+    )
     fit_shapes([part])
     assert part.position_sd_m > 5 * whole.position_sd_m
 
@@ -110,7 +119,9 @@ def test_a_short_arc_leaves_the_line_of_sight_uncertain():
 def test_a_surface_is_bounded_and_never_surer_than_the_mount(places):
     surface = SurfaceCells()
     for _ in range(3):
-        surface.add(np.array(places), np.full(len(places), 0.001), np.tile([1.0, 0.0], (len(places), 1)))
+        surface.add(
+            np.array(places), np.full(len(places), 0.001), np.tile([1.0, 0.0], (len(places), 1))
+        )
     assert 0 < len(surface) <= MAX_CELLS
     assert surface.weights.max() <= MAX_INFORMATION
 
@@ -119,8 +130,13 @@ def test_fusing_looks_lowers_the_scatter_and_the_told_error():
     random, truth = np.random.default_rng(3), make_cylinder("it", 0.8, 0.1)
 
     def scatter_m(looks: int) -> tuple[float, float]:
-        found = [track_shape(truth, random=random, views=((0.0, 0.0),) * looks, noise_m=0.005) for _ in range(30)]
-        return float(np.std([t.center_w[0] for t in found])), float(np.median([t.position_sd_m for t in found]))
+        found = [
+            track_shape(truth, random=random, views=((0.0, 0.0),) * looks, noise_m=0.005)
+            for _ in range(30)
+        ]
+        return float(np.std([t.center_w[0] for t in found])), float(
+            np.median([t.position_sd_m for t in found])
+        )
 
     once, often = scatter_m(1), scatter_m(10)
     assert often[0] < 0.5 * once[0]

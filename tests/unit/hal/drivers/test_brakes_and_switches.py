@@ -14,10 +14,21 @@ ANGLE_RAD = np.array([0.5])
 
 
 def command(
-    *, follow: bool, mode: JointMode = JointMode.POSITION, target: float = 0.9, emergency: bool = False
+    *,
+    follow: bool,
+    mode: JointMode = JointMode.POSITION,
+    target: float = 0.9,
+    emergency: bool = False,
 ) -> BusCommand:
     following = frozenset({0}) if follow else frozenset[int]()
-    return BusCommand(following, [mode], np.array([target]), np.array([2.0]), may_enable=follow, emergency=emergency)
+    return BusCommand(
+        following,
+        [mode],
+        np.array([target]),
+        np.array([2.0]),
+        may_enable=follow,
+        emergency=emergency,
+    )
 
 
 class Brake:
@@ -46,7 +57,9 @@ def test_torque_is_held_until_the_brake_has_closed() -> None:
     brake = Brake()
     for _ in range(8):
         brake.step(command(follow=True))
-    plans = [brake.step(command(follow=False, mode=JointMode.PASSIVE, target=0.0)) for _ in range(5)]
+    plans = [
+        brake.step(command(follow=False, mode=JointMode.PASSIVE, target=0.0)) for _ in range(5)
+    ]
     assert not any(plan.released for plan in plans)
     assert [bool(plan.command.enabled_drives) for plan in plans] == [True] * 3 + [False] * 2
     assert plans[0].command.modes == [JointMode.POSITION]
@@ -68,7 +81,11 @@ def test_drive_that_was_never_enabled_holds_nothing_when_disarmed() -> None:
 
 @pytest.mark.parametrize(
     ("mode", "into", "kept_at", "away"),
-    [(JointMode.POSITION, 0.9, 0.5, 0.1), (JointMode.VELOCITY, 1.0, 0.0, -1.0), (JointMode.TORQUE, 1.0, 0.0, -1.0)],
+    [
+        (JointMode.POSITION, 0.9, 0.5, 0.1),
+        (JointMode.VELOCITY, 1.0, 0.0, -1.0),
+        (JointMode.TORQUE, 1.0, 0.0, -1.0),
+    ],
 )
 def test_closed_switch_allows_motion_away_from_it_alone(
     mode: JointMode, into: float, kept_at: float, away: float
@@ -76,7 +93,9 @@ def test_closed_switch_allows_motion_away_from_it_alone(
     switches = LimitSwitches(["joint_1"])
     switches.record_switches(0, lower=False, upper=True)
     for target, expected in ((into, kept_at), (away, away)):
-        restricted = switches.restrict_command(command(follow=True, mode=mode, target=target), ANGLE_RAD)
+        restricted = switches.restrict_command(
+            command(follow=True, mode=mode, target=target), ANGLE_RAD
+        )
         assert restricted.targets[0] == expected
 
 
@@ -99,4 +118,8 @@ def test_safe_torque_off_has_a_fault_of_its_own_that_stops_the_robot() -> None:
     states.drives[0].safe_torque_off = True
     states.drives[0].errors = "something else, which is its consequence"
     [finding] = states.findings()
-    assert (finding.what, finding.joint, finding.affects_only_joint) == ("safe_torque_off", 0, False)
+    assert (finding.what, finding.joint, finding.affects_only_joint) == (
+        "safe_torque_off",
+        0,
+        False,
+    )

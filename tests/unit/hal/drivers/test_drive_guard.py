@@ -19,7 +19,9 @@ class Bench:
 
     def __init__(self) -> None:
         self.now_ns = 0
-        self.guard = DriveGuard(lambda: self.now_ns, watchdog_timeout_ns=GAP_NS, reset_grace_period_ns=GRACE_NS)
+        self.guard = DriveGuard(
+            lambda: self.now_ns, watchdog_timeout_ns=GAP_NS, reset_grace_period_ns=GRACE_NS
+        )
 
     def armed(self) -> frozenset[int]:
         return self.guard.select_drives_to_enable(BOTH, may_enable=True)
@@ -97,19 +99,30 @@ EVERYBODY = frozenset({0, 1, 2})
 
 
 def test_guard_joint_brakes_until_rest_or_watchdog_time() -> None:
-    braking, modes = BrakingJoints([100 * MS, 200 * MS, 100 * MS], is_hold_mode=False), [JointMode.VELOCITY] * 3
+    braking, modes = (
+        BrakingJoints([100 * MS, 200 * MS, 100 * MS], is_hold_mode=False),
+        [JointMode.VELOCITY] * 3,
+    )
     for _ in range(2):  # a fault, and the next one
         assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 0) == {0, 1}
         assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 99 * MS) == {0, 1}
         assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 100 * MS) == {1}
-        assert braking.select_braking_joints(EVERYBODY, modes, 10 * VELOCITIES, 100 * MS) == {1}, "none begins again"
+        assert braking.select_braking_joints(EVERYBODY, modes, 10 * VELOCITIES, 100 * MS) == {1}, (
+            "none begins again"
+        )
         assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 200 * MS) == NONE
         braking.reset()
 
 
 def test_guard_hold_has_no_end_and_passive_disables_at_once() -> None:
     braking = BrakingJoints([100 * MS] * 3, is_hold_mode=True)
-    assert braking.select_braking_joints(EVERYBODY, [JointMode.POSITION] * 3, 0 * VELOCITIES, 0) == EVERYBODY
-    assert braking.select_braking_joints(EVERYBODY, [JointMode.POSITION] * 3, VELOCITIES, 10_000 * MS) == EVERYBODY
+    assert (
+        braking.select_braking_joints(EVERYBODY, [JointMode.POSITION] * 3, 0 * VELOCITIES, 0)
+        == EVERYBODY
+    )
+    assert (
+        braking.select_braking_joints(EVERYBODY, [JointMode.POSITION] * 3, VELOCITIES, 10_000 * MS)
+        == EVERYBODY
+    )
     modes = [JointMode.PASSIVE, JointMode.POSITION, JointMode.POSITION]
     assert braking.select_braking_joints(EVERYBODY, modes, VELOCITIES, 10_000 * MS) == {1, 2}

@@ -9,7 +9,13 @@ from snakesim_drivers.emulation.emulator_control import LOGGED_STEP_RAD, DriveLo
 def test_drive_log_has_a_line_for_each_change_of_torque_or_angle():
     file = io.StringIO()
     log = DriveLog(file)
-    for enabled, angle_rad in [(False, 0.0), (False, 0.0), (True, 0.0), (True, LOGGED_STEP_RAD), (False, 0.1)]:
+    for enabled, angle_rad in [
+        (False, 0.0),
+        (False, 0.0),
+        (True, 0.0),
+        (True, LOGGED_STEP_RAD),
+        (False, 0.1),
+    ]:
         log.write(TrueState([enabled], [angle_rad]))
     lines = [json.loads(line) for line in file.getvalue().splitlines()]
     assert [line["enabled"] for line in lines] == [[False], [True], [True], [False]]

@@ -34,7 +34,9 @@ def test_example_is_the_template() -> None:
     assert EXAMPLE.read_text() == DRIVER.read_text()
 
 
-@pytest.mark.parametrize("name", ["", "Acme", "acme-servo", "1st", "a__b", "../acme", "x" * 41, "lambda", "odrive"])
+@pytest.mark.parametrize(
+    "name", ["", "Acme", "acme-servo", "1st", "a__b", "../acme", "x" * 41, "lambda", "odrive"]
+)
 def test_bad_names_are_refused(name: str) -> None:
     with raises_error(ConfigError, code=("config/invalid-value", "config/duplicate-name")):
         validate_driver_name(name)

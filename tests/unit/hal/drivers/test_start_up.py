@@ -21,7 +21,10 @@ class Bench:
         self.readings = DriveReadings(joints, lambda: self.now_ns)
         steps = [
             StartUpStep(
-                "configuring", 1.0, start=lambda i: self.sent.append(("configure", i)), is_done=self.configured
+                "configuring",
+                1.0,
+                start=lambda i: self.sent.append(("configure", i)),
+                is_done=self.configured,
             ),
             StartUpStep(
                 "homing",
@@ -32,7 +35,9 @@ class Bench:
                 moves_joint=True,
             ),
         ]
-        self.start_up = StartUp(LABELS, self.readings, lambda: self.now_ns, steps=steps, may_move=may_move)
+        self.start_up = StartUp(
+            LABELS, self.readings, lambda: self.now_ns, steps=steps, may_move=may_move
+        )
 
     def configured(self, i: int) -> bool:
         return ("configured", i) in self.done

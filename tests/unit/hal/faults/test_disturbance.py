@@ -8,7 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.faults.disturbance import MAX_REPEATS_PER_CALL, MessageDisturbance, corrupt_payload
+from snakesim_hal.faults.disturbance import (
+    MAX_REPEATS_PER_CALL,
+    MessageDisturbance,
+    corrupt_payload,
+)
 from snakesim_hal.model.fault_kinds import FaultInjection, validate_and_complete_injection
 from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import JointCommand
@@ -37,7 +41,10 @@ def sent(
     out: list[tuple[float, bytes]] = []
     for i, message in enumerate(messages):
         now_s = i * step_s
-        out += [(now_s, payload) for payload in way.pop_due_payloads(now_s) + way.disturb_payload(message, now_s)]
+        out += [
+            (now_s, payload)
+            for payload in way.pop_due_payloads(now_s) + way.disturb_payload(message, now_s)
+        ]
     while (now_s := way.next_due_s()) < inf:
         out += [(now_s, payload) for payload in way.pop_due_payloads(now_s)]
     return out
@@ -53,7 +60,9 @@ faults = st.lists(
 
 
 @given(faults, st.text(max_size=5))
-def test_nothing_is_invented_and_nothing_comes_before_its_time(chosen: list[FaultInjection], seed: str) -> None:
+def test_nothing_is_invented_and_nothing_comes_before_its_time(
+    chosen: list[FaultInjection], seed: str
+) -> None:
     way = disturbed(*chosen, seed=seed)
     out = sent(way, MESSAGES[:40])
     assert {payload for _, payload in out} <= set(MESSAGES[:40])
@@ -90,16 +99,22 @@ def test_disturbance_depends_only_on_its_seed() -> None:
 
 @pytest.mark.parametrize(("kind", "change"), [("drop", -1), ("duplicate", 1)])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5, 0.9, 1.0])
-def test_disturbance_drops_and_duplicates_the_configured_fraction(kind: str, change: int, share: float) -> None:
+def test_disturbance_drops_and_duplicates_the_configured_fraction(
+    kind: str, change: int, share: float
+) -> None:
     payloads = [payload for _, payload in sent(disturbed(on(kind, share)))]
     struck = change * (len(payloads) - len(MESSAGES))
-    assert struck == pytest.approx(share * len(MESSAGES), abs=4 * (share * (1 - share) * len(MESSAGES)) ** 0.5)
+    assert struck == pytest.approx(
+        share * len(MESSAGES), abs=4 * (share * (1 - share) * len(MESSAGES)) ** 0.5
+    )
     assert payloads == sorted(payloads)
 
 
 def test_disturbance_reordered_message_follows_its_successor() -> None:
     payloads = [payload for _, payload in sent(disturbed(on("reorder")))]
-    assert payloads == [payload for i in range(0, 400, 2) for payload in (MESSAGES[i + 1], MESSAGES[i])]
+    assert payloads == [
+        payload for i in range(0, 400, 2) for payload in (MESSAGES[i + 1], MESSAGES[i])
+    ]
 
 
 def test_a_held_message_goes_out_when_the_reordering_ends() -> None:
@@ -132,9 +147,10 @@ def test_a_flood_repeats_the_newest_message_at_its_rate() -> None:
     repeated = [way.pop_due_payloads(1.0 + i / 1000) for i in range(100)]
     assert 100 <= sum(map(len, repeated)) <= 101
     way.disturb_payload(b"2", 1.2)
-    assert set(way.pop_due_payloads(1.3)) == {b"2"} and len(way.pop_due_payloads(99.0)) == MAX_REPEATS_PER_CALL, (
-        "a hiccup is not made up for"
-    )
+    assert (
+        set(way.pop_due_payloads(1.3)) == {b"2"}
+        and len(way.pop_due_payloads(99.0)) == MAX_REPEATS_PER_CALL
+    ), "a hiccup is not made up for"
     assert way.pop_due_payloads(99.0) == []
     way.end_fault("flood", 99.0)
     assert way.is_over
@@ -167,7 +183,9 @@ def test_disturbance_corrupted_payloads_are_refused_by_decoders() -> None:
     assert min(lengths) == 0
     assert max(lengths) > len(payload)
     assert len(lengths) > 100
-    assert refused > 5_000 and taken > 1_000, "some still make sense: what those ask for is the limiter's to judge"
+    assert refused > 5_000 and taken > 1_000, (
+        "some still make sense: what those ask for is the limiter's to judge"
+    )
 
 
 def test_corruption_strikes_as_often_as_it_says() -> None:

@@ -102,7 +102,9 @@ def test_an_angle_can_be_off_and_can_be_no_number(bench: Bench) -> None:
     assert bench.sample().angle_rad == [pytest.approx(0.03)] * 3
 
 
-def test_slow_simulator_sample_takes_the_amount(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_simulator_sample_takes_the_amount(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     slept_s: list[float] = []
     monkeypatch.setattr(time, "sleep", slept_s.append)
     bench.backend.inject(parse_injection("slow:simulator@0=0.2"), begins=True)

@@ -29,11 +29,15 @@ def test_service_is_not_awaited_for_a_tick_that_was_published_before_it_connecte
 
 
 @pytest.mark.parametrize(("next_tick", "awaited_from"), [(5, 9), (8, 9), (9, 13)])
-def test_service_with_decimation_is_awaited_from_its_first_due_tick_on(next_tick: int, awaited_from: int) -> None:
+def test_service_with_decimation_is_awaited_from_its_first_due_tick_on(
+    next_tick: int, awaited_from: int
+) -> None:
     """The end of tick 9 needs the answer to tick 8: navigation is due every 4 ticks, and has 2 ticks for it."""
     participants = LockstepParticipants(SERVICES)
     participants.mark_present("navigation", next_tick)
-    assert [tick for tick in range(16) if participants.find_services_behind(tick)] == list(range(awaited_from, 16))
+    assert [tick for tick in range(16) if participants.find_services_behind(tick)] == list(
+        range(awaited_from, 16)
+    )
 
 
 def test_second_token_of_a_connected_service_changes_nothing() -> None:

@@ -13,7 +13,9 @@ def test_percentiles_are_right_to_one_percent(percent: int) -> None:
     for one in took_us.tolist():
         durations.add(one)
     assert durations.count == 20_000
-    assert durations.percentile_us(percent) == pytest.approx(np.percentile(took_us, percent), rel=0.01)
+    assert durations.percentile_us(percent) == pytest.approx(
+        np.percentile(took_us, percent), rel=0.01
+    )
 
 
 def test_what_is_out_of_range_counts_at_its_end() -> None:
@@ -39,6 +41,11 @@ def test_histogram_counts_each_value_from_shortest_to_longest() -> None:
     assert timing.median_us == pytest.approx(100, rel=0.05)
     assert timing.p99_us == pytest.approx(200, rel=0.05)
     assert timing.max_us == pytest.approx(10_000, rel=0.05)
-    ends_us = [timing.low_us * 10 ** (timing.bin_decades * (place + 1)) for place in range(len(timing.bins))]
-    assert next(sum(timing.bins[: place + 1]) for place, end in enumerate(ends_us) if end > 120) == 90
+    ends_us = [
+        timing.low_us * 10 ** (timing.bin_decades * (place + 1))
+        for place in range(len(timing.bins))
+    ]
+    assert (
+        next(sum(timing.bins[: place + 1]) for place, end in enumerate(ends_us) if end > 120) == 90
+    )
     assert timing.bins[-1] == 1

@@ -13,6 +13,10 @@ OF_THE_CLASS = {"check", "limit_modes"}  # used before a backend is opened, on t
 
 @pytest.mark.parametrize("wrapper", [FaultyBackend, GuardedBackend])
 def test_wrapped_backend_passes_on_every_method(wrapper: type[Backend]) -> None:
-    methods = {name for name, _ in inspect.getmembers(Backend, inspect.isfunction) if not name.startswith("_")}
+    methods = {
+        name
+        for name, _ in inspect.getmembers(Backend, inspect.isfunction)
+        if not name.startswith("_")
+    }
     missing = {name for name in methods - OF_THE_CLASS if name not in vars(wrapper)}
     assert not missing

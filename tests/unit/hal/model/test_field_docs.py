@@ -65,7 +65,10 @@ def test_field_without_literal_uses_description_of_its_type() -> None:
 
 def test_descriptions_are_inherited_and_overridden() -> None:
     assert collect_field_descriptions(SpareWheel)["spokes"] == "Number of spokes."
-    assert collect_field_descriptions(SpareWheel)["radius_m"] == collect_field_descriptions(Wheel)["radius_m"]
+    assert (
+        collect_field_descriptions(SpareWheel)["radius_m"]
+        == collect_field_descriptions(Wheel)["radius_m"]
+    )
 
 
 def test_joint_exception_fields_use_descriptions_of_their_section() -> None:
@@ -122,7 +125,12 @@ class Wave:
     ],
 )
 def test_type_unit_range_and_default(
-    struct: type[msgspec.Struct], field: str, type_words: str, unit: str, range_words: str, default: str | None
+    struct: type[msgspec.Struct],
+    field: str,
+    type_words: str,
+    unit: str,
+    range_words: str,
+    default: str | None,
 ) -> None:
     doc = docs_of(struct)[field]
     assert doc.type_words == type_words
@@ -172,6 +180,10 @@ def test_two_classes_of_one_name_have_descriptions_each() -> None:
     both: Any = msgspec.defstruct("Both", [("front", Wheel), ("rear", Other.Wheel)])
     descriptions: list[str] = []
     for definition in make_schema(both)["$defs"].values():
-        descriptions += [field["description"] for field in definition["properties"].values() if "description" in field]
+        descriptions += [
+            field["description"]
+            for field in definition["properties"].values()
+            if "description" in field
+        ]
     assert "Radius of the wheel, without its tire." in descriptions
     assert "Number of teeth." in descriptions

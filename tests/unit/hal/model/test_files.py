@@ -36,7 +36,10 @@ class Whole(FileStruct, frozen=True):
     parts: list[Part] = []
     by_name: dict[str, Part] = {}
     free: dict[str, dict[str, Any]] = {}
-    at_m: tuple[Annotated[float, Meta(ge=-5, le=5, extra_json_schema={"unit": "m"})], float] = (0.0, 0.0)
+    at_m: tuple[Annotated[float, Meta(ge=-5, le=5, extra_json_schema={"unit": "m"})], float] = (
+        0.0,
+        0.0,
+    )
     open: bool = False
     word: str = ""
 
@@ -63,7 +66,10 @@ WRONG: dict[str, dict[str, Any]] = {
     "in a tuple": {**GOOD, "at_m": [9.0, 0.0]},
     "tuple too short": {**GOOD, "at_m": [1.0]},
     "free key": {**GOOD, "by_name": {"a": {"size_m": 1}, "b": {"size_m": 1, "many": 99}}},
-    "unknown under a free key": {**GOOD, "by_name": {"ok": {"size_m": 1}, "b-2": {"size_m": 1, "mnay": 1}}},
+    "unknown under a free key": {
+        **GOOD,
+        "by_name": {"ok": {"size_m": 1}, "b-2": {"size_m": 1, "mnay": 1}},
+    },
     "missing under a free key": {**GOOD, "by_name": {"b": {}}},
     "free key that is no section": {**GOOD, "free": {"a": {}, "b": 3}},
     "flag": {**GOOD, "open": 1},
@@ -141,7 +147,12 @@ def test_a_wrong_value_is_explained_by_what_is_allowed(wrong: str) -> None:
     values = WRONG[wrong] if wrong in WRONG else UNION[wrong]
     with raises_error(
         ConfigError,
-        code=("config/invalid-value", "config/missing-key", "config/out-of-range", "config/unknown-key"),
+        code=(
+            "config/invalid-value",
+            "config/missing-key",
+            "config/out-of-range",
+            "config/unknown-key",
+        ),
         field="my.toml",
     ) as caught:
         decode_table(ConfigTable(values, "my.toml"), Whole if wrong in WRONG else Thing)
@@ -170,13 +181,20 @@ JSON = st.recursive(
     st.none() | st.booleans() | st.integers(-20, 20) | st.floats() | st.text(max_size=3),
     lambda inner: (
         st.lists(inner, max_size=3)
-        | st.dictionaries(st.sampled_from(["part", "parts", "by_name", "free", "at_m", "size_m", "many", "x.y"]), inner)
+        | st.dictionaries(
+            st.sampled_from(["part", "parts", "by_name", "free", "at_m", "size_m", "many", "x.y"]),
+            inner,
+        )
     ),
     max_leaves=8,
 )
 
 
-@given(values=st.dictionaries(st.sampled_from(["part", "parts", "by_name", "free", "at_m", "open", "zz"]), JSON))
+@given(
+    values=st.dictionaries(
+        st.sampled_from(["part", "parts", "by_name", "free", "at_m", "open", "zz"]), JSON
+    )
+)
 def test_any_values_decode_or_end_in_a_config_error(values: dict[str, Any]) -> None:
     try:
         assert isinstance(decode_table(ConfigTable(values, "my.toml"), Whole), Whole)
@@ -216,7 +234,9 @@ def test_find_takes_names_and_paths(tmp_path: Path) -> None:
     assert resolve_file_path("x.toml", "robots", tmp_path) == tmp_path / "x.toml"
     assert resolve_file_path("/abs/x.toml", "robots", tmp_path) == Path("/abs/x.toml")
     assert resolve_file_path("sub/x", "robots", tmp_path) == tmp_path / "sub/x"
-    with raises_error(ConfigError, code="config/unknown-name", field="planar31", stored=False) as caught:
+    with raises_error(
+        ConfigError, code="config/unknown-name", field="planar31", stored=False
+    ) as caught:
         resolve_file_path("planar31", "robots")
     assert all(name in str(caught.value) for name in list_shipped_names("robots"))
 
@@ -225,7 +245,9 @@ def test_find_takes_names_and_paths(tmp_path: Path) -> None:
 
 
 def test_origins_follow_the_last_writer(tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text("word = 'x'\n[part]\nsize_m = 1.0\nmany = 2\n[[parts]]\nsize_m = 1.0\n[free]\n")
+    (tmp_path / "a.toml").write_text(
+        "word = 'x'\n[part]\nsize_m = 1.0\nmany = 2\n[[parts]]\nsize_m = 1.0\n[free]\n"
+    )
     table = read_table(tmp_path / "a.toml")
     file = str(tmp_path / "a.toml")
     table.set_value("part.many", 3, "--many 3")
@@ -245,7 +267,13 @@ def test_putting_into_lists() -> None:
     table = ConfigTable({"at_m": [0.0, 0.0], "parts": [{"size_m": 1.0}], "word": "x"}, "my.toml")
     table.set_value("at_m.1", 2.0, "--set at_m.1=2")
     assert table.values["at_m"] == [0.0, 2.0]
-    for dotted in ("parts.1.size_m", "parts.-1.size_m", "parts.first.size_m", "at_m.2", "word.length"):
+    for dotted in (
+        "parts.1.size_m",
+        "parts.-1.size_m",
+        "parts.first.size_m",
+        "at_m.2",
+        "word.length",
+    ):
         with raises_error(ConfigError, code="config/unknown-key", field=f"--set {dotted}=1"):
             table.set_value(dotted, 1, f"--set {dotted}=1")
     table.values["parts"] = []
@@ -253,7 +281,13 @@ def test_putting_into_lists() -> None:
         table.set_value("parts.0.size_m", 1, "--set")
 
 
-@given(st.recursive(st.integers(), lambda x: st.dictionaries(st.sampled_from("abc"), x, min_size=1), max_leaves=9))
+@given(
+    st.recursive(
+        st.integers(),
+        lambda x: st.dictionaries(st.sampled_from("abc"), x, min_size=1),
+        max_leaves=9,
+    )
+)
 def test_leaves_and_put_are_each_others_inverse(value: Any) -> None:
     table = ConfigTable({}, "my.toml")
     for dotted, leaf in iterate_leaves({"root": value}):

@@ -5,7 +5,13 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.model.fitting import compute_joint_spacing_m
-from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option, place_obstacles, write_config
+from snakesim_hal.model.scenario import (
+    RunConfig,
+    load_scenario,
+    parse_set_option,
+    place_obstacles,
+    write_config,
+)
 from snakesim_hal.model.scene import SineRoute
 
 
@@ -44,7 +50,8 @@ def test_fitting_scene_for_other_joints_and_radius_scales_it() -> None:
 
 def test_fitting_keeps_values_set_by_flags_and_marks_others() -> None:
     loaded = load_scenario(
-        "surveyed_clutter", [parse_set_option("robot=mamba"), parse_set_option("scene.route.wavelength_m=0.7")]
+        "surveyed_clutter",
+        [parse_set_option("robot=mamba"), parse_set_option("scene.route.wavelength_m=0.7")],
     )
     assert sine(loaded.config).wavelength_m == 0.7
     origin = {key: source for key, _, source in loaded.list_effective_values()}

@@ -5,7 +5,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.model.friction import PassiveWheels, Skin, Surface, compute_link_factors, compute_surface_friction
+from snakesim_hal.model.friction import (
+    PassiveWheels,
+    Skin,
+    Surface,
+    compute_link_factors,
+    compute_surface_friction,
+)
 from snakesim_testing.sim.simulator_rig import make_config
 
 SCALES = {"forward": 0.11, "backward": 0.14, "sideways": 0.19}
@@ -27,16 +33,22 @@ def test_only_ratios_of_a_skin_matter(friction: float) -> None:
 
 def test_coefficients_of_a_surface_replace_those_of_the_skin() -> None:
     surface = Surface(forward_friction=0.05)
-    assert compute_surface_friction(0.19, surface, MILK_SNAKE, None) == pytest.approx((0.05, 0.14, 0.19))
+    assert compute_surface_friction(0.19, surface, MILK_SNAKE, None) == pytest.approx(
+        (0.05, 0.14, 0.19)
+    )
     assert compute_surface_friction(0.3, surface, None, None) == (0.05, 0.3, 0.3)
 
 
 def test_wheels_roll_along_and_slide_sideways() -> None:
-    wheels = msgspec.convert({**WHEELS, "rolling_resistance": 0.01, "tire_friction": 0.6}, PassiveWheels)
-    assert compute_surface_friction(0.2, Surface(forward_friction=0.1), None, wheels) == pytest.approx(
-        (0.014, 0.014, 0.6)
+    wheels = msgspec.convert(
+        {**WHEELS, "rolling_resistance": 0.01, "tire_friction": 0.6}, PassiveWheels
     )
-    assert compute_surface_friction(0.2, None, None, BALL_BEARINGS) == pytest.approx((0.004, 0.004, 0.2))
+    assert compute_surface_friction(
+        0.2, Surface(forward_friction=0.1), None, wheels
+    ) == pytest.approx((0.014, 0.014, 0.6))
+    assert compute_surface_friction(0.2, None, None, BALL_BEARINGS) == pytest.approx(
+        (0.004, 0.004, 0.2)
+    )
 
 
 def test_wheels_on_ice_slide_instead_of_rolling() -> None:
@@ -44,15 +56,25 @@ def test_wheels_on_ice_slide_instead_of_rolling() -> None:
 
 
 def test_factors_of_a_link_are_its_coefficients_over_those_of_the_skin() -> None:
-    skin = msgspec.convert({**SCALES, "links": {"link_2": {"forward": 0.22, "sideways": 0.095}}}, Skin)
-    assert compute_link_factors(skin, 4) == [(1, 1, 1), (1, 1, 1), pytest.approx((2.0, 1.0, 0.5)), (1, 1, 1)]
+    skin = msgspec.convert(
+        {**SCALES, "links": {"link_2": {"forward": 0.22, "sideways": 0.095}}}, Skin
+    )
+    assert compute_link_factors(skin, 4) == [
+        (1, 1, 1),
+        (1, 1, 1),
+        pytest.approx((2.0, 1.0, 0.5)),
+        (1, 1, 1),
+    ]
     assert compute_link_factors(None, 2) == [(1, 1, 1), (1, 1, 1)]
 
 
 @pytest.mark.parametrize(
     ("robot", "words"),
     [
-        ({"skin": {**SCALES, "links": {"link_14": {}}}}, ["skin.links.link_14", "link_0", "link_13"]),
+        (
+            {"skin": {**SCALES, "links": {"link_14": {}}}},
+            ["skin.links.link_14", "link_0", "link_13"],
+        ),
         ({"skin": SCALES, "wheels": WHEELS}, ["[skin]", "[wheels]", "leave one out"]),
         ({"wheels": {**WHEELS, "bearing_radius_m": 0.03}}, ["bearing_radius_m", "0.03 m", "below"]),
         ({"skin": {**SCALES, "sideways": 0.0}}, ["> 0"]),

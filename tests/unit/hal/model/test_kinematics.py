@@ -42,7 +42,9 @@ def turn(vector: Floats, wxyz: tuple[float, float, float, float]) -> Floats:
     return vector + 2 * w * np.cross(axis, vector) + 2 * np.cross(axis, np.cross(axis, vector))
 
 
-def homogeneous(axes: list[str], angles: list[float], lengths: list[float], base: Floats) -> list[Floats]:
+def homogeneous(
+    axes: list[str], angles: list[float], lengths: list[float], base: Floats
+) -> list[Floats]:
     """Frames of all links as a product of 4 x 4 matrices."""
     frames = [base]
     for axis, angle, length in zip(axes, angles, lengths, strict=False):
@@ -81,7 +83,9 @@ def test_the_planar_shortcut_is_the_full_calculation(
     planar = ["yaw"] * len(angles)
     base = rotation_from_quaternion(wxyz)
     short_o, short_r = compute_link_frames((1.0, 2.0, 3.0), base, np.array(angles), planar, lengths)
-    full_o, full_r = compute_link_frames((1.0, 2.0, 3.0), base, [*angles, 0.0], [*planar, "pitch"], [*lengths, 0.1])
+    full_o, full_r = compute_link_frames(
+        (1.0, 2.0, 3.0), base, [*angles, 0.0], [*planar, "pitch"], [*lengths, 0.1]
+    )
     assert short_o == pytest.approx(full_o[:-1], abs=1e-9)
     assert short_r == pytest.approx(full_r[:-1], abs=1e-9)
 
@@ -90,20 +94,26 @@ QUARTER_TURN_RAD = math.pi / 2
 
 
 def test_positive_yaw_turns_next_link_left() -> None:
-    origins, rotations = compute_link_frames((0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["yaw"], [1.0, 1.0])
+    origins, rotations = compute_link_frames(
+        (0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["yaw"], [1.0, 1.0]
+    )
     assert origins[1] == pytest.approx([1, 0, 0])
     assert rotations[1][:, 0] == pytest.approx([0, 1, 0])
 
 
 def test_positive_pitch_turns_next_link_down() -> None:
     """Pitch is right-handed about y, which points left."""
-    _, rotations = compute_link_frames((0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["pitch"], [1.0, 1.0])
+    _, rotations = compute_link_frames(
+        (0, 0, 0), np.eye(3), [QUARTER_TURN_RAD], ["pitch"], [1.0, 1.0]
+    )
     assert rotations[1][:, 0] == pytest.approx([0, 0, -1])
 
 
 def test_pitch_after_yaw_turns_about_yawed_axis() -> None:
     angles_rad = [QUARTER_TURN_RAD, QUARTER_TURN_RAD]
-    origins, rotations = compute_link_frames((0, 0, 0), np.eye(3), angles_rad, ["yaw", "pitch"], [1.0, 2.0, 1.0])
+    origins, rotations = compute_link_frames(
+        (0, 0, 0), np.eye(3), angles_rad, ["yaw", "pitch"], [1.0, 2.0, 1.0]
+    )
     assert origins[2] == pytest.approx([1, 2, 0])
     assert rotations[2][:, 0] == pytest.approx([0, 0, -1])
 

@@ -71,7 +71,9 @@ NAMELESS = {"no class": "", "empty class": ":", "unknown class": ":Wove"}
 
 @pytest.mark.parametrize("nameless", NAMELESS)
 @pytest.mark.parametrize("find", [load_plugin, load_plugin_unless_file])
-def test_a_file_without_its_class_lists_the_classes(find: Any, nameless: str, tmp_path: Path) -> None:
+def test_a_file_without_its_class_lists_the_classes(
+    find: Any, nameless: str, tmp_path: Path
+) -> None:
     (tmp_path / "wave.py").write_text(TRAP.format(mark=str(tmp_path / "mark")))
     with raises_error(ConfigError, code="plugin/not-found", field=f"{tmp_path}/wave.py:Wave"):
         find(CONTROLLERS, f"{tmp_path}/wave.py{NAMELESS[nameless]}")
@@ -138,14 +140,22 @@ def test_a_plugin_without_settings_is_told_to_state_them() -> None:
             decode_plugin_settings(bad, {}, "a.toml", "x")
 
 
-def test_plugin_name_in_two_packages_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plugin_name_in_two_packages_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for package in ("waves", "gaits"):
         metadata = tmp_path / f"{package}-1.0.dist-info"
         metadata.mkdir()
-        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-        (metadata / "entry_points.txt").write_text(f"[snakesim.controllers]\nwave = {package}:Wave\n")
+        (metadata / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n"
+        )
+        (metadata / "entry_points.txt").write_text(
+            f"[snakesim.controllers]\nwave = {package}:Wave\n"
+        )
     monkeypatch.syspath_prepend(tmp_path)
     with raises_error(ConfigError, code="plugin/ambiguous", field="wave") as raised:
         load_plugin(CONTROLLERS, "wave")
-    assert {"waves (waves:Wave)", "gaits (gaits:Wave)"} <= set(re.split(": | and |; ", str(raised.value)))
+    assert {"waves (waves:Wave)", "gaits (gaits:Wave)"} <= set(
+        re.split(": | and |; ", str(raised.value))
+    )
     assert load_plugin(CONTROLLERS, "hold").__name__ == "HoldPose"

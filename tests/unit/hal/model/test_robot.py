@@ -8,12 +8,25 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
-from snakesim_hal.model.joints import JointDrive, JointExceptions, JointMotor, JointSupply, MotionLimits, MotorHeat
+from snakesim_hal.model.joints import (
+    JointDrive,
+    JointExceptions,
+    JointMotor,
+    JointSupply,
+    MotionLimits,
+    MotorHeat,
+)
 from snakesim_hal.model.robot import RobotFile, compute_layout_hash, describe_robot
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import JointMode, RobotDescription
-from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, ROBOT, make_description, make_robot_file
+from snakesim_testing.hal.small_robots import (
+    LEASE_NS,
+    PERIOD_NS,
+    ROBOT,
+    make_description,
+    make_robot_file,
+)
 from snakesim_testing.messages import raises_error
 
 SECTIONS = ("limits", "motor", "drive", "heat", "supply")
@@ -22,8 +35,15 @@ SECTIONS = ("limits", "motor", "drive", "heat", "supply")
 @pytest.mark.parametrize("name", list_shipped_names("robots"))
 def test_every_shipped_robot_can_be_published(name: str) -> None:
     robot = decode_table(read_table_with_base(name, "robots"), RobotFile)
-    described = describe_robot(robot, backend="sim", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0")
-    assert MessageDecoder(RobotDescription).decode(encode(described), format_encoding(RobotDescription)) == described
+    described = describe_robot(
+        robot, backend="sim", period_ns=PERIOD_NS, lease_ns=LEASE_NS, config_hash="0"
+    )
+    assert (
+        MessageDecoder(RobotDescription).decode(
+            encode(described), format_encoding(RobotDescription)
+        )
+        == described
+    )
     assert len(described.joints) == robot.chain.modules == len(described.links) - 1
     for joint in described.joints:
         assert joint.angle_min_rad < 0 < joint.angle_max_rad
@@ -37,7 +57,11 @@ def test_every_shipped_robot_can_be_published(name: str) -> None:
 )
 def test_links_add_up_to_the_modules(modules: int, axes: list[str], length_m: float) -> None:
     robot = make_robot_file(chain={"modules": modules, "axes": axes}, module__length_m=length_m)
-    assert sum(robot.link_lengths_m) == pytest.approx(modules * length_m) == pytest.approx(robot.length_m)
+    assert (
+        sum(robot.link_lengths_m)
+        == pytest.approx(modules * length_m)
+        == pytest.approx(robot.length_m)
+    )
     assert sum(robot.link_masses_kg) == pytest.approx(modules * robot.module.mass_kg)
     assert robot.link_lengths_m[0] == robot.link_lengths_m[-1] == 0.5 * length_m
     assert robot.axes == [axes[i % len(axes)] for i in range(modules)]
@@ -71,25 +95,45 @@ def test_robot_joint_exception_is_allowed_for_every_section_field() -> None:
     robot = make_robot_file(joints={"joint_2": own}, drive__gear=9.0, limits__angle_max_rad=1.0)
     first, second, third = robot.joint_table
     for field, value in own.items():
-        found = [part for part in (second, *(getattr(second, s) for s in SECTIONS)) if hasattr(part, field)]
+        found = [
+            part
+            for part in (second, *(getattr(second, s) for s in SECTIONS))
+            if hasattr(part, field)
+        ]
         assert {getattr(part, field) for part in found} == {value}, field
     assert first.id == 1
     assert third.id == 3
     assert first.drive.gear == 9.0
     assert first.supply.voltage_v == 24.0
-    assert (first.limits.lower_rad, first.limits.upper_rad) == (-1.5, 1.0) == (third.limits.lower_rad, 1.0)
+    assert (
+        (first.limits.lower_rad, first.limits.upper_rad)
+        == (-1.5, 1.0)
+        == (third.limits.lower_rad, 1.0)
+    )
     joints = make_description(joints={"joint_2": own}, limits__angle_max_rad=1.0).joints
-    assert [(joint.angle_min_rad, joint.angle_max_rad) for joint in joints] == [(-1.5, 1.0), (-0.4, 1.2), (-1.5, 1.0)]
+    assert [(joint.angle_min_rad, joint.angle_max_rad) for joint in joints] == [
+        (-1.5, 1.0),
+        (-0.4, 1.2),
+        (-1.5, 1.0),
+    ]
     assert [joint.torque_limit_nm for joint in joints] == [4.0, 3.0, 4.0]
     assert [joint.speed_limit_rad_s for joint in joints] == [5.0, 2.0, 5.0]
     assert [joint.derate_from_c for joint in joints] == [80.0, 60.0, 80.0]
-    either = make_robot_file(joints={"joint_2": {"angle_rad": 0.2}}, limits__angle_max_rad=1.0).joint_table[1].limits
-    assert (either.lower_rad, either.upper_rad) == (-0.2, 0.2), "to either side, whatever the others' sides are"
+    either = (
+        make_robot_file(joints={"joint_2": {"angle_rad": 0.2}}, limits__angle_max_rad=1.0)
+        .joint_table[1]
+        .limits
+    )
+    assert (either.lower_rad, either.upper_rad) == (-0.2, 0.2), (
+        "to either side, whatever the others' sides are"
+    )
 
 
 def test_the_description_says_what_each_joint_can_do_and_measure() -> None:
     own = {"joint_2": {"modes": ["torque", "position"], "measures": ["torque"]}}
-    first, second, third = make_description(drive__modes=["position"], drive__measures=[], joints=own).joints
+    first, second, third = make_description(
+        drive__modes=["position"], drive__measures=[], joints=own
+    ).joints
     assert first.modes == third.modes == [JointMode.PASSIVE, JointMode.POSITION]
     assert first.measures == []
     assert second.modes == [JointMode.PASSIVE, JointMode.POSITION, JointMode.TORQUE]
@@ -104,13 +148,19 @@ def test_robot_every_section_field_has_a_joint_field() -> None:
         for section in (MotionLimits, JointMotor, JointDrive, MotorHeat, JointSupply)
         for field in section.__struct_fields__
     }
-    assert said - set(JointExceptions.__struct_fields__) == {"ambient_c"}, "the water is the same for all"
+    assert said - set(JointExceptions.__struct_fields__) == {"ambient_c"}, (
+        "the water is the same for all"
+    )
 
 
 def test_robot_description_lists_only_its_sensors_within_loop_rate() -> None:
     assert [sensor.key for sensor in make_description().sensors] == [keys.JOINTS]
     rich = make_description(
-        sensors={"contacts": {"rate_hz": 1000.0}, "imu": {"rate_hz": 20.0, "delay_s": 0.1}, "pose": {}}
+        sensors={
+            "contacts": {"rate_hz": 1000.0},
+            "imu": {"rate_hz": 20.0, "delay_s": 0.1},
+            "pose": {},
+        }
     )
     rates = {sensor.key: sensor.rate_hz for sensor in rich.sensors}
     assert rates == {keys.JOINTS: 100.0, keys.CONTACTS: 100.0, keys.IMU: 20.0, keys.POSE: 100.0}
@@ -122,7 +172,9 @@ def test_robot_cameras_and_lidars_are_named_and_one_period_late() -> None:
         {"name": "head", "delay_s": 0.0, "color": True},
         {"name": "back", "link": 2, "position_m": [0.0, 0.0, 0.1]},
     ]
-    rich = make_description(sensors={"depth": depth, "range": [{"name": "front", "rate_hz": 500.0, "delay_s": 0.04}]})
+    rich = make_description(
+        sensors={"depth": depth, "range": [{"name": "front", "rate_hz": 500.0, "delay_s": 0.04}]}
+    )
     found = {sensor.key: (sensor.rate_hz, sensor.delay_s) for sensor in rich.sensors}
     del found[keys.JOINTS]
     assert found == {
@@ -168,6 +220,9 @@ def test_the_layout_tells_robots_apart_that_take_other_vectors() -> None:
     three, four = make_description(), make_description(chain__modules=4)
     mixed = make_description(chain__axes=["yaw", "pitch"])
     swapped = list(reversed(three.joints))
-    found = {compute_layout_hash(joints) for joints in (three.joints, four.joints, mixed.joints, swapped)}
+    found = {
+        compute_layout_hash(joints) for joints in (three.joints, four.joints, mixed.joints, swapped)
+    }
     assert len(found) == 4
-    assert make_description(limits__torque_nm=1.0).layout == three.layout  # the same vectors, other numbers
+    # The same vectors, other numbers.
+    assert make_description(limits__torque_nm=1.0).layout == three.layout

@@ -43,13 +43,25 @@ def test_arc_length_of_known_curves() -> None:
 
 def test_route_passes_through_points_and_extends_straight_at_ends() -> None:
     route = Route([(0, 0), (3, 4), (3, 5)])
-    wanted = {-5.0: (-3, -4), 0.0: (0, 0), 2.5: (1.5, 2), 5.0: (3, 4), 5.5: (3, 4.5), 6.0: (3, 5), 8.0: (3, 7)}
-    assert route.compute_positions_w(np.array(list(wanted))) == pytest.approx(np.array(list(wanted.values())))
+    wanted = {
+        -5.0: (-3, -4),
+        0.0: (0, 0),
+        2.5: (1.5, 2),
+        5.0: (3, 4),
+        5.5: (3, 4.5),
+        6.0: (3, 5),
+        8.0: (3, 7),
+    }
+    assert route.compute_positions_w(np.array(list(wanted))) == pytest.approx(
+        np.array(list(wanted.values()))
+    )
 
 
 @given(route=gentle(), s_m=st.floats(-1, 8))
 def test_the_fast_lookup_is_the_slow_one(route: Route, s_m: float) -> None:
-    assert route.compute_point(s_m) == pytest.approx(tuple(route.compute_positions_w(s_m)), abs=1e-9)
+    assert route.compute_point(s_m) == pytest.approx(
+        tuple(route.compute_positions_w(s_m)), abs=1e-9
+    )
 
 
 @given(route=gentle(), s_m=st.floats(-0.5, 7), step_m=st.floats(1e-4, 0.05))
@@ -97,13 +109,19 @@ def project_by_measuring_all(route: Route, point_w: Floats, first: int, last: in
 
 
 @given(
-    seed=st.integers(0, 2**31), count=st.sampled_from([1, 2, 5, 17, 300]), spread_m=st.sampled_from([0.02, 1.0, 50.0])
+    seed=st.integers(0, 2**31),
+    count=st.sampled_from([1, 2, 5, 17, 300]),
+    spread_m=st.sampled_from([0.02, 1.0, 50.0]),
 )
-def test_projection_has_the_bits_of_measuring_every_segment(seed: int, count: int, spread_m: float) -> None:
+def test_projection_has_the_bits_of_measuring_every_segment(
+    seed: int, count: int, spread_m: float
+) -> None:
     """Random walks that cross themselves, points on them and far away, with and without a window."""
     random = np.random.default_rng(seed)
     headings_rad = np.cumsum(random.normal(0.0, random.choice([0.05, 1.0]), count))
-    steps = random.uniform(0.002, 0.05, count)[:, None] * np.column_stack([np.cos(headings_rad), np.sin(headings_rad)])
+    steps = random.uniform(0.002, 0.05, count)[:, None] * np.column_stack(
+        [np.cos(headings_rad), np.sin(headings_rad)]
+    )
     route = Route(np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
     for _ in range(8):
         place_w = route.points_w[random.integers(len(route.points_w))]
@@ -111,7 +129,9 @@ def test_projection_has_the_bits_of_measuring_every_segment(seed: int, count: in
         assert route.project_point(point_w) == project_by_measuring_all(route, point_w, 0, count)
         near_s_m = float(random.uniform(-1.0, route.length_m + 1.0))
         first, last = route._find_segments_near(near_s_m, 0.3)
-        assert route.project_point(point_w, near_s_m, 0.3) == project_by_measuring_all(route, point_w, first, last)
+        assert route.project_point(point_w, near_s_m, 0.3) == project_by_measuring_all(
+            route, point_w, first, last
+        )
 
 
 def test_projection_near_a_place_stays_on_its_branch() -> None:
@@ -127,7 +147,10 @@ def test_projection_near_a_place_stays_on_its_branch() -> None:
 @given(route=gentle(), s_m=st.floats(0, 5), near_m=st.floats(-0.3, 0.3))
 def test_projection_near_the_right_place_finds_it(route: Route, s_m: float, near_m: float) -> None:
     point = np.array(route.compute_point(s_m))
-    assert math.dist(route.compute_point(route.project_point(point, near_s_m=s_m + near_m)), point) < 1e-7
+    assert (
+        math.dist(route.compute_point(route.project_point(point, near_s_m=s_m + near_m)), point)
+        < 1e-7
+    )
 
 
 # --- inflections -----------------------------------------------------------------------------------------------
@@ -171,7 +194,9 @@ def test_sine_points_begin_at_the_origin_and_end_where_told() -> None:
 # --- chains ----------------------------------------------------------------------------------------------------
 
 
-def nodes(tail_w: tuple[float, float], heading_rad: float, angles_rad: Floats, lengths_m: list[float]) -> Floats:
+def nodes(
+    tail_w: tuple[float, float], heading_rad: float, angles_rad: Floats, lengths_m: list[float]
+) -> Floats:
     """Tail, joints and head of a planar chain, worked out the plain way."""
     headings = heading_rad + np.concatenate([[0.0], np.cumsum(angles_rad)])
     steps = np.array(lengths_m)[:, None] * np.column_stack([np.cos(headings), np.sin(headings)])
@@ -183,14 +208,21 @@ def nodes(tail_w: tuple[float, float], heading_rad: float, angles_rad: Floats, l
     tail_s_m=st.floats(-0.5, 2.0),
     lengths_m=st.lists(st.floats(0.04, 0.15), min_size=2, max_size=15),
 )
-def test_route_laid_chain_has_joints_at_their_distances(route: Route, tail_s_m: float, lengths_m: list[float]) -> None:
+def test_route_laid_chain_has_joints_at_their_distances(
+    route: Route, tail_s_m: float, lengths_m: list[float]
+) -> None:
     lay = place_chain_on_route(route, tail_s_m, lengths_m)
     points = nodes(lay.tail_w, lay.heading_rad, lay.angles_rad, lengths_m)
     assert lay.tail_w == pytest.approx(route.compute_point(tail_s_m))
     assert len(lay.angles_rad) == len(lengths_m) - 1
     assert np.abs(lay.angles_rad).max() <= math.pi
-    along = [route.project_point(point, near_s_m=tail_s_m + sum(lengths_m[:i])) for i, point in enumerate(points)]
-    assert max(math.dist(route.compute_point(s), p) for s, p in zip(along, points, strict=True)) < 1e-5
+    along = [
+        route.project_point(point, near_s_m=tail_s_m + sum(lengths_m[:i]))
+        for i, point in enumerate(points)
+    ]
+    assert (
+        max(math.dist(route.compute_point(s), p) for s, p in zip(along, points, strict=True)) < 1e-5
+    )
     assert np.diff(along).min() > 0  # tail to head, in the direction of travel
 
 
@@ -200,17 +232,20 @@ def test_a_laid_chain_bends_the_way_the_route_does() -> None:
     straight = place_chain_on_route(Route([(0, 0), (0, 5)]), 1.0, [0.1] * 5)
     assert straight.heading_rad == pytest.approx(math.pi / 2)
     assert np.abs(straight.angles_rad).max() < 1e-9
-    backwards = place_chain_on_route(
-        circle(1.0, 6.0), 2.8, [0.2] * 5
-    )  # headings pass half a turn: no joint turns by 2 pi
+    # Headings pass half a turn: no joint turns by 2 pi.
+    backwards = place_chain_on_route(circle(1.0, 6.0), 2.8, [0.2] * 5)
     assert backwards.angles_rad == pytest.approx([2 * math.asin(0.1)] * 4, rel=1e-3)
 
 
 @given(route=gentle(), s_m=st.floats(0, 4), distance_m=st.floats(0.01, 0.2))
-def test_the_next_point_is_ahead_at_the_straight_distance(route: Route, s_m: float, distance_m: float) -> None:
+def test_the_next_point_is_ahead_at_the_straight_distance(
+    route: Route, s_m: float, distance_m: float
+) -> None:
     s = find_arc_length_at_distance(route, route.compute_point(s_m), s_m, distance_m)
     assert s >= s_m + distance_m - 1e-6
-    assert math.dist(route.compute_point(s), route.compute_point(s_m)) == pytest.approx(distance_m, abs=1e-6)
+    assert math.dist(route.compute_point(s), route.compute_point(s_m)) == pytest.approx(
+        distance_m, abs=1e-6
+    )
 
 
 @given(axes=st.lists(st.sampled_from(["yaw", "pitch"]), min_size=1, max_size=12))

@@ -14,7 +14,11 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.participants import LockstepParticipants
 from snakesim_hal.model.fault_plan import parse_and_validate_planned_faults
 from snakesim_hal.model.files import list_shipped_names
-from snakesim_hal.model.kinematics import compute_link_frames, quaternion_from_yaw, rotation_from_quaternion
+from snakesim_hal.model.kinematics import (
+    compute_link_frames,
+    quaternion_from_yaw,
+    rotation_from_quaternion,
+)
 from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.model.scenario import (
     KeyOverride,
@@ -54,7 +58,10 @@ def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
     assert config.name == "crawl"
     assert config.robot.name == "worm"
     assert config.scene.name == "bend"
-    assert config.services == {"control": ServiceSchedule(), "guidance": ServiceSchedule(decimation=2)}
+    assert config.services == {
+        "control": ServiceSchedule(),
+        "guidance": ServiceSchedule(decimation=2),
+    }
     assert config.robot.sensors.pose is not None
     assert config.robot.sensors.contacts is None
     assert config.clock_mode == "lockstep"
@@ -73,7 +80,9 @@ def test_a_flag_makes_another_field_or_another_goal() -> None:
 
 
 def test_scenario_survey_error_is_the_same_for_all_services() -> None:
-    exact, off = (with_flags("surveyed_clutter", f"mission.map_error_m={sd}").config for sd in (0.0, 0.005))
+    exact, off = (
+        with_flags("surveyed_clutter", f"mission.map_error_m={sd}").config for sd in (0.0, 0.005)
+    )
     truth = np.array([placed.obstacle.position_w for placed in place_obstacles(off)])
     assert np.array_equal([one.position_w for one in get_noisy_obstacle_map(exact)], truth)
     errors_m = np.array([one.position_w for one in get_noisy_obstacle_map(off)]) - truth
@@ -86,7 +95,9 @@ def test_scenario_survey_error_is_the_same_for_all_services() -> None:
 
 def test_scenario_parts_beside_it_or_shipped_are_named_by_flags(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
-    path = write_scenario_files(tmp_path, scenario=SCENARIO_TOML.replace('"worm.toml"', '"planar13"'))
+    path = write_scenario_files(
+        tmp_path, scenario=SCENARIO_TOML.replace('"worm.toml"', '"planar13"')
+    )
     assert load_scenario(path).config.robot.name == "planar13"
     other = tmp_path / "elsewhere" / "other.toml"
     other.write_text(ROBOT_TOML.replace('"worm"', '"other"'))
@@ -97,7 +108,9 @@ def test_scenario_parts_beside_it_or_shipped_are_named_by_flags(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", list_shipped_names("scenarios"))
-def test_every_shipped_scenario_repeats_itself_from_its_effective_configuration(name: str, tmp_path: Path) -> None:
+def test_every_shipped_scenario_repeats_itself_from_its_effective_configuration(
+    name: str, tmp_path: Path
+) -> None:
     config = load_scenario(name).config
     write_config(config, tmp_path / "config.json")
     assert read_config(tmp_path / "config.json") == config
@@ -107,7 +120,9 @@ def test_every_shipped_scenario_repeats_itself_from_its_effective_configuration(
 
 
 def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Path) -> None:
-    first = with_flags(write_scenario_files(tmp_path), "robot.limits.torque_nm=2.5", "control.gain=3", "seed=9").config
+    first = with_flags(
+        write_scenario_files(tmp_path), "robot.limits.torque_nm=2.5", "control.gain=3", "seed=9"
+    ).config
     write_config(first, tmp_path / "config.json")
     assert read_config(tmp_path / "config.json") == first
     again = with_flags(str(tmp_path / "config.json"), "seed=10")
@@ -118,22 +133,37 @@ def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("change", "same"),
-    [({}, True), ({"seed": 2}, False), ({"robot__limits__torque_nm": 3.0}, False), ({"rate_hz": 50.0}, False)],
+    [
+        ({}, True),
+        ({"seed": 2}, False),
+        ({"robot__limits__torque_nm": 3.0}, False),
+        ({"rate_hz": 50.0}, False),
+    ],
 )
 def test_the_hash_follows_everything_that_matters(change: dict[str, Any], same: bool) -> None:
-    assert (compute_config_hash(make_run_config(**change)) == compute_config_hash(make_run_config())) == same
+    assert (
+        compute_config_hash(make_run_config(**change)) == compute_config_hash(make_run_config())
+    ) == same
     assert 1 <= len(compute_config_hash(make_run_config())) <= 64
 
 
 def test_an_external_service_is_waited_for_and_not_started() -> None:
-    own, external = (with_flags("triplet", *flags).config for flags in ([], ["services.control.external=true"]))
+    own, external = (
+        with_flags("triplet", *flags).config for flags in ([], ["services.control.external=true"])
+    )
     assert own.has_internal_control
     assert own.commander_name == "obstacle_triplet"
     assert "control" in own.internal_services
     assert not external.has_internal_control
     assert external.commander_name == "external"
-    policies = [with_flags("triplet", f"controller=policy:{model}").config for model in ("clutter", "./mine.onnx")]
-    assert [policy.commander_name for policy in policies] == ["policy:clutter", "policy:./mine.onnx"]
+    policies = [
+        with_flags("triplet", f"controller=policy:{model}").config
+        for model in ("clutter", "./mine.onnx")
+    ]
+    assert [policy.commander_name for policy in policies] == [
+        "policy:clutter",
+        "policy:./mine.onnx",
+    ]
     assert set(external.services) - set(external.internal_services) == {"control"}
     assert list(LockstepParticipants(external.services)) == list(own.services)
     for text in ("kill:control@1", "hang:control@1", "drop:actuator/joints@1"):
@@ -193,7 +223,10 @@ def test_set_without_key_or_value_is_refused(text: str) -> None:
 
 def test_every_value_says_where_it_came_from(tmp_path: Path) -> None:
     loaded = with_flags(
-        write_scenario_files(tmp_path), "robot.limits.torque_nm=2.0", "start.tail_s_m=0.2", "control.gain=1"
+        write_scenario_files(tmp_path),
+        "robot.limits.torque_nm=2.0",
+        "start.tail_s_m=0.2",
+        "control.gain=1",
     )
     reported = {key: (value, origin) for key, value, origin in loaded.list_effective_values()}
     assert reported["robot.limits.torque_nm"] == (2.0, "--set robot.limits.torque_nm=2.0")
@@ -217,7 +250,9 @@ def test_every_value_says_where_it_came_from(tmp_path: Path) -> None:
 
 def flat(value: Any, at: str = "") -> list[tuple[str, Any]]:
     if isinstance(value, dict) and value:
-        return [leaf for key, inner in value.items() for leaf in flat(inner, f"{at}.{key}".lstrip("."))]
+        return [
+            leaf for key, inner in value.items() for leaf in flat(inner, f"{at}.{key}".lstrip("."))
+        ]
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return [leaf for i, inner in enumerate(value) for leaf in flat(inner, f"{at}.{i}")]
     return [(at, value)]
@@ -226,13 +261,18 @@ def flat(value: Any, at: str = "") -> list[tuple[str, Any]]:
 def test_scenario_control_alias_means_chosen_controller_in_any_flag_order(tmp_path: Path) -> None:
     path = write_scenario_files(tmp_path)
     assert with_flags(path, "control.gain=3").config.controllers == {"hold": {"gain": 3}}
-    for flags in (["control.gain=3", "controller=./w.py:Wave"], ["controller=./w.py:Wave", "control.gain=3"]):
+    for flags in (
+        ["control.gain=3", "controller=./w.py:Wave"],
+        ["controller=./w.py:Wave", "control.gain=3"],
+    ):
         config = with_flags(path, *flags).config
         assert config.controllers == {"hold": {}, "Wave": {"gain": 3}}
         assert config.controller_parameters == {"gain": 3}
         assert config.control_section == "controllers.Wave"
     assert with_flags(path, "backend.step=1").config.backends == {"sim": {"step": 1}}
-    assert with_flags(path, "backend=emulator", "backend.step=1").config.backends == {"emulator": {"step": 1}}
+    assert with_flags(path, "backend=emulator", "backend.step=1").config.backends == {
+        "emulator": {"step": 1}
+    }
 
 
 # --- what is wrong: one error, in words ------------------------------------------------------------------------
@@ -256,7 +296,13 @@ def test_a_wrong_file_is_named(wrong: str, tmp_path: Path) -> None:
     assert old in text
     (tmp_path / name).write_text(text.replace(old, new, 1))
     with raises_error(
-        ConfigError, code=("config/invalid-value", "config/missing-key", "config/out-of-range", "file/invalid-syntax")
+        ConfigError,
+        code=(
+            "config/invalid-value",
+            "config/missing-key",
+            "config/out-of-range",
+            "file/invalid-syntax",
+        ),
     ) as caught:
         load_scenario(path)
     said = str(caught.value)
@@ -304,13 +350,20 @@ def test_the_snake_lies_on_its_route_with_every_joint(tmp_path: Path) -> None:
     assert pose.position_w == pytest.approx(route.compute_point(0.1))
     rotation = rotation_from_quaternion(quaternion_from_yaw(pose.yaw_rad))
     lengths = config.robot.link_lengths_m
-    origins, _ = compute_link_frames((*pose.position_w, 0.0), rotation, pose.angles_rad, config.robot.axes, lengths)
+    origins, _ = compute_link_frames(
+        (*pose.position_w, 0.0), rotation, pose.angles_rad, config.robot.axes, lengths
+    )
     for origin in origins:
-        assert np.hypot(*(route.compute_positions_w(route.project_point(origin[:2])) - origin[:2])) < 1e-5
+        assert (
+            np.hypot(*(route.compute_positions_w(route.project_point(origin[:2])) - origin[:2]))
+            < 1e-5
+        )
 
 
 def test_a_snake_with_pitch_joints_lies_flat_on_its_route(tmp_path: Path) -> None:
-    mixed = ROBOT_TOML.replace('axes = ["yaw"]', 'axes = ["pitch", "yaw"]').replace("modules = 3", "modules = 6")
+    mixed = ROBOT_TOML.replace('axes = ["yaw"]', 'axes = ["pitch", "yaw"]').replace(
+        "modules = 3", "modules = 6"
+    )
     pose = compute_start_pose(load_scenario(write_scenario_files(tmp_path, robot=mixed)).config)
     assert pose.angles_rad[0::2].tolist() == [0.0, 0.0, 0.0]
     assert np.abs(pose.angles_rad[1::2]).min() > 0
@@ -330,16 +383,25 @@ def test_off_the_route_the_snake_lies_straight_where_told() -> None:
 
 
 def test_random_fields_stay_clear_of_the_start() -> None:
-    field = {"seed": 1, "min_corner_m": [-0.3, -0.3], "max_corner_m": [0.7, 0.3], "density_per_m2": 30.0}
+    field = {
+        "seed": 1,
+        "min_corner_m": [-0.3, -0.3],
+        "max_corner_m": [0.7, 0.3],
+        "density_per_m2": 30.0,
+    }
     field |= {"radius_m": [0.02, 0.03], "clearance_m": 0.01}
     config = make_run_config(scene__random_field=[field])
     placed = place_obstacles(config)
     assert len(placed) == 18
     snake = make_start_capsules(config)
-    rears, fronts = np.array([link.rear_m for link in snake]), np.array([link.front_m for link in snake])
+    rears, fronts = (
+        np.array([link.rear_m for link in snake]),
+        np.array([link.front_m for link in snake]),
+    )
     links = ObstacleOutlines.from_segments(rears, fronts, snake[0].radius_m)
     for item in placed:
         assert (
-            links.compute_distances_m(np.array(item.obstacle.position_w[:2])).min() - item.obstacle.radius_m
+            links.compute_distances_m(np.array(item.obstacle.position_w[:2])).min()
+            - item.obstacle.radius_m
             >= 0.01 - 1e-9
         )

@@ -13,7 +13,11 @@ from hypothesis import strategies as st
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable, decode_table
 from snakesim_hal.model.outlines import CapsuleOutline, ObstacleOutlines, compute_outline_distance_m
-from snakesim_hal.model.placement import PlacedObstacle, place_scene_obstacles, validate_start_clearance
+from snakesim_hal.model.placement import (
+    PlacedObstacle,
+    place_scene_obstacles,
+    validate_start_clearance,
+)
 from snakesim_hal.model.scene import SceneFile, make_route
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.hal.small_robots import SCENE
@@ -29,7 +33,9 @@ FIELD: dict[str, Any] = {
     "clearance_m": 0.05,
 }
 SNAKE = [
-    CapsuleOutline(name=f"link_{i}", rear_m=(0.2 * i, 0.0), front_m=(0.2 * i + 0.2, 0.0), radius_m=0.04)
+    CapsuleOutline(
+        name=f"link_{i}", rear_m=(0.2 * i, 0.0), front_m=(0.2 * i + 0.2, 0.0), radius_m=0.04
+    )
     for i in range(3)
 ]
 LINKS = ObstacleOutlines.from_segments(
@@ -55,19 +61,33 @@ def place_one(**sections: Any) -> PlacedObstacle:
 
 def test_scene_cylinder_stands_on_ground_with_its_name_and_friction() -> None:
     placed = place_one(
-        cylinder=[{"position_m": [1, 2], "radius_m": 0.1, "height_m": 0.4, "friction": 0.3, "name": "post"}]
+        cylinder=[
+            {
+                "position_m": [1, 2],
+                "radius_m": 0.1,
+                "height_m": 0.4,
+                "friction": 0.3,
+                "name": "post",
+            }
+        ]
     )
     center_height_m = 0.4 / 2
     assert placed == PlacedObstacle(
         obstacle=KnownObstacle(
-            name="post", shape="cylinder", position_w=(1, 2, center_height_m), radius_m=0.1, height_m=0.4
+            name="post",
+            shape="cylinder",
+            position_w=(1, 2, center_height_m),
+            radius_m=0.1,
+            height_m=0.4,
         ),
         friction=0.3,
     )
 
 
 def test_scene_box_without_name_is_numbered_and_stands_on_ground() -> None:
-    obstacle = place_one(box=[{"position_m": [3, 0], "size_m": [0.4, 0.2, 0.6], "yaw_rad": 0.5}]).obstacle
+    obstacle = place_one(
+        box=[{"position_m": [3, 0], "size_m": [0.4, 0.2, 0.6], "yaw_rad": 0.5}]
+    ).obstacle
     assert obstacle.name == "box_0"
     assert obstacle.half_size_m == pytest.approx((0.2, 0.1, 0.3))
     assert obstacle.position_w[2] == 0.6 / 2
@@ -75,7 +95,9 @@ def test_scene_box_without_name_is_numbered_and_stands_on_ground() -> None:
 
 
 def test_scene_sphere_is_at_its_center_height() -> None:
-    obstacle = place_one(sphere=[{"position_m": [0, 3], "radius_m": 0.2, "center_height_m": 0.05}]).obstacle
+    obstacle = place_one(
+        sphere=[{"position_m": [0, 3], "radius_m": 0.2, "center_height_m": 0.05}]
+    ).obstacle
     assert obstacle.position_w == (0, 3, 0.05)
     assert obstacle.radius_m == 0.2
 
@@ -102,11 +124,15 @@ def test_scene_row_material_applies_to_all_and_keeps_places() -> None:
     plain = place_scene_obstacles(scene(route=SINE, pegs_along_route=[row], random_field=[FIELD]))
     leaning = {**FIELD, **made, "lean_up_to_rad": 0.2}
     loose = place_scene_obstacles(
-        scene(route=SINE, pegs_along_route=[{**row, **made, "lean_rad": 0.3}], random_field=[leaning])
+        scene(
+            route=SINE, pegs_along_route=[{**row, **made, "lean_rad": 0.3}], random_field=[leaning]
+        )
     )
     assert [item.obstacle for item in loose] == [item.obstacle for item in plain]
     assert {(item.friction, item.compute_sliding_force_n()) for item in plain} == {(0.2, None)}
-    assert {(item.friction, item.compute_sliding_force_n()) for item in loose} == {(0.1, 0.5 * 9.81 * 2.0)}
+    assert {(item.friction, item.compute_sliding_force_n()) for item in loose} == {
+        (0.1, 0.5 * 9.81 * 2.0)
+    }
     assert not any(item.can_move for item in plain)
     assert all(item.can_move for item in loose)
     assert [item.lean_rad for item in loose[:3]] == [0.3] * 3
@@ -152,28 +178,44 @@ def test_scene_pegs_stand_at_distance_on_the_forward_pushing_side(
         assert push @ route.tangent_w(spots[k]) == pytest.approx(0.0, abs=1e-6)
         assert push[0] > 0  # the route runs along x
     sides = [
-        math.copysign(1, peg.position_w[1] - route.compute_point(s)[1]) for peg, s in zip(pegs, spots, strict=False)
+        math.copysign(1, peg.position_w[1] - route.compute_point(s)[1])
+        for peg, s in zip(pegs, spots, strict=False)
     ]
     assert all(a == -b for a, b in itertools.pairwise(sides))
 
 
 def test_too_many_pegs_and_pegs_without_a_route_are_refused() -> None:
     row = {"corridor_m": 0.05, "radius_m": 0.05}
-    with raises_error(ConfigError, code="scene/invalid", field=("pegs_along_route.0", "count"), value=12):
-        place_scene_obstacles(scene(route=SINE, pegs_along_route=[{**row, "count": 12, "first": 1}]))
+    with raises_error(
+        ConfigError, code="scene/invalid", field=("pegs_along_route.0", "count"), value=12
+    ):
+        place_scene_obstacles(
+            scene(route=SINE, pegs_along_route=[{**row, "count": 12, "first": 1}])
+        )
     with raises_error(ConfigError, code="scene/no-route", field="pegs_along_route.0"):
         place_scene_obstacles(scene(pegs_along_route=[{**row, "count": 1}]))
     with raises_error(ConfigError, code="scene/invalid"):
-        place_scene_obstacles(scene(route=SINE, pegs_along_route=[{**row, "count": 1, "first": 50}]))
+        place_scene_obstacles(
+            scene(route=SINE, pegs_along_route=[{**row, "count": 1, "first": 50}])
+        )
 
 
 # --- random fields ---------------------------------------------------------------------------------------------
 
 
-@given(seed=st.integers(0, 2**31), clearance_m=st.floats(0, 0.1), route_clearance_m=st.floats(0, 0.1))
+@given(
+    seed=st.integers(0, 2**31), clearance_m=st.floats(0, 0.1), route_clearance_m=st.floats(0, 0.1)
+)
 @settings(max_examples=20)
-def test_a_random_field_keeps_its_clearances(seed: int, clearance_m: float, route_clearance_m: float) -> None:
-    field = {**FIELD, "seed": seed, "clearance_m": clearance_m, "route_clearance_m": route_clearance_m}
+def test_a_random_field_keeps_its_clearances(
+    seed: int, clearance_m: float, route_clearance_m: float
+) -> None:
+    field = {
+        **FIELD,
+        "seed": seed,
+        "clearance_m": clearance_m,
+        "route_clearance_m": route_clearance_m,
+    }
     post = {"position_m": [1.0, 0.5], "radius_m": 0.1, "name": "post"}
     made = scene(route=SINE, cylinder=[post], random_field=[field])
     route = make_route(made)
@@ -211,7 +253,11 @@ def test_blocks_keep_their_clearances_from_everything(seed: int) -> None:
             assert all(0.06 <= 2 * half <= 0.18 for half in one.half_size_m[:2])
         for point in np.array(one.position_w[:2]) + rim:
             assert (
-                min((compute_outline_distance_m(o, point) for o in placed if o is not one), default=1.0) >= 0.1 - 1e-9
+                min(
+                    (compute_outline_distance_m(o, point) for o in placed if o is not one),
+                    default=1.0,
+                )
+                >= 0.1 - 1e-9
             )
             assert LINKS.compute_distances_m(point).min() >= 0.1 - 1e-9
 
@@ -220,7 +266,9 @@ def test_scene_random_pegs_depend_only_on_their_seed() -> None:
     first, again = (place_scene_obstacles(scene(random_field=[FIELD])) for _ in range(2))
     assert first == again
     assert place_scene_obstacles(scene(random_field=[{**FIELD, "seed": 8}])) != first
-    two = place_scene_obstacles(scene(random_field=[FIELD, {**FIELD, "min_corner_m": [3, -1], "max_corner_m": [5, 1]}]))
+    two = place_scene_obstacles(
+        scene(random_field=[FIELD, {**FIELD, "min_corner_m": [3, -1], "max_corner_m": [5, 1]}])
+    )
     assert two[: len(first)] == first  # a second field does not stir the first
     assert {peg.obstacle.name for peg in two[len(first) :]} == {f"random_1_{k}" for k in range(20)}
     assert [p.obstacle.radius_m for p in two[len(first) :]] != [p.obstacle.radius_m for p in first]
@@ -235,7 +283,10 @@ def test_two_obstacles_with_one_name_are_refused() -> None:
         place_scene_obstacles(scene(cylinder=[post, {**post, "position_m": [2, 2]}]))
     with raises_error(ConfigError, code="config/duplicate-name", field="box_0"):
         place_scene_obstacles(
-            scene(cylinder=[{**post, "name": "box_0"}], box=[{"position_m": [5, 5], "size_m": [1, 1, 1]}])
+            scene(
+                cylinder=[{**post, "name": "box_0"}],
+                box=[{"position_m": [5, 5], "size_m": [1, 1, 1]}],
+            )
         )
 
 
@@ -250,7 +301,9 @@ def test_scene_zero_length_wall_and_equal_route_points_are_refused() -> None:
 
 
 @given(x=st.floats(-0.3, 0.9), y=st.floats(-0.3, 0.3), radius_m=st.floats(0.02, 0.1))
-def test_a_peg_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float, radius_m: float) -> None:
+def test_a_peg_is_refused_exactly_when_it_overlaps_the_snake(
+    x: float, y: float, radius_m: float
+) -> None:
     gap = math.dist((x, y), (min(max(x, 0.0), 0.6), 0.0)) - 0.04 - radius_m
     assume(abs(gap) > 2e-4)
     made = scene(cylinder=[{"position_m": [x, y], "radius_m": radius_m, "name": "post"}])
@@ -258,7 +311,9 @@ def test_a_peg_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float,
 
 
 @given(x=st.floats(-0.5, 1.1), y=st.floats(-0.5, 0.5), yaw_rad=st.floats(-3, 3))
-def test_a_block_is_refused_exactly_when_it_overlaps_the_snake(x: float, y: float, yaw_rad: float) -> None:
+def test_a_block_is_refused_exactly_when_it_overlaps_the_snake(
+    x: float, y: float, yaw_rad: float
+) -> None:
     made = scene(box=[{"position_m": [x, y], "size_m": [0.3, 0.1, 0.2], "yaw_rad": yaw_rad}])
     (block,) = place_scene_obstacles(made)
     line = np.column_stack([np.linspace(0, 0.6, 1200), np.zeros(1200)])
@@ -275,7 +330,9 @@ def test_a_snake_may_start_on_a_step() -> None:
 def test_distances_to_outlines() -> None:
     peg = KnownObstacle(name="p", shape="cylinder", position_w=(1, 0, 0), radius_m=0.2)
     assert compute_outline_distance_m(peg, np.array([2.0, 0.0])) == pytest.approx(0.8)
-    block = KnownObstacle(name="b", shape="box", position_w=(0, 0, 0), yaw_rad=math.pi / 2, half_size_m=(2, 1, 1))
+    block = KnownObstacle(
+        name="b", shape="box", position_w=(0, 0, 0), yaw_rad=math.pi / 2, half_size_m=(2, 1, 1)
+    )
     assert compute_outline_distance_m(block, np.array([0.0, 3.0])) == pytest.approx(1.0)
     assert compute_outline_distance_m(block, np.array([4.0, 6.0])) == pytest.approx(5.0)
     assert compute_outline_distance_m(block, np.array([0.5, 0.0])) == pytest.approx(-0.5)

@@ -9,12 +9,22 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable, decode_table
 from snakesim_hal.model.outlines import CapsuleOutline, ObstacleOutlines
-from snakesim_hal.model.placement import outline_pipes, place_scene_obstacles, validate_start_clearance
+from snakesim_hal.model.placement import (
+    outline_pipes,
+    place_scene_obstacles,
+    validate_start_clearance,
+)
 from snakesim_hal.model.scene import SceneFile
 from snakesim_testing.hal.small_robots import SCENE
 from snakesim_testing.messages import raises_error
 
-STAIRS: dict[str, Any] = {"position_m": [1.0, 2.0], "count": 3, "rise_m": 0.1, "run_m": 0.3, "width_m": 2.0}
+STAIRS: dict[str, Any] = {
+    "position_m": [1.0, 2.0],
+    "count": 3,
+    "rise_m": 0.1,
+    "run_m": 0.3,
+    "width_m": 2.0,
+}
 GAPS: dict[str, Any] = {
     "position_m": [-0.5, 0.0],
     "count": 2,
@@ -23,7 +33,12 @@ GAPS: dict[str, Any] = {
     "platform_m": 1.0,
     "width_m": 2.0,
 }
-PIPE: dict[str, Any] = {"position_m": [0.0, 0.0], "length_m": 4.0, "radius_m": 0.11, "inner_radius_m": 0.1}
+PIPE: dict[str, Any] = {
+    "position_m": [0.0, 0.0],
+    "length_m": 4.0,
+    "radius_m": 0.11,
+    "inner_radius_m": 0.1,
+}
 
 
 def decode_scene(**sections: Any) -> SceneFile:
@@ -34,7 +49,11 @@ def find_height_m(scene: SceneFile, x: float, y: float) -> float:
     """Return the height of the highest block at a point; 0 on the ground."""
     blocks = [placed.obstacle for placed in place_scene_obstacles(scene)]
     distances_m = ObstacleOutlines.from_obstacles(blocks).compute_distances_m(np.array([x, y]))
-    tops_m = [block.height_m for block, distance_m in zip(blocks, distances_m, strict=True) if distance_m < 0]
+    tops_m = [
+        block.height_m
+        for block, distance_m in zip(blocks, distances_m, strict=True)
+        if distance_m < 0
+    ]
     return max(tops_m, default=0.0)
 
 
@@ -51,7 +70,8 @@ def test_stairs_rise_step_by_step_to_the_landing(yaw_rad: float) -> None:
     assert all(item.walkable and item.friction == 0.7 for item in placed)
     along_m = (-0.05, 0.05, 0.25, 0.35, 0.55, 0.65, 1.55, 1.65)
     heights_m = [
-        find_height_m(scene, 1.0 + along * math.cos(yaw_rad), 2.0 + along * math.sin(yaw_rad)) for along in along_m
+        find_height_m(scene, 1.0 + along * math.cos(yaw_rad), 2.0 + along * math.sin(yaw_rad))
+        for along in along_m
     ]
     assert heights_m == pytest.approx([0.0, 0.1, 0.1, 0.2, 0.2, 0.3, 0.3, 0.0])
 
@@ -61,7 +81,10 @@ def test_gaps_are_between_platforms_of_equal_height() -> None:
     placed = place_scene_obstacles(scene)
     assert [item.obstacle.name for item in placed] == ["row_0", "row_1", "row_2"]
     assert all(item.walkable and item.forward_friction == 0.1 for item in placed)
-    heights_m = [find_height_m(scene, x, 0.9) for x in (-0.49, 0.49, 0.51, 0.74, 0.76, 1.74, 1.76, 1.99, 2.01)]
+    heights_m = [
+        find_height_m(scene, x, 0.9)
+        for x in (-0.49, 0.49, 0.51, 0.74, 0.76, 1.74, 1.76, 1.99, 2.01)
+    ]
     assert heights_m == pytest.approx([0.2, 0.2, 0.0, 0.0, 0.2, 0.2, 0.0, 0.0, 0.2])
 
 
@@ -107,7 +130,9 @@ def test_pipe_that_cannot_be_built_is_refused(change: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("y", "is_refused"), [(0.0, False), (0.055, False), (0.065, True), (0.14, True), (0.16, False)]
 )
-def test_snake_starts_in_a_pipe_or_beside_it_but_not_in_its_wall(y: float, is_refused: bool) -> None:
+def test_snake_starts_in_a_pipe_or_beside_it_but_not_in_its_wall(
+    y: float, is_refused: bool
+) -> None:
     scene = decode_scene(pipe=[PIPE])
     if not is_refused:
         check_start(scene, y)

@@ -11,7 +11,13 @@ import pytest
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable, read_table, resolve_file_path
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
-from snakesim_hal.model.textfiles import MAX_DEPTH, MAX_TOML_CHARACTERS, parse_toml, read_text, write_text
+from snakesim_hal.model.textfiles import (
+    MAX_DEPTH,
+    MAX_TOML_CHARACTERS,
+    parse_toml,
+    read_text,
+    write_text,
+)
 from snakesim_hal.network.router import open_router
 from snakesim_testing.messages import raises_error
 
@@ -53,12 +59,16 @@ ODD: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("odd", ODD)
-def test_an_odd_file_is_one_clear_line_at_once(odd: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_odd_file_is_one_clear_line_at_once(
+    odd: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "odd.toml"
     ODD[odd](path)
     started = time.monotonic()
-    with raises_error(ConfigError, code=("file/invalid-syntax", "file/not-readable", "file/too-large")) as caught:
+    with raises_error(
+        ConfigError, code=("file/invalid-syntax", "file/not-readable", "file/too-large")
+    ) as caught:
         load_scenario(str(path))
     assert time.monotonic() - started < LIMIT_S
     assert str(caught.value).startswith(f"{path}: "), caught.value
@@ -83,7 +93,8 @@ def test_text_file_of_maximum_size_is_read_in_bounded_time(tmp_path: Path) -> No
     started = time.monotonic()
     with raises_error(ConfigError, code="config/unknown-key", stored=False):
         load_scenario(
-            str(tmp_path / "large.toml"), [parse_set_option("robot=planar13"), parse_set_option("scene=triplet")]
+            str(tmp_path / "large.toml"),
+            [parse_set_option("robot=planar13"), parse_set_option("scene=triplet")],
         )
     assert time.monotonic() - started < 3 * LIMIT_S
 
@@ -94,7 +105,9 @@ def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
         assert read_table(tmp_path / name).values == {"a": 1}
 
 
-@pytest.mark.parametrize("text", [f"{DEEP}=1", f"robot={{{DEEP}=1}}", "rate_hz=" + "[" * 50_000, "x" * 200_000])
+@pytest.mark.parametrize(
+    "text", [f"{DEEP}=1", f"robot={{{DEEP}=1}}", "rate_hz=" + "[" * 50_000, "x" * 200_000]
+)
 def test_a_flag_of_any_length_is_one_short_line(text: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load_scenario("triplet", [parse_set_option(text)])
@@ -115,12 +128,17 @@ def test_names_that_no_file_has() -> None:
 def test_a_router_file_that_would_overflow_zenoh(tmp_path: Path) -> None:
     for text in ("[" * 100_000, "{plugins:" * 20_000):
         (tmp_path / "router.json5").write_text(text)
-        with raises_error(ConfigError, code="file/too-large"), open_router(tmp_path / "router.json5"):
+        with (
+            raises_error(ConfigError, code="file/too-large"),
+            open_router(tmp_path / "router.json5"),
+        ):
             pass
 
 
 def test_a_dotted_text_is_no_dotted_key() -> None:
-    assert parse_toml("about = 'wait ..................................... 1.2.3.4'", "x")["about"].endswith("4")
+    assert parse_toml("about = 'wait ..................................... 1.2.3.4'", "x")[
+        "about"
+    ].endswith("4")
 
 
 # --- writing ---------------------------------------------------------------------------------------------------

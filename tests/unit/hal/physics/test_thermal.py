@@ -12,7 +12,9 @@ LIMITS = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
 
 
 def windings(count: int = 1, **exceptions: Any) -> ThermalModel:
-    robot = make_robot_file(chain__modules=count, limits__torque_nm=4.0, joints={"joint_1": exceptions})
+    robot = make_robot_file(
+        chain__modules=count, limits__torque_nm=4.0, joints={"joint_1": exceptions}
+    )
     return ThermalModel(robot.joint_table)
 
 
@@ -29,16 +31,26 @@ def test_it_is_exact_whatever_the_step() -> None:
         fine.advance_temperatures(0.01, np.array([9.0]))
     coarse.advance_temperatures(10.0, np.array([9.0]))
     assert fine.winding_temperature_c == pytest.approx(coarse.winding_temperature_c)
-    assert coarse.winding_temperature_c[0] == pytest.approx(20 + 240 * 9 / 16 * (1 - np.exp(-10 / 60)))
+    assert coarse.winding_temperature_c[0] == pytest.approx(
+        20 + 240 * 9 / 16 * (1 - np.exp(-10 / 60))
+    )
 
 
 def test_thermal_share_is_reported_while_hot_and_once_after_cooling() -> None:
     heat = windings(2)
-    for celsius, reported in ((80.0, False), (80.1, True), (100.0, True), (79.0, True), (79.0, False)):
+    for celsius, reported in (
+        (80.0, False),
+        (80.1, True),
+        (100.0, True),
+        (79.0, True),
+        (79.0, False),
+    ):
         heat.winding_temperature_c[1] = celsius
         share = heat.compute_remaining_fractions()
         assert (share is not None) is reported
-        assert share is None or share.tolist() == pytest.approx([1.0, LIMITS.compute_remaining_fraction(celsius)])
+        assert share is None or share.tolist() == pytest.approx(
+            [1.0, LIMITS.compute_remaining_fraction(celsius)]
+        )
 
 
 def test_a_motor_at_stall_fades_and_never_overheats() -> None:
@@ -76,11 +88,20 @@ def test_a_warm_module_at_work_takes_more_from_its_supply() -> None:
 
 def test_one_motor_may_warm_up_otherwise_than_the_others() -> None:
     heat = windings(
-        2, rated_nm=2.0, rise_at_rated_k=100.0, time_constant_s=30.0, derate_from_c=50.0, board_fraction=0.5
+        2,
+        rated_nm=2.0,
+        rise_at_rated_k=100.0,
+        time_constant_s=30.0,
+        derate_from_c=50.0,
+        board_fraction=0.5,
     )
     heat.advance_temperatures(30.0, np.array([4.0, 4.0]))
-    assert heat.winding_temperature_c == pytest.approx([20 + 100 * (1 - np.exp(-1)), 20 + 60 * (1 - np.exp(-0.5))])
+    assert heat.winding_temperature_c == pytest.approx(
+        [20 + 100 * (1 - np.exp(-1)), 20 + 60 * (1 - np.exp(-0.5))]
+    )
     share = heat.compute_remaining_fractions()
     assert share is not None and share[0] < 1.0 and share[1] == 1.0, "each by its own limits"
-    assert (heat.compute_board_temperatures_c() - 20) / (heat.winding_temperature_c - 20) == pytest.approx([0.5, 0.3])
+    assert (heat.compute_board_temperatures_c() - 20) / (
+        heat.winding_temperature_c - 20
+    ) == pytest.approx([0.5, 0.3])
     assert heat.compute_power_w(np.array([2.0, 2.0]), np.zeros(2)) == pytest.approx([48.0, 12.0])

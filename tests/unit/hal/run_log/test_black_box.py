@@ -14,13 +14,20 @@ from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_
 from snakesim_hal.safety.authority import TickOutput
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, JointMode
-from snakesim_testing.hal.small_robots import make_description, make_joint_state, make_link_contact, make_pose
+from snakesim_testing.hal.small_robots import (
+    make_description,
+    make_joint_state,
+    make_link_contact,
+    make_pose,
+)
 from snakesim_testing.messages import raises_error
 
 ROBOT = make_description()
 
 
-def decision(target: float = 0.1, mode: JointMode = JointMode.POSITION, torque_limit: float = 4.0) -> TickOutput:
+def decision(
+    target: float = 0.1, mode: JointMode = JointMode.POSITION, torque_limit: float = 4.0
+) -> TickOutput:
     return TickOutput(SafeSetpoints([mode] * 3, [target] * 3, [torque_limit] * 3), 1, {})
 
 
@@ -65,7 +72,12 @@ def long_run() -> BlackBox:
         if tick == RELEASE_TICK:
             others[keys.CONTACTS] = Contacts(tick=tick, timestamp_ns=0, contacts=[])
         joints = make_joint_state(ROBOT, [0.1, 0.2, 0.001 * tick], 2.0, [3.0, 4.0, 5.0])
-        box.record_tick(tick, tick * 10_000_000, Samples(joints, others), decision(tick * 1e-4, JointMode.TORQUE))
+        box.record_tick(
+            tick,
+            tick * 10_000_000,
+            Samples(joints, others),
+            decision(tick * 1e-4, JointMode.TORQUE),
+        )
     return box
 
 
@@ -135,7 +147,9 @@ def on_disk(box: BlackBox, path: Path, torn: int = 0) -> Path:
 def test_a_box_on_disk_reads_back_without_its_torn_row(tmp_path: Path, torn: int) -> None:
     box = BlackBox(ROBOT)
     for tick in range(5):
-        box.record_tick(tick, tick * 10_000_000, Samples(make_joint_state(ROBOT, 0.3 * tick)), decision())
+        box.record_tick(
+            tick, tick * 10_000_000, Samples(make_joint_state(ROBOT, 0.3 * tick)), decision()
+        )
     layout, columns = read_black_box(on_disk(box, tmp_path / "box", torn))
     assert layout.robot == "worm"
     assert layout.joints == ["joint_1", "joint_2", "joint_3"]
@@ -186,8 +200,11 @@ def test_when_nobody_takes_them_the_newest_rows_are_kept() -> None:
     assert first == 16
     assert all_rows(box)["tick"].tolist() == list(range(16, 25))
     assert box.row_count == 25
-    assert box.layout.decode_rows(rows)["angle_rad"][:, 1] == pytest.approx([0.001 * tick for tick in range(16, 20)])
-    assert box.command_digest == digest(*((tick, decision()) for tick in range(25)))  # of all, kept or not
+    assert box.layout.decode_rows(rows)["angle_rad"][:, 1] == pytest.approx(
+        [0.001 * tick for tick in range(16, 20)]
+    )
+    # Of all, kept or not.
+    assert box.command_digest == digest(*((tick, decision()) for tick in range(25)))
 
 
 def test_rows_are_whole_while_another_thread_takes_them() -> None:
@@ -221,7 +238,9 @@ def test_black_box_tick_has_constant_cost_and_memory() -> None:
         BlackBox(robot, memory_bytes=100 * BlackBox(robot).layout.row_bytes),
         Samples(make_joint_state(robot, 0.1)),
     )
-    reported = TickOutput(SafeSetpoints([JointMode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {})
+    reported = TickOutput(
+        SafeSetpoints([JointMode.POSITION] * 100, [0.1] * 100, [4.0] * 100), 1, {}
+    )
     for tick in range(300):
         box.record_tick(tick, tick, row, reported)
     peaks = [0] * 700
@@ -240,7 +259,12 @@ def test_black_box_tick_has_constant_cost_and_memory() -> None:
 def test_black_box_keeps_mean_force_where_sensor_measures_it() -> None:
     box = BlackBox(ROBOT)
     touches = Contacts(
-        tick=0, timestamp_ns=0, contacts=[make_link_contact(force_l=(3.0, 4.0, 0.0))], measured_force_n=1.5
+        tick=0,
+        timestamp_ns=0,
+        contacts=[make_link_contact(force_l=(3.0, 4.0, 0.0))],
+        measured_force_n=1.5,
     )
-    box.record_tick(0, 0, Samples(make_joint_state(ROBOT, 0.0, 0.0, 0.0), {keys.CONTACTS: touches}), decision())
+    box.record_tick(
+        0, 0, Samples(make_joint_state(ROBOT, 0.0, 0.0, 0.0), {keys.CONTACTS: touches}), decision()
+    )
     assert all_rows(box)["contact_peak_n"].tolist() == [1.5]

@@ -16,7 +16,9 @@ def test_arming_target_may_be_one_step_away_at_most(side: float) -> None:
     here = np.zeros(len(ROBOT.joints))
     assert find_far_targets(make_joint_command(ROBOT, side * MAX), here, ROBOT, NONE) == []
     further = np.nextafter(MAX, np.inf)
-    assert len(find_far_targets(make_joint_command(ROBOT, side * further), here, ROBOT, NONE)) == len(ROBOT.joints)
+    assert len(
+        find_far_targets(make_joint_command(ROBOT, side * further), here, ROBOT, NONE)
+    ) == len(ROBOT.joints)
 
 
 def test_a_joint_that_is_set_aside_may_be_anywhere() -> None:

@@ -41,7 +41,10 @@ def test_arming_unmet_conditions_are_named_until_met() -> None:
     rig.send(0.7)
     assert "joint_1 has a target +0.60 rad" in rig.arm().reason
     rig.send(0.1, JointMode.TORQUE)
-    assert "joint_1 is commanded in mode torque; it must hold its position at arming" in rig.arm().reason
+    assert (
+        "joint_1 is commanded in mode torque; it must hold its position at arming"
+        in rig.arm().reason
+    )
     rig.send(0.0, JointMode.PASSIVE)
     assert rig.authority.list_unmet_conditions(rig.now_ns) == []
     rig.send(0.1)
@@ -65,8 +68,12 @@ def test_arming_stopped_robot_asks_for_reset() -> None:
         pytest.param({"robot": None, "backend": None}, "wrong_robot", "names None", id="no-robot"),
         pytest.param({"robot": "other"}, "wrong_robot", "this robot is 'worm'", id="other-robot"),
         pytest.param({"backend": None}, "wrong_backend", "the request names None", id="no-backend"),
-        pytest.param({"backend": "can"}, "wrong_backend", "this backend is 'lag'", id="other-backend"),
-        pytest.param({"config_hash": None}, "wrong_config", "arm with its config_hash", id="no-configuration"),
+        pytest.param(
+            {"backend": "can"}, "wrong_backend", "this backend is 'lag'", id="other-backend"
+        ),
+        pytest.param(
+            {"config_hash": None}, "wrong_config", "arm with its config_hash", id="no-configuration"
+        ),
         pytest.param({"config_hash": "1" * 16}, "wrong_config", "1" * 16, id="other-configuration"),
     ],
 )
@@ -74,7 +81,9 @@ def test_arming_request_for_another_robot_is_explained(
     request_fields: dict[str, Any], refusal: str, explanation: str
 ) -> None:
     rig = make_commanded_rig()
-    answer = rig.authority.handle_lifecycle_request(msgspec.structs.replace(ARM, **request_fields), rig.now_ns)
+    answer = rig.authority.handle_lifecycle_request(
+        msgspec.structs.replace(ARM, **request_fields), rig.now_ns
+    )
     assert answer.refusal == refusal
     assert explanation in answer.reason
 
@@ -151,7 +160,9 @@ def test_arming_unchecked_robot_needs_explicit_request() -> None:
 
 
 def test_arming_with_unknown_cable_is_refused_even_unchecked() -> None:
-    rig = make_commanded_rig(unchecked="nobody has checked it", cables=CableTracker((), {}, {"joint_2": "unknown"}))
+    rig = make_commanded_rig(
+        unchecked="nobody has checked it", cables=CableTracker((), {}, {"joint_2": "unknown"})
+    )
     answer = rig.authority.handle_lifecycle_request(ARM_UNCHECKED, rig.now_ns)
     assert answer.refusal == "cable"
     assert answer.reason == "joint_2: unknown"
@@ -161,7 +172,9 @@ def test_arming_in_lockstep_does_not_wait_for_power_reports() -> None:
     """Time may stand still until the robot is armed, so that no report can arrive."""
     power_sensor = SensorDescription(key=keys.POWER, rate_hz=2.0, delay_s=0.0)
     rig = AuthorityRig()
-    rig.authority = CommandAuthority(msgspec.structs.replace(rig.robot, sensors=[*rig.robot.sensors, power_sensor]))
+    rig.authority = CommandAuthority(
+        msgspec.structs.replace(rig.robot, sensors=[*rig.robot.sensors, power_sensor])
+    )
     rig.observe(0.1)
     rig.acquire()
     rig.tick_with(0.1)
@@ -308,13 +321,23 @@ def test_estop_stays_until_reset_and_arming() -> None:
 
 @pytest.mark.parametrize(
     ("stop_mode", "mode", "target"),
-    [("passive", JointMode.PASSIVE, 0.0), ("damp", JointMode.VELOCITY, 0.0), ("hold", JointMode.POSITION, 0.4)],
+    [
+        ("passive", JointMode.PASSIVE, 0.0),
+        ("damp", JointMode.VELOCITY, 0.0),
+        ("hold", JointMode.POSITION, 0.4),
+    ],
 )
-def test_fault_starts_the_stop_mode_of_the_robot(stop_mode: str, mode: JointMode, target: float) -> None:
+def test_fault_starts_the_stop_mode_of_the_robot(
+    stop_mode: str, mode: JointMode, target: float
+) -> None:
     rig = make_armed_rig(safety__action=stop_mode)
     rig.observe(0.4)
     rig.authority.latch_fault(HOT)
-    for angle_rad in (0.4, 0.6, 0.9):  # later motion of the joint does not change the pose that is held
+    for angle_rad in (
+        0.4,
+        0.6,
+        0.9,
+    ):  # later motion of the joint does not change the pose that is held
         rig.observe(angle_rad)
         decision = rig.pass_tick()
         assert list_modes(decision) == {mode}
@@ -323,7 +346,9 @@ def test_fault_starts_the_stop_mode_of_the_robot(stop_mode: str, mode: JointMode
 
 def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
     """From 1 rad/s at 50 rad/s² the joint is at rest after two periods of 10 ms."""
-    rig = make_armed_rig(joints={"joint_2": {"modes": ["position"]}}, limits__acceleration_rad_s2=50.0)
+    rig = make_armed_rig(
+        joints={"joint_2": {"modes": ["position"]}}, limits__acceleration_rad_s2=50.0
+    )
     rig.observe(0.1, 1.0)
     rig.authority.latch_fault(HOT)
     braking = rig.pass_tick().setpoints
@@ -382,8 +407,11 @@ def test_heat_derates_then_stops_then_blocks_arming() -> None:
     assert rig.authority.derated_joints == {"joint_2": pytest.approx(0.6)}
     report_power(rig, [20.0, 110.0, 20.0])
     stopped = rig.pass_tick()
-    assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [("overheated", "joint_2")]
-    assert stopped.setpoints.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])  # also while stopping
+    assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [
+        ("overheated", "joint_2")
+    ]
+    # Also while stopping.
+    assert stopped.setpoints.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])
     rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
     rig.acquire()
     rig.tick_with(0.1)
@@ -417,7 +445,9 @@ def test_joint_angle_after_a_host_pause_may_be_far() -> None:
 
 def test_joint_state_with_nan_is_published_as_last_good() -> None:
     rig = make_armed_rig()
-    published = rig.authority.replace_non_finite_values(make_joint_state(rig.robot, [0.2, float("nan"), 0.2]))
+    published = rig.authority.replace_non_finite_values(
+        make_joint_state(rig.robot, [0.2, float("nan"), 0.2])
+    )
     assert published.angle_rad == [0.2, 0.1, 0.2]
     assert published.valid == [True, False, True]
 
@@ -446,13 +476,17 @@ def test_command_with_a_sequence_number_again_is_a_replay() -> None:
 
 
 @pytest.mark.parametrize("is_armed", [False, True], ids=["disarmed", "armed"])
-def test_angles_that_never_change_are_implausible_only_while_commanded_to_move(is_armed: bool) -> None:
+def test_angles_that_never_change_are_implausible_only_while_commanded_to_move(
+    is_armed: bool,
+) -> None:
     """A robot that nothing commands may rest for as long as it likes."""
     rig = make_armed_rig() if is_armed else make_commanded_rig()
     for tick in range(1, 400):
         rig.tick_with(0.1 + 0.001 * tick)
         rig.authority.observe_joints(
-            make_joint_state(rig.robot, 0.1, tick=tick, timestamp_ns=rig.timestamp_ns + tick * PERIOD_NS)
+            make_joint_state(
+                rig.robot, 0.1, tick=tick, timestamp_ns=rig.timestamp_ns + tick * PERIOD_NS
+            )
         )
         rig.authority.latch_faults_and_expire_lease(rig.now_ns, rig.tick)
     assert (rig.authority.state == "fault") == is_armed

@@ -17,7 +17,14 @@ from snakesim_hal.safety import authority as under_test
 from snakesim_hal.safety.authority import CommandAuthority
 from snakesim_hal.safety.lease import CommandLease
 from snakesim_hal.wire.freshness import FRESH_NS
-from snakesim_hal.wire.messages import EstopRequest, Fault, JointCommand, JointMode, LeaseRequest, LifecycleRequest
+from snakesim_hal.wire.messages import (
+    EstopRequest,
+    Fault,
+    JointCommand,
+    JointMode,
+    LeaseRequest,
+    LifecycleRequest,
+)
 from snakesim_testing.hal.authority_model import (
     ALL,
     ANGLE_LIMIT_RAD,
@@ -51,7 +58,8 @@ KEPT = 4  # commands: fewer than in earnest, so that a few are a flood
 
 HOLDERS = st.sampled_from(["control", "teleop", "mission"])
 NUMBERS = st.floats(-2, 2) | st.floats(-6, 6) | st.sampled_from([0.0, 1e5, -1e5, 5e-324, 1.5, -1.5])
-DEFECTS = ("epoch", "replayed", "future", "stale", "layout", "length", "finite")  # in the order of the limiter's checks
+# In the order of the limiter's checks.
+DEFECTS = "epoch", "replayed", "future", "stale", "layout", "length", "finite"
 REASONS = {
     "epoch": "wrong_epoch",
     "replayed": "replayed",
@@ -61,9 +69,9 @@ REASONS = {
     "length": "wrong_length",
     "finite": "not_finite",
 }
-TIMES_NS = st.sampled_from([0, 1, PERIOD_NS, LEASE_NS - 1, LEASE_NS, LEASE_NS + 1, KNOWN_FOR_NS + 1]) | st.integers(
-    0, 3 * LEASE_NS
-)
+TIMES_NS = st.sampled_from(
+    [0, 1, PERIOD_NS, LEASE_NS - 1, LEASE_NS, LEASE_NS + 1, KNOWN_FOR_NS + 1]
+) | st.integers(0, 3 * LEASE_NS)
 
 
 def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
@@ -97,8 +105,12 @@ class Everything(AuthorityModel):
         max_isolated=st.sampled_from([0, 0, 1, 2]),
         at_once=often(True, False),
     )
-    def begin(self, action: str, first_epoch: int, lag: int | None, max_isolated: int, at_once: bool) -> None:
-        self.robot = make_description(safety__action=action, safety__max_isolated_joints=max_isolated)
+    def begin(
+        self, action: str, first_epoch: int, lag: int | None, max_isolated: int, at_once: bool
+    ) -> None:
+        self.robot = make_description(
+            safety__action=action, safety__max_isolated_joints=max_isolated
+        )
         self.max_isolated = max_isolated
         self.action = action
         self.lag = lag  # in lockstep; None: the newest command counts
@@ -180,15 +192,31 @@ class Everything(AuthorityModel):
         failure=often(None, "nan", "short"),
     )
     def hear_of_power(
-        self, celsius: list[float], volts: list[float], leak: int | None, silent: int | None, failure: str | None
+        self,
+        celsius: list[float],
+        volts: list[float],
+        leak: int | None,
+        silent: int | None,
+        failure: str | None,
     ) -> None:
         leaks, valid = [i == leak for i in range(JOINTS)], [i != silent for i in range(JOINTS)]
-        reported = [NAN, *celsius[1:]] if failure == "nan" else celsius[1:] if failure == "short" else celsius
+        reported = (
+            [NAN, *celsius[1:]]
+            if failure == "nan"
+            else celsius[1:]
+            if failure == "short"
+            else celsius
+        )
         self.authority.observe_power(make_power(reported, volts, leaks, valid), self.now_ns)
         for i, health in enumerate(self.healths if failure != "short" else ()):
             if i == silent or not math.isfinite(reported[i]):
                 continue
-            health.received_ns, health.celsius, health.volts, health.leak = self.now_ns, celsius[i], volts[i], leaks[i]
+            health.received_ns, health.celsius, health.volts, health.leak = (
+                self.now_ns,
+                celsius[i],
+                volts[i],
+                leaks[i],
+            )
             health.hot = celsius[i] >= (DERATE_FROM if health.hot else STOP_AT)
             if volts[i] >= MIN_V:
                 health.low_since_ns = None
@@ -200,7 +228,9 @@ class Everything(AuthorityModel):
         before, self.health_faults = self.health_faults, set()
         for i, health in enumerate(self.healths):
             self.health_faults |= {(word, i) for word in health.wrong(self.now_ns)}
-        for word, i in sorted(self.health_faults - before, key=lambda found: (found[1], WORDS.index(found[0]))):
+        for word, i in sorted(
+            self.health_faults - before, key=lambda found: (found[1], WORDS.index(found[0]))
+        ):
             self.lose_or_fail({i} if word == "overheated" else None)
         quiet_before, self.silent = self.silent, set()
         for i, health in enumerate(self.healths):
@@ -290,7 +320,9 @@ class Everything(AuthorityModel):
         if not self.is_lease_held:
             expected = "no_lease"
         counted = self.authority.rejected_counts[expected] if expected else 0
-        refusal = self.authority.process_command(asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns)
+        refusal = self.authority.process_command(
+            asked, now_ns=self.now_ns, tick=self.tick, age_ns=age_ns
+        )
         self.offered += 1
         if expected is not None:
             assert refusal == expected
@@ -322,13 +354,20 @@ class Everything(AuthorityModel):
         config_hash=often("0" * 16, "1" * 16, None),
     )
     def arm(self, robot: str | None, backend: str | None, config_hash: str | None) -> None:
-        ready = self.state == "disarmed" and self.known and self.is_lease_held and self.newest_command is not None
+        ready = (
+            self.state == "disarmed"
+            and self.known
+            and self.is_lease_held
+            and self.newest_command is not None
+        )
         wrong = {
             (word, i)
             for word, i in self.health_faults
             if word == "leak" or (word == "overheated" and i not in self.isolated)
         }
-        weak = any(health.low_since_ns is not None and health.known(self.now_ns) for health in self.healths)
+        weak = any(
+            health.low_since_ns is not None and health.known(self.now_ns) for health in self.healths
+        )
         ready = ready and not wrong and not weak and (self.is_stop_sent or self.arm_session == 0)
         if ready and self.newest_command is not None:
             received_ns, asked = self.newest_command
@@ -336,7 +375,9 @@ class Everything(AuthorityModel):
                 i in self.isolated
                 or mode == JointMode.PASSIVE
                 or (mode == JointMode.POSITION and abs(target - angle) <= MAX_STEP_RAD)
-                for i, mode, target, angle in zip(ALL, asked.mode, asked.target, self.measured[0], strict=True)
+                for i, mode, target, angle in zip(
+                    ALL, asked.mode, asked.target, self.measured[0], strict=True
+                )
             )
         assert (not self.authority.list_unmet_conditions(self.now_ns)) == ready
         reported = {
@@ -346,7 +387,9 @@ class Everything(AuthorityModel):
         }
         reported |= {"wrong_state": self.state == "disarmed", "not_ready": ready}
         ready = all(reported.values())
-        request = LifecycleRequest(action="arm", robot=robot, backend=backend, config_hash=config_hash)
+        request = LifecycleRequest(
+            action="arm", robot=robot, backend=backend, config_hash=config_hash
+        )
         answer = self.authority.handle_lifecycle_request(request, self.now_ns)
         if ready:
             self.change_state("armed")
@@ -360,10 +403,14 @@ class Everything(AuthorityModel):
 
     @rule(action=st.sampled_from(["disarm", "finish", "reset"]))
     def ask_for_less(self, action: Any) -> None:
-        ok = action == "finish" or self.state in (("armed", "disarmed") if action == "disarm" else ("fault", "estop"))
+        ok = action == "finish" or self.state in (
+            ("armed", "disarmed") if action == "disarm" else ("fault", "estop")
+        )
         if action == "reset" and self.state == "disarmed":
             ok = True
-        answer = self.authority.handle_lifecycle_request(LifecycleRequest(action=action), self.now_ns)
+        answer = self.authority.handle_lifecycle_request(
+            LifecycleRequest(action=action), self.now_ns
+        )
         if ok and (action != "finish" or self.state == "armed"):
             self.change_state("disarmed")
         if ok and action == "reset":
@@ -380,7 +427,9 @@ class Everything(AuthorityModel):
         self.change_state("estop")
         self.note_fault()
         self.check(answer, True)
-        assert self.authority.faults[-1] == Fault(tick=self.tick, what="estop", cause=f"emergency stop by {who}")
+        assert self.authority.faults[-1] == Fault(
+            tick=self.tick, what="estop", cause=f"emergency stop by {who}"
+        )
 
     @rule(
         cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]),
@@ -389,7 +438,9 @@ class Everything(AuthorityModel):
     )
     def backend_fault(self, cause: str, reach: Any, joint: int | None) -> None:
         name = None if joint is None else f"joint_{joint + 1}"
-        self.authority.latch_fault(Fault(tick=self.tick, what="hot", cause=cause, joint=name, reach=reach))
+        self.authority.latch_fault(
+            Fault(tick=self.tick, what="hot", cause=cause, joint=name, reach=reach)
+        )
         if reach == "none":
             self.note_fault()
             return
@@ -484,7 +535,15 @@ class Everything(AuthorityModel):
         """Only a command that answers a state after the arming counts as rejected."""
         back = self.tick - self.armed_tick - later
         self.send_commands(
-            [0.0] * JOINTS, [JointMode.POSITION] * JOINTS, None, False, set(), False, -1, max(back, 0), 1
+            [0.0] * JOINTS,
+            [JointMode.POSITION] * JOINTS,
+            None,
+            False,
+            set(),
+            False,
+            -1,
+            max(back, 0),
+            1,
         )
 
     # --- time, and what goes out -------------------------------------------------------------------------------
@@ -521,8 +580,12 @@ class Everything(AuthorityModel):
             assert self.doubtful_joints is not None
             assert self.doubtful_joints <= self.isolated
             for sent in self.commands_since_arming[-KEPT:]:
-                self.active_command = sent if up_to is None or sent.tick <= up_to else self.active_command
-            assert decision.command_sequence == (None if self.active_command is None else self.active_command.sequence)
+                self.active_command = (
+                    sent if up_to is None or sent.tick <= up_to else self.active_command
+                )
+            assert decision.command_sequence == (
+                None if self.active_command is None else self.active_command.sequence
+            )
             if self.active_command is None:  # nothing was commanded since the robot was armed
                 self.check_held(decision, self.hold_angles_rad)
             else:
@@ -537,7 +600,9 @@ class Everything(AuthorityModel):
         assert found.state == self.state, f"{found.state}, not {self.state}: {found.reason}"
         assert found.arm_session == self.arm_session
         expected = (
-            CommandLease(self.holder, self.epoch, self.priority, self.expires_ns) if self.holder else CommandLease()
+            CommandLease(self.holder, self.epoch, self.priority, self.expires_ns)
+            if self.holder
+            else CommandLease()
         )
         assert found.lease.epoch == self.epoch  # the model's only ever grows
         assert found.lease.holder == self.holder
@@ -549,7 +614,10 @@ class Everything(AuthorityModel):
         assert all(len(fault.cause) <= 500 for fault in found.faults)
         assert found.rejected_counts.total() == self.rejected
         assert found.accepted_count == len(self.commands_since_arming) or found.arm_session > 1
-        assert found.accepted_count + found.standby_count + found.rejected_counts.total() == self.offered
+        assert (
+            found.accepted_count + found.standby_count + found.rejected_counts.total()
+            == self.offered
+        )
 
 
 @pytest.mark.timeout(600)  # a busy computer may take minutes, which is no failure

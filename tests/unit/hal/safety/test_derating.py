@@ -18,11 +18,15 @@ S = 1000 * MS
 class Bench:
     """A derating and its clock."""
 
-    def __init__(self, *, expected: bool = False, awaits_reports: bool = False, **robot: Any) -> None:
+    def __init__(
+        self, *, expected: bool = False, awaits_reports: bool = False, **robot: Any
+    ) -> None:
         sensor = SensorDescription(key=keys.POWER, rate_hz=2.0, delay_s=0.0)
         plain = make_description(**robot)
         sensors = [*plain.sensors, sensor] if expected else plain.sensors
-        self.derating = HealthMonitor(msgspec.structs.replace(plain, sensors=sensors), awaits_reports=awaits_reports)
+        self.derating = HealthMonitor(
+            msgspec.structs.replace(plain, sensors=sensors), awaits_reports=awaits_reports
+        )
         self.now_ns = 5 * S
         self.notes: list[Fault] = []
 
@@ -57,12 +61,16 @@ def test_nothing_is_derated_before_anything_is_known() -> None:
 
 
 def test_derating_joint_without_heat_or_voltage_sensor_never_stops() -> None:
-    bench = Bench(joints={"joint_2": {"measures": ["torque"]}, "joint_3": {"measures": ["voltage"]}})
+    bench = Bench(
+        joints={"joint_2": {"measures": ["torque"]}, "joint_3": {"measures": ["voltage"]}}
+    )
     assert bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 24.0]) == []
     assert bench.look(100 * MS) == []
     assert bench.shares == [1.0] * JOINTS
     assert bench.against_arming == []
-    low = bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 12.0]) + bench.look(100 * MS)
+    low = bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 12.0]) + bench.look(
+        100 * MS
+    )
     assert [(fault.what, fault.joint) for fault in low] == [("undervoltage", "joint_3")]
 
 
@@ -74,7 +82,9 @@ def test_torque_fades_linearly(celsius: float, share: float) -> None:
     bench = Bench()
     bench.receive([20.0, celsius, 20.0])
     assert bench.shares == pytest.approx([1.0, share, 1.0])
-    assert bench.derating.derated_joints() == ({} if share == 1.0 else {"joint_2": pytest.approx(share)})
+    assert bench.derating.derated_joints() == (
+        {} if share == 1.0 else {"joint_2": pytest.approx(share)}
+    )
 
 
 def test_the_robot_file_says_from_where_to_where() -> None:
@@ -95,7 +105,10 @@ def test_derating_winding_at_stop_temperature_is_a_fault_of_its_joint() -> None:
     assert fault.what == "overheated"
     assert fault.joint == "joint_2"
     assert fault.tick == 3
-    assert fault.cause == "the winding of joint_2 is at 105.0 °C; the limit is 105 °C, and it must cool below 80 °C"
+    assert (
+        fault.cause
+        == "the winding of joint_2 is at 105.0 °C; the limit is 105 °C, and it must cool below 80 °C"
+    )
 
 
 @pytest.mark.parametrize("temperature_c", [STOP_AT_C - 1.0, COOL_BELOW_C])
@@ -152,9 +165,13 @@ WAY_OUT = "check the supply, or set `min_voltage_v` under [limits] in the robot 
 def test_a_weak_supply_keeps_the_robot_from_arming_at_once() -> None:
     bench = Bench()
     assert bench.receive(voltage_v=[24.0, 17.9, 18.0]) == []
-    assert bench.against_arming == [f"the supply is at 17.9 V at joint_2, which needs 18 V: {WAY_OUT}"]
+    assert bench.against_arming == [
+        f"the supply is at 17.9 V at joint_2, which needs 18 V: {WAY_OUT}"
+    ]
     bench.receive(voltage_v=[12.5, 17.9, 12.0])
-    assert bench.against_arming == [f"the supply is at 12.0 V at joint_3, which needs 18 V, and 2 more: {WAY_OUT}"]
+    assert bench.against_arming == [
+        f"the supply is at 12.0 V at joint_3, which needs 18 V, and 2 more: {WAY_OUT}"
+    ]
     bench.look(REPORT_TIMEOUT_NS)
     assert bench.against_arming != []
     bench.look(1)
@@ -174,7 +191,10 @@ def test_a_robot_is_not_armed_before_its_supply_is_known() -> None:
     bench.look(1)
     assert bench.against_arming == []
     assert bench.notes != []  # it is noted, and ignored from now on
-    for other in (Bench(expected=True), Bench(awaits_reports=True)):  # whose time may stand; without such a sensor
+    for other in (
+        Bench(expected=True),
+        Bench(awaits_reports=True),
+    ):  # whose time may stand; without such a sensor
         assert other.against_arming == []
 
 
@@ -190,7 +210,10 @@ def test_a_dip_of_the_supply_is_forgiven() -> None:
 def test_what_is_not_valid_or_no_number_says_nothing() -> None:
     bench = Bench()
     nan = float("nan")
-    assert bench.receive([300.0, nan, 300.0], [5.0, 24.0, nan], leak=True, valid=[False, True, True]) == []
+    assert (
+        bench.receive([300.0, nan, 300.0], [5.0, 24.0, nan], leak=True, valid=[False, True, True])
+        == []
+    )
     assert bench.look(1 * S) == []
     assert bench.shares == [1.0] * JOINTS
 
@@ -262,9 +285,12 @@ def test_a_long_list_of_silent_modules_fits_into_a_message() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reported", "reach"), [({"motor_c": 110.0}, "joint"), ({"leak": True}, "robot"), ({"voltage_v": 12.0}, "robot")]
+    ("reported", "reach"),
+    [({"motor_c": 110.0}, "joint"), ({"leak": True}, "robot"), ({"voltage_v": 12.0}, "robot")],
 )
-def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(reported: dict[str, Any], reach: str) -> None:
+def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(
+    reported: dict[str, Any], reach: str
+) -> None:
     bench = Bench()
     bench.receive(**reported)
     bench.look(50 * MS)

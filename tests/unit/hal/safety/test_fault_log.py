@@ -3,7 +3,8 @@
 from snakesim_hal.safety.fault_log import MAX_FAULTS, FaultLog
 from snakesim_hal.wire.messages import Fault
 
-MAX_FAULTS_IN_STATUS = 64  # what the message `RobotStatus` holds: those since the reset, and those since the start
+# What the message `RobotStatus` holds: those since the reset, and those since the start.
+MAX_FAULTS_IN_STATUS = 64
 
 
 def add_faults(log: FaultLog, ticks: range) -> None:

@@ -62,9 +62,13 @@ def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
 def situations(draw: st.DrawFn) -> tuple[JointCommand, MeasuredState, AppliedSetpoints]:
     """Any command that passes the refusals, any state, and any setpoints that were applied before."""
     any_target = st.floats(-2, 2) | HUGE
-    torque_limit = draw(st.none() | per_joint(st.sampled_from([0.0, 1e-12, 2.0, 4.0, 1e5]) | st.floats(0, 10)))
+    torque_limit = draw(
+        st.none() | per_joint(st.sampled_from([0.0, 1e-12, 2.0, 4.0, 1e5]) | st.floats(0, 10))
+    )
     modes = draw(per_joint(st.sampled_from(list(JointMode))))
-    asked = make_joint_command(ROBOT, draw(per_joint(any_target)), modes, torque_limit_nm=torque_limit)
+    asked = make_joint_command(
+        ROBOT, draw(per_joint(any_target)), modes, torque_limit_nm=torque_limit
+    )
     measured = MeasuredState(
         np.array(draw(per_joint(ANY_ANGLE))),
         np.array(draw(per_joint(st.floats(-10, 10) | HUGE))),
@@ -107,19 +111,26 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(
                     assert target == np.clip(measured.angle_rad[i], -1.5, 1.5)
                 # Only where staying near the measured angle, or inside the limits, leaves no choice:
                 edges = np.clip(measured.angle_rad[i] + np.array([-0.3, 0.3]), -1.5, 1.5)
-                assert moved <= ANGLE_STEP + TINY * abs(start[i]) + TINY or np.abs(edges - target).min() < TINY
+                assert (
+                    moved <= ANGLE_STEP + TINY * abs(start[i]) + TINY
+                    or np.abs(edges - target).min() < TINY
+                )
             case JointMode.VELOCITY:
                 low, high = ends(asked.mode[i], measured, i)
                 assert abs(target) <= 5.0
                 assert low - TINY <= target <= high + TINY
-                assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or at_a_bound(target, 5.0, low, high)
+                assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or at_a_bound(
+                    target, 5.0, low, high
+                )
             case JointMode.TORQUE:
                 low, high = ends(asked.mode[i], measured, i)
                 most = applied.torque_limit_nm[i]
                 assert abs(target) <= most
                 assert target <= max(high, -most)
                 assert target >= min(low, most)
-                assert moved <= TORQUE_STEP + TINY * abs(start[i]) + TINY or at_a_bound(target, most, low, high)
+                assert moved <= TORQUE_STEP + TINY * abs(start[i]) + TINY or at_a_bound(
+                    target, most, low, high
+                )
 
 
 @given(situations())
@@ -128,9 +139,15 @@ def test_gate_names_exactly_the_targets_it_changes(
 ) -> None:
     asked, measured, last = case
     applied = limited(asked, measured, last)
-    changed = {i for i in range(JOINTS) if asked.mode[i] != JointMode.PASSIVE and applied.target[i] != asked.target[i]}
+    changed = {
+        i
+        for i in range(JOINTS)
+        if asked.mode[i] != JointMode.PASSIVE and applied.target[i] != asked.target[i]
+    }
     assert set(words(asked, applied, measured)) == changed
-    again = limited(msgspec.structs.replace(asked, target=applied.target.tolist()), measured, applied)
+    again = limited(
+        msgspec.structs.replace(asked, target=applied.target.tolist()), measured, applied
+    )
     assert (again.target == applied.target).all()  # what came out once passes unchanged
 
 
@@ -139,7 +156,9 @@ def test_gate_random_targets_never_exceed_speed_limit(stream: list[list[float]])
     """A joint that follows at once, so that nearness to the measured angle never overrides the rate."""
     zero, last = np.zeros(JOINTS), before(JointMode.POSITION)
     for target in stream:
-        applied = limited(make_joint_command(ROBOT, target), MeasuredState(last.target, zero, zero), last)
+        applied = limited(
+            make_joint_command(ROBOT, target), MeasuredState(last.target, zero, zero), last
+        )
         assert np.abs(applied.target - last.target).max() <= ANGLE_STEP + TINY
         last = applied
 
@@ -169,21 +188,35 @@ def test_gate_joint_beyond_its_end_is_only_commanded_back(angle: float, side: in
 def test_with_no_torque_allowed_there_is_none() -> None:
     none = [0.0] * JOINTS
     for mode in JointMode:
-        applied = applied_for(make_joint_command(ROBOT, 1.0, mode, torque_limit_nm=none), torque=3.0)
+        applied = applied_for(
+            make_joint_command(ROBOT, 1.0, mode, torque_limit_nm=none), torque=3.0
+        )
         assert (applied.torque_limit_nm == 0).all()
     assert (
-        applied_for(make_joint_command(ROBOT, 1.0, JointMode.TORQUE, torque_limit_nm=none), torque=3.0).target == 0
+        applied_for(
+            make_joint_command(ROBOT, 1.0, JointMode.TORQUE, torque_limit_nm=none), torque=3.0
+        ).target
+        == 0
     ).all()
 
 
 def test_a_negative_torque_limit_is_none_at_all() -> None:
     assert (
-        applied_for(make_joint_command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINTS)).torque_limit_nm.tolist()
+        applied_for(
+            make_joint_command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINTS)
+        ).torque_limit_nm.tolist()
         == [0.0] * JOINTS
     )
 
 
-@pytest.mark.parametrize("held", [LIMITS, MeasuredState(*np.zeros((3, 1))), AppliedSetpoints(*np.zeros((3, 1)))])  # pyright: ignore[reportArgumentType]
+FROZEN_VALUES = [
+    LIMITS,
+    MeasuredState(*np.zeros((3, 1))),
+    AppliedSetpoints(*np.zeros((3, 1))),  # pyright: ignore[reportArgumentType]
+]
+
+
+@pytest.mark.parametrize("held", FROZEN_VALUES)
 def test_what_was_decided_stays(held: Any) -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         held.torque_nm = 1.0
@@ -196,7 +229,9 @@ def test_a_torque_limit_never_raises_the_robots_own() -> None:
 
 
 def test_modes_may_differ_from_joint_to_joint() -> None:
-    mixed = make_joint_command(ROBOT, 9.0, [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE])
+    mixed = make_joint_command(
+        ROBOT, 9.0, [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE]
+    )
     assert applied_for(mixed).target == pytest.approx([ANGLE_STEP, SPEED_STEP, TORQUE_STEP])
 
 
@@ -228,14 +263,24 @@ def test_gate_switch_to_position_mode_keeps_present_torque(
     wanted=st.floats(-10, 10),
     mode=st.sampled_from([JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY]),
 )
-def test_gate_switch_to_torque_mode_keeps_present_torque(torque: float, wanted: float, mode: JointMode) -> None:
-    applied = applied_for(make_joint_command(ROBOT, wanted, JointMode.TORQUE), 0.3, 1.0, torque, mode)
+def test_gate_switch_to_torque_mode_keeps_present_torque(
+    torque: float, wanted: float, mode: JointMode
+) -> None:
+    applied = applied_for(
+        make_joint_command(ROBOT, wanted, JointMode.TORQUE), 0.3, 1.0, torque, mode
+    )
     assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
 
 
 @given(velocity=st.floats(-5, 5), wanted=st.floats(-10, 10))
 def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, wanted: float) -> None:
-    applied = applied_for(make_joint_command(ROBOT, wanted, JointMode.VELOCITY), 0.3, velocity, 1.0, JointMode.POSITION)
+    applied = applied_for(
+        make_joint_command(ROBOT, wanted, JointMode.VELOCITY),
+        0.3,
+        velocity,
+        1.0,
+        JointMode.POSITION,
+    )
     joint = ROBOT.joints[0]
     bumpless_rad_s = velocity + 1.0 / joint.velocity_gain_nm_s_per_rad
     top = joint.speed_limit_rad_s
@@ -250,9 +295,14 @@ def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
 
 
 def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
-    measured = MeasuredState(np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0]))
+    measured = MeasuredState(
+        np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0])
+    )
     hold = bumpless([JointMode.POSITION] * JOINTS, measured)
-    implied = [motor_torque(*row) for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)]
+    implied = [
+        motor_torque(*row)
+        for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)
+    ]
     assert implied == pytest.approx(measured.torque_nm.tolist())
     assert bumpless([JointMode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
 
@@ -270,7 +320,11 @@ def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
     soft = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
     measured, last = every(torque=4.0), before(JointMode.PASSIVE)
     applied = limit_command(
-        make_joint_command(ROBOT, 0.0), measured=measured, last=last, limits=soft, torque_fraction=COOL
+        make_joint_command(ROBOT, 0.0),
+        measured=measured,
+        last=last,
+        limits=soft,
+        torque_fraction=COOL,
     )
     assert np.abs(applied.target).max() <= 0.3
 
@@ -284,7 +338,11 @@ def test_a_joint_can_stop_before_its_end() -> None:
         speed = compute_stoppable_speed(distance, 100.0, 0.01)
         assert speed * 0.04 + speed**2 / 200.0 == pytest.approx(distance)
         assert speed < np.sqrt(2 * 100.0 * distance)
-    assert compute_stoppable_speed(0.0, 100.0, 0.01) == compute_stoppable_speed(-1.0, 100.0, 0.01) == 0.0
+    assert (
+        compute_stoppable_speed(0.0, 100.0, 0.01)
+        == compute_stoppable_speed(-1.0, 100.0, 0.01)
+        == 0.0
+    )
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -295,14 +353,19 @@ def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) 
     last = before(JointMode.VELOCITY)
     speeds: list[float] = []
     for _ in range(400):
-        last = limited(make_joint_command(ROBOT, side * 5.0, JointMode.VELOCITY), every(angle, reported[0]), last)
+        last = limited(
+            make_joint_command(ROBOT, side * 5.0, JointMode.VELOCITY),
+            every(angle, reported[0]),
+            last,
+        )
         reported = [*reported[1:], float(last.target[0])]
         angle += reported[0] * 0.01
         speeds.append(abs(reported[0]))
         assert abs(angle) <= 1.5
     assert max(speeds) == 5.0
     assert abs(angle) > 1.49
-    assert max(np.abs(np.diff(speeds))) <= SPEED_STEP + TINY  # what outranks the rate limit hardly needs to
+    # What outranks the rate limit hardly needs to.
+    assert max(np.abs(np.diff(speeds))) <= SPEED_STEP + TINY
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -312,16 +375,24 @@ def test_at_the_end_nothing_drives_outwards(side: int, mode: JointMode, beyond: 
     for velocity in (-50.0, -1.0, 0.0, 1.0, 50.0):
         for last in (before(mode, side * 3.0), before(JointMode.POSITION, side * 3.0)):
             for wanted in (-9.0, 9.0):
-                applied = limited(make_joint_command(ROBOT, wanted, mode), every(side * (1.5 + beyond), velocity), last)
+                applied = limited(
+                    make_joint_command(ROBOT, wanted, mode),
+                    every(side * (1.5 + beyond), velocity),
+                    last,
+                )
                 assert (side * applied.target <= 0.0).all()
 
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_gate_torque_mode_brakes_a_fast_joint(side: int) -> None:
-    measured, asked = every(side * 1.4, side * 5.0), make_joint_command(ROBOT, side * 4.0, JointMode.TORQUE)
+    measured, asked = (
+        every(side * 1.4, side * 5.0),
+        make_joint_command(ROBOT, side * 4.0, JointMode.TORQUE),
+    )
     applied = limited(asked, measured, before(JointMode.TORQUE, side * 4.0))
     allowed = compute_stoppable_speed(0.1, 100.0, 0.01)
-    assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed - 5.0)))  # gain 1 N·m·s/rad
+    # Gain 1 N·m·s/rad.
+    assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed - 5.0)))
     assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "angle")
 
 
@@ -352,7 +423,8 @@ def test_gate_torque_far_from_ends_is_not_named_angle_limited() -> None:
     assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "torque")
 
 
-BRAKED = compute_stoppable_speed(1.5 - 1.45, 100.0, 0.01)  # the maximum speed there: below the speed limit of 5 rad/s
+# The maximum speed there: below the speed limit of 5 rad/s.
+BRAKED = compute_stoppable_speed(1.5 - 1.45, 100.0, 0.01)
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -370,9 +442,16 @@ def test_the_tightest_limit_is_the_one_that_is_named(
     side: int, angle: float, wanted: float, speed_limit: float, word: str
 ) -> None:
     robot = make_description(limits__speed_rad_s=speed_limit)
-    asked, limits = make_joint_command(robot, side * wanted, JointMode.VELOCITY), JointLimits.from_description(robot)
+    asked, limits = (
+        make_joint_command(robot, side * wanted, JointMode.VELOCITY),
+        JointLimits.from_description(robot),
+    )
     named = find_active_limits(
-        asked, before(JointMode.VELOCITY), measured=every(side * angle), limits=limits, torque_fraction=COOL
+        asked,
+        before(JointMode.VELOCITY),
+        measured=every(side * angle),
+        limits=limits,
+        torque_fraction=COOL,
     )
     assert named == dict.fromkeys(range(JOINTS), word)
 

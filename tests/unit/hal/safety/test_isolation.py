@@ -6,7 +6,15 @@ import pytest
 
 from snakesim_hal.safety.fault_log import MAX_FAULTS
 from snakesim_hal.wire.messages import Fault, JointMode
-from snakesim_testing.hal.authority_rig import CLEAR, DISARM, ESTOP, JOINTS, AuthorityRig, make_armed_rig, report_power
+from snakesim_testing.hal.authority_rig import (
+    CLEAR,
+    DISARM,
+    ESTOP,
+    JOINTS,
+    AuthorityRig,
+    make_armed_rig,
+    report_power,
+)
 
 SAYS_NO = [True, False, True]  # joint_2 has no valid state
 
@@ -22,7 +30,9 @@ def armed_without_joint_2(**robot: Any) -> AuthorityRig:
 
 
 def fault_in(joint: str | None = "joint_2", reach: Any = "joint") -> Fault:
-    return Fault(tick=3, what="module_frozen", cause=f"{joint} repeats itself", joint=joint, reach=reach)
+    return Fault(
+        tick=3, what="module_frozen", cause=f"{joint} repeats itself", joint=joint, reach=reach
+    )
 
 
 def test_by_default_one_joint_stops_the_robot() -> None:
@@ -61,7 +71,10 @@ def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
 def test_nothing_is_limited_where_nothing_is_asked() -> None:
     rig = armed_without_joint_2()
     assert (
-        rig.tick_with([0.1, 0.0, 0.1], [JointMode.POSITION, JointMode.PASSIVE, JointMode.POSITION]).limit_by_joint == {}
+        rig.tick_with(
+            [0.1, 0.0, 0.1], [JointMode.POSITION, JointMode.PASSIVE, JointMode.POSITION]
+        ).limit_by_joint
+        == {}
     )
 
 
@@ -148,7 +161,10 @@ def test_isolation_ends_after_reset_and_a_new_state() -> None:
     rig = armed_without_joint_2()
     answer = rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)  # not while it moves
     assert answer.refusal == "wrong_state"
-    assert answer.reason == "nothing to reset in state armed; disarm first, then a reset ends the isolation of joint_2"
+    assert (
+        answer.reason
+        == "nothing to reset in state armed; disarm first, then a reset ends the isolation of joint_2"
+    )
     rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     rig.pass_tick()
     assert rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns).ok
@@ -233,7 +249,9 @@ def test_isolation_fault_in_a_full_log_is_dropped_like_others() -> None:
     rig = make_armed_rig(safety__max_isolated_joints=1)
     for tick in range(16):
         rig.authority.log_fault(Fault(tick=tick, what="noted", cause=""))
-    rig.authority.latch_fault(Fault(tick=16, what="module_frozen", cause="", joint="joint_2", reach="joint"))
+    rig.authority.latch_fault(
+        Fault(tick=16, what="module_frozen", cause="", joint="joint_2", reach="joint")
+    )
     assert rig.authority.isolated_joints == ["joint_2"]
     for tick in range(17, 100):
         rig.authority.log_fault(Fault(tick=tick, what="noted", cause=""))

@@ -6,7 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_hal.safety.lease import CommandLease, LeaseDecision, decide_lease_request, free_lease, renew_lease
+from snakesim_hal.safety.lease import (
+    CommandLease,
+    LeaseDecision,
+    decide_lease_request,
+    free_lease,
+    renew_lease,
+)
 from snakesim_hal.wire.messages import LeaseRequest
 
 TERM = 50
@@ -15,7 +21,9 @@ FREE = CommandLease(epoch=4)
 DURING, AFTER = 990, 1001
 
 
-def request(action: str, holder: str = "control", epoch: int = 4, priority: int = 100) -> LeaseRequest:
+def request(
+    action: str, holder: str = "control", epoch: int = 4, priority: int = 100
+) -> LeaseRequest:
     return LeaseRequest(action=action, holder=holder, epoch=epoch, priority=priority)  # pyright: ignore[reportArgumentType]
 
 
@@ -24,11 +32,26 @@ def taken(holder: str, now: int, priority: int = 100) -> LeaseDecision:
 
 
 GRANTED = {
-    "acquire a free lease": (FREE, request("acquire", "teleop", 0), DURING, taken("teleop", DURING)),
-    "acquire a lease that ran out": (HELD, request("acquire", "teleop", 0), AFTER, taken("teleop", AFTER)),
+    "acquire a free lease": (
+        FREE,
+        request("acquire", "teleop", 0),
+        DURING,
+        taken("teleop", DURING),
+    ),
+    "acquire a lease that ran out": (
+        HELD,
+        request("acquire", "teleop", 0),
+        AFTER,
+        taken("teleop", AFTER),
+    ),
     "acquire again after it ran out": (HELD, request("acquire"), AFTER, taken("control", AFTER)),
     "preempt": (HELD, request("acquire", "teleop", 0, 101), DURING, taken("teleop", DURING, 101)),
-    "renew": (HELD, request("renew"), DURING, LeaseDecision(CommandLease("control", 4, 100, DURING + TERM))),
+    "renew": (
+        HELD,
+        request("renew"),
+        DURING,
+        LeaseDecision(CommandLease("control", 4, 100, DURING + TERM)),
+    ),
     "renew at the last moment": (
         HELD,
         request("renew"),
@@ -46,8 +69,18 @@ def test_granted(case: str) -> None:
 
 
 REFUSED = {
-    "acquire, held at the same priority": (HELD, request("acquire", "teleop", 0), DURING, "priority above 100"),
-    "acquire, held at a higher one": (HELD, request("acquire", "teleop", 0, 99), DURING, "held by control (epoch 4"),
+    "acquire, held at the same priority": (
+        HELD,
+        request("acquire", "teleop", 0),
+        DURING,
+        "priority above 100",
+    ),
+    "acquire, held at a higher one": (
+        HELD,
+        request("acquire", "teleop", 0, 99),
+        DURING,
+        "held by control (epoch 4",
+    ),
     "acquire one's own": (HELD, request("acquire"), DURING, "held by control"),
     "renew another's": (HELD, request("renew", "teleop"), DURING, "teleop does not hold epoch 4"),
     "renew an old epoch": (HELD, request("renew", epoch=3), DURING, "does not hold epoch 3"),
@@ -103,7 +136,9 @@ REQUESTS = st.tuples(
 
 
 @given(st.lists(REQUESTS, max_size=30))
-def test_lease_every_holder_in_any_history_has_unique_epoch(history: list[tuple[str, str, int, int, int]]) -> None:
+def test_lease_every_holder_in_any_history_has_unique_epoch(
+    history: list[tuple[str, str, int, int, int]],
+) -> None:
     lease, now, holders = CommandLease(), 0, {}
     for action, holder, epoch, priority, passes in history:
         now += passes
@@ -111,7 +146,9 @@ def test_lease_every_holder_in_any_history_has_unique_epoch(history: list[tuple[
         ruling = decide_lease_request(lease, request(action, holder, epoch, priority), now, TERM)
         lease = ruling.lease
         assert lease.epoch in (before.epoch, before.epoch + 1)
-        assert (lease.epoch > before.epoch) == (ruling.has_holder_changed and lease.holder is not None)
+        assert (lease.epoch > before.epoch) == (
+            ruling.has_holder_changed and lease.holder is not None
+        )
         assert lease.expires_ns <= now + TERM or lease == before
         if lease.holder is not None:
             assert holders.setdefault(lease.epoch, lease.holder) == lease.holder

@@ -9,7 +9,13 @@ from snakesim_hal.wire.messages import LifecycleState
 
 STATES, EVENTS = get_args(LifecycleState), get_args(LifecycleEvent)
 TABLE: dict[str, dict[str, str | None]] = {
-    "disarmed": {"arm": "armed", "disarm": "disarmed", "fault": "fault", "estop": "estop", "reset": "disarmed"},
+    "disarmed": {
+        "arm": "armed",
+        "disarm": "disarmed",
+        "fault": "fault",
+        "estop": "estop",
+        "reset": "disarmed",
+    },
     "armed": {"arm": None, "disarm": "disarmed", "fault": "fault", "estop": "estop", "reset": None},
     "fault": {"arm": None, "disarm": None, "fault": "fault", "estop": "estop", "reset": "disarmed"},
     "estop": {"arm": None, "disarm": None, "fault": "estop", "estop": "estop", "reset": "disarmed"},

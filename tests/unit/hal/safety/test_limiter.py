@@ -11,12 +11,28 @@ from snakesim_hal.safety.lease import CommandLease
 from snakesim_hal.safety.limiter import RejectionReason, find_rejection_reason, make_safe_setpoints
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointCommand, JointMode, SensorDescription
-from snakesim_testing.hal.limiter_rig import JOINTS, LEASE, LIMITS, ROBOT, applied_for, before, every, limited, words
+from snakesim_testing.hal.limiter_rig import (
+    JOINTS,
+    LEASE,
+    LIMITS,
+    ROBOT,
+    applied_for,
+    before,
+    every,
+    limited,
+    words,
+)
 from snakesim_testing.hal.small_robots import LEASE_NS, make_description, make_joint_command
 
 
 def judge(given: JointCommand, **changes: Any) -> RejectionReason | None:
-    values: dict[str, Any] = {"lease": LEASE, "now_ns": 900, "tick": 5, "last_sequence": 0, "age_ns": 0} | changes
+    values: dict[str, Any] = {
+        "lease": LEASE,
+        "now_ns": 900,
+        "tick": 5,
+        "last_sequence": 0,
+        "age_ns": 0,
+    } | changes
     limits = values.pop("limits", LIMITS)
     return find_rejection_reason(given, limits=limits, **values)
 
@@ -24,7 +40,9 @@ def judge(given: JointCommand, **changes: Any) -> RejectionReason | None:
 # --- refusals --------------------------------------------------------------------------------------------------
 
 SERVOS = JointLimits.from_description(
-    make_description(drive__modes=["position"], joints={"joint_3": {"modes": ["position", "velocity"]}})
+    make_description(
+        drive__modes=["position"], joints={"joint_3": {"modes": ["position", "velocity"]}}
+    )
 )
 NAN, INF = float("nan"), float("inf")
 REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
@@ -34,7 +52,10 @@ REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
     "from_the_future": [({"tick": 6}, {})],
     "stale": [
         ({"valid_for_ns": 10}, {"age_ns": 11}),
-        ({"valid_for_ns": 2**62}, {"age_ns": LEASE_NS + 1}),  # nobody may ask for more than a lease term
+        (
+            {"valid_for_ns": 2**62},
+            {"age_ns": LEASE_NS + 1},
+        ),  # nobody may ask for more than a lease term
         ({"valid_for_ns": 2**62}, {"age_ns": 2**61}),
     ],
     "wrong_layout": [({"layout": "of another robot"}, {})],
@@ -70,14 +91,21 @@ def test_a_good_command_passes() -> None:
     assert judge(make_joint_command(ROBOT, valid_for_ns=0), age_ns=0) is None
     assert (
         judge(
-            make_joint_command(ROBOT, mode=[JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY]), limits=SERVOS
+            make_joint_command(
+                ROBOT, mode=[JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY]
+            ),
+            limits=SERVOS,
         )
         is None
     )
 
 
-@pytest.mark.parametrize(("reason", "case"), [(reason, case) for reason, cases in REFUSED.items() for case in cases])
-def test_refused_with_its_reason(reason: RejectionReason, case: tuple[dict[str, Any], dict[str, Any]]) -> None:
+@pytest.mark.parametrize(
+    ("reason", "case"), [(reason, case) for reason, cases in REFUSED.items() for case in cases]
+)
+def test_refused_with_its_reason(
+    reason: RejectionReason, case: tuple[dict[str, Any], dict[str, Any]]
+) -> None:
     changes, circumstances = case
     assert judge(make_joint_command(ROBOT, **changes), **circumstances) == reason
 
@@ -122,7 +150,11 @@ def limit_hot_joints(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
     [
         (None, [4.0, 2.0, 1.0], {1: "thermal", 2: "thermal"}),
         (2.0, [2.0, 2.0, 1.0], {2: "thermal"}),
-        (1.0, [1.0, 1.0, 1.0], {0: "torque", 1: "torque", 2: "torque"}),  # the command's own limit is below its target
+        (
+            1.0,
+            [1.0, 1.0, 1.0],
+            {0: "torque", 1: "torque", 2: "torque"},
+        ),  # the command's own limit is below its target
     ],
 )
 def test_limiter_hot_joint_has_lower_torque_limit(
@@ -171,7 +203,9 @@ def test_limiter_passive_hot_joint_is_not_limited() -> None:
         (JointMode.PASSIVE, 3.0, None),
     ],
 )
-def test_a_changed_target_is_named_by_its_limit(mode: JointMode, wanted: float, word: str | None) -> None:
+def test_a_changed_target_is_named_by_its_limit(
+    mode: JointMode, wanted: float, word: str | None
+) -> None:
     asked = make_joint_command(ROBOT, [0.0, wanted, 0.0], mode)
     applied = limited(asked, every(), before(mode))
     assert words(asked, applied, every()) == ({} if word is None else {1: word})
@@ -201,4 +235,8 @@ def test_how_old_a_joint_state_may_be(period_ms: int, delay_ms: int, oldest_ms: 
 
 def test_limiter_without_joint_sensor_assumes_oldest_allowed_state() -> None:
     robot = msgspec.structs.replace(ROBOT, sensors=[])
-    assert JointLimits.from_description(robot).max_state_age_ns == max(3 * ROBOT.period_ns, 30_000_000) < ROBOT.lease_ns
+    assert (
+        JointLimits.from_description(robot).max_state_age_ns
+        == max(3 * ROBOT.period_ns, 30_000_000)
+        < ROBOT.lease_ns
+    )

@@ -14,15 +14,24 @@ from snakesim_hal.safety.plausibility import PlausibilityChecker, replace_non_fi
 from snakesim_hal.wire.freshness import FRESH_PERIODS
 from snakesim_hal.wire.messages import Fault, JointMode, JointState
 from snakesim_testing.hal.limiter_rig import JOINTS, LIMITS, ROBOT
-from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, make_description, make_joint_state
+from snakesim_testing.hal.small_robots import (
+    LEASE_NS,
+    PERIOD_NS,
+    make_description,
+    make_joint_state,
+)
 
 REACH = 0.05 + 2 * 5.0 * 0.01  # rad in a period
 WORD = "state_invalid"
 NOBODY: JointMask = np.zeros(JOINTS, dtype=np.bool_)
 
 
-def targets(target: Any = 0.0, mode: JointMode = JointMode.POSITION, torque_limit: float = 4.0) -> AppliedSetpoints:
-    return AppliedSetpoints(np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit))
+def targets(
+    target: Any = 0.0, mode: JointMode = JointMode.POSITION, torque_limit: float = 4.0
+) -> AppliedSetpoints:
+    return AppliedSetpoints(
+        np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit)
+    )
 
 
 class Bench:
@@ -44,8 +53,12 @@ class Bench:
         **other: Any,
     ) -> Fault | None:
         self.timestamp_ns += round(periods * PERIOD_NS)
-        seen = make_joint_state(ROBOT, angle, *values, timestamp_ns=self.timestamp_ns, tick=7, **other)
-        doubt = self.watch.check(seen, now_ns=self.timestamp_ns + late_ns, applied=applied, isolated=aside)
+        seen = make_joint_state(
+            ROBOT, angle, *values, timestamp_ns=self.timestamp_ns, tick=7, **other
+        )
+        doubt = self.watch.check(
+            seen, now_ns=self.timestamp_ns + late_ns, applied=applied, isolated=aside
+        )
         self.doubted = [] if doubt is None else np.flatnonzero(doubt.joints).tolist()
         return None if doubt is None else doubt.fault
 
@@ -63,7 +76,9 @@ def test_the_first_angle_is_believed_wherever_it_is() -> None:
 
 @pytest.mark.parametrize("applied", [None, targets()])
 @pytest.mark.parametrize("side", [1, -1])
-def test_plausibility_angle_jump_is_rejected_as_fault_of_its_joint(applied: AppliedSetpoints | None, side: int) -> None:
+def test_plausibility_angle_jump_is_rejected_as_fault_of_its_joint(
+    applied: AppliedSetpoints | None, side: int
+) -> None:
     bench = Bench()
     assert bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied) is None
     fault = bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
@@ -72,12 +87,17 @@ def test_plausibility_angle_jump_is_rejected_as_fault_of_its_joint(applied: Appl
     assert fault.joint == "joint_2"
     assert fault.tick == 7
     jump_rad = side * (0.9 - REACH)
-    assert fault.cause == f"faster than any joint turns: a jump of joint_2 by {jump_rad:+.2f} rad in 10 ms"
+    assert (
+        fault.cause
+        == f"faster than any joint turns: a jump of joint_2 by {jump_rad:+.2f} rad in 10 ms"
+    )
 
 
 @pytest.mark.parametrize("applied", [None, targets()])
 @pytest.mark.parametrize("side", [1, -1])
-def test_plausibility_jumping_joint_keeps_last_valid_angle(applied: AppliedSetpoints | None, side: int) -> None:
+def test_plausibility_jumping_joint_keeps_last_valid_angle(
+    applied: AppliedSetpoints | None, side: int
+) -> None:
     bench = Bench()
     bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied)
     bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
@@ -120,7 +140,9 @@ def test_plausibility_new_place_is_accepted_after_repeats_unless_armed() -> None
     """A joint that was bent by hand between two samples; slowly, so that time alone does not make it good."""
     for applied, seen in ((None, 5), (targets(), 6)):
         bench = Bench()
-        found = [bench.see(1.2 + 0.01 * k, applied=applied) for k in range(5)] + [bench.see(1.25, periods=0.5)]
+        found = [bench.see(1.2 + 0.01 * k, applied=applied) for k in range(5)] + [
+            bench.see(1.25, periods=0.5)
+        ]
         assert [fault is None for fault in found].index(True) == seen - 1
         assert bench.angles == pytest.approx([1.24 if seen == 5 else 1.25] * JOINTS, abs=0.011)
 
@@ -178,7 +200,12 @@ def test_joints_are_judged_each_by_itself() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"valid": [True, False, True]}, {"age_ns": [0, LEASE_NS + 1, 0]}, {"angle": [0.1, float("nan"), 0.1]}]
+    "bad",
+    [
+        {"valid": [True, False, True]},
+        {"age_ns": [0, LEASE_NS + 1, 0]},
+        {"angle": [0.1, float("nan"), 0.1]},
+    ],
 )
 def test_plausibility_unknown_joint_leaves_others_unchanged(bad: dict[str, Any]) -> None:
     bench = Bench()
@@ -248,7 +275,11 @@ def test_what_is_published_has_numbers_only(column: str) -> None:
     assert published.velocity_rad_s[1] == published.torque_nm[1] == 0.0
     assert getattr(published, column)[::2] == [0.5, 0.7]
     assert published.age_ns == sound.age_ns
-    assert [published.angle_rad[0], published.velocity_rad_s[2], published.torque_nm[2]] != [0.1, 0.0, 0.0]
+    assert [published.angle_rad[0], published.velocity_rad_s[2], published.torque_nm[2]] != [
+        0.1,
+        0.0,
+        0.0,
+    ]
     assert replace_non_finite_values(
         msgspec.structs.replace(corrupted, valid=[False, True, True]), bench.watch.measured
     ).valid == [
@@ -273,9 +304,15 @@ FAR_PERIODS = 4  # until a target that moves by 0.02 rad a period is further tha
 
 
 def stuck(
-    bench: Bench, periods: int, step: float = 0.02, torque: float = 0.5, mode: JointMode = JointMode.POSITION
+    bench: Bench,
+    periods: int,
+    step: float = 0.02,
+    torque: float = 0.5,
+    mode: JointMode = JointMode.POSITION,
 ) -> Fault | None:
-    return [bench.see(0.0, 0.0, torque, applied=targets(step * k, mode)) for k in range(periods)][-1]
+    return [bench.see(0.0, 0.0, torque, applied=targets(step * k, mode)) for k in range(periods)][
+        -1
+    ]
 
 
 def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
@@ -284,7 +321,9 @@ def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
     fault = bench.see(0.0, 0.0, 0.5, applied=targets(0.2))
     assert fault is not None
     assert fault.what == "joint_frozen"
-    assert fault.cause == "the same state repeated while its target moves: joint_1, joint_2, joint_3"
+    assert (
+        fault.cause == "the same state repeated while its target moves: joint_1, joint_2, joint_3"
+    )
 
 
 @pytest.mark.parametrize("step", [0.02, -0.02])
@@ -335,7 +374,9 @@ def test_plausibility_revived_joint_has_a_full_lease_until_frozen() -> None:
     bench = Bench(torque=0.5)
     assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None  # far for nearly a lease
     assert bench.see(1e-9, 0.0, 0.5, applied=targets(0.2)) is None  # every joint moves
-    assert [bench.see(1e-9, 0.0, 0.5, applied=targets(0.4)) for _ in range(LEASE_PERIODS)] == [None] * LEASE_PERIODS
+    assert [bench.see(1e-9, 0.0, 0.5, applied=targets(0.4)) for _ in range(LEASE_PERIODS)] == [
+        None
+    ] * LEASE_PERIODS
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
@@ -343,7 +384,10 @@ def test_whatever_still_changes_is_alive(column: int) -> None:
     bench = Bench()
     for k in range(50):
         row = np.array([0.0, 0.0, 0.5]) + 1e-9 * (k % 2) * (np.arange(3) == column)
-        assert bench.see(float(row[0]), float(row[1]), float(row[2]), applied=targets(0.02 * k)) is None
+        assert (
+            bench.see(float(row[0]), float(row[1]), float(row[2]), applied=targets(0.02 * k))
+            is None
+        )
 
 
 def test_a_target_that_moved_just_so_far_proves_nothing() -> None:
@@ -363,7 +407,10 @@ def test_a_sample_that_is_only_old_is_not_frozen() -> None:
     """It was taken once: what is lost is judged by its age."""
     bench = Bench(torque=0.5)
     for k in range(1, FRESH_PERIODS + 1):
-        assert bench.see(0.0, 0.0, 0.5, applied=targets(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS) is None
+        assert (
+            bench.see(0.0, 0.0, 0.5, applied=targets(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS)
+            is None
+        )
 
 
 # --- the shortcut for ordinary states ----------------------------------------------------------------------------
@@ -387,7 +434,20 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, AppliedS
         velocity, torque = [rng.choice((0.5, 0.6))] * JOINTS, [rng.choice((0.5, 0.6))] * JOINTS
         ages, valid = [0] * JOINTS, [True] * JOINTS
         odd = rng.randrange(JOINTS)
-        match rng.choice(("angle", "angle", "angle", "mirrored", "velocity", "torque", "age", "valid", "none", "none")):
+        match rng.choice(
+            (
+                "angle",
+                "angle",
+                "angle",
+                "mirrored",
+                "velocity",
+                "torque",
+                "age",
+                "valid",
+                "none",
+                "none",
+            )
+        ):
             case "angle":
                 angle[odd] += rng.choice((0.05, -0.05, 0.3, -0.3, 2.0))
             case "mirrored":
@@ -404,7 +464,13 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, AppliedS
                 pass
         count = 0 if rng.random() < 0.02 else JOINTS
         seen = make_joint_state(
-            ROBOT, angle[:count], velocity, torque, timestamp_ns=timestamp_ns, age_ns=ages, valid=valid
+            ROBOT,
+            angle[:count],
+            velocity,
+            torque,
+            timestamp_ns=timestamp_ns,
+            age_ns=ages,
+            valid=valid,
         )
         yield seen, targets(target) if rng.random() < 0.9 else None
 
@@ -416,10 +482,13 @@ def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
         quick, whole = PlausibilityChecker(LIMITS), Whole(LIMITS)
         for seen, applied in walk(rng, 24):
             taken = [
-                one.check(seen, now_ns=seen.timestamp_ns, applied=applied, isolated=NOBODY) for one in (quick, whole)
+                one.check(seen, now_ns=seen.timestamp_ns, applied=applied, isolated=NOBODY)
+                for one in (quick, whole)
             ]
             assert repr(taken[0]) == repr(taken[1])
-            for good, expected in zip(vars(quick.measured).values(), vars(whole.measured).values(), strict=True):
+            for good, expected in zip(
+                vars(quick.measured).values(), vars(whole.measured).values(), strict=True
+            ):
                 assert good.tolist() == expected.tolist()
 
 
@@ -427,4 +496,9 @@ def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
 def test_an_angle_may_differ_by_the_noise_at_once(check: type[PlausibilityChecker]) -> None:
     watch = check(LIMITS)
     for angle in (0.0, 0.05):
-        assert watch.check(make_joint_state(ROBOT, angle), now_ns=0, applied=targets(), isolated=NOBODY) is None
+        assert (
+            watch.check(
+                make_joint_state(ROBOT, angle), now_ns=0, applied=targets(), isolated=NOBODY
+            )
+            is None
+        )

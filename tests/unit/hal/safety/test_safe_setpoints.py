@@ -4,10 +4,8 @@ import ast
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[4]
-MAY_CREATE = {
-    "snakesim_hal/safety/limiter.py",
-    "snakesim/environments/no_limiter.py",  # simulated robots whose environment was asked for without limits
-}
+# Simulated robots whose environment was asked for without limits.
+MAY_CREATE = {"snakesim_hal/safety/limiter.py", "snakesim/environments/no_limiter.py"}
 
 
 def files_that_create_safe_setpoints() -> set[str]:
@@ -20,7 +18,10 @@ def files_that_create_safe_setpoints() -> set[str]:
         if "SafeSetpoints(" not in text:  # parsing all files takes seconds
             continue
         for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == "SafeSetpoints":
+            if (
+                isinstance(node, ast.Call)
+                and ast.unparse(node.func).split(".")[-1] == "SafeSetpoints"
+            ):
                 found.add(str(path.relative_to(REPOSITORY)))
     return found
 

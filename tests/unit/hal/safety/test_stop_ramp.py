@@ -15,7 +15,9 @@ ROBOT = make_description(motor__damping_nm_s_per_rad=2.0)
 LIMITS = JointLimits.from_description(ROBOT)
 
 
-def beginning(angle: float, velocity: float, torque: float, mode: JointMode, target: float) -> StopRamp:
+def beginning(
+    angle: float, velocity: float, torque: float, mode: JointMode, target: float
+) -> StopRamp:
     return StopRamp.start(every(angle, velocity, torque), before(mode, target), LIMITS)
 
 
@@ -69,4 +71,5 @@ def test_stop_ramp_from_any_state_never_jumps_or_leaves_range(
     assert np.abs(np.diff(way)).max() <= ANGLE_STEP + TINY
     assert way[-1] == way[-2] == way[-10]
     stops_at = np.clip(angle, -1.5, 1.5) + np.sign(velocity) * min(abs(velocity), 5.0) ** 2 / 200.0
-    assert abs(way[-1] - np.clip(stops_at, -1.5, 1.5)) <= ANGLE_STEP / 2  # it slows down in whole periods
+    # It slows down in whole periods.
+    assert abs(way[-1] - np.clip(stops_at, -1.5, 1.5)) <= ANGLE_STEP / 2

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from msgspec import inspect
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.wire.codec import ENCODING_PREFIX, MAX_PAYLOAD_BYTES, MessageDecoder, encode, format_encoding
+from snakesim_hal.wire.codec import (
+    ENCODING_PREFIX,
+    MAX_PAYLOAD_BYTES,
+    MessageDecoder,
+    encode,
+    format_encoding,
+)
 from snakesim_hal.wire.messages import (
     VERSIONS,
     Clock,
@@ -31,7 +37,9 @@ from snakesim_testing.hal.strategies import (
 from snakesim_testing.messages import raises_error
 
 ALL = list(VERSIONS)
-DECODERS: dict[type[Message], MessageDecoder[Any]] = {message: MessageDecoder(message) for message in ALL}
+DECODERS: dict[type[Message], MessageDecoder[Any]] = {
+    message: MessageDecoder(message) for message in ALL
+}
 each_message = pytest.mark.parametrize("message", ALL, ids=lambda message: message.__name__)
 
 
@@ -49,7 +57,9 @@ def take(message: type[Message], payload: bytes) -> Message | None:
 @each_message
 @given(data=st.data())
 @settings(max_examples=25)
-def test_codec_round_trip_returns_an_equal_message(message: type[Message], data: st.DataObject) -> None:
+def test_codec_round_trip_returns_an_equal_message(
+    message: type[Message], data: st.DataObject
+) -> None:
     sent = data.draw(make_strategy(message))
     payload = encode(sent)
     assert take(message, payload) == sent
@@ -82,12 +92,20 @@ def test_lists_longer_than_allowed_are_refused(message: type[Message]) -> None:
     for at, info in iter_places(example, inspect.type_info(message)):
         if isinstance(info, inspect.ListType) and info.max_length is not None:
             entry = reduce(lambda inner, step: inner[step], at, example)[0]
-            assert take(message, encode(replace_at(example, at, [entry] * info.max_length))) is not None, at
-            assert take(message, encode(replace_at(example, at, [entry] * (info.max_length + 1)))) is None, at
+            assert (
+                take(message, encode(replace_at(example, at, [entry] * info.max_length)))
+                is not None
+            ), at
+            assert (
+                take(message, encode(replace_at(example, at, [entry] * (info.max_length + 1))))
+                is None
+            ), at
 
 
 @each_message
-def test_codec_missing_required_field_is_refused_and_new_one_ignored(message: type[Message]) -> None:
+def test_codec_missing_required_field_is_refused_and_new_one_ignored(
+    message: type[Message],
+) -> None:
     example = make_plain_example(message)
     info = inspect.type_info(message)
     assert isinstance(info, inspect.StructType)
@@ -153,12 +171,20 @@ def test_a_payload_above_the_size_limit_is_refused_unread() -> None:
 
 def test_codec_accepts_largest_images_and_no_other_large_message() -> None:
     for message, field, pixel in ((DepthImage, "depth", b"\1\2"), (ColorImage, "rgb", b"\1\2\3")):
-        largest = {**make_plain_example(message), "width": 1280, "height": 960, field: pixel * (1280 * 960)}
+        largest = {
+            **make_plain_example(message),
+            "width": 1280,
+            "height": 960,
+            field: pixel * (1280 * 960),
+        }
         taken = take(message, encode(largest))
         assert taken is not None
         assert getattr(taken, field) == largest[field]
         assert take(message, encode({**largest, field: largest[field] + b"\1"})) is None
-        assert take(JointState, encode({**make_plain_example(JointState), "other": largest[field]})) is None
+        assert (
+            take(JointState, encode({**make_plain_example(JointState), "other": largest[field]}))
+            is None
+        )
 
 
 def test_nobody_but_the_contract_can_write_a_mode() -> None:

@@ -15,7 +15,10 @@ from snakesim_testing.messages import raises_error
 
 
 def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
-    kind, sample = parse_custom_message(make_message_schema(SkinSample, "skin")), SkinSample(**PLACE, **GOOD)
+    kind, sample = (
+        parse_custom_message(make_message_schema(SkinSample, "skin")),
+        SkinSample(**PLACE, **GOOD),
+    )
     decoded = MessageDecoder(kind.message).decode(encode(sample), format_encoding(SkinSample))
     assert msgspec.to_builtins(decoded) == msgspec.to_builtins(sample)
     assert kind.units == {"pressed_n": "N", "flow_m_s": "m/s", "wet": "1", "count": "1"}
@@ -24,7 +27,9 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
         | {f"flow_m_s.{i}": i + 1 for i in range(3)},
         nan_ok=True,
     )
-    assert MessageDecoder(CustomSample).decode(encode(sample), format_encoding(SkinSample)) == CustomSample(**PLACE)
+    assert MessageDecoder(CustomSample).decode(
+        encode(sample), format_encoding(SkinSample)
+    ) == CustomSample(**PLACE)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +48,10 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
 )
 def test_the_schema_refuses_what_the_class_would(wrong: dict[str, Any]) -> None:
     written = msgspec.msgpack.encode(PLACE | GOOD | wrong)
-    for message in (SkinSample, parse_custom_message(make_message_schema(SkinSample, "skin")).message):
+    for message in (
+        SkinSample,
+        parse_custom_message(make_message_schema(SkinSample, "skin")).message,
+    ):
         with pytest.raises(WireError) as caught:
             MessageDecoder(message).decode(written, format_encoding(SkinSample))
         assert next(iter(wrong)) in str(caught.value)

@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ColorImage, DepthImage, RangeScan, TickDone
 
-CHUNK = st.text(st.characters(categories=("L", "N"), include_characters="_-"), min_size=1, max_size=12)
+CHUNK = st.text(
+    st.characters(categories=("L", "N"), include_characters="_-"), min_size=1, max_size=12
+)
 NAMESPACE = st.lists(CHUNK, min_size=1, max_size=3).map("/".join)
 
 
@@ -32,13 +34,17 @@ def test_keys_are_unique_without_outer_slashes() -> None:
 
 
 def test_every_key_constant_is_in_the_space() -> None:
-    constants = {value for name, value in vars(keys).items() if name[0].isupper() and isinstance(value, str)}
+    constants = {
+        value for name, value in vars(keys).items() if name[0].isupper() and isinstance(value, str)
+    }
     assert constants == {row.key for row in keys.SPACE}
 
 
 @given(name=CHUNK)
 def test_keys_of_a_service_or_sensor_contain_its_name(name: str) -> None:
-    assert keys.parse_service(keys.done_key(name)) == keys.parse_service(keys.alive_key(name)) == name
+    assert (
+        keys.parse_service(keys.done_key(name)) == keys.parse_service(keys.alive_key(name)) == name
+    )
     assert keys.find_message(keys.done_key(name)) is TickDone
     assert keys.find_message(keys.depth_key(name)) is DepthImage
     assert keys.find_message(keys.color_key(name)) is ColorImage

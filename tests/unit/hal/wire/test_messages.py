@@ -11,7 +11,9 @@ from snakesim_hal.wire import keys, messages
 from snakesim_hal.wire.messages import VERSIONS, JointMode, Message
 from snakesim_testing.hal.strategies import iter_places, make_plain_example
 
-each_message = pytest.mark.parametrize("message", list(VERSIONS), ids=lambda message: message.__name__)
+each_message = pytest.mark.parametrize(
+    "message", list(VERSIONS), ids=lambda message: message.__name__
+)
 
 
 def declared() -> set[type[Message]]:
@@ -49,7 +51,9 @@ def test_numbers_carry_their_unit_in_type_or_name(message: type[Message]) -> Non
     for name, struct in schema.items():
         for field, about in struct.get("properties", {}).items():
             for leaf in floats_of(about):
-                assert "unit" in leaf or re.search("_(hz|s|m|kg|rad|nm|rad_s2|nm_s|per_rad)$", field), (name, field)
+                assert "unit" in leaf or re.search(
+                    "_(hz|s|m|kg|rad|nm|rad_s2|nm_s|per_rad)$", field
+                ), (name, field)
 
 
 def floats_of(about: Any) -> list[dict[str, Any]]:
@@ -61,7 +65,12 @@ def floats_of(about: Any) -> list[dict[str, Any]]:
 
 def test_modes_keep_their_numbers() -> None:
     """The numbers are the contract with other languages and with recordings."""
-    assert {mode.name: mode.value for mode in JointMode} == {"PASSIVE": 0, "POSITION": 1, "VELOCITY": 2, "TORQUE": 3}
+    assert {mode.name: mode.value for mode in JointMode} == {
+        "PASSIVE": 0,
+        "POSITION": 1,
+        "VELOCITY": 2,
+        "TORQUE": 3,
+    }
 
 
 def test_messages_of_sensors_have_tick_and_timestamp() -> None:

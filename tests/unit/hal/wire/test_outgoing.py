@@ -23,14 +23,20 @@ from snakesim_testing.hal.strategies import (
     replace_at,
 )
 
-STREAMED = {row.message: row.key for row in keys.SPACE if row.kind == "stream" and row.message and "*" not in row.key}
+STREAMED = {
+    row.message: row.key
+    for row in keys.SPACE
+    if row.kind == "stream" and row.message and "*" not in row.key
+}
 each_message = pytest.mark.parametrize("message", STREAMED, ids=lambda message: message.__name__)
 
 
 @each_message
 @given(data=st.data())
 @settings(max_examples=10)
-def test_outgoing_valid_message_is_sent_unchanged(message: type[Message], data: st.DataObject) -> None:
+def test_outgoing_valid_message_is_sent_unchanged(
+    message: type[Message], data: st.DataObject
+) -> None:
     sent = data.draw(make_strategy(message))
     encoded = encode_checked(STREAMED[message], sent)
     assert encoded.payload == encode(sent)
@@ -69,10 +75,26 @@ INFINITE, SHORT, ARRAY = (1.0, math.inf), (1.0,), np.ones(2)
             trajectory((0.0, 0.0), INFINITE),
             r"path_w\[1\]\[1\] is inf, must be `float` <= ",
         ),
-        (keys.TRAJECTORY, trajectory((0.0, 0.0), SHORT), r"path_w\[1\] is \(1\.0,\), must be `array` of length 2"),
-        (keys.TRAJECTORY, trajectory(ARRAY), r"path_w is \[array\(\[1\., 1\.\]\)\], must be plain Python .*\.tolist"),
-        (keys.TRAJECTORY, trajectory((0.0, 0.0)), r"path_w is \[\(0\.0, 0\.0\)\], must be `array` of length >= 2"),
-        (keys.CONTACTS, contacts(link=-1), r"^Contacts\.contacts\[2\]\.link is -1, must be `int` >= 0$"),
+        (
+            keys.TRAJECTORY,
+            trajectory((0.0, 0.0), SHORT),
+            r"path_w\[1\] is \(1\.0,\), must be `array` of length 2",
+        ),
+        (
+            keys.TRAJECTORY,
+            trajectory(ARRAY),
+            r"path_w is \[array\(\[1\., 1\.\]\)\], must be plain Python .*\.tolist",
+        ),
+        (
+            keys.TRAJECTORY,
+            trajectory((0.0, 0.0)),
+            r"path_w is \[\(0\.0, 0\.0\)\], must be `array` of length >= 2",
+        ),
+        (
+            keys.CONTACTS,
+            contacts(link=-1),
+            r"^Contacts\.contacts\[2\]\.link is -1, must be `int` >= 0$",
+        ),
         (keys.CONTACTS, trajectory(), r"^a Trajectory, must be a Contacts$"),
         ("sensor/poze", contacts(), r"^there is no such key; did you mean `sensor/pose`\?"),
     ],

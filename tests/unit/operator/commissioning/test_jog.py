@@ -3,7 +3,12 @@
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.features.commissioning.jog import KEY_HOLD_S, MAX_LEAD_RAD, JogRequest, JogTarget
+from snakesim_operator.features.commissioning.jog import (
+    KEY_HOLD_S,
+    MAX_LEAD_RAD,
+    JogRequest,
+    JogTarget,
+)
 from snakesim_testing.hal.small_robots import make_description
 from snakesim_testing.messages import raises_error
 
@@ -34,13 +39,15 @@ def test_jog_moves_at_its_speed_only_while_key_repeats() -> None:
 
 
 def test_jog_stays_within_travel_and_near_a_blocked_joint() -> None:
-    assert held(JogTarget(JogRequest(joint="joint_1"), JOINT, 0.0), "left", 10.0) == pytest.approx(-0.2)
+    assert held(JogTarget(JogRequest(joint="joint_1"), JOINT, 0.0), "left", 10.0) == pytest.approx(
+        -0.2
+    )
     ends = JogTarget(JogRequest(joint="joint_1", travel_rad=3.0), JOINT, 0.0)
     assert ends.lower_rad == JOINT.angle_min_rad
     assert ends.upper_rad == JOINT.angle_max_rad
-    assert held(JogTarget(JogRequest(joint="joint_1"), JOINT, 0.0), "up", 5.0, blocked_rad=0.0) == pytest.approx(
-        MAX_LEAD_RAD
-    )
+    assert held(
+        JogTarget(JogRequest(joint="joint_1"), JOINT, 0.0), "up", 5.0, blocked_rad=0.0
+    ) == pytest.approx(MAX_LEAD_RAD)
 
 
 def test_jog_speed_above_limit_is_refused() -> None:

@@ -10,7 +10,10 @@ from snakesim_hal.model.checked import PROPERTIES
 from snakesim_hal.model.joints import JointDrive
 from snakesim_operator.features.commissioning.check import format_report
 from snakesim_operator.features.commissioning.judge import MATCHES_FILE, JointVerdict, judge_joints
-from snakesim_operator.features.commissioning.measured import CheckMeasurements, remove_clamped_targets
+from snakesim_operator.features.commissioning.measured import (
+    CheckMeasurements,
+    remove_clamped_targets,
+)
 
 PERIOD_S = 0.01
 WAY_RAD = 0.06
@@ -22,7 +25,9 @@ SWING = np.concatenate((WAY_RAD * np.sin(np.linspace(0, np.pi, LEG)), np.zeros(R
 TO_AND_FRO = np.concatenate((SWING, -SWING))
 
 
-def measurements(backlash_rad: float = 0.0, gear: float = 1.0, pitched_rad: float = 0.0) -> CheckMeasurements:
+def measurements(
+    backlash_rad: float = 0.0, gear: float = 1.0, pitched_rad: float = 0.0
+) -> CheckMeasurements:
     """Joints that move one after the other to both sides, on IMUs at every tick; the tail link stays where it is.
 
     backlash_rad, gear: of joint_1, in truth; pitched_rad: of joint_2 in truth, while its encoder says 0.
@@ -72,7 +77,11 @@ def verdicts(run: CheckMeasurements) -> list[str]:
 
 
 def states(row: JointVerdict) -> dict[str, str]:
-    return {name: row.findings[name].state for name in PROPERTIES if row.findings[name].state != "confirmed"}
+    return {
+        name: row.findings[name].state
+        for name in PROPERTIES
+        if row.findings[name].state != "confirmed"
+    }
 
 
 def without_imus(run: CheckMeasurements, *links: int) -> CheckMeasurements:
@@ -90,7 +99,9 @@ def test_a_sound_robot_is_as_its_file_says() -> None:
 def test_judge_without_imus_confirms_only_encoders_and_detects_wrong_zero() -> None:
     run = without_imus(measurements(), *range(JOINTS + 1))
     run = replace(run, angle_rad=run.angle_rad + np.array((0.15, 0.0, 0.0)))
-    rows = [row.confirm_by_hand(["order", "sign"]) for row in judge_joints(run, was_laid_straight=True)]
+    rows = [
+        row.confirm_by_hand(["order", "sign"]) for row in judge_joints(run, was_laid_straight=True)
+    ]
     assert states(rows[0]) == {"gear": "unknown", "zero": "wrong"}
     assert rows[0].summary == "its zero is off by +0.150 rad: zero_rad = 0.150"
     assert states(rows[1]) == {"gear": "unknown"}
@@ -132,8 +143,15 @@ def test_a_gear_of_another_ratio_is_no_backlash() -> None:
 
 def test_judge_gravity_reveals_zero_of_a_bent_pitch_joint() -> None:
     run = measurements(pitched_rad=0.2)  # the encoder says 0
-    assert verdicts(run) == [MATCHES_FILE, "its zero is off by -0.200 rad: zero_rad = 0.500", MATCHES_FILE]
-    assert verdicts(replace(run, angle_rad=run.angle_rad + np.array((0.0, 0.2, 0.0)))) == [MATCHES_FILE] * JOINTS
+    assert verdicts(run) == [
+        MATCHES_FILE,
+        "its zero is off by -0.200 rad: zero_rad = 0.500",
+        MATCHES_FILE,
+    ]
+    assert (
+        verdicts(replace(run, angle_rad=run.angle_rad + np.array((0.0, 0.2, 0.0))))
+        == [MATCHES_FILE] * JOINTS
+    )
 
 
 def test_judge_torque_against_its_motion_has_wrong_sign() -> None:
@@ -164,7 +182,8 @@ def test_judge_joint_without_its_motion_is_not_confirmed() -> None:
     unmoved = judge_joints(ended, was_laid_straight=True)[2]
     assert states(unmoved) == dict.fromkeys(("drive", "order", "sign", "gear"), "unknown")
     dead = judge_joints(
-        replace(run, angle_rad=run.angle_rad * 0, velocity_rad_s=run.velocity_rad_s * 0), was_laid_straight=True
+        replace(run, angle_rad=run.angle_rad * 0, velocity_rad_s=run.velocity_rad_s * 0),
+        was_laid_straight=True,
     )[0]
     assert dead.summary.startswith("did not move")
     assert not dead.confirm_by_hand(["order", "sign", "gear"]).all_confirmed
@@ -178,7 +197,9 @@ def test_judge_dead_joint_swung_by_others_affects_no_verdict() -> None:
     target_rad[:, 2] = np.maximum(angle_rad[:, 2] - 0.35, 0.0)
     target_rad = remove_clamped_targets(target_rad, angle_rad, max_step_rad=0.35)
     assert target_rad[:, 2] == pytest.approx(0.0)
-    swung = replace(run, angle_rad=angle_rad, target_rad=target_rad, link_rate_rad_s=run.link_rate_rad_s)
+    swung = replace(
+        run, angle_rad=angle_rad, target_rad=target_rad, link_rate_rad_s=run.link_rate_rad_s
+    )
     rows = judge_joints(swung, was_laid_straight=True)
     assert [row.findings["zero"].state for row in rows] == ["confirmed"] * JOINTS
     assert rows[0].all_confirmed
@@ -187,7 +208,8 @@ def test_judge_dead_joint_swung_by_others_affects_no_verdict() -> None:
 
 def test_motion_capture_of_the_base_stands_for_its_imu() -> None:
     run = without_imus(measurements(), 0)
-    run.link_rate_rad_s[:, 1:, 2] -= run.velocity_rad_s[:, :1]  # the tail link turned, and the body stayed
+    # The tail link turned, and the body stayed.
+    run.link_rate_rad_s[:, 1:, 2] -= run.velocity_rad_s[:, :1]
     turn = np.zeros((TICKS, 3))
     turn[:, 2] = -run.angle_rad[:, 0]
     assert verdicts(replace(run, base_rotation_rad=turn))[0] == MATCHES_FILE

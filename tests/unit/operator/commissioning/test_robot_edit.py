@@ -17,8 +17,12 @@ from snakesim_operator.features.commissioning.robot_edit import (
 from snakesim_testing.messages import raises_error
 
 
-@pytest.mark.parametrize(("changed", "same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)])
-def test_robot_edit_drives_of_running_robot_match_the_edited_file(tmp_path: Path, changed: str, same: bool) -> None:
+@pytest.mark.parametrize(
+    ("changed", "same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)]
+)
+def test_robot_edit_drives_of_running_robot_match_the_edited_file(
+    tmp_path: Path, changed: str, same: bool
+) -> None:
     path = tmp_path / "snake.toml"
     path.write_text((SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text())
     running = restrict_drive_modes(
@@ -26,7 +30,8 @@ def test_robot_edit_drives_of_running_robot_match_the_edited_file(tmp_path: Path
     ).joint_table
     path.write_text(path.read_text() + changed)
     assert (
-        [joint.drive for joint in read_joints_with_drive_modes(path, running)] == [joint.drive for joint in running]
+        [joint.drive for joint in read_joints_with_drive_modes(path, running)]
+        == [joint.drive for joint in running]
     ) is same
 
 
@@ -41,7 +46,11 @@ def test_robot_edit_follows_symbolic_link_and_keeps_permissions_and_text(tmp_pat
     assert "zero_rad = 0.25" in real.read_text()
     assert "# ours" in real.read_text()
     assert stat.S_IMODE(real.stat().st_mode) == 0o640
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["robots.git", "snake.toml", "snake.toml"]
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [
+        "robots.git",
+        "snake.toml",
+        "snake.toml",
+    ]
 
 
 def test_robot_edit_invalid_change_leaves_file_unchanged(tmp_path: Path) -> None:

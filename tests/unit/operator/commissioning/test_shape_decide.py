@@ -22,12 +22,25 @@ from snakesim_operator.features.commissioning.shape.decide import (
     find_placement_hint,
     judge_shapes,
 )
-from snakesim_operator.features.commissioning.shape.design import PLACEMENT_TOLERANCE_RAD, ShapePose, design_poses
+from snakesim_operator.features.commissioning.shape.design import (
+    PLACEMENT_TOLERANCE_RAD,
+    ShapePose,
+    design_poses,
+)
 
 TRIALS = 100
 SMALLEST_ZERO_RAD = 2.02 * PLACEMENT_TOLERANCE_RAD  # that is always found
 GEAR_ERRORS = (0.25, 0.5, 2 / 3, 0.87, 1.14, 1.5, 2.0, 4.0)
-FAULTS = ("sign", "gear", "zero", "exchange", "cycle of three", "sign and gear", "sign and zero", "exchange and sign")
+FAULTS = (
+    "sign",
+    "gear",
+    "zero",
+    "exchange",
+    "cycle of three",
+    "sign and gear",
+    "sign and zero",
+    "exchange and sign",
+)
 
 
 @dataclass(frozen=True)
@@ -64,7 +77,9 @@ def make_joints(rng: np.random.Generator, count: int) -> list[Joint]:
             gear=float(rng.choice((0.5, 1.0, 50.0))),
         )
         joints.append(
-            dataclasses.replace(joint, name=f"joint_{i + 1}", axis=axes[i % len(axes)], id=i + 1, drive=drive)
+            dataclasses.replace(
+                joint, name=f"joint_{i + 1}", axis=axes[i % len(axes)], id=i + 1, drive=drive
+            )
         )
     return joints
 
@@ -80,7 +95,9 @@ def make_robot(trial: int, fault: str | None) -> tuple[HiddenRobot, np.random.Ge
     first, second, third = rng.permutation(count)[:3].tolist()
 
     def rebuild(name: JointProperty, **fields: Any) -> None:
-        built[first] = dataclasses.replace(built[first], drive=msgspec.structs.replace(built[first].drive, **fields))
+        built[first] = dataclasses.replace(
+            built[first], drive=msgspec.structs.replace(built[first].drive, **fields)
+        )
         faults.setdefault(first, set()).add(name)
 
     def move(*joints: int) -> None:
@@ -109,7 +126,9 @@ def list_states(verdicts: Sequence[ShapeVerdict], state: str) -> dict[int, set[J
     """The properties in this state, by the index of their joint."""
     states: dict[int, set[JointProperty]] = {}
     for joint, verdict in enumerate(verdicts):
-        names: set[JointProperty] = {name for name in SHAPE_PROPERTIES if verdict.findings[name].state == state}
+        names: set[JointProperty] = {
+            name for name in SHAPE_PROPERTIES if verdict.findings[name].state == state
+        }
         if names:
             states[joint] = names
     return states
@@ -120,7 +139,9 @@ def test_shapes_name_the_fault_of_each_of_100_robots_and_no_other(at_the_toleran
     for trial in range(TRIALS):
         fault = FAULTS[trial % len(FAULTS)]
         robot, rng = make_robot(trial, fault)
-        verdicts = judge_shapes(robot.file, robot.poses, robot.measure(rng, at_the_tolerance=at_the_tolerance))
+        verdicts = judge_shapes(
+            robot.file, robot.poses, robot.measure(rng, at_the_tolerance=at_the_tolerance)
+        )
         assert list_states(verdicts, "wrong") == robot.faults, f"trial {trial}, {fault}: {verdicts}"
         assert list_states(verdicts, "unknown") == {}, f"trial {trial}, {fault}: {verdicts}"
 
@@ -129,14 +150,18 @@ def test_shapes_name_the_fault_of_each_of_100_robots_and_no_other(at_the_toleran
 def test_shapes_confirm_each_of_100_robots_that_are_as_their_file(at_the_tolerance: bool) -> None:
     for trial in range(1000, 1000 + TRIALS):
         robot, rng = make_robot(trial, None)
-        verdicts = judge_shapes(robot.file, robot.poses, robot.measure(rng, at_the_tolerance=at_the_tolerance))
+        verdicts = judge_shapes(
+            robot.file, robot.poses, robot.measure(rng, at_the_tolerance=at_the_tolerance)
+        )
         assert all(verdict.all_confirmed for verdict in verdicts), f"trial {trial}: {verdicts}"
 
 
 def test_reasons_state_what_the_file_should_have() -> None:
     robot, _ = make_robot(1, None)
     joints = [
-        dataclasses.replace(joint, drive=msgspec.structs.replace(joint.drive, sign=1, zero_rad=0.0, gear=1.0))
+        dataclasses.replace(
+            joint, drive=msgspec.structs.replace(joint.drive, sign=1, zero_rad=0.0, gear=1.0)
+        )
         for joint in robot.file
     ]
     poses = design_poses(joints)
@@ -147,7 +172,9 @@ def test_reasons_state_what_the_file_should_have() -> None:
     reading_rad[:, [3, 4]] = reading_rad[:, [4, 3]]
     verdicts = judge_shapes(joints, poses, reading_rad)
     assert verdicts[0].findings["sign"].reason == "turns the other way: sign = -1"
-    assert verdicts[1].findings["gear"].reason == "turns 0.50 as far as its drive measures: gear = 2"
+    assert (
+        verdicts[1].findings["gear"].reason == "turns 0.50 as far as its drive measures: gear = 2"
+    )
     assert verdicts[2].findings["zero"].reason == "its zero is off by +0.300 rad: zero_rad = 0.300"
     assert verdicts[3].findings["order"].reason == "exchanged with joint_5: id = 5"
     assert verdicts[4].findings["order"].reason == "exchanged with joint_4: id = 4"
@@ -188,11 +215,16 @@ def test_two_drives_that_measure_one_joint_are_both_unknown() -> None:
     reading_rad[:, 2] = reading_rad[:, 0]
     verdicts = judge_shapes(robot.file, robot.poses, reading_rad)
     for joint in (0, 2):
-        assert verdicts[joint].findings["order"].reason.startswith("joint_1 and joint_3 all measure joint_1")
+        assert (
+            verdicts[joint]
+            .findings["order"]
+            .reason.startswith("joint_1 and joint_3 all measure joint_1")
+        )
 
 
 @pytest.mark.parametrize(
-    ("limit_rad", "unknown"), [(0.02, {*SHAPE_PROPERTIES}), (0.3, {"gear"}), (0.6, set[JointProperty]())]
+    ("limit_rad", "unknown"),
+    [(0.02, {*SHAPE_PROPERTIES}), (0.3, {"gear"}), (0.6, set[JointProperty]())],
 )
 def test_a_joint_that_hardly_bends_is_unknown_with_what_is_needed(
     limit_rad: float, unknown: set[JointProperty]
@@ -216,7 +248,9 @@ def test_a_robot_that_lay_on_its_back_gets_a_hint() -> None:
 
 
 @pytest.mark.parametrize("limit_rad", [0.5, 0.7])
-def test_no_fault_of_robots_that_bend_less_is_confirmed_and_no_sound_joint_is_blamed(limit_rad: float) -> None:
+def test_no_fault_of_robots_that_bend_less_is_confirmed_and_no_sound_joint_is_blamed(
+    limit_rad: float,
+) -> None:
     for trial in range(TRIALS // 4):
         robot, rng = make_robot(trial, FAULTS[trial % len(FAULTS)])
         file = [shorten_travel(joint, limit_rad) for joint in robot.file]
@@ -225,9 +259,15 @@ def test_no_fault_of_robots_that_bend_less_is_confirmed_and_no_sound_joint_is_bl
         verdicts = judge_shapes(robot.file, robot.poses, robot.measure(rng))
         found = list_states(verdicts, "wrong")
         assert set(found) <= set(robot.faults), f"trial {trial}: {verdicts}"
-        assert not any(verdicts[joint].all_confirmed for joint in robot.faults), f"trial {trial}: {verdicts}"
-        assert "order" not in {name for names in list_states(verdicts, "unknown").values() for name in names}
+        assert not any(verdicts[joint].all_confirmed for joint in robot.faults), (
+            f"trial {trial}: {verdicts}"
+        )
+        assert "order" not in {
+            name for names in list_states(verdicts, "unknown").values() for name in names
+        }
 
 
 def shorten_travel(joint: Joint, limit_rad: float) -> Joint:
-    return dataclasses.replace(joint, limits=msgspec.structs.replace(joint.limits, angle_rad=limit_rad))
+    return dataclasses.replace(
+        joint, limits=msgspec.structs.replace(joint.limits, angle_rad=limit_rad)
+    )

@@ -16,7 +16,11 @@ from snakesim_operator.features.commissioning.shape.design import (
     compute_separations,
     design_poses,
 )
-from snakesim_operator.features.commissioning.shape.drawing import POINTS_PER_MM, encode_pdf, encode_svg
+from snakesim_operator.features.commissioning.shape.drawing import (
+    POINTS_PER_MM,
+    encode_pdf,
+    encode_svg,
+)
 from snakesim_operator.features.commissioning.shape.outline import (
     compute_drawing_mark,
     compute_joint_positions_mm,
@@ -43,7 +47,10 @@ def test_codes_have_both_signs_and_are_separated_by_more_than_the_tolerance(coun
 def test_joints_that_bend_less_are_separated_by_more_shapes(smallest_rad: float) -> None:
     codes = choose_codes(13, smallest_rad)
     for i, j in itertools.permutations(range(13), 2):
-        assert smallest_rad * compute_separations(codes[i], codes[j : j + 1])[0] > PLACEMENT_TOLERANCE_RAD
+        assert (
+            smallest_rad * compute_separations(codes[i], codes[j : j + 1])[0]
+            > PLACEMENT_TOLERANCE_RAD
+        )
 
 
 def test_up_to_18_joints_of_an_axis_need_three_shapes() -> None:
@@ -61,7 +68,9 @@ def test_shapes_stay_within_limits_and_do_not_cross_themselves(name: str) -> Non
         positions_mm = compute_joint_positions_mm(robot, pose)
         for i, j in itertools.combinations(range(len(positions_mm)), 2):
             if j > i + 2:  # links that are no neighbors are further apart than the body is wide
-                assert np.linalg.norm(positions_mm[i] - positions_mm[j]) > 2000 * robot.module.radius_m
+                assert (
+                    np.linalg.norm(positions_mm[i] - positions_mm[j]) > 2000 * robot.module.radius_m
+                )
 
 
 def test_yaw_turns_left_and_pitch_turns_right_on_the_page() -> None:
@@ -113,7 +122,9 @@ def test_svg_has_all_shapes_in_millimeters() -> None:
     robot = read_robot("planar13")
     poses = design_poses(robot.joint_table)
     text = encode_svg(make_poster(robot, poses, "abc123"), "shapes <1>")
-    width, height, box = re.findall(r'width="(\d+)mm" height="(\d+)mm" viewBox="0 0 (\d+ \d+)"', text)[0]
+    width, height, box = re.findall(
+        r'width="(\d+)mm" height="(\d+)mm" viewBox="0 0 (\d+ \d+)"', text
+    )[0]
     assert f"{width} {height}" == box
     assert text.count("joint_13 ") == len(poses) - 1
     assert "shapes &lt;1&gt;" in text

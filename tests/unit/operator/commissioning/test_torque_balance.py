@@ -3,8 +3,16 @@
 import numpy as np
 import pytest
 
-from snakesim_operator.features.commissioning.smoothing import smooth, smooth_derivative, smooth_second_derivative
-from snakesim_operator.features.commissioning.torque_balance import JointRecord, TorqueBalance, fit_torque_balance
+from snakesim_operator.features.commissioning.smoothing import (
+    smooth,
+    smooth_derivative,
+    smooth_second_derivative,
+)
+from snakesim_operator.features.commissioning.torque_balance import (
+    JointRecord,
+    TorqueBalance,
+    fit_torque_balance,
+)
 from snakesim_testing.messages import raises_error
 
 TRUTH = {"dry_nm": 0.15, "viscous_nm_s_per_rad": 0.1, "armature_kg_m2": 0.005}

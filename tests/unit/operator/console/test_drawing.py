@@ -6,9 +6,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import quaternion_from_yaw, quaternions_from_rotations, rotation_from_quaternion
+from snakesim_hal.model.kinematics import (
+    quaternion_from_yaw,
+    quaternions_from_rotations,
+    rotation_from_quaternion,
+)
 from snakesim_hal.wire.messages import DepthImage, KnownObstacle
-from snakesim_operator.features.console.page.force_polygon import draw_force_polygon, format_push_point_table
+from snakesim_operator.features.console.page.force_polygon import (
+    draw_force_polygon,
+    format_push_point_table,
+)
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import M_PER_N, MAX_FORCE_ARROW_M, draw
 from snakesim_testing.operator.drawn_samples import COUNT, ROBOT, contact, joints, pushing, world
@@ -45,7 +52,8 @@ def test_drawing_has_forces_and_their_resultant():
     assert drawing.propulsion_joint == COUNT - 1
     assert drawing.pushed_obstacles == {"peg"}
     spans = [
-        arrows[:, 1] - arrows[:, 0] for arrows in (drawing.measured_forces, drawing.resultant, drawing.desired_forces)
+        arrows[:, 1] - arrows[:, 0]
+        for arrows in (drawing.measured_forces, drawing.resultant, drawing.desired_forces)
     ]
     assert [len(span) for span in spans] == [2, 1, 1]
     assert spans[0][0] == pytest.approx([0.0, 10 * M_PER_N, 0.0])
@@ -54,17 +62,21 @@ def test_drawing_has_forces_and_their_resultant():
 
 
 def test_drawing_requested_force_without_contact_is_no_contact_force():
-    points = [contact((0.0, 10.0, 0.0), peg, x_m=x_m) for peg, x_m in (("felt", 0.1), ("clear", 0.3))]
+    points = [
+        contact((0.0, 10.0, 0.0), peg, x_m=x_m) for peg, x_m in (("felt", 0.1), ("clear", 0.3))
+    ]
     control = pushing(points, [20.0, 30.0], measured_force_n=[17.5, 0.0])
-    snapshot = RobotSnapshot(robot=ROBOT, body=joints(), world=world(points[:1], []), control=control)
+    snapshot = RobotSnapshot(
+        robot=ROBOT, body=joints(), world=world(points[:1], []), control=control
+    )
     drawing = draw(snapshot, None)
     assert drawing is not None
     assert drawing.pushed_obstacles == {"felt"}
     assert drawing.desired_forces[:, 0, 0] == pytest.approx([0.1])
     assert drawing.forces_without_contact[:, 0, 0] == pytest.approx([0.3])
-    assert drawing.forces_without_contact[0, 1] - drawing.forces_without_contact[0, 0] == pytest.approx(
-        [0.0, MAX_FORCE_ARROW_M, 0.0]
-    )
+    assert drawing.forces_without_contact[0, 1] - drawing.forces_without_contact[
+        0, 0
+    ] == pytest.approx([0.0, MAX_FORCE_ARROW_M, 0.0])
     table = format_push_point_table(control)
     assert "<td>felt</td><td>20.0</td><td>17.5</td>" in table
     assert "<td>clear</td><td>30.0</td><td>0.0</td>" in table
@@ -82,7 +94,10 @@ def test_drawing_strong_force_has_arrow_of_limited_length():
 
 
 def test_the_force_polygon_names_every_force_and_their_resultant():
-    later, first = (contact((*at_n, 0.0), "<b>", body_s_m=s_m) for s_m, at_n in ((0.3, (0.0, 4.0)), (0.1, (3.0, 0.0))))
+    later, first = (
+        contact((*at_n, 0.0), "<b>", body_s_m=s_m)
+        for s_m, at_n in ((0.3, (0.0, 4.0)), (0.1, (3.0, 0.0)))
+    )
     drawn = draw_force_polygon(RobotSnapshot(robot=ROBOT, world=world([later, first], [])))
     assert "resultant 5.0 N" in drawn
     assert drawn.index(">3.0 N<") < drawn.index(">4.0 N<") < drawn.index(">5.0 N<")
@@ -93,7 +108,9 @@ def test_what_a_map_tells_is_not_drawn_as_perceived():
     mapped = KnownObstacle(name="a", shape="sphere", position_w=(0.0, 0.0, 0.0))
     found = KnownObstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
     felt = KnownObstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), touched=True)
-    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([], [mapped, found, felt])), None)
+    drawing = draw(
+        RobotSnapshot(robot=ROBOT, body=joints(), world=world([], [mapped, found, felt])), None
+    )
     assert drawing is not None
     assert [o.name for o in drawing.perceived] == ["b", "c"]
 
@@ -104,7 +121,9 @@ def test_a_camera_that_looks_along_its_link_looks_along_x():
         height=2, fx_px=1.0, fy_px=1.0, cx_px=2.0, cy_px=1.0, range_min_m=0.1, range_max_m=1.0, scale_m=0.001,
         depth=bytes(16),
     )  # fmt: skip
-    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), images={"sensor/depth/head": image}), None)
+    drawing = draw(
+        RobotSnapshot(robot=ROBOT, body=joints(), images={"sensor/depth/head": image}), None
+    )
     assert drawing is not None
     looks = rotation_from_quaternion(drawing.cameras[0].wxyz)
     assert looks[:, 2] == pytest.approx([1.0, 0.0, 0.0])

@@ -25,7 +25,9 @@ from snakesim_operator.features.console.scene.meshes import (
         (make_tube(1.0, 0.5, 4.0, open_top=False), (2.0, 1.0, 1.0), 3 * math.pi),
     ],
 )
-def test_a_shape_has_its_size_and_faces_outwards(mesh: Mesh, half_m: tuple[float, ...], volume_m3: float):
+def test_a_shape_has_its_size_and_faces_outwards(
+    mesh: Mesh, half_m: tuple[float, ...], volume_m3: float
+):
     vertices, faces = mesh
     assert vertices.max(axis=0) == pytest.approx(half_m)
     assert vertices.min(axis=0) == pytest.approx(np.negative(half_m))

@@ -16,12 +16,16 @@ VALUES = '{"push_n": 10.0, "share": 0.5, "bend_rad": -0.2, "mode": "b", "on": tr
 
 
 def in_force(values: str, schema: str) -> ControlParameters:
-    return ControlParameters(tick=0, timestamp_ns=0, controller="any", parameters=values, schema=schema)
+    return ControlParameters(
+        tick=0, timestamp_ns=0, controller="any", parameters=values, schema=schema
+    )
 
 
 def test_each_setting_has_an_input_within_its_bounds():
     push, share, bend, mode, on = list_input_fields(in_force(VALUES, SCHEMA))
-    assert push == InputField("push_n", 10.0, "N", low=0.1, high=40.0, step=0.1, hint="a bound; > 0, <= 10000 N")
+    assert push == InputField(
+        "push_n", 10.0, "N", low=0.1, high=40.0, step=0.1, hint="a bound; > 0, <= 10000 N"
+    )
     assert share.low == 0.0
     assert share.high == 1.0
     assert bend.low == -0.8
@@ -30,6 +34,8 @@ def test_each_setting_has_an_input_within_its_bounds():
     assert on.value is True
 
 
-@pytest.mark.parametrize("schema", ["", "[]", "{}", "null", '{"properties": 1}', '{"$ref": "#/$defs/x"}', "{" * 9000])
+@pytest.mark.parametrize(
+    "schema", ["", "[]", "{}", "null", '{"properties": 1}', '{"$ref": "#/$defs/x"}', "{" * 9000]
+)
 def test_a_schema_that_cannot_be_read_gives_no_form(schema: str):
     assert list_input_fields(in_force(VALUES, schema)) == []

@@ -14,7 +14,9 @@ from snakesim_operator.run.in_process import simulate
 
 def test_state_faults_and_supply_are_those_of_the_instant(tmp_path: Path) -> None:
     sets = ["duration_s=2", 'faults=["nan:joint_3@1"]']
-    simulate(load_scenario("triplet", [parse_set_option(one) for one in sets]).config, tmp_path / "run")
+    simulate(
+        load_scenario("triplet", [parse_set_option(one) for one in sets]).config, tmp_path / "run"
+    )
     recorded = RunPlayback(tmp_path / "run")
     moving, (_, end_s) = recorded.make_snapshot(0.5), recorded.span_s
     assert moving.status is not None
@@ -34,7 +36,9 @@ def test_state_faults_and_supply_are_those_of_the_instant(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_cameras_rates_and_charts_are_those_of_the_instant(tmp_path: Path) -> None:
-    simulate(load_scenario("clutter", [parse_set_option("duration_s=1.5")]).config, tmp_path / "run")
+    simulate(
+        load_scenario("clutter", [parse_set_option("duration_s=1.5")]).config, tmp_path / "run"
+    )
     recorded = RunPlayback(tmp_path / "run")
     early, late = recorded.make_snapshot(0.3), recorded.make_snapshot(1.4)
     (seen,), (later,) = early.images.values(), late.images.values()

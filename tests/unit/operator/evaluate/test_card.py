@@ -34,7 +34,9 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
         suite = EvaluationSuite(scenario="surveyed_clutter", set={"duration_s": 3.0, **more})
         cases = make_cases(suite, "here", controllers, 6, first_field=seed)
         done = {
-            case.id: CaseOutcome(numbers={**numbers, "crossed": crosses == (case.controller == "hold")})
+            case.id: CaseOutcome(
+                numbers={**numbers, "crossed": crosses == (case.controller == "hold")}
+            )
             for case in cases
         }
         return make_card("mine", cases, done)
@@ -45,15 +47,15 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
     assert paired.only_one == 0
     assert paired.only_other == 6
     assert paired.p == pytest.approx(2 / 64)
-    other = card(
-        ["hold"], 4, crosses=False, **{"controllers.path_following.look_ahead_m": 0.05}
-    )  # fields 4 to 9: three are shared
+    # Fields 4 to 9: three are shared.
+    other = card(["hold"], 4, crosses=False, **{"controllers.path_following.look_ahead_m": 0.05})
     pairs = compare_cards(ours, [other])
     assert [one.fields for one in pairs] == [6, 3, 3]
     assert pairs[2].only_one == 3
     assert all(one.p >= compute_mcnemar_p(one.only_one, one.only_other) for one in pairs)
     assert not compare_cards(
-        card(["hold"], 1, crosses=True), [card(["hold"], 1, crosses=True, **{"scene.ground.friction": 0.3})]
+        card(["hold"], 1, crosses=True),
+        [card(["hold"], 1, crosses=True, **{"scene.ground.friction": 0.3})],
     )
     said = "\n".join(format_card(ours, pairs))
     assert "desired forces: median error                    unknown" in said

@@ -39,10 +39,14 @@ def quick_runs() -> Iterator[None]:
         def count_workers(self) -> int:
             return 2
 
-        def run_cases(self, cases: Sequence[EvaluationCase]) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
+        def run_cases(
+            self, cases: Sequence[EvaluationCase]
+        ) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
             for case in cases:
                 config = msgspec.json.decode(case.config)
-                value = config["controllers"]["obstacle_triplet"]["propulsion_n"] + 100 * config["seed"]
+                value = (
+                    config["controllers"]["obstacle_triplet"]["propulsion_n"] + 100 * config["seed"]
+                )
                 yield case, CaseOutcome(numbers={"path_distance_m": value, "advance_m": value})
 
     @contextmanager
@@ -104,7 +108,9 @@ def test_a_scenario_file_that_has_changed_is_another_search(tmp_path: Path) -> N
 
 def test_search_file_of_unknown_search_stays_unchanged(tmp_path: Path) -> None:
     storage = tmp_path / "search.db"
-    study = optuna.create_study(storage=f"sqlite:///{storage}", study_name="triplet path_distance_m")
+    study = optuna.create_study(
+        storage=f"sqlite:///{storage}", study_name="triplet path_distance_m"
+    )
     study.add_trial(optuna.trial.create_trial(value=1.0))
     with raises_error(ConfigError, code="evaluation/other-search"):
         searched(storage)
@@ -112,7 +118,9 @@ def test_search_file_of_unknown_search_stays_unchanged(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a?b 50%20.db", "{x}#&ä.db"])
-def test_search_accepts_any_file_name(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_search_accepts_any_file_name(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     searched(tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == [name]
     printed(capsys)
@@ -142,14 +150,20 @@ def test_search_trials_are_numbered_from_one_to_requested_count(
     assert numbers == list(range(1, 6))
     best = next(line for line in lines[::-1] if line.startswith("best "))
     value, _, number = best.removeprefix("best path_distance_m: ").partition(", trial ")
-    assert any(line.startswith(f"trial {number}:") and line.endswith(f": {value}") for line in lines)
+    assert any(
+        line.startswith(f"trial {number}:") and line.endswith(f": {value}") for line in lines
+    )
 
 
-def test_search_printout_for_several_seeds_names_the_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_search_printout_for_several_seeds_names_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     searched(tmp_path / "search.db", seeds=3, seed=5)
     *_, best, about, command = printed(capsys)
     words = shlex.split(command)
-    propulsion = float(next(word for word in words if word.startswith(PROPULSION)).partition("=")[2])
+    propulsion = float(
+        next(word for word in words if word.startswith(PROPULSION)).partition("=")[2]
+    )
     assert best.startswith(f"best path_distance_m: {propulsion + 600:.4g}, trial ")
     assert "seed=5" in words
     assert about == f"  the mean of 3 runs; the first of them, {propulsion + 500:.4g}, again:"

@@ -10,7 +10,12 @@ from snakesim_hal.model.files import list_shipped_names
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_operator.cli import main
 from snakesim_operator.features.evaluate.case import EvaluationCase
-from snakesim_operator.features.evaluate.suite import EvaluationSuite, make_cases, make_suite_settings, read_suite
+from snakesim_operator.features.evaluate.suite import (
+    EvaluationSuite,
+    make_cases,
+    make_suite_settings,
+    read_suite,
+)
 from snakesim_testing.messages import raises_error
 
 ROWS = """
@@ -66,10 +71,14 @@ def test_suite_contains_every_row_in_every_combination(tmp_path: Path) -> None:
 
 def test_a_case_is_known_again_by_what_it_runs(tmp_path: Path) -> None:
     suite, source = read(tmp_path, ROWS)
-    few, more = (make_cases(suite, source, ["hold"], fields, seed) for fields, seed in ((1, 8), (2, 7)))
+    few, more = (
+        make_cases(suite, source, ["hold"], fields, seed) for fields, seed in ((1, 8), (2, 7))
+    )
     assert {case.id for case in few} < {case.id for case in more}
     renamed = msgspec.structs.replace(suite, title="another", row=[])
-    assert {case.id for case in make_cases(renamed, "elsewhere", ["hold"], 1, 8)} < {case.id for case in few}
+    assert {case.id for case in make_cases(renamed, "elsewhere", ["hold"], 1, 8)} < {
+        case.id for case in few
+    }
 
 
 QUICK = {"pushing"}  # the others are tried by `make verify`
@@ -77,7 +86,10 @@ QUICK = {"pushing"}  # the others are tried by `make verify`
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in list_shipped_names("suites")],
+    [
+        pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow)
+        for name in list_shipped_names("suites")
+    ],
 )
 def test_shipped_suites_can_be_run(name: str) -> None:
     suite, source = read_suite(name)
@@ -92,19 +104,37 @@ def test_shipped_suites_can_be_run(name: str) -> None:
         ('scenario = "nowhere"', ["no scenario called 'nowhere'", "triplet"]),
         ('scenario = "jam"\nfield = 3', ["mine.toml", "`field`", "did you mean `fields`"]),
         ('scenario = "jam"\nfields = 0', ["mine.toml", "`fields` = 0", ">= 1"]),
-        ('scenario = "jam"\ncontrollers = ["wave"]', ["no controller called 'wave'", "obstacle_triplet"]),
-        ('scenario = "jam"\n[set]\nscene.ground.frictoin = 1', ["mine.toml: [set]", "did you mean `friction`"]),
-        ('scenario = "jam"\n[set]\nscene.ground.friction = 9', ["[set]: `scene.ground.friction` = 9", "<= 5"]),
+        (
+            'scenario = "jam"\ncontrollers = ["wave"]',
+            ["no controller called 'wave'", "obstacle_triplet"],
+        ),
+        (
+            'scenario = "jam"\n[set]\nscene.ground.frictoin = 1',
+            ["mine.toml: [set]", "did you mean `friction`"],
+        ),
+        (
+            'scenario = "jam"\n[set]\nscene.ground.friction = 9',
+            ["[set]: `scene.ground.friction` = 9", "<= 5"],
+        ),
         ('scenario = "jam"\n[vary]\nseed = []', ["mine.toml", "`vary.seed` is empty"]),
         ('scenario = "jam"\n[vary]\nrate_hz = "1:2"', ["`vary.rate_hz` = '1:2'", "low:high:count"]),
-        ('scenario = "jam"\n[vary]\nrate_hz = "1:2:1"', ["`vary.rate_hz` = '1:2:1'", "count of 2 to 1000"]),
-        ('scenario = "jam"\n[vary]\nrate_hz = [100, 1]', ["mine.toml: [vary]", "`rate_hz` = 1", "Hz", ">= 20"]),
+        (
+            'scenario = "jam"\n[vary]\nrate_hz = "1:2:1"',
+            ["`vary.rate_hz` = '1:2:1'", "count of 2 to 1000"],
+        ),
+        (
+            'scenario = "jam"\n[vary]\nrate_hz = [100, 1]',
+            ["mine.toml: [vary]", "`rate_hz` = 1", "Hz", ">= 20"],
+        ),
         ('scenario = "jam"\n[[row]]\nname = "a"\n[[row]]\nname = "a"', ["two rows are called 'a'"]),
         (
             'scenario = "jam"\n[set]\nscene.random_field.0.density_per_m2 = 3',
             ["[set]", "`scene.random_field`", "expected a list"],
         ),
-        ('scenario = "surveyed_clutter"\n[set]\nscene.random_field.0.density_per_m2 = 150', ["row 1", "1380 pegs"]),
+        (
+            'scenario = "surveyed_clutter"\n[set]\nscene.random_field.0.density_per_m2 = 150',
+            ["row 1", "1380 pegs"],
+        ),
         ('scenario = "jam"\n[set]\nbackend = "nobody"', ["no backend called 'nobody'"]),
     ],
 )
@@ -112,7 +142,10 @@ def test_a_wrong_suite_is_told_what_and_where(
     text: str, reported: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.toml").write_text(text)
-    assert main(["study", "evaluate", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert (
+        main(["study", "evaluate", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")])
+        == 2
+    )
     said = capsys.readouterr().err
     assert all(part in said for part in reported), said
     assert not (tmp_path / "out").exists()

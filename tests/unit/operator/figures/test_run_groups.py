@@ -23,7 +23,9 @@ def make_run(folder: str, seed: int, duration_s: float = 10.0) -> RunRecord:
     return dataclasses.replace(triplet(), path=Path(folder), config=config)
 
 
-def test_arguments_are_runs_and_then_signals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arguments_are_runs_and_then_signals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "b").mkdir()
     runs, names = split_runs_and_signals(["runs/a", "b", "angle_rad", "torque_nm.joint_1"])
@@ -35,8 +37,14 @@ def test_arguments_are_runs_and_then_signals(tmp_path: Path, monkeypatch: pytest
 def test_runs_that_differ_in_the_seed_are_one_group() -> None:
     runs = [make_run("a", 1), make_run("b", 2), make_run("c", 1, 5.0), make_run("d", 3)]
     groups = group_runs_by_configuration(runs)
-    assert [[run.path.name for run in group.records] for group in groups] == [["a", "b", "d"], ["c"]]
-    assert [group.label for group in groups] == ["duration_s 10 (mean of 3 runs)", "duration_s 5 (1 run)"]
+    assert [[run.path.name for run in group.records] for group in groups] == [
+        ["a", "b", "d"],
+        ["c"],
+    ]
+    assert [group.label for group in groups] == [
+        "duration_s 10 (mean of 3 runs)",
+        "duration_s 5 (1 run)",
+    ]
 
 
 def test_no_mean_of_runs_that_are_not_repetitions() -> None:

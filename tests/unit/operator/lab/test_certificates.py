@@ -26,7 +26,9 @@ def states(folder: Path, *, rotate: bool = False) -> dict[str, str]:
     return {identity.common_name: state for identity, state, _ in done}
 
 
-def test_private_keys_are_their_owners_and_never_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_private_keys_are_their_owners_and_never_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["lab", "certs", str(EXAMPLE_PATH), "--out", str(tmp_path)]) == 0
     keys = list(tmp_path.rglob("*.key"))
     assert len(keys) == len(list(iterate_identities(LAB))) + 1

@@ -10,7 +10,11 @@ import pytest
 import yaml
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.programs.arguments import add_host_arguments, add_service_arguments, load_scenario_from_arguments
+from snakesim_hal.programs.arguments import (
+    add_host_arguments,
+    add_service_arguments,
+    load_scenario_from_arguments,
+)
 from snakesim_operator.features.lab.check import CheckResults, check_emulation
 from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH, load_lab
 from snakesim_operator.features.lab.render import render_files
@@ -37,7 +41,9 @@ BUSES = {  # as the host is to be given them
     "odrive": {"odrive": {"channels": ["can0"], "bit_rate": 1_000_000}},
     "moteus": {"moteus": {"channels": ["can0"], "bit_rate": 1_000_000, "data_bit_rate": 2_000_000}},
     "cia402": {"cia402": {"channels": ["can0"], "bit_rate": 500_000}},
-    "virtual moteus": {"moteus": {"channels": ["vcan0"], "bit_rate": 1_000_000, "data_bit_rate": 5_000_000}},
+    "virtual moteus": {
+        "moteus": {"channels": ["vcan0"], "bit_rate": 1_000_000, "data_bit_rate": 5_000_000}
+    },
     "dynamixel": {"dynamixel": {"ports": ["/dev/ttyUSB0", BY_ID]}},
     "mixed": {
         "odrive": {"channels": ["can0"], "bit_rate": 1_000_000},
@@ -49,14 +55,21 @@ BUSES = {  # as the host is to be given them
 }
 CAN_FD = "type can bitrate 1000000 dbitrate {} fd on restart-ms"
 BRING_UP = {
-    "can": {"can0": "type can bitrate 500000 restart-ms", "can1": "type can bitrate 500000 restart-ms"},
+    "can": {
+        "can0": "type can bitrate 500000 restart-ms",
+        "can1": "type can bitrate 500000 restart-ms",
+    },
     "odrive": {"can0": "type can bitrate 1000000 restart-ms"},
     "moteus": {"can0": CAN_FD.format(2_000_000)},
     "cia402": {"can0": "type can bitrate 500000 restart-ms"},
     "virtual moteus": {"vcan0": "mtu 72"},
     "mixed": {"can0": "type can bitrate 1000000 restart-ms", "can1": CAN_FD.format(5_000_000)},
 }
-DEVICES = {"slcan": ["/dev/ttyACM0"], "dynamixel": ["/dev/ttyUSB0", BY_ID], "mixed": ["/dev/ttyUSB0"]}
+DEVICES = {
+    "slcan": ["/dev/ttyACM0"],
+    "dynamixel": ["/dev/ttyUSB0", BY_ID],
+    "mixed": ["/dev/ttyUSB0"],
+}
 
 
 def lab_text(robot: str) -> str:
@@ -85,23 +98,34 @@ def test_the_host_is_given_its_buses(tmp_path: Path, name: str) -> None:
     host_parser, service_parser = argparse.ArgumentParser(), argparse.ArgumentParser()
     add_host_arguments(host_parser)
     add_service_arguments(service_parser)
-    host = host_parser.parse_args(command_of(files["robot1/systemd/snakesim-robot.planar13.service"]))
+    host = host_parser.parse_args(
+        command_of(files["robot1/systemd/snakesim-robot.planar13.service"])
+    )
     config = load_scenario_from_arguments(host).config
     given = {section: settings for section, settings in config.backends.items() if settings}
     assert given == BUSES[name]
     assert config.clock_mode == ("realtime" if BUSES[name] else "lockstep")
-    control = service_parser.parse_args(command_of(files["ws1/systemd/snakesim-gnc.planar13-control.service"]))
+    control = service_parser.parse_args(
+        command_of(files["ws1/systemd/snakesim-gnc.planar13-control.service"])
+    )
     assert load_scenario_from_arguments(control).config == config
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_units_bring_interfaces_up_and_grant_device_access(tmp_path: Path, name: str) -> None:
     files = files_of(ROBOTS[name], tmp_path)
-    interfaces = {path: text for path, text in files.items() if re.search(r"snakesim-v?can\d+\.service$", path)}
+    interfaces = {
+        path: text
+        for path, text in files.items()
+        if re.search(r"snakesim-v?can\d+\.service$", path)
+    }
     wanted = BRING_UP.get(name, {})
     assert {path.split("-")[1].removesuffix(".service") for path in interfaces} == set(wanted)
     for interface, words in wanted.items():
-        assert f"/sbin/ip link set {interface} {words}" in files[f"robot1/systemd/snakesim-{interface}.service"]
+        assert (
+            f"/sbin/ip link set {interface} {words}"
+            in files[f"robot1/systemd/snakesim-{interface}.service"]
+        )
     host = files["robot1/systemd/snakesim-robot.planar13.service"]
     service = yaml.safe_load(files["robot1/compose.yaml"])["services"]["snakesim-robot_planar13"]
     assert ("AF_CAN" in host) == bool(wanted)
@@ -137,7 +161,9 @@ def test_units_bring_interfaces_up_and_grant_device_access(tmp_path: Path, name:
     ],
 )
 def test_a_robot_without_its_bus_is_refused(tmp_path: Path, robot: str) -> None:
-    with raises_error(ConfigError, code=("config/invalid-value", "lab/invalid-file"), field="lab.toml"):
+    with raises_error(
+        ConfigError, code=("config/invalid-value", "lab/invalid-file"), field="lab.toml"
+    ):
         files_of(robot, tmp_path)
 
 
@@ -165,7 +191,11 @@ def test_bus_of_an_external_backend_is_passed_as_setting(tmp_path: Path) -> None
         ("mixed", True, "but the lab file names its bus"),
         ("virtual moteus", True, ""),
         ("emulated", True, ""),
-        ("emulated", False, "REAL: motors move (backend lag), but by the lab file nothing real is to move"),
+        (
+            "emulated",
+            False,
+            "REAL: motors move (backend lag), but by the lab file nothing real is to move",
+        ),
         ("sim", False, "but by the lab file nothing real is to move"),
         ("sim", None, "UNKNOWN whether motors move"),
     ],
@@ -175,7 +205,9 @@ def test_check_marks_robot_that_contradicts_lab_file(
 ) -> None:
     path = tmp_path / "lab.toml"
     path.write_text(lab_text(ROBOTS[name]))
-    described = None if emulated is None else msgspec.structs.replace(make_description(), emulated=emulated)
+    described = (
+        None if emulated is None else msgspec.structs.replace(make_description(), emulated=emulated)
+    )
     said: list[str] = []
     found = CheckResults(said.append)
     check_emulation(load_lab(path).file.robots["planar13"], described, found)

@@ -40,7 +40,12 @@ def test_lab_file_errors_name_the_conflict(tmp_path: Path, old: str, new: str) -
     path.write_text(TEXT.replace(old, new, 1))
     with raises_error(
         ConfigError,
-        code=("config/invalid-value", "config/out-of-range", "config/unknown-key", "lab/invalid-file"),
+        code=(
+            "config/invalid-value",
+            "config/out-of-range",
+            "config/unknown-key",
+            "lab/invalid-file",
+        ),
         field="lab.toml",
     ):
         load_lab(path)
@@ -48,7 +53,11 @@ def test_lab_file_errors_name_the_conflict(tmp_path: Path, old: str, new: str) -
 
 def test_every_key_has_a_role_that_writes_it() -> None:
     """A key that is new in the key space names a writer that `snakesim_hal/wire/roles.py` knows."""
-    assert not [line.key for line in ACCESS_RULES if not line.writers or (line.kind == "query" and not line.answerers)]
+    assert not [
+        line.key
+        for line in ACCESS_RULES
+        if not line.writers or (line.kind == "query" and not line.answerers)
+    ]
     assert set(ROLE_DESCRIPTIONS) == set(Role)
 
 
@@ -58,7 +67,16 @@ def test_lab_rights_only_gnc_commands_and_only_robot_publishes() -> None:
         granted = list(iterate_permissions(role, ["control"], allow_fault_injection=True))
         puts = {key for flow, message, key in granted if (flow, message) == ("ingress", "put")}
         assert ("actuator/joints" in puts) == (role is Role.GNC)
-        own = {key for key in puts if key.startswith(("hal/", "sensor/")) and not key.startswith("hal/done/")}
+        own = {
+            key
+            for key in puts
+            if key.startswith(("hal/", "sensor/")) and not key.startswith("hal/done/")
+        }
         assert bool(own) == (role is Role.ROBOT)
-    faults = {message for role in Role for _, message, key in iterate_permissions(role) if key.startswith("fault/")}
+    faults = {
+        message
+        for role in Role
+        for _, message, key in iterate_permissions(role)
+        if key.startswith("fault/")
+    }
     assert not faults

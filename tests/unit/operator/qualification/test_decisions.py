@@ -14,9 +14,20 @@ from snakesim_operator.features.qualification.protocol.checks import (
     describe_check,
     judge_check,
 )
-from snakesim_operator.features.qualification.protocol.claims import CLAIM_BY_ID, CLAIMS, list_claims
-from snakesim_operator.features.qualification.protocol.steps import STEPS, Bounds, describe_criterion
-from snakesim_operator.features.qualification.protocol.torque_timeline import TorqueReading, make_timeline
+from snakesim_operator.features.qualification.protocol.claims import (
+    CLAIM_BY_ID,
+    CLAIMS,
+    list_claims,
+)
+from snakesim_operator.features.qualification.protocol.steps import (
+    STEPS,
+    Bounds,
+    describe_criterion,
+)
+from snakesim_operator.features.qualification.protocol.torque_timeline import (
+    TorqueReading,
+    make_timeline,
+)
 
 DOCS = Path(__file__).parents[4] / "docs"
 BOUNDS = Bounds(has_watchdog=True, watchdog_s=0.1, period_s=0.02)
@@ -39,7 +50,9 @@ BOUNDS = Bounds(has_watchdog=True, watchdog_s=0.1, period_s=0.02)
         ("A1", {}, "confirmed"),
     ],
 )
-def test_value_confirms_only_within_its_bounds(value: float | str | None, bounds: dict[str, Any], verdict: str):
+def test_value_confirms_only_within_its_bounds(
+    value: float | str | None, bounds: dict[str, Any], verdict: str
+):
     assert judge_check(Check(name="value", value=value, source="host", **bounds)) == verdict
 
 
@@ -60,7 +73,9 @@ def readings(*values: tuple[float, bool]) -> list[TorqueReading]:
 
 
 def test_drive_log_gives_the_time_without_torque_and_every_enabling_after_it():
-    log = make_timeline(readings((0.0, True), (1.1, False), (1.9, True)), "drive log", lists_changes=True)
+    log = make_timeline(
+        readings((0.0, True), (1.1, False), (1.9, True)), "drive log", lists_changes=True
+    )
     assert log.find_torque_off_s(1_000_000_000) == pytest.approx(0.1)
     assert log.count_enabled_again(1_200_000_000, 1_500_000_000) == 0
     assert log.count_enabled_again(1_200_000_000, 2_000_000_000) == 1
@@ -74,7 +89,9 @@ def test_polled_status_tells_nothing_between_two_answers():
     assert make_timeline([], "drive status", lists_changes=False).find_torque_off_s(0) is None
 
 
-@pytest.mark.parametrize("bounds", [BOUNDS, Bounds(has_watchdog=False, watchdog_s=0.1, period_s=0.02)])
+@pytest.mark.parametrize(
+    "bounds", [BOUNDS, Bounds(has_watchdog=False, watchdog_s=0.1, period_s=0.02)]
+)
 def test_every_step_has_a_procedure_and_a_criterion_with_values(bounds: Bounds):
     assert [step.key for step in STEPS] == list(PROCEDURES)
     for step in STEPS:

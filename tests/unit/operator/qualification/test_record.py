@@ -53,7 +53,9 @@ def step(key: str, *checks: Check, problem: str = "") -> StepResult:
 
 
 def off(value: float | None, claim: str = "stops-without-host") -> Check:
-    return Check(name="torque off", value=value, unit="s", maximum=0.2, source="drive log", claims=(claim,))
+    return Check(
+        name="torque off", value=value, unit="s", maximum=0.2, source="drive log", claims=(claim,)
+    )
 
 
 def make_record(*steps: StepResult) -> Record:
@@ -113,18 +115,25 @@ def test_whole_numbers_do_not_spoil_the_signature(tmp_path: Path):
 
 
 def test_changed_record_is_not_valid(tmp_path: Path):
-    record = sign_record(make_record(step("watchdog", off(0.9))), load_or_create_key(tmp_path / "key.pem"))
+    record = sign_record(
+        make_record(step("watchdog", off(0.9))), load_or_create_key(tmp_path / "key.pem")
+    )
     real = msgspec.structs.replace(record, subject=msgspec.structs.replace(SUBJECT, emulated=False))
     better = msgspec.structs.replace(record, steps=(step("watchdog", off(0.1)),))
     for changed in (real, better, msgspec.structs.replace(record, operator="another")):
         assert "changed after it was signed" in find_signature_problem(changed)
-    assert find_signature_problem(msgspec.structs.replace(record, signature=None)) == "it is not signed"
+    assert (
+        find_signature_problem(msgspec.structs.replace(record, signature=None))
+        == "it is not signed"
+    )
 
 
 def test_claims_that_do_not_follow_from_the_checks_are_found(tmp_path: Path):
     record = make_record(step("watchdog", off(0.9)))
     claims = tuple(msgspec.structs.replace(claim, verdict="confirmed") for claim in record.claims)
-    signed = sign_record(msgspec.structs.replace(record, claims=claims), load_or_create_key(tmp_path / "key.pem"))
+    signed = sign_record(
+        msgspec.structs.replace(record, claims=claims), load_or_create_key(tmp_path / "key.pem")
+    )
     assert find_signature_problem(signed) == ""
     assert find_claim_problem(signed)
 
@@ -143,7 +152,9 @@ def test_interrupted_record_is_continued_only_with_the_same_drive():
     assert "emulated" in find_resume_conflict(record, real)
     other = msgspec.structs.replace(real, serial="9")
     assert "serial" in find_resume_conflict(msgspec.structs.replace(record, subject=real), other)
-    assert "config_hash" in find_resume_conflict(record, msgspec.structs.replace(SUBJECT, config_hash="x"))
+    assert "config_hash" in find_resume_conflict(
+        record, msgspec.structs.replace(SUBJECT, config_hash="x")
+    )
 
 
 def test_repeated_step_replaces_the_earlier_one():
@@ -156,7 +167,10 @@ def test_summary_of_an_emulated_drive_claims_no_hardware_and_contains_no_markup(
     assert EMULATED_BANNER in summary
     assert "confirmed on an emulated drive" in summary
     assert "A \\| B &lt;script>" in summary
-    assert "| `stops-without-host` | Every drive but one stops by itself when its host dies. |" in summary
+    assert (
+        "| `stops-without-host` | Every drive but one stops by itself when its host dies. |"
+        in summary
+    )
 
 
 def test_key_of_another_kind_or_readable_by_all_is_refused(tmp_path: Path):

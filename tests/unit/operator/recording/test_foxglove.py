@@ -46,7 +46,11 @@ class Json:
 
     def decoder_for(self, message_encoding: str, _schema: Any) -> Any:
         return (
-            json.loads if message_encoding == "json" else (lambda data: data) if message_encoding == "msgpack" else None
+            json.loads
+            if message_encoding == "json"
+            else (lambda data: data)
+            if message_encoding == "msgpack"
+            else None
         )
 
 
@@ -59,7 +63,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("shown") / "run"
     simulate(
         load_scenario(
-            "triplet", [parse_set_option("robot=planar13_camera"), parse_set_option("duration_s=0.8")]
+            "triplet",
+            [parse_set_option("robot=planar13_camera"), parse_set_option("duration_s=0.8")],
         ).config,
         out,
     )
@@ -108,7 +113,9 @@ def test_transforms_and_joints_are_those_of_the_robot(run: Path) -> None:
     assert np.allclose(forward, towards, atol=1e-6)
     states = dict(found[f"{ROBOT}/joint_states"])[at_ns]
     assert [joint.position for joint in states.joints] == record.angle_rad[row].tolist()
-    assert [joint.name for joint in states.joints] == [joint.name for joint in record.description.joints]
+    assert [joint.name for joint in states.joints] == [
+        joint.name for joint in record.description.joints
+    ]
 
 
 def test_foxglove_joint_states_equal_reference_encoder_to_the_byte() -> None:
@@ -134,9 +141,17 @@ def test_foxglove_joints_forces_and_state_keep_robot_rates(run: Path) -> None:
     topics = Counter(channel.topic for _, channel, *_ in read)
     assert topics[f"{ROBOT}/joint_states"] == wire[keys.JOINTS] > 80
     assert topics[f"{ROBOT}/contact_forces"] == wire[keys.CONTACTS] > 80
-    assert topics[f"{ROBOT}/joint_references"] <= wire[keys.CONTROL_STATE] <= topics[f"{ROBOT}/state"]
-    forces = {at.log_time: one for _, channel, at, one in read if channel.topic == f"{ROBOT}/contact_forces"}
-    touching = [one for one in raw if one.key == keys.CONTACTS and CONTACTS.decode(one.payload).contacts][-1]
+    assert (
+        topics[f"{ROBOT}/joint_references"] <= wire[keys.CONTROL_STATE] <= topics[f"{ROBOT}/state"]
+    )
+    forces = {
+        at.log_time: one
+        for _, channel, at, one in read
+        if channel.topic == f"{ROBOT}/contact_forces"
+    }
+    touching = [
+        one for one in raw if one.key == keys.CONTACTS and CONTACTS.decode(one.payload).contacts
+    ][-1]
     felt, contacts = forces[touching.robot_time_ns], CONTACTS.decode(touching.payload).contacts
     for axis, name in enumerate(("along_n", "left_n", "up_n")):
         links = [sum(c.force_l[axis] for c in contacts if c.link == link) for link in range(14)]
@@ -157,11 +172,19 @@ def test_the_scene_has_body_obstacles_map_forces_and_path(run: Path) -> None:
     found, record = shown(run / RECORDING_FILENAME), RunRecord.load(run)
     scene = {topic.rpartition("/")[2]: update.entities for topic, messages in found.items()
              if "/scene/" in topic for _, update in messages[-1:]}  # fmt: skip
-    assert [entity.frame_id for entity in scene["body"]] == [link.name for link in record.description.links]
+    assert [entity.frame_id for entity in scene["body"]] == [
+        link.name for link in record.description.links
+    ]
     truth = scene["obstacles"][0]
-    assert len(truth.cylinders) + len(truth.cubes) + len(truth.spheres) == len(record.placed_obstacles)
-    assert len(scene["path"][0].lines[0].points) in {len(reported.path_w) for reported in record.trajectories}
-    arrows = [arrow for _, update in found[f"{ROBOT}/scene/forces"] for arrow in update.entities[0].arrows]
+    assert len(truth.cylinders) + len(truth.cubes) + len(truth.spheres) == len(
+        record.placed_obstacles
+    )
+    assert len(scene["path"][0].lines[0].points) in {
+        len(reported.path_w) for reported in record.trajectories
+    }
+    arrows = [
+        arrow for _, update in found[f"{ROBOT}/scene/forces"] for arrow in update.entities[0].arrows
+    ]
     turns = [arrow.pose.orientation for arrow in arrows]
     assert arrows
     assert all(math.hypot(q.w, q.x, q.y, q.z) == pytest.approx(1.0) for q in turns)
@@ -186,7 +209,8 @@ def test_images_come_with_their_camera(run: Path) -> None:
 def test_an_image_that_lacks_pixels_is_not_shown(run: Path) -> None:
     channels, key = FoxgloveConverter(ROBOT), "sensor/depth/head"
     sent = {
-        one.key: one.payload for one in RecordingReader(run / RECORDING_FILENAME).read_messages((keys.DESCRIPTION, key))
+        one.key: one.payload
+        for one in RecordingReader(run / RECORDING_FILENAME).read_messages((keys.DESCRIPTION, key))
     }
     whole = msgspec.msgpack.decode(sent[key], type=DepthImage)
     torn = msgspec.msgpack.encode(msgspec.structs.replace(whole, depth=whole.depth[:-1]))
@@ -196,7 +220,10 @@ def test_an_image_that_lacks_pixels_is_not_shown(run: Path) -> None:
 
 
 def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
-    record, logged = RunRecord.load(run), [one for _, one in shown(run / RECORDING_FILENAME)[f"{ROBOT}/log"]]
+    record, logged = (
+        RunRecord.load(run),
+        [one for _, one in shown(run / RECORDING_FILENAME)[f"{ROBOT}/log"]],
+    )
     with (run / RECORDING_FILENAME).open("rb") as file:
         read = list(make_reader(file).iter_messages(topics=[f"{ROBOT}/state"]))
     schema, channel, _ = read[0]
@@ -205,10 +232,14 @@ def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
     assert channel.message_encoding == "json"
     states = [json.loads(message.data) for *_, message in read]
     wanted = json.loads(schema.data)
-    assert all(set(wanted["required"]) <= set(state) <= set(wanted["properties"]) for state in states)
+    assert all(
+        set(wanted["required"]) <= set(state) <= set(wanted["properties"]) for state in states
+    )
     assert [one["lifecycle"] for one in states[-2:]] == ["armed", "disarmed"]
     assert states[-2]["path_s_m"] > 0
-    assert {one["locomotion"] for one in states} <= {reported.state for reported in record.control_states} | {""}
+    assert {one["locomotion"] for one in states} <= {
+        reported.state for reported in record.control_states
+    } | {""}
     assert any(one.name == "hal" and one.message.startswith("armed: armed by") for one in logged)
     assert any(one.name == "control" and one.message.startswith("Locomoting: ") for one in logged)
 
@@ -216,16 +247,23 @@ def test_state_and_log_tell_what_host_and_control_told(run: Path) -> None:
 def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
     layout, newest = json.loads(LAYOUT.read_text()), {}
     with (run / RECORDING_FILENAME).open("rb") as file:
-        for _, channel, _, one in make_reader(file, decoder_factories=FACTORIES).iter_decoded_messages():
+        for _, channel, _, one in make_reader(
+            file, decoder_factories=FACTORIES
+        ).iter_decoded_messages():
             if channel.topic.startswith("/"):
-                newest[channel.topic.replace(ROBOT, "/planar13")] = one  # as docs/how-to/foxglove.md shows
+                # As docs/how-to/foxglove.md shows.
+                newest[channel.topic.replace(ROBOT, "/planar13")] = one
     panels, text = layout["configById"], json.dumps(layout["layout"])
     assert all(f'"{name}"' in text for name in panels)
     assert text.count("!") == len(panels)
     paths = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
     topics = [topic for panel in panels.values() for topic in panel.get("topics", {})]
     image = panels["Image!depth"]["imageMode"]
-    topics += [image["imageTopic"], image["calibrationTopic"], panels["RosOut!log"]["topicToRender"]]
+    topics += [
+        image["imageTopic"],
+        image["calibrationTopic"],
+        panels["RosOut!log"]["topicToRender"],
+    ]
     assert not set(topics) - set(newest)
     for path in paths:
         topic, _, fields = path.partition(".")
@@ -237,12 +275,16 @@ def test_the_layout_shows_fields_that_a_recording_has(run: Path) -> None:
         assert isinstance(at, (str, float)), path
 
 
-def test_foxglove_unfinished_recording_has_transforms_joints_and_images(run: Path, tmp_path: Path) -> None:
+def test_foxglove_unfinished_recording_has_transforms_joints_and_images(
+    run: Path, tmp_path: Path
+) -> None:
     """As one that was killed: test_recording.py kills one."""
     torn = tmp_path / "torn.mcap"
     recording = RecordingWriter(torn, "planar13_camera")
     for number, one in enumerate(RecordingReader(run / RECORDING_FILENAME).read_messages()):
-        recording.write_arrival(ReceivedSample(one.key, one.payload, one.encoding, one.wall_time_ns))
+        recording.write_arrival(
+            ReceivedSample(one.key, one.payload, one.encoding, one.wall_time_ns)
+        )
         if number % 100 == 0:
             recording.flush()
     found: dict[str, Any] = {}
@@ -253,7 +295,8 @@ def test_foxglove_unfinished_recording_has_transforms_joints_and_images(run: Pat
     assert len(found[f"{ROBOT}/joint_states"].joints) == 13
     assert found[f"{ROBOT}/tf"].transforms
     assert len(found[f"{ROBOT}/head/depth/image_raw"].data) > 1000
-    count, lacks = recover_recording(torn, tmp_path / "whole.mcap")  # for readers that want an index
+    # For readers that want an index.
+    count, lacks = recover_recording(torn, tmp_path / "whole.mcap")
     whole = shown(tmp_path / "whole.mcap")
     assert count > 500
     assert len(whole[f"{ROBOT}/tf"]) > 10
@@ -265,21 +308,37 @@ def test_foxglove_unfinished_recording_has_transforms_joints_and_images(run: Pat
 def test_foxglove_reason_with_changing_number_is_logged_once() -> None:
     reported, logged = StateMessages(), []
     for k in range(20):
-        control = msgspec.msgpack.encode({"state": "Locomoting", "reason": f"pushes with {k + 0.5} N", "jammed": True})
+        control = msgspec.msgpack.encode(
+            {"state": "Locomoting", "reason": f"pushes with {k + 0.5} N", "jammed": True}
+        )
         logged += reported.update_state(None, control, k).new_logs
     assert [one.message for one in logged] == ["Locomoting: pushes with 0.5 N"]
 
 
 def test_foxglove_state_of_silent_controller_is_not_shown_current() -> None:
     channels, robot = FoxgloveConverter("snake"), make_description()
-    control = ControlState(tick=0, timestamp_ns=0, controller="hold", state="Locomoting", reason="pushes")
+    control = ControlState(
+        tick=0, timestamp_ns=0, controller="hold", state="Locomoting", reason="pushes"
+    )
     seen: list[tuple[str, list[str]]] = []
     channels.convert(keys.DESCRIPTION, encode(robot), 0)
     for time_s in (0, 4, 6, 8):
         made = channels.convert(keys.CONTROL_STATE, encode(control), 0) if time_s == 0 else []
         made += channels.convert(keys.JOINTS, encode(joint_state(robot)), time_s * 10**9)
         made += channels.convert(keys.CLOCK, b"", time_s * 10**9)
-        (state,) = (json.loads(one.payload)["locomotion"] for one in made if one.topic == "/snake/state")
-        seen.append((state, [Log.FromString(one.payload).message for one in made if one.topic == "/snake/log"]))
+        (state,) = (
+            json.loads(one.payload)["locomotion"] for one in made if one.topic == "/snake/state"
+        )
+        seen.append(
+            (
+                state,
+                [Log.FromString(one.payload).message for one in made if one.topic == "/snake/log"],
+            )
+        )
     silent = "silent: the state of control is no longer published"
-    assert seen == [("Locomoting", ["Locomoting: pushes"]), ("Locomoting", []), ("", [silent]), ("", [])]
+    assert seen == [
+        ("Locomoting", ["Locomoting: pushes"]),
+        ("Locomoting", []),
+        ("", [silent]),
+        ("", []),
+    ]

@@ -40,24 +40,33 @@ def wall(recording: Path) -> Path:
     return path
 
 
-def read_with_stock_reader(path: Path, topics: list[str] | None = None) -> list[tuple[Any, Any, Any]]:
+def read_with_stock_reader(
+    path: Path, topics: list[str] | None = None
+) -> list[tuple[Any, Any, Any]]:
     """Return channel, message and decoded protobuf of each message, in the order of the file."""
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         if topics is None:
-            return [(channel, message, None) for _, channel, message in reader.iter_messages(log_time_order=False)]
+            return [
+                (channel, message, None)
+                for _, channel, message in reader.iter_messages(log_time_order=False)
+            ]
         decoded = reader.iter_decoded_messages(topics, log_time_order=False)
         return [(channel, message, content) for _, channel, message, content in decoded]
 
 
-def test_copy_with_wall_stamps_keeps_both_times_of_every_message(recording: Path, wall: Path) -> None:
+def test_copy_with_wall_stamps_keeps_both_times_of_every_message(
+    recording: Path, wall: Path
+) -> None:
     found = read_with_stock_reader(wall)
     assert found
     for channel, message, _ in found:
         assert channel.metadata[CLOCK_ENTRY] == "wall"
         assert message.log_time > YEAR_2020_NS
         assert message.publish_time < MAX_ROBOT_NS
-    assert list(RecordingReader(wall).read_messages()) == list(RecordingReader(recording).read_messages())
+    assert list(RecordingReader(wall).read_messages()) == list(
+        RecordingReader(recording).read_messages()
+    )
     assert RecordingReader(wall).missing == []
 
 
@@ -84,7 +93,10 @@ def test_copy_of_a_copy_is_in_robot_time_again(recording: Path, wall: Path, tmp_
     original = read_with_stock_reader(recording)
     assert all(CLOCK_ENTRY not in channel.metadata for channel, _, _ in found)
     found_times, original_times = (
-        [(channel.topic, message.log_time, message.publish_time, message.data) for channel, message, _ in messages]
+        [
+            (channel.topic, message.log_time, message.publish_time, message.data)
+            for channel, message, _ in messages
+        ]
         for messages in (found, original)
     )
     assert found_times == original_times
@@ -93,7 +105,9 @@ def test_copy_of_a_copy_is_in_robot_time_again(recording: Path, wall: Path, tmp_
 def test_copy_without_a_choice_keeps_the_stamps(wall: Path, tmp_path: Path) -> None:
     count, _ = recover_recording(wall, tmp_path / "again.mcap")
     original, copy = (read_with_stock_reader(path) for path in (wall, tmp_path / "again.mcap"))
-    assert [message.log_time for _, message, _ in copy] == [message.log_time for _, message, _ in original]
+    assert [message.log_time for _, message, _ in copy] == [
+        message.log_time for _, message, _ in original
+    ]
     assert count == len(copy)
 
 
@@ -102,7 +116,9 @@ def test_recorder_writes_wall_stamps(tmp_path: Path) -> None:
     contacts = Contacts(tick=3, timestamp_ns=3 * PERIOD_NS, contacts=[])
     before_ns = time.time_ns()
     writer.write_arrival(
-        ReceivedSample(keys.CONTACTS, encode(contacts), format_encoding(Contacts), time.monotonic_ns())
+        ReceivedSample(
+            keys.CONTACTS, encode(contacts), format_encoding(Contacts), time.monotonic_ns()
+        )
     )
     writer.close({})
     ((_, message, _),) = read_with_stock_reader(tmp_path / "a.mcap")

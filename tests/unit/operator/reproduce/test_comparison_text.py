@@ -31,7 +31,12 @@ class Sledge(Experiment):
 
     name = "sledge"
     source = PublishedSource(
-        authors="A. Author", title="On sledges", published_in="Journal 1", year=1999, place="table 2", seen="the table"
+        authors="A. Author",
+        title="On sledges",
+        published_in="Journal 1",
+        year=1999,
+        place="table 2",
+        seen="the table",
     )
     claim = "A sledge slides at 2 m/s."
     published_conditions = "Snow."
@@ -43,9 +48,17 @@ class Sledge(Experiment):
 
 
 SPEED = PublishedComparison(
-    quantity="speed", unit="m/s", published=2.0, basis="printed", ours=1.5, interval=(1.25, 1.75), runs=3
+    quantity="speed",
+    unit="m/s",
+    published=2.0,
+    basis="printed",
+    ours=1.5,
+    interval=(1.25, 1.75),
+    runs=3,
 )
-ORDER = PublishedComparison(quantity="order", unit="", published="a, b", basis="printed", ours="a, b", runs=1)
+ORDER = PublishedComparison(
+    quantity="order", unit="", published="a, b", basis="printed", ours="a, b", runs=1
+)
 FINDINGS = ExperimentFindings(
     comparisons=(SPEED, ORDER),
     reasons=(
@@ -53,7 +66,9 @@ FINDINGS = ExperimentFindings(
         DifferenceReason(cause="The wind."),
     ),
     picture=ExperimentPicture(
-        x_label="x", y_label="y", curves=(PictureCurve(label="ours", x=[1.0], y=[2.0], is_ours=True),)
+        x_label="x",
+        y_label="y",
+        curves=(PictureCurve(label="ours", x=[1.0], y=[2.0], is_ours=True),),
     ),
     notes=("A note.",),
 )
@@ -89,7 +104,9 @@ def test_a_text_has_the_source_the_numbers_and_the_reasons() -> None:
 
 
 def test_texts_that_differ_are_said_to_differ() -> None:
-    other = PublishedComparison(quantity="order", unit="", published="a", basis="printed", ours="b", runs=2)
+    other = PublishedComparison(
+        quantity="order", unit="", published="a", basis="printed", ours="b", runs=2
+    )
     assert describe_difference(other) == "they are not the same"
     assert describe_ours(other) == "b (2 runs)"
 
@@ -108,9 +125,16 @@ def test_every_experiment_states_its_source_and_conditions() -> None:
     assert len(EXPERIMENTS) >= 6
     for name, experiment in EXPERIMENTS.items():
         assert experiment.name == name
-        stated = [experiment.claim, experiment.published_conditions, experiment.our_conditions, experiment.method]
+        stated = [
+            experiment.claim,
+            experiment.published_conditions,
+            experiment.our_conditions,
+            experiment.method,
+        ]
         assert all(text.endswith(".") for text in [*stated, experiment.source.seen]), name
-        assert all((experiment.source.authors, experiment.source.title, experiment.source.place)), name
+        assert all((experiment.source.authors, experiment.source.title, experiment.source.place)), (
+            name
+        )
         assert 1900 < experiment.source.year < 2100, name
 
 
@@ -123,7 +147,9 @@ def test_the_list_has_a_line_with_name_and_year_for_each() -> None:
 
 def test_experiments_are_selected_once_each_or_all() -> None:
     names = list(EXPERIMENTS)
-    assert [experiment.name for experiment in select_experiments([names[2], names[0], names[2]])] == [
+    assert [
+        experiment.name for experiment in select_experiments([names[2], names[0], names[2]])
+    ] == [
         names[2],
         names[0],
     ]

@@ -22,7 +22,9 @@ NO_DRY = DirectionalFriction(0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("drag_ratio", [2.0, 10.0])
-def test_the_formula_of_gray_and_hancock_is_the_balance_of_drag_for_small_bends(drag_ratio: float) -> None:
+def test_the_formula_of_gray_and_hancock_is_the_balance_of_drag_for_small_bends(
+    drag_ratio: float,
+) -> None:
     angle_rad = 0.02
     endless = find_endless_motion(angle_rad, GroundFriction(NO_DRY, 1.0, drag_ratio)).speed
     published = find_published_ratio(angle_rad, drag_ratio)
@@ -69,9 +71,13 @@ def test_feet_share_the_weight_and_the_directions_of_their_links() -> None:
 
 
 @pytest.mark.parametrize(("drag_ratio", "sign"), [(4.0, 1.0), (1.0, 0.0)])
-def test_a_chain_travels_only_on_ground_that_rubs_more_sideways(drag_ratio: float, sign: float) -> None:
+def test_a_chain_travels_only_on_ground_that_rubs_more_sideways(
+    drag_ratio: float, sign: float
+) -> None:
     run = make_serpenoid_run(0.6, 1.0, 1.0, set_viscous(2.0, 2.0 * drag_ratio), module_count=6)
-    motion = find_chain_motion(run.robot, JointWaves.from_serpenoid(run.robot, 0.6, 1.0, 1.0), run.friction)
+    motion = find_chain_motion(
+        run.robot, JointWaves.from_serpenoid(run.robot, 0.6, 1.0, 1.0), run.friction
+    )
     wave_m_s = run.robot.length_m
     assert motion.speed_m_s / wave_m_s == pytest.approx(0.15 * sign, abs=0.1 if sign else 0.01)
     assert motion.ground_power_w > 0.0
@@ -79,13 +85,17 @@ def test_a_chain_travels_only_on_ground_that_rubs_more_sideways(drag_ratio: floa
 
 def test_a_chain_dissipates_what_dragging_costs_and_more() -> None:
     run = make_serpenoid_run(0.6, 0.8, 1.0, set_skin(0.1, 0.1, 1.0), module_count=8)
-    motion = find_chain_motion(run.robot, JointWaves.from_serpenoid(run.robot, 0.6, 0.8, 1.0), run.friction)
+    motion = find_chain_motion(
+        run.robot, JointWaves.from_serpenoid(run.robot, 0.6, 0.8, 1.0), run.friction
+    )
     weight_n = 9.81 * sum(run.robot.link_masses_kg)
     assert motion.ground_power_w > 0.1 * weight_n * motion.speed_m_s > 0.0
 
 
 def test_reasons_add_up_to_the_difference() -> None:
-    reasons = explain_by_steps([("", 1.0), ("a", 0.9), ("b", 0.95), ("", 0.97)], unit="m/s", rest="contacts")
+    reasons = explain_by_steps(
+        [("", 1.0), ("a", 0.9), ("b", 0.95), ("", 0.97)], unit="m/s", rest="contacts"
+    )
     assert [reason.cause for reason in reasons] == ["a", "b", "Unknown, possibly contacts."]
     assert [reason.effect for reason in reasons] == pytest.approx([-0.1, 0.05, 0.02])
 

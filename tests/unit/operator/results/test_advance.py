@@ -21,8 +21,16 @@ def simulate_run(controller: str, duration_s: float = 2.5, goal: str = "") -> In
         "backward": {**HEADING, "heading_rad": np.pi},
         "points": {"kind": "waypoints", "points_m": [[1.7, 0.0], [1.9, 0.0]], "within_m": 0.05},
     }
-    asked = {"controller": controller, "duration_s": duration_s, **({"mission.goal": goals[goal]} if goal else {})}
-    return simulate(load_scenario("peg_row", [KeyOverride(key, value, "--set") for key, value in asked.items()]).config)
+    asked = {
+        "controller": controller,
+        "duration_s": duration_s,
+        **({"mission.goal": goals[goal]} if goal else {}),
+    }
+    return simulate(
+        load_scenario(
+            "peg_row", [KeyOverride(key, value, "--set") for key, value in asked.items()]
+        ).config
+    )
 
 
 def center_m(result: InProcessResult, row: int) -> float:
@@ -94,7 +102,10 @@ def test_advance_without_goal_is_forward_distance() -> None:
 
 
 def test_the_work_of_torque_joints_is_told_apart() -> None:
-    pushed, followed = simulate_run("obstacle_triplet").summary, simulate_run("path_following").summary
+    pushed, followed = (
+        simulate_run("obstacle_triplet").summary,
+        simulate_run("path_following").summary,
+    )
     assert followed.torque_joints_j == 0
     assert followed.position_joints_j
     assert pushed.torque_joints_j is not None
@@ -117,13 +128,12 @@ def test_advance_of_sideways_travel_has_metrics_along_both_directions() -> None:
     """Along its first heading it hardly advances, and per metre of that its energy says nothing."""
     straight = simulate_run("path_following")
     record = straight.record
-    turned = record.position_w_m[:, [1, 0, 2]] * [
-        -1.0,
-        1.0,
-        1.0,
-    ]  # as if it had gone to its left, by a quarter of a turn
+    # As if it had gone to its left, by a quarter of a turn.
+    turned = record.position_w_m[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]
     sideways = summarize_run(dataclasses.replace(record, position_w_m=turned), "complete")
-    assert sideways.net_displacement_m == pytest.approx(straight.summary.net_displacement_m, rel=0.1)
+    assert sideways.net_displacement_m == pytest.approx(
+        straight.summary.net_displacement_m, rel=0.1
+    )
     assert sideways.heading_advance_m is not None
     assert sideways.heading_advance_m < 0.1
     assert sideways.heading_energy_j_per_m is None
@@ -134,5 +144,9 @@ def test_advance_of_sideways_travel_has_metrics_along_both_directions() -> None:
     expected = (sideways.net_displacement_m or 0.0) / 2.5 / length_m
     assert sideways.displacement_body_lengths_s == pytest.approx(expected, rel=0.02)
     ahead = straight.summary
-    assert ahead.heading_energy_j_per_m == pytest.approx(ahead.displacement_energy_j_per_m, rel=0.02)
-    assert ahead.heading_body_lengths_s == pytest.approx(ahead.displacement_body_lengths_s, rel=0.02)
+    assert ahead.heading_energy_j_per_m == pytest.approx(
+        ahead.displacement_energy_j_per_m, rel=0.02
+    )
+    assert ahead.heading_body_lengths_s == pytest.approx(
+        ahead.displacement_body_lengths_s, rel=0.02
+    )

@@ -30,7 +30,9 @@ SPEED_M_S = 0.1
 
 
 def configured(**changes: Any) -> RunConfig:
-    return load_scenario("triplet", [parse_set_option(f"{key}={value}") for key, value in changes.items()]).config
+    return load_scenario(
+        "triplet", [parse_set_option(f"{key}={value}") for key, value in changes.items()]
+    ).config
 
 
 def made_up(
@@ -55,7 +57,9 @@ def made_up(
             state="Locomoting",
             reason="pushing",
             path_s_m=speed_m_s * t if controller_knows else None,
-            propulsion_joint=next((joints[j] for at_s, j in reversed(propelled) if at_s <= t + 1e-9), None),
+            propulsion_joint=next(
+                (joints[j] for at_s, j in reversed(propelled) if at_s <= t + 1e-9), None
+            ),
         )
         for row, t in enumerate(since_s.tolist())
     ]
@@ -82,7 +86,9 @@ def made_up(
 
 
 def describe_of(run: RunConfig):
-    return describe_robot(run.robot, backend="sim", period_ns=run.period_ns, lease_ns=run.lease_ns, config_hash="x")
+    return describe_robot(
+        run.robot, backend="sim", period_ns=run.period_ns, lease_ns=run.lease_ns, config_hash="x"
+    )
 
 
 def shown(difference: RunDifference) -> tuple[str, str]:
@@ -96,7 +102,8 @@ def shown(difference: RunDifference) -> tuple[str, str]:
     )
     for text in reported:
         assert not re.search(
-            r"\b(nan|inf|None)\b", re.sub(r"<(style|script)>.*?</\1>|base64,[^\"]*", "", text, flags=re.S)
+            r"\b(nan|inf|None)\b",
+            re.sub(r"<(style|script)>.*?</\1>|base64,[^\"]*", "", text, flags=re.S),
         )
     return reported
 
@@ -106,7 +113,8 @@ def test_the_same_run_twice_differs_in_nothing() -> None:
     assert difference.is_identical
     assert difference.divergence is None
     assert difference.differing_settings == []
-    assert [gap.rms for gap in difference.quantities] == [0.0] * 4  # angle, speed, torque, angle target
+    # Angle, speed, torque, angle target.
+    assert [gap.rms for gap in difference.quantities] == [0.0] * 4
     assert difference.torque.correlation == pytest.approx(1)
     assert difference.advance is not None
     assert difference.advance.percent == 0
@@ -118,7 +126,9 @@ def test_the_same_run_twice_differs_in_nothing() -> None:
 
 
 @pytest.mark.parametrize("name", ["angle_rad", "velocity_rad_s", "torque_nm", "target"])
-@pytest.mark.parametrize(("where", "wrong"), [(np.s_[:], np.nan), (np.s_[50:60, 3], np.nan), (np.s_[:], np.inf)])
+@pytest.mark.parametrize(
+    ("where", "wrong"), [(np.s_[:], np.nan), (np.s_[50:60, 3], np.nan), (np.s_[:], np.inf)]
+)
 def test_compare_nan_in_both_runs_is_not_equal(name: str, where: Any, wrong: float) -> None:
     record = made_up()
     hurt = getattr(record, name).copy()
@@ -213,14 +223,17 @@ def test_compare_uses_only_the_common_time() -> None:
     difference = compute_difference(made_up(seconds=2), made_up(seconds=1))
     assert difference.aligned.time_s[-1] == pytest.approx(0.99)
     assert difference.is_identical
-    assert [one.joint_index for one in difference.hand_overs.a] == [9, 8]  # the third comes later than B lasts
+    # The third comes later than B lasts.
+    assert [one.joint_index for one in difference.hand_overs.a] == [9, 8]
     assert [one.key for one in difference.differing_settings] == ["duration_s"]
 
 
 def test_compare_delayed_run_has_its_delay() -> None:
     a, late = made_up(), 0.05
     since_s = a.time_s[:, None] - a.time_s[0] - late
-    b = dataclasses.replace(a, angle_rad=0.3 * np.sin(2 * math.pi * since_s + 0.3 * np.arange(JOINTS)))
+    b = dataclasses.replace(
+        a, angle_rad=0.3 * np.sin(2 * math.pi * since_s + 0.3 * np.arange(JOINTS))
+    )
     difference = compute_difference(a, b)
     size = 0.3 * 2 * math.sin(math.pi * late)  # of the difference of two sines
     assert difference.angle.rms == pytest.approx(size / math.sqrt(2), rel=0.01)
@@ -240,7 +253,10 @@ def test_scaled_torques_correlate_fully() -> None:
 def test_compare_different_rates_uses_the_coarser_and_says_so() -> None:
     difference = compute_difference(made_up(rate_hz=100), made_up(rate_hz=30, seconds=1.5))
     assert len(difference.aligned.time_s) == 45
-    assert difference.aligned.sampling_description == "A at 100 Hz, B at 30 Hz: A is interpolated at the ticks of B"
+    assert (
+        difference.aligned.sampling_description
+        == "A at 100 Hz, B at 30 Hz: A is interpolated at the ticks of B"
+    )
     assert difference.angle.rms is not None
     assert difference.angle.rms < 2e-4  # a sine between 10 ms ticks
     assert {"rate_hz", "duration_s"} <= {one.key for one in difference.differing_settings}
@@ -250,36 +266,55 @@ def test_compare_different_rates_uses_the_coarser_and_says_so() -> None:
 def test_a_set_point_holds_until_the_next_one() -> None:
     a = made_up(rate_hz=50)
     b = made_up(rate_hz=40)
-    steps = [np.repeat(np.floor((r.time_s - 0.5) * 10 + 1e-9)[:, None], JOINTS, axis=1) for r in (a, b)]
-    difference = compute_difference(dataclasses.replace(a, target=steps[0]), dataclasses.replace(b, target=steps[1]))
+    steps = [
+        np.repeat(np.floor((r.time_s - 0.5) * 10 + 1e-9)[:, None], JOINTS, axis=1) for r in (a, b)
+    ]
+    difference = compute_difference(
+        dataclasses.replace(a, target=steps[0]), dataclasses.replace(b, target=steps[1])
+    )
     assert difference.targets[0].rms == 0
 
 
 def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
     """As a simulator and joint modules describe one robot."""
     a, b = made_up(), made_up()
-    described = add_drive_identities(b.description, [f"AE{i:02d}" for i in range(JOINTS)], ["1.0"] * JOINTS)
+    described = add_drive_identities(
+        b.description, [f"AE{i:02d}" for i in range(JOINTS)], ["1.0"] * JOINTS
+    )
     imu = next(sensor for sensor in described.sensors if sensor.key == keys.IMU)
     slower = msgspec.structs.replace(imu, rate_hz=5.0)
     sensors = [slower, *(sensor for sensor in reversed(described.sensors) if sensor is not imu)]
     described = msgspec.structs.replace(described, sensors=sensors, simulated_time=True)
     difference = compute_difference(a, dataclasses.replace(b, description=described))
-    assert [one.key for one in difference.differing_settings] == [f"description.sensors.{keys.IMU}.rate_hz"]
+    assert [one.key for one in difference.differing_settings] == [
+        f"description.sensors.{keys.IMU}.rate_hz"
+    ]
     lines = format_comparison(difference)
     assert "1 setting differs" in lines
-    assert "drives: A reports no serial numbers and no firmware versions, B those of 13 of 13 joints" in lines
+    assert (
+        "drives: A reports no serial numbers and no firmware versions, B those of 13 of 13 joints"
+        in lines
+    )
     assert "drives: A reports no serial numbers" in shown(difference)[1]
-    assert make_json_values(difference)["drives"]["joint_1"]["b"] == {"serial": "AE00", "firmware": "1.0"}
+    assert make_json_values(difference)["drives"]["joint_1"]["b"] == {
+        "serial": "AE00",
+        "firmware": "1.0",
+    }
 
 
 def test_compare_names_different_drives() -> None:
     a, b = made_up(), made_up()
     of_a = add_drive_identities(a.description, [f"A{i}" for i in range(JOINTS)], ["1.0"] * JOINTS)
-    of_b = add_drive_identities(a.description, [f"A{i}" for i in range(JOINTS - 1)] + ["B"], ["1.1"] * JOINTS)
-    difference = compute_difference(dataclasses.replace(a, description=of_a), dataclasses.replace(b, description=of_b))
+    of_b = add_drive_identities(
+        a.description, [f"A{i}" for i in range(JOINTS - 1)] + ["B"], ["1.1"] * JOINTS
+    )
+    difference = compute_difference(
+        dataclasses.replace(a, description=of_a), dataclasses.replace(b, description=of_b)
+    )
     assert difference.differing_settings == []
-    assert "drives: another serial number at 1 of 13 joints, another firmware version at 13" in format_comparison(
-        difference
+    assert (
+        "drives: another serial number at 1 of 13 joints, another firmware version at 13"
+        in format_comparison(difference)
     )
 
 
@@ -287,8 +322,12 @@ def test_ticks_that_are_missing_are_told() -> None:
     a = made_up()
     keep = np.arange(200) != 50
     columns = [name for name, value in vars(a).items() if isinstance(value, np.ndarray)]
-    difference = compute_difference(a, dataclasses.replace(a, **{name: getattr(a, name)[keep] for name in columns}))
-    assert difference.aligned.sampling_description.startswith("both at 100 Hz, but some ticks are missing")
+    difference = compute_difference(
+        a, dataclasses.replace(a, **{name: getattr(a, name)[keep] for name in columns})
+    )
+    assert difference.aligned.sampling_description.startswith(
+        "both at 100 Hz, but some ticks are missing"
+    )
     assert difference.is_identical
 
 
@@ -312,7 +351,9 @@ def test_compare_targets_of_different_modes_are_not_compared() -> None:
     assert angle_target.quantity == "angle target"
     assert angle_target.rms == 0
     assert not difference.is_identical
-    assert difference.other_mode_fraction == pytest.approx((TICKS - TORQUE_FROM_TICK) / (TICKS * JOINTS))
+    assert difference.other_mode_fraction == pytest.approx(
+        (TICKS - TORQUE_FROM_TICK) / (TICKS * JOINTS)
+    )
     assert difference.tracking_errors_rad == pytest.approx((0.01, 0.01))
 
 
@@ -324,9 +365,11 @@ def test_compare_torque_targets_names_worst_joint_and_time() -> None:
     assert torque_target.max_difference.joint == TORQUE_JOINT
     assert torque_target.max_difference.time_s == pytest.approx(1.0)
     assert torque_target.max_difference.difference == 1.0
-    assert [joint for joint, worst in enumerate(torque_target.max_difference_by_joint) if worst is not None] == [
-        TORQUE_JOINT
-    ]
+    assert [
+        joint
+        for joint, worst in enumerate(torque_target.max_difference_by_joint)
+        if worst is not None
+    ] == [TORQUE_JOINT]
     shown(difference)
 
 
@@ -345,7 +388,10 @@ def test_distance_is_relative_to_the_first_run(speed_m_s: float, percent: float)
 
 def test_compare_standing_run_has_no_relative_distance() -> None:
     stood = made_up(speed_m_s=0)
-    both, one = compute_difference(stood, made_up(speed_m_s=1e-5)), compute_difference(stood, made_up())
+    both, one = (
+        compute_difference(stood, made_up(speed_m_s=1e-5)),
+        compute_difference(stood, made_up()),
+    )
     assert both.advance is not None
     assert both.advance.percent == 0
     assert one.advance is not None
@@ -382,7 +428,9 @@ def test_compare_hand_overs_agree_until_first_difference() -> None:
 
 def test_settings_that_differ_are_named_with_both_values() -> None:
     a = made_up()
-    b = dataclasses.replace(a, config=configured(**{"robot.motor.stiffness_nm_per_rad": 50, "seed": 2}))
+    b = dataclasses.replace(
+        a, config=configured(**{"robot.motor.stiffness_nm_per_rad": 50, "seed": 2})
+    )
     found = {one.key: (one.a, one.b) for one in compute_difference(a, b).differing_settings}
     assert found["robot.motor.stiffness_nm_per_rad"] == ("60.0", "50.0")
     assert found["seed"] == ("1", "2")

@@ -15,7 +15,11 @@ EVERY_NS = 50_000_000
 
 
 def state(
-    k: int, desired_force_n: list[float], measured_force_n: list[float | None], *, moves: bool = True
+    k: int,
+    desired_force_n: list[float],
+    measured_force_n: list[float | None],
+    *,
+    moves: bool = True,
 ) -> ControlState:
     points = [
         WorldContact(
@@ -32,7 +36,9 @@ def state(
 
 def test_force_tracking_accepts_forces_slightly_after_solution():
     solved = np.random.default_rng(1).uniform(2.0, 20.0, (60, 3)).tolist()
-    found = measure_force_tracking([state(k, solved[k], solved[k - 2] if k > 1 else [0.0] * 3) for k in range(60)])
+    found = measure_force_tracking(
+        [state(k, solved[k], solved[k - 2] if k > 1 else [0.0] * 3) for k in range(60)]
+    )
     assert found is not None
     assert found.correlation == pytest.approx(1.0)
     assert found.median_error == pytest.approx(0.0)
@@ -48,14 +54,16 @@ def test_force_tracking_counts_empty_push_points_but_not_unjudged_ones():
     assert (
         measure_force_tracking([state(k, [4.0], [0.0], moves=False) for k in range(20)]) is None
     )  # friction may take all of it
-    assert measure_force_tracking([state(k, [4.0], []) for k in range(20)]) is None  # no sensor tells
+    # No sensor tells.
+    assert measure_force_tracking([state(k, [4.0], []) for k in range(20)]) is None
     assert measure_force_tracking([state(k, [4.0], [None]) for k in range(20)]) is None
 
 
 @pytest.mark.slow
 def test_force_tracking_summary_states_how_well_forces_matched(record: RunRecord):
     assert any(
-        one.measured_force_n and max(n or 0.0 for n in one.measured_force_n) > 1.0 for one in record.control_states
+        one.measured_force_n and max(n or 0.0 for n in one.measured_force_n) > 1.0
+        for one in record.control_states
     )
     summary = summarize_run(record, "complete")
     assert summary.desired_force_correlation is not None
@@ -65,4 +73,9 @@ def test_force_tracking_summary_states_how_well_forces_matched(record: RunRecord
     assert summary.desired_force_error > 0.0
     assert 0.0 < summary.empty_push_points < 0.5
     blind = [msgspec.structs.replace(one, measured_force_n=[]) for one in record.control_states]
-    assert summarize_run(dataclasses.replace(record, control_states=blind), "complete").desired_force_error is None
+    assert (
+        summarize_run(
+            dataclasses.replace(record, control_states=blind), "complete"
+        ).desired_force_error
+        is None
+    )

@@ -5,7 +5,10 @@ import pytest
 
 from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle
-from snakesim_operator.results.metrics.form_closure import compute_form_closure_margin, find_body_contacts
+from snakesim_operator.results.metrics.form_closure import (
+    compute_form_closure_margin,
+    find_body_contacts,
+)
 
 
 def margin(contacts: object, length_m: float) -> float:
@@ -19,7 +22,8 @@ TURNS = ((0.1, 0.05, -1, 0), (-0.1, -0.05, 1, 0), (0.05, -0.1, 0, 1), (-0.05, 0.
 
 
 def test_form_closure_of_square_is_lost_without_one_contact() -> None:
-    wound = [*TURNS[:2], (-0.05, -0.1, 0, 1), (0.05, 0.1, 0, -1)]  # two contacts turn it one way, two the other way
+    # Two contacts turn it one way, two the other way.
+    wound = [*TURNS[:2], (-0.05, -0.1, 0, 1), (0.05, 0.1, 0, -1)]
     assert margin(wound, 0.1) > 0.05
     assert margin(TURNS, 0.1) <= 0.0  # all four turn it the same way
     for gone in range(4):
@@ -31,12 +35,16 @@ def test_a_body_between_two_walls_may_slide_along_them() -> None:
 
 
 def test_form_closure_by_pegs_on_both_sides_of_a_wave() -> None:
-    normals = np.repeat([[-0.6, 0.8], [0.6, 0.8], [-0.6, 0.8]], 2, axis=0) * np.resize([[1.0], [-1.0]], (6, 1))
+    normals = np.repeat([[-0.6, 0.8], [0.6, 0.8], [-0.6, 0.8]], 2, axis=0) * np.resize(
+        [[1.0], [-1.0]], (6, 1)
+    )
     places = np.repeat([[0.0, 0.0], [0.3, 0.0], [0.6, 0.0]], 2, axis=0) - 0.04 * normals
     held = compute_form_closure_margin(places, normals, 0.5)
     assert held > 0.05
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    assert compute_form_closure_margin(places @ turn.T + (3.0, -2.0), normals @ turn.T, 0.5) == pytest.approx(held)
+    assert compute_form_closure_margin(
+        places @ turn.T + (3.0, -2.0), normals @ turn.T, 0.5
+    ) == pytest.approx(held)
 
 
 def test_form_closure_counts_an_obstacle_once_at_nearest_link() -> None:

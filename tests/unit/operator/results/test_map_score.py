@@ -11,11 +11,17 @@ HEAD = (0.0, 0.0)
 
 
 def peg(name: str, x: float, y: float, radius_m: float = 0.05, sd_m: float = 0.01) -> KnownObstacle:
-    return KnownObstacle(name=name, shape="cylinder", position_w=(x, y, 0.1), radius_m=radius_m, position_sd_m=sd_m)
+    return KnownObstacle(
+        name=name, shape="cylinder", position_w=(x, y, 0.1), radius_m=radius_m, position_sd_m=sd_m
+    )
 
 
-def block(name: str, x: float, y: float, half: tuple[float, float], yaw: float = 0.0) -> KnownObstacle:
-    return KnownObstacle(name=name, shape="box", position_w=(x, y, 0.1), half_size_m=(*half, 0.1), yaw_rad=yaw)
+def block(
+    name: str, x: float, y: float, half: tuple[float, float], yaw: float = 0.0
+) -> KnownObstacle:
+    return KnownObstacle(
+        name=name, shape="box", position_w=(x, y, 0.1), half_size_m=(*half, 0.1), yaw_rad=yaw
+    )
 
 
 def test_a_true_map_has_no_errors():
@@ -54,11 +60,17 @@ def test_what_is_hidden_behind_or_far_is_no_miss():
     found = score_map([], truth, HEAD, 0.0)
     assert found.visible_count == 1
     assert found.missed_count == 1
-    assert score_map([], truth, HEAD, math.pi).missed_count == 1  # the one behind, after turning around
+    # The one behind, after turning around.
+    assert score_map([], truth, HEAD, math.pi).missed_count == 1
 
 
 def test_map_score_partly_seen_wall_is_no_ghost():
-    found = score_map([block("seen_1", 0.6, 0.2, (0.025, 0.3))], [block("wall", 0.6, 0.0, (0.025, 2.0))], HEAD, 0.0)
+    found = score_map(
+        [block("seen_1", 0.6, 0.2, (0.025, 0.3))],
+        [block("wall", 0.6, 0.0, (0.025, 2.0))],
+        HEAD,
+        0.0,
+    )
     assert not found.ghost_count
     assert not found.missed_count
     assert max(found.surface_errors_m) < 1e-9

@@ -18,7 +18,10 @@ def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
     """The same body, which goes along x like this and does not bend."""
     position = np.repeat(record.position_w_m[:1], len(x_m), axis=0)
     position[:, 0] += x_m
-    still = {name: np.repeat(getattr(record, name)[:1], len(x_m), axis=0) for name in ("orientation_wxyz", "angle_rad")}
+    still = {
+        name: np.repeat(getattr(record, name)[:1], len(x_m), axis=0)
+        for name in ("orientation_wxyz", "angle_rad")
+    }
     return changed(record, position_w_m=position, **still)
 
 
@@ -35,7 +38,9 @@ def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> N
 
 
 @pytest.mark.parametrize(("amplitude_m", "moves"), [(0.004, False), (0.06, True)])
-def test_a_body_that_wriggles_in_place_does_not_locomote(record: RunRecord, amplitude_m: float, moves: bool) -> None:
+def test_a_body_that_wriggles_in_place_does_not_locomote(
+    record: RunRecord, amplitude_m: float, moves: bool
+) -> None:
     time_s = record.time_s - record.time_s[0]
     motion = find_stops(moved_as(record, amplitude_m * np.sin(2 * np.pi * time_s / 1.6)))
     assert motion is not None
@@ -58,10 +63,14 @@ def test_motion_uses_measured_pose_but_not_dead_reckoning(record: RunRecord) -> 
         known = changed(blind, worlds=worlds)
         summary = summarize_run(known, "complete")
         assert summary.locomoting_fraction == fraction
-        assert make_verdict(known, summary).text.startswith("Ran for 10.0 s; the distance is unknown;")
+        assert make_verdict(known, summary).text.startswith(
+            "Ran for 10.0 s; the distance is unknown;"
+        )
 
 
-def test_hand_overs_are_counted_in_one_place(record: RunRecord, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hand_overs_are_counted_in_one_place(
+    record: RunRecord, capsys: pytest.CaptureFixture[str]
+) -> None:
     names = [joint.name for joint in record.description.joints]
     control = [
         msgspec.structs.replace(state, propulsion_joint=names[i // 5 % 3])
@@ -74,21 +83,35 @@ def test_hand_overs_are_counted_in_one_place(record: RunRecord, capsys: pytest.C
     said = re.search(r"handed over (\d+) times among 3 joints", make_verdict(many, summary).text)
     assert printed is not None
     assert said is not None
-    assert int(printed[1]) == int(said[1]) == summary.hand_overs == len(summary.propulsion_joints or []) - 1 > 30
+    assert (
+        int(printed[1])
+        == int(said[1])
+        == summary.hand_overs
+        == len(summary.propulsion_joints or []) - 1
+        > 30
+    )
 
 
 def test_the_terminal_shows_both_directions_and_what_control_reported_besides(
     record: RunRecord, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    claims = [msgspec.structs.replace(one, state="Locomoting", reason="pushing") for one in record.control_states]
+    claims = [
+        msgspec.structs.replace(one, state="Locomoting", reason="pushing")
+        for one in record.control_states
+    ]
     summary = summarize_run(changed(record, control_states=claims), "complete")
-    sideways = msgspec.structs.replace(summary, energy_j_per_m=None, displacement_energy_j_per_m=50.4)
+    sideways = msgspec.structs.replace(
+        summary, energy_j_per_m=None, displacement_energy_j_per_m=50.4
+    )
     print_summary(sideways)
     printed = capsys.readouterr().out
-    assert "last state            NotLocomoting: standing still: less than 20 mm in 1 s\n" in printed
+    assert (
+        "last state            NotLocomoting: standing still: less than 20 mm in 1 s\n" in printed
+    )
     assert "control reported      Locomoting: pushing\n" in printed
     assert (
-        "energy per meter      50.4 J/m along its displacement, too little advance along the first heading" in printed
+        "energy per meter      50.4 J/m along its displacement, too little advance along the first heading"
+        in printed
     )
     print_summary(summarize_run(record, "complete"))
     assert "control reported" not in capsys.readouterr().out

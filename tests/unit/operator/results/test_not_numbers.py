@@ -92,7 +92,9 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     begin_ns, end_ns = (round(kept["time_s"][i] * 1e9) for i in (0, -1))
     record = dataclasses.replace(
         whole,
-        control_states=[state for state in whole.control_states if begin_ns <= state.timestamp_ns <= end_ns],
+        control_states=[
+            state for state in whole.control_states if begin_ns <= state.timestamp_ns <= end_ns
+        ],
         worlds=[world for world in whole.worlds if begin_ns <= world.timestamp_ns <= end_ns],
         host=msgspec.structs.replace(whole.host, ticks=LAST - FIRST),
         **kept,
@@ -113,7 +115,9 @@ def summary_and_page(record: RunRecord) -> tuple[RunSummary, ReportReader]:
     assert len(numbers) > 5
     assert all(map(math.isfinite, numbers))
     msgspec.json.decode(msgspec.json.encode(summary), type=RunSummary)
-    assert not [a for a in reader.attributes if a[2] is not None and re.search(r"\b(nan|inf|None)\b", a[2])]
+    assert not [
+        a for a in reader.attributes if a[2] is not None and re.search(r"\b(nan|inf|None)\b", a[2])
+    ]
     assert not re.search(r"\b(None|nan|inf)\b", reader.text)
     return summary, reader
 
@@ -139,13 +143,17 @@ def spoilt_cells(draw: st.DrawFn) -> list[tuple[str, slice, int, float]]:
     for _ in range(draw(st.integers(1, 12))):
         signal = draw(st.sampled_from(sorted(SIGNALS)))
         first = draw(st.integers(0, LAST - FIRST - 1))
-        rows = draw(st.sampled_from([slice(first, first + 1), slice(first, first + 20), slice(0, None)]))
+        rows = draw(
+            st.sampled_from([slice(first, first + 1), slice(first, first + 20), slice(0, None)])
+        )
         found.append((signal, rows, draw(st.integers(0, max(SIGNALS[signal] - 1, 0))), draw(WRONG)))
     return found
 
 
 @given(cells=spoilt_cells())
-@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 def test_black_box_with_nan_is_summarized(base: RunRecord, tmp_path: Path, cells: Any) -> None:
     corrupted = {name: np.array(getattr(base, name)) for name in SIGNALS}
     for signal, rows, column, value in cells:
@@ -179,8 +187,12 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 @pytest.mark.slow  # the black box is read with the same checks
 @given(data=st.data())
-@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_recording_with_nan_is_summarized(base: RunRecord, tmp_path: Path, data: st.DataObject) -> None:
+@settings(
+    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+def test_recording_with_nan_is_summarized(
+    base: RunRecord, tmp_path: Path, data: st.DataObject
+) -> None:
     write_record(tmp_path, base)
     messages = [(keys.CONTROL_STATE, state) for state in base.control_states] + [
         (keys.WORLD, world) for world in base.worlds

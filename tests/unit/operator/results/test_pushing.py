@@ -18,7 +18,9 @@ MOVING = ("position_w_m", "orientation_wxyz", "angle_rad")
 
 @pytest.fixture(scope="module")
 def record() -> RunRecord:
-    return simulate(load_scenario("surveyed_clutter", [parse_set_option(f"duration_s={SECONDS}")]).config).record
+    return simulate(
+        load_scenario("surveyed_clutter", [parse_set_option(f"duration_s={SECONDS}")]).config
+    ).record
 
 
 @pytest.mark.slow
@@ -30,14 +32,19 @@ def test_pushing_forces_are_listed_along_the_body(record: RunRecord) -> None:
     assert 2.0 < np.nanmax(wanted) < 60.0
     assert np.nanmax(felt) > 2.0
     (drag,) = [one for one in reported.forces["layout"]["shapes"] if one.get("xref") == "paper"]
-    assert drag["y0"] == pytest.approx(0.1 * 9.81 * sum(link.mass_kg for link in record.description.links))
+    assert drag["y0"] == pytest.approx(
+        0.1 * 9.81 * sum(link.mass_kg for link in record.description.links)
+    )
 
 
 def test_every_obstacle_that_was_pushed_has_a_row(record: RunRecord) -> None:
     reported = make_pushing_section(record)
     assert reported is not None
     pushed = {
-        p.obstacle for state in record.control_states for p in state.push_points if np.hypot(*p.force_w[:2]) >= 0.5
+        p.obstacle
+        for state in record.control_states
+        for p in state.push_points
+        if np.hypot(*p.force_w[:2]) >= 0.5
     }
     assert set(reported.obstacles["data"][0]["y"]) == pushed
     assert len(pushed) >= 3
@@ -45,7 +52,9 @@ def test_every_obstacle_that_was_pushed_has_a_row(record: RunRecord) -> None:
 
 def test_pushing_stop_has_the_longest_reported_reason(record: RunRecord) -> None:
     control = [
-        msgspec.structs.replace(one, state="NotLocomoting", reason="contacts lost" if k < 4 else "jam")
+        msgspec.structs.replace(
+            one, state="NotLocomoting", reason="contacts lost" if k < 4 else "jam"
+        )
         for k, one in enumerate(record.control_states)
     ]
     reported = make_pushing_section(changed(record, control_states=control))
@@ -63,7 +72,9 @@ def test_a_perceived_map_is_held_against_the_truth(record: RunRecord) -> None:
     )
     truth = [placed.obstacle for placed in place_obstacles(config)]
     shifted = [
-        msgspec.structs.replace(one, position_w=(one.position_w[0] + 0.01, *one.position_w[1:]), position_sd_m=0.01)
+        msgspec.structs.replace(
+            one, position_w=(one.position_w[0] + 0.01, *one.position_w[1:]), position_sd_m=0.01
+        )
         for one in truth
     ]
     worlds = [msgspec.structs.replace(world, obstacles=shifted) for world in record.worlds]
@@ -72,10 +83,17 @@ def test_a_perceived_map_is_held_against_the_truth(record: RunRecord) -> None:
     assert reported.map_score is not None
     assert reported.map_errors is not None
     assert reported.position_error_percentiles_mm == pytest.approx((10.0, 10.0), abs=0.01)
-    assert reported.map_score.missed_count == reported.map_score.ghost_count == 0 < reported.map_score.visible_count
+    assert (
+        reported.map_score.missed_count
+        == reported.map_score.ghost_count
+        == 0
+        < reported.map_score.visible_count
+    )
 
 
 def test_the_page_has_the_section_only_for_such_a_controller(record: RunRecord) -> None:
     assert "pushing" in ReportReader(render_report(record, summarize_run(record, "complete"))).ids
-    one_joint = [msgspec.structs.replace(one, propulsion_joint="joint_5") for one in record.control_states]
+    one_joint = [
+        msgspec.structs.replace(one, propulsion_joint="joint_5") for one in record.control_states
+    ]
     assert make_pushing_section(changed(record, control_states=one_joint)) is None

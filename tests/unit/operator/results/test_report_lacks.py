@@ -48,7 +48,8 @@ def test_report_without_recording_has_all_sections(short_record: RunRecord) -> N
     page = read(changed(short_record, control_states=[], worlds=[]))
     assert "recording holds no message of the controller" in page.text
     assert "No joint propelled" in page.text
-    assert len([title for title in page.titles if title.startswith("Top view")]) == 3  # the pose is known
+    # The pose is known.
+    assert len([title for title in page.titles if title.startswith("Top view")]) == 3
 
 
 @pytest.mark.slow  # the limit of its size holds above, too
@@ -56,7 +57,11 @@ def test_report_of_a_long_run_is_not_larger(record: RunRecord) -> None:
     """Ten runs a minute, for ten minutes."""
     times = 60
     reported = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
-    long = {name: np.concatenate([one] * times) for name, one in reported.items() if isinstance(one, np.ndarray)}
+    long = {
+        name: np.concatenate([one] * times)
+        for name, one in reported.items()
+        if isinstance(one, np.ndarray)
+    }
     long["time_s"] = ARMED_S + np.arange(len(long["time_s"])) / RATE_HZ
     later = [
         [
@@ -66,7 +71,8 @@ def test_report_of_a_long_run_is_not_larger(record: RunRecord) -> None:
         ]
         for reported in (record.control_states, record.worlds)
     ]
-    page = read(changed(record, control_states=later[0], worlds=later[1], **long))  # holds the size against the limit
+    # Holds the size against the limit.
+    page = read(changed(record, control_states=later[0], worlds=later[1], **long))
     assert len(page.film["frames"]) <= 300
     assert "handed over 419 times among 7 joints" in page.text
 
@@ -74,20 +80,29 @@ def test_report_of_a_long_run_is_not_larger(record: RunRecord) -> None:
 def test_report_without_pose_has_all_sections(short_record: RunRecord) -> None:
     count = len(short_record.time_s)
     blind = changed(
-        short_record, position_w_m=np.full((count, 3), np.nan), orientation_wxyz=np.full((count, 4), np.nan)
+        short_record,
+        position_w_m=np.full((count, 3), np.nan),
+        orientation_wxyz=np.full((count, 4), np.nan),
     )
     page = read(blind)
     assert "No playback: no valid pose was recorded." in page.text
     assert "pose sensor" not in page.text
-    assert "pose sensor" not in make_verdict(blind, summarize_run(blind, "complete")).text  # the robot has one
+    # The robot has one.
+    assert "pose sensor" not in make_verdict(blind, summarize_run(blind, "complete")).text
     assert not [title for title in page.titles if title.startswith("Top view")]
-    assert "as the controller knew it" in page.text  # distance from the controller's own place on the path
+    # Distance from the controller's own place on the path.
+    assert "as the controller knew it" in page.text
 
 
 def test_report_without_route_has_all_sections(short_record: RunRecord) -> None:
     scene = msgspec.structs.replace(short_record.config.scene, route=None, pegs_along_route=[])
     start = StartPlacement(on_route=False, position_m=(-5.0, 0.0))
-    page = read(changed(short_record, config=msgspec.structs.replace(short_record.config, scene=scene, start=start)))
+    page = read(
+        changed(
+            short_record,
+            config=msgspec.structs.replace(short_record.config, scene=scene, start=start),
+        )
+    )
     assert "distance of the tail end" in page.text
     assert "net displacement" in page.text
 
@@ -95,23 +110,44 @@ def test_report_without_route_has_all_sections(short_record: RunRecord) -> None:
 def test_report_without_ticks_names_the_end(short_record: RunRecord) -> None:
     fields = [field.name for field in dataclasses.fields(short_record)]
     empty = {
-        name: getattr(short_record, name)[:0] for name in fields if isinstance(getattr(short_record, name), np.ndarray)
+        name: getattr(short_record, name)[:0]
+        for name in fields
+        if isinstance(getattr(short_record, name), np.ndarray)
     }
     host = msgspec.structs.replace(short_record.host, ticks=0, armed_ticks=0, answered_ticks=0)
-    page = read(changed(short_record, control_states=[], worlds=[], host=host, **empty), "the host never became ready")
-    assert "Nothing was recorded: the robot was never armed (the host never became ready)." in page.text
+    page = read(
+        changed(short_record, control_states=[], worlds=[], host=host, **empty),
+        "the host never became ready",
+    )
+    assert (
+        "Nothing was recorded: the robot was never armed (the host never became ready)."
+        in page.text
+    )
 
 
 def test_report_without_contact_sensor_has_all_sections(short_record: RunRecord) -> None:
     """Whatever the robot file lists: its drives have none."""
     sensors = [sensor for sensor in short_record.description.sensors if sensor.key != keys.CONTACTS]
-    page = read(changed(short_record, description=msgspec.structs.replace(short_record.description, sensors=sensors)))
+    page = read(
+        changed(
+            short_record,
+            description=msgspec.structs.replace(short_record.description, sensors=sensors),
+        )
+    )
     assert "No contact forces: the robot has no contact sensor." in page.text
 
 
 def test_report_of_controller_without_push_points_has_all_sections(short_record: RunRecord) -> None:
-    nothing = {"push_points": [], "desired_force_n": [], "propulsion_joint": None, "propulsion_n": None}
-    plain = [msgspec.structs.replace(state, controller="hold", **nothing) for state in short_record.control_states]
+    nothing = {
+        "push_points": [],
+        "desired_force_n": [],
+        "propulsion_joint": None,
+        "propulsion_n": None,
+    }
+    plain = [
+        msgspec.structs.replace(state, controller="hold", **nothing)
+        for state in short_record.control_states
+    ]
     config_ = msgspec.structs.replace(short_record.config, controller="hold")
     page = read(changed(short_record, control_states=plain, config=config_))
     assert "controller hold published no desired forces" in page.text
@@ -121,21 +157,42 @@ def test_report_of_controller_without_push_points_has_all_sections(short_record:
 
 @pytest.mark.slow
 def test_report_of_run_with_isolated_joint_names_it(record: RunRecord) -> None:
-    lost = Fault(tick=537, what="joint_frozen", cause="joint_3 repeats itself", joint="joint_3", reach="joint")
-    page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost], isolated=["joint_3"])))
+    lost = Fault(
+        tick=537,
+        what="joint_frozen",
+        cause="joint_3 repeats itself",
+        joint="joint_3",
+        reach="joint",
+    )
+    page = read(
+        changed(
+            record, host=msgspec.structs.replace(record.host, faults=[lost], isolated=["joint_3"])
+        )
+    )
     assert "went on without joint_3, 2 commands refused" in page.text
     assert "Stopped by a fault" not in page.text
     stop = Fault(tick=600, what="leak", cause="joint_4 reports water inside", joint="joint_4")
-    page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[lost, stop])), stop.cause)
+    page = read(
+        changed(record, host=msgspec.structs.replace(record.host, faults=[lost, stop])), stop.cause
+    )
     assert "Stopped by a fault" in page.text
     assert "at joint_4: joint_4 reports water inside." in page.text
 
 
 @pytest.mark.parametrize("joint", [None, "joint_3"])
-def test_report_of_harmless_fault_says_run_continued(short_record: RunRecord, joint: str | None) -> None:
+def test_report_of_harmless_fault_says_run_continued(
+    short_record: RunRecord, joint: str | None
+) -> None:
     """The host noted it before the first arming; the run was complete."""
     noting = CommandAuthority(short_record.description)
-    noting.log_fault(Fault(tick=0, what="power_unknown", cause="supply and heat are unknown, and ignored", joint=joint))
+    noting.log_fault(
+        Fault(
+            tick=0,
+            what="power_unknown",
+            cause="supply and heat are unknown, and ignored",
+            joint=joint,
+        )
+    )
     host = msgspec.structs.replace(short_record.host, faults=noting.faults, ended="complete")
     page = read(changed(short_record, host=host))
     assert "Stopped by a fault" not in page.text
@@ -148,7 +205,9 @@ def test_report_of_harmless_fault_says_run_continued(short_record: RunRecord, jo
 
 def test_report_of_run_ended_by_fault_explains_it(record: RunRecord) -> None:
     fault = Fault(tick=537, what="diverged", cause="joint_3 at 1e9 rad/s", joint="joint_3")
-    page = read(changed(record, host=msgspec.structs.replace(record.host, faults=[fault])), fault.cause)
+    page = read(
+        changed(record, host=msgspec.structs.replace(record.host, faults=[fault])), fault.cause
+    )
     assert "Stopped by a fault after 5.0 s at joint_3: joint_3 at 1e9 rad/s." in page.text
     assert "diverged" in page.words
     marks = [shape for chart in page.charts.values() for shape in chart["layout"]["shapes"]]
@@ -158,7 +217,10 @@ def test_report_of_run_ended_by_fault_explains_it(record: RunRecord) -> None:
 @pytest.mark.slow
 def test_report_of_jammed_run_says_so(record: RunRecord) -> None:
     page = read(stopped_at(record, 0.0, jammed=True, reason="jammed at peg_2"))
-    assert "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault, 2 commands refused" in page.text
+    assert (
+        "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault, 2 commands refused"
+        in page.text
+    )
     assert "jam" in page.charts["States and propulsion joint over time"]["data"][0]["y"]
 
 
@@ -182,7 +244,8 @@ def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
         column[row:] = column[row]
     since_ns = (float(record.time_s[0]) + at_s) * 1e9
     control = [
-        msgspec.structs.replace(one, **state) if one.timestamp_ns > since_ns else one for one in record.control_states
+        msgspec.structs.replace(one, **state) if one.timestamp_ns > since_ns else one
+        for one in record.control_states
     ]
     return changed(record, control_states=control, **held)
 
@@ -213,12 +276,18 @@ def test_report_of_jam_ignores_last_control_message(record: RunRecord) -> None:
     assert found.text.startswith("Jammed at 6.0 s of 10.0 s: wedged. Moved")
     claims = judged(stopped_at(record, 4.0, state="Locomoting", reason="pushing"))
     assert claims.rating == "poor"
-    assert claims.text.startswith("Stopped at 4.0 s of 10.0 s: standing still: less than 20 mm in 1 s. Moved 0.")
-    assert "reported" not in claims.text, "`pushing` is what control measured, not a report of the controller"
+    assert claims.text.startswith(
+        "Stopped at 4.0 s of 10.0 s: standing still: less than 20 mm in 1 s. Moved 0."
+    )
+    assert "reported" not in claims.text, (
+        "`pushing` is what control measured, not a report of the controller"
+    )
 
 
 def test_report_of_rest_at_path_end_is_no_failure(record: RunRecord) -> None:
-    rests = judged(stopped_at(record, 4.0, state="Idle", reason="no motion intended: the path is finished"))
+    rests = judged(
+        stopped_at(record, 4.0, state="Idle", reason="no motion intended: the path is finished")
+    )
     assert rests.rating == "good"
     assert "Locomotion ended at 4.0 s" in rests.text
 
@@ -227,8 +296,13 @@ def test_report_motion_is_measured_despite_control_reports(record: RunRecord) ->
     """State and share of time are the same for a controller that reports nothing, falls silent, or claims to stand."""
     whole = summarize_run(record, "complete")
     assert whole.locomoting_fraction == pytest.approx(0.63, abs=0.01)
-    silent = [state for state in record.control_states if state.timestamp_ns < (ARMED_S + 4.0) * 1e9]
-    claims = [msgspec.structs.replace(one, state="NotLocomoting", reason="lost") for one in record.control_states]
+    silent = [
+        state for state in record.control_states if state.timestamp_ns < (ARMED_S + 4.0) * 1e9
+    ]
+    claims = [
+        msgspec.structs.replace(one, state="NotLocomoting", reason="lost")
+        for one in record.control_states
+    ]
     for control in (silent, [], claims):
         reported = summarize_run(changed(record, control_states=control), "complete")
         assert reported.locomoting_fraction == whole.locomoting_fraction
@@ -270,11 +344,17 @@ def test_report_of_moving_run_contradicts_its_controller(record: RunRecord) -> N
 def test_report_of_run_moving_to_its_end_says_so(record: RunRecord) -> None:
     rows = slice(0, 500)
     fields = [field.name for field in dataclasses.fields(record)]
-    short = {name: getattr(record, name)[rows] for name in fields if isinstance(getattr(record, name), np.ndarray)}
+    short = {
+        name: getattr(record, name)[rows]
+        for name in fields
+        if isinstance(getattr(record, name), np.ndarray)
+    }
     cut = changed(
         record,
         **short,
-        control_states=[one for one in record.control_states if one.timestamp_ns < (ARMED_S + 5.0) * 1e9],
+        control_states=[
+            one for one in record.control_states if one.timestamp_ns < (ARMED_S + 5.0) * 1e9
+        ],
     )
     found = judged(cut)
     assert found.rating == "good"
@@ -286,9 +366,12 @@ def test_report_escapes_text_of_the_run(short_record: RunRecord) -> None:
     nasty = '<script>alert("x")</script>&'
     config_ = msgspec.structs.replace(short_record.config, title=nasty)
     reported = [
-        msgspec.structs.replace(state, reason=nasty, state="NotLocomoting") for state in short_record.control_states
+        msgspec.structs.replace(state, reason=nasty, state="NotLocomoting")
+        for state in short_record.control_states
     ]
-    host = msgspec.structs.replace(short_record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)])
+    host = msgspec.structs.replace(
+        short_record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)]
+    )
     hurt = changed(short_record, config=config_, control_states=reported, host=host)
     page = report_page(hurt, summarize_run(hurt, nasty))
     assert "<script>alert" not in page
@@ -298,7 +381,9 @@ def test_report_escapes_text_of_the_run(short_record: RunRecord) -> None:
 
 def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> None:
     nasty = "</title><script>alert(1)\u202e\x9b31m\x1b[31m\u2028"
-    encoded = msgspec.json.encode(short_record.description).replace(b"joint_", msgspec.json.encode(nasty)[1:-1])
+    encoded = msgspec.json.encode(short_record.description).replace(
+        b"joint_", msgspec.json.encode(nasty)[1:-1]
+    )
     reported = [
         msgspec.structs.replace(one, propulsion_joint=one.propulsion_joint.replace("joint_", nasty))
         if one.propulsion_joint
@@ -306,7 +391,8 @@ def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> No
         for one in short_record.control_states
     ]
     pegs_ = [
-        msgspec.structs.replace(peg, name=f"{nasty}{i}") for i, peg in enumerate(short_record.config.scene.cylinder)
+        msgspec.structs.replace(peg, name=f"{nasty}{i}")
+        for i, peg in enumerate(short_record.config.scene.cylinder)
     ]
     scene = msgspec.structs.replace(short_record.config.scene, cylinder=pegs_)
     config_ = msgspec.structs.replace(short_record.config, scene=scene)

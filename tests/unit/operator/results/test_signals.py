@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from snakesim_hal.wire import messages as m
-from snakesim_operator.results.contact_log import MAX_OBSTACLES, OTHER, UNIDENTIFIED, ContactCollector
+from snakesim_operator.results.contact_log import (
+    MAX_OBSTACLES,
+    OTHER,
+    UNIDENTIFIED,
+    ContactCollector,
+)
 from snakesim_operator.results.metrics.directions import measure_slip
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.signals import (
@@ -38,7 +43,9 @@ def make_contact(link: int, obstacle: str | None, force_l: tuple[float, float, f
     )
 
 
-def make_straight_run(record: RunRecord, direction_rad: float, turn_rate_rad_s: float = 0.0) -> RunRecord:
+def make_straight_run(
+    record: RunRecord, direction_rad: float, turn_rate_rad_s: float = 0.0
+) -> RunRecord:
     """Return a run of a straight body that heads along YAW_RAD, and travels at SPEED_M_S in a direction."""
     time_s = record.time_s - record.time_s[0]
     position_w = np.zeros_like(record.position_w_m)
@@ -49,15 +56,21 @@ def make_straight_run(record: RunRecord, direction_rad: float, turn_rate_rad_s: 
     orientation[:, 0] = np.cos(half_yaw_rad)
     orientation[:, 3] = np.sin(half_yaw_rad)
     angle_rad = np.zeros_like(record.angle_rad)
-    return dataclasses.replace(record, position_w_m=position_w, orientation_wxyz=orientation, angle_rad=angle_rad)
+    return dataclasses.replace(
+        record, position_w_m=position_w, orientation_wxyz=orientation, angle_rad=angle_rad
+    )
 
 
 def test_velocity_is_in_world_and_body_frame(record: RunRecord) -> None:
     sideways = make_straight_run(record, YAW_RAD + np.pi / 2)
     motion = compute_motion_signals(sideways)
     expected_w = SPEED_M_S * np.array([-np.sin(YAW_RAD), np.cos(YAW_RAD), 0.0])
-    assert motion["velocity_w_m_s"] == pytest.approx(np.tile(expected_w, (len(record.time_s), 1)), abs=1e-9)
-    assert motion["velocity_b_m_s"] == pytest.approx(np.tile([0.0, SPEED_M_S, 0.0], (len(record.time_s), 1)), abs=1e-9)
+    assert motion["velocity_w_m_s"] == pytest.approx(
+        np.tile(expected_w, (len(record.time_s), 1)), abs=1e-9
+    )
+    assert motion["velocity_b_m_s"] == pytest.approx(
+        np.tile([0.0, SPEED_M_S, 0.0], (len(record.time_s), 1)), abs=1e-9
+    )
     assert motion["heading_w_rad"] == pytest.approx(np.full(len(record.time_s), YAW_RAD))
 
 
@@ -77,7 +90,9 @@ def test_no_velocity_reaches_over_a_gap(record: RunRecord) -> None:
 def test_body_frame_is_unknown_while_head_and_tail_meet(record: RunRecord) -> None:
     angle_rad = np.zeros_like(record.angle_rad)
     angle_rad[:, len(record.description.links) // 2 - 1] = np.pi  # folded in the middle
-    motion = compute_motion_signals(dataclasses.replace(make_straight_run(record, 0.0), angle_rad=angle_rad))
+    motion = compute_motion_signals(
+        dataclasses.replace(make_straight_run(record, 0.0), angle_rad=angle_rad)
+    )
     assert np.isnan(motion["heading_w_rad"]).all()
     assert np.isnan(motion["velocity_b_m_s"]).all()
     assert np.isfinite(motion["velocity_w_m_s"]).all()
@@ -108,16 +123,24 @@ def test_forces_add_up_on_links_and_obstacles(record: RunRecord) -> None:
     assert forces["obstacle_force_w_n"][2, 0] == pytest.approx(4.0 * np.array(left_w))
     columns = make_signal_columns(run)
     assert columns["obstacle_force_n.peg_10"][2] == pytest.approx(4.0)
-    assert list(select_columns("link_force_l_n.link_5", columns)) == [f"link_force_l_n.link_5.{axis}" for axis in "xyz"]
+    assert list(select_columns("link_force_l_n.link_5", columns)) == [
+        f"link_force_l_n.link_5.{axis}" for axis in "xyz"
+    ]
 
 
 def test_forces_of_obstacles_have_a_magnitude_without_a_pose(record: RunRecord) -> None:
     collector = ContactCollector()
     collector.add_sample(
-        m.Contacts(tick=int(record.ticks[0]), timestamp_ns=0, contacts=[make_contact(1, "peg", (0.0, 3.0, 4.0))])
+        m.Contacts(
+            tick=int(record.ticks[0]),
+            timestamp_ns=0,
+            contacts=[make_contact(1, "peg", (0.0, 3.0, 4.0))],
+        )
     )
     blind = dataclasses.replace(
-        record, position_w_m=np.full_like(record.position_w_m, np.nan), contact_log=collector.make_log()
+        record,
+        position_w_m=np.full_like(record.position_w_m, np.nan),
+        contact_log=collector.make_log(),
     )
     forces = compute_contact_signals(blind)
     assert forces["obstacle_force_n"][0, 0] == pytest.approx(5.0)
@@ -155,9 +178,13 @@ def test_sideways_motion_counts_along_the_displacement(record: RunRecord) -> Non
     cost_j_per_m = summary.energy_j / summary.net_displacement_m
     assert summary.displacement_energy_j_per_m == pytest.approx(cost_j_per_m)
     weight_n = 9.81 * sum(link.mass_kg for link in record.description.links)
-    assert summary.displacement_cost_of_transport == pytest.approx(cost_j_per_m / weight_n, rel=0.001)
+    assert summary.displacement_cost_of_transport == pytest.approx(
+        cost_j_per_m / weight_n, rel=0.001
+    )
     friction = record.config.scene.ground.friction
-    assert summary.displacement_efficiency == pytest.approx(friction * weight_n / cost_j_per_m, rel=0.001)
+    assert summary.displacement_efficiency == pytest.approx(
+        friction * weight_n / cost_j_per_m, rel=0.001
+    )
     assert summary.displacement_slip == pytest.approx(0.0, abs=1e-9)
     assert summary.lateral_slip == pytest.approx(1.0)
 

@@ -30,7 +30,9 @@ READ_ALL = '<mujoco><compiler fusestatic="false" discardvisual="false" strippath
 
 
 def config(scenario: str, robot: Path, *sets: str) -> RunConfig:
-    return load_scenario(scenario, [KeyOverride("robot", str(robot), "--set"), *map(parse_set_option, sets)]).config
+    return load_scenario(
+        scenario, [KeyOverride("robot", str(robot), "--set"), *map(parse_set_option, sets)]
+    ).config
 
 
 def robot_at(name: str | Path) -> RobotFile:
@@ -50,7 +52,11 @@ def hinge_inertia(model: mujoco.MjModel) -> np.ndarray:
     mujoco.mj_forward(model, data)
     full = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, full)
-    hinges = [model.jnt_dofadr[i] for i in range(model.njnt) if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE]
+    hinges = [
+        model.jnt_dofadr[i]
+        for i in range(model.njnt)
+        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE
+    ]
     return full[np.ix_(hinges, hinges)]
 
 
@@ -93,8 +99,12 @@ def test_urdf_round_trip_keeps_limits_and_friction_of_each_joint(tmp_path: Path)
     assert text.count('lower="-0.4"') == 1
     edited.write_text(text.replace('lower="-0.4"', 'lower="-0.7"'))
     found = import_urdf(edited, ImportOptions())
-    assert found.robot.joint_table[1].limits.lower_rad == -0.7, "what was changed in the URDF counts"
-    assert "angle_min_rad differs from that of the others: joint_2 (joint_2) -0.7 rad" in found.changed
+    assert found.robot.joint_table[1].limits.lower_rad == -0.7, (
+        "what was changed in the URDF counts"
+    )
+    assert (
+        "angle_min_rad differs from that of the others: joint_2 (joint_2) -0.7 rad" in found.changed
+    )
 
 
 def test_urdf_import_has_exceptions_only_for_differing_joints() -> None:
@@ -114,7 +124,9 @@ def test_mujocos_own_importer_reads_the_same_bodies_joints_and_shapes(name: str)
     np.testing.assert_allclose(hinge_inertia(theirs), hinge_inertia(own), rtol=1e-6, atol=1e-9)
     for i in range(robot.chain.modules + 1):
         a, b = theirs.body(f"link_{i}"), own.body(f"link_{i}")
-        np.testing.assert_allclose([a.mass[0], *np.sort(a.inertia)], [b.mass[0], *np.sort(b.inertia)], rtol=1e-6)
+        np.testing.assert_allclose(
+            [a.mass[0], *np.sort(a.inertia)], [b.mass[0], *np.sort(b.inertia)], rtol=1e-6
+        )
         np.testing.assert_allclose(a.ipos, b.ipos, atol=1e-9)
         sizes = [theirs.geom_size[g] for g in range(theirs.ngeom) if theirs.geom_bodyid[g] == a.id]
         capsule = own.geom(f"link_{i}").size
@@ -130,11 +142,17 @@ def test_mujocos_own_importer_reads_the_same_bodies_joints_and_shapes(name: str)
 def test_urdf_import_planar_snake_has_inertia_of_mujoco(tmp_path: Path) -> None:
     found = import_urdf(SLIDER, ImportOptions())
     theirs = by_mujoco(SLIDER.read_text(), HERE / "meshes")
-    sign = np.array([-1.0 if "hinge0" in name and "negated" in name else 1.0 for name in found.names[9:]])
-    np.testing.assert_allclose(
-        hinge_inertia(ours(found, tmp_path)), hinge_inertia(theirs) * np.outer(sign, sign), rtol=1e-6
+    sign = np.array(
+        [-1.0 if "hinge0" in name and "negated" in name else 1.0 for name in found.names[9:]]
     )
-    assert found.robot.module.radius_m == pytest.approx(np.hypot(0.015, 0.03)), "of the covers' boxes"
+    np.testing.assert_allclose(
+        hinge_inertia(ours(found, tmp_path)),
+        hinge_inertia(theirs) * np.outer(sign, sign),
+        rtol=1e-6,
+    )
+    assert found.robot.module.radius_m == pytest.approx(np.hypot(0.015, 0.03)), (
+        "of the covers' boxes"
+    )
 
 
 def test_urdf_import_alternating_millimeter_snake_has_inertia_of_mujoco(tmp_path: Path) -> None:
@@ -171,7 +189,10 @@ def test_urdf_import_of_foreign_snakes_can_run(
 
 def test_urdf_import_names_values_it_cannot_express() -> None:
     slider, hexa = import_urdf(SLIDER, ImportOptions()), import_urdf(HEXA, HEXA_ORDER)
-    left_out, changed = "\n".join(slider.left_out + hexa.left_out), "\n".join(slider.changed + hexa.changed)
+    left_out, changed = (
+        "\n".join(slider.left_out + hexa.left_out),
+        "\n".join(slider.changed + hexa.changed),
+    )
     for words in (
         "<transmission> left out: lines 26, 41",
         "<gazebo><plugin>",
@@ -224,8 +245,24 @@ def test_urdf_import_of_other_robot_is_refused_with_place(case: str, tmp_path: P
         import_urdf(file, ImportOptions())
 
 
-def test_urdf_import_report_is_available_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["robot", "import", str(SLIDER), "--out", str(tmp_path / "a.toml"), "--tail", "seg08", "--json"]) == 0
+def test_urdf_import_report_is_available_as_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(
+            [
+                "robot",
+                "import",
+                str(SLIDER),
+                "--out",
+                str(tmp_path / "a.toml"),
+                "--tail",
+                "seg08",
+                "--json",
+            ]
+        )
+        == 0
+    )
     reported = json.loads(capsys.readouterr().out)
     assert reported["file"] == str(tmp_path / "a.toml")
     assert "joint_1: hinge08 (line 122), yaw" in reported["names"]
@@ -244,18 +281,23 @@ def test_urdf_mesh_is_text_or_binary_and_missing_one_reported(tmp_path: Path) ->
         "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 2 0\n"
     )
     assert read_mesh_vertices(tmp_path / "a.stl").max(axis=0).tolist() == [1.0, 2.0, 0.0]
-    assert read_mesh_vertices(HERE / "meshes" / "segment.stl").max(axis=0) == pytest.approx([90.0, 32.0, 32.0])
+    assert read_mesh_vertices(HERE / "meshes" / "segment.stl").max(axis=0) == pytest.approx(
+        [90.0, 32.0, 32.0]
+    )
     (tmp_path / "b.stl").write_bytes(b"solid\nvertex a b c\n")
     with raises_error(ConfigError, code="urdf/invalid"):
         read_mesh_vertices(tmp_path / "b.stl")
     (tmp_path / "far.urdf").write_text(SLIDER.read_text())
-    assert "mesh 'package://slider_description/meshes/head.obj' left out: not on this computer" in "\n".join(
-        import_urdf(tmp_path / "far.urdf", ImportOptions()).left_out
+    assert (
+        "mesh 'package://slider_description/meshes/head.obj' left out: not on this computer"
+        in "\n".join(import_urdf(tmp_path / "far.urdf", ImportOptions()).left_out)
     )
 
 
 def test_a_document_that_shows_a_robot_shows_one_that_runs(tmp_path: Path) -> None:
-    document = (Path(__file__).parents[4] / "docs" / "how-to" / "robots.md").read_text(encoding="utf-8")
+    document = (Path(__file__).parents[4] / "docs" / "how-to" / "robots.md").read_text(
+        encoding="utf-8"
+    )
     robot = tmp_path / "eel.toml"
     robot.write_text(document.partition("```toml eel.toml\n")[2].partition("```")[0])
     result = simulate(config("peg_row", robot, "duration_s=3"))

@@ -82,7 +82,9 @@ KEPT: dict[str, Place] = {
 
 IN_RADIANS = re.compile(r"rpy|lower|upper|velocity|fov|angle")
 
-CHANGE_THE_BODY = re.compile(r"origin@|inertia@|inertial/mass@|axis@|geometry/|/pose|(min|max)_angle|sensor@type|@link")
+CHANGE_THE_BODY = re.compile(
+    r"origin@|inertia@|inertial/mass@|axis@|geometry/|/pose|(min|max)_angle|sensor@type|@link"
+)
 """What the robot file has in another form, such as a place in another frame: there another value is another robot."""
 
 
@@ -155,7 +157,14 @@ def _values(name: str, given: str) -> dict[str, str | None]:
     """What the attribute is set to: left out, zero, negative, huge, and in a unit that is smaller."""
     numbers = _numbers(given)
     if not numbers:
-        return {"absent": None, "empty": "", "zero": "0", "negative": "-1", "huge": "x" * 3000, "other": "N·mm"}
+        return {
+            "absent": None,
+            "empty": "",
+            "zero": "0",
+            "negative": "-1",
+            "huge": "x" * 3000,
+            "other": "N·mm",
+        }
 
     def times(factor: float) -> str:
         return " ".join(f"{factor * number:.12g}" for number in numbers)
@@ -238,14 +247,19 @@ def _line_of(root: ET.Element, wanted: ET.Element) -> int:
 
 def _mentions(line: str, number: int) -> bool:
     """Whether a line of the report names a line of the file."""
-    return any(str(number) in re.findall(r"\d+", places) for places in re.findall(r"\blines? ([\d, ]+)", line))
+    return any(
+        str(number) in re.findall(r"\d+", places)
+        for places in re.findall(r"\blines? ([\d, ]+)", line)
+    )
 
 
 def _is_reported(lines: list[str], line: int, value: str) -> bool:
     """Whether the report has a line with this value and this line of the file."""
     numbers = _numbers(value)
     spellings = [value[:50], *(f"{number:g}" for number in numbers[:1])]
-    return any(_mentions(one, line) and any(spelling in one for spelling in spellings) for one in lines)
+    return any(
+        _mentions(one, line) and any(spelling in one for spelling in spellings) for one in lines
+    )
 
 
 def _accounted(row: Row, tried: Tried, base: RobotFile) -> bool:
@@ -276,7 +290,11 @@ def _unread(file: Path) -> list[Row]:
     left_out = _imported(SNAKE, file).left_out
     ET.indent(root)
     rows = [row for row in ROWS if row.keeps is None]
-    return [row for row in rows if _is_reported(left_out, _line_of(root, _element(root, row)), _given(row))]
+    return [
+        row
+        for row in rows
+        if _is_reported(left_out, _line_of(root, _element(root, row)), _given(row))
+    ]
 
 
 def test_whatever_is_not_read_is_reported_whatever_it_says(tmp_path: Path) -> None:
@@ -294,7 +312,9 @@ def test_whatever_is_not_read_is_reported_whatever_it_says(tmp_path: Path) -> No
         found = import_urdf(_written(root, file), ImportOptions())
         assert found.robot == base
         for row, element, value in places:
-            assert _is_reported(found.left_out, _line_of(root, element), value), f"{row.name} = {value[:50]}"
+            assert _is_reported(found.left_out, _line_of(root, element), value), (
+                f"{row.name} = {value[:50]}"
+            )
 
 
 def _read() -> list[Row]:
@@ -309,12 +329,16 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> RobotFile:
 
 
 @pytest.mark.parametrize("row", _read(), ids=lambda row: row.name)
-def test_every_value_that_is_read_is_kept_reported_or_refused(row: Row, base: RobotFile, tmp_path: Path) -> None:
+def test_every_value_that_is_read_is_kept_reported_or_refused(
+    row: Row, base: RobotFile, tmp_path: Path
+) -> None:
     lost: list[str] = []
     for name, value in _values(row.name, _given(row)).items():
         tried = _try(row, value, tmp_path / "robot.urdf")
         if not _accounted(row, tried, base):
-            lost.append(f"{name} ({str(value)[:50]!r}, line {tried.line}): {tried.error or 'no line of the report'}")
+            lost.append(
+                f"{name} ({str(value)[:50]!r}, line {tried.line}): {tried.error or 'no line of the report'}"
+            )
     assert not lost, "\n".join(lost)
 
 
@@ -337,7 +361,11 @@ def _edited(tmp_path: Path, *edits: tuple[str, str]) -> ImportResult:
 def test_urdf_report_joint_friction_is_individual_or_absent(tmp_path: Path) -> None:
     found = _edited(tmp_path, ('<dynamics damping="0.04" friction="0.07"/>', ""))
     assert [joint.motor.friction_nm for joint in found.robot.joint_table] == [0.06, 0.06, 0.0]
-    assert [joint.motor.viscous_nm_s_per_rad for joint in found.robot.joint_table] == [0.03, 0.03, 0.0]
+    assert [joint.motor.viscous_nm_s_per_rad for joint in found.robot.joint_table] == [
+        0.03,
+        0.03,
+        0.0,
+    ]
     line = _line('name="j3"')
     said = f"<dynamics friction> has no value: 0 N·m, the URDF default for a missing value: j3 (line {line})"
     assert said in found.assumed, "the line of the joint, which has no <dynamics>"
@@ -354,14 +382,18 @@ def test_urdf_report_joint_without_motor_gets_none_from_neighbors(tmp_path: Path
 
 
 def test_urdf_report_lists_assumptions_for_all_zero_limits(tmp_path: Path) -> None:
-    found = _edited(tmp_path, *[(f'effort="{effort}"', 'effort="0"') for effort in ("4.5", "4.6", "4.7")])
+    found = _edited(
+        tmp_path, *[(f'effort="{effort}"', 'effort="0"') for effort in ("4.5", "4.6", "4.7")]
+    )
     assert {joint.limits.torque_nm for joint in found.robot.joint_table} == {7.0}, "as planar13"
     said = "<limit effort> has 0: 7 N·m, from the robot of --like, because no joint has a value"
     places = [f"j{i + 1} (line {_line(f'4.{5 + i}')})" for i in range(3)]
     assert f"{said}: {', '.join(places)}" in found.assumed
 
 
-@pytest.mark.parametrize(("old", "new"), [('lower="-1.2"', 'lower="-90"'), ('upper="1.1"', 'upper="90"')])
+@pytest.mark.parametrize(
+    ("old", "new"), [('lower="-1.2"', 'lower="-90"'), ('upper="1.1"', 'upper="90"')]
+)
 def test_limits_in_degrees_are_refused(old: str, new: str, tmp_path: Path) -> None:
     with raises_error(ConfigError, code="urdf/invalid", field="j1"):
         _edited(tmp_path, (old, new))
@@ -381,19 +413,32 @@ def test_what_is_allowed_and_odd_is_to_be_checked(tmp_path: Path) -> None:
     assert found.robot.joint_table[0].limits.torque_nm == 450
     fast = "`velocity` = 60 rad/s is much for a snake robot; is it in degrees per second?"
     strong = "`effort` = 450 N·m is much for a snake robot; is it in N·mm?"
-    assert found.doubtful == [f"{fast}: j2 (line {_line('4.6')})", f"{strong}: j1 (line {_line('4.5')})"]
+    assert found.doubtful == [
+        f"{fast}: j2 (line {_line('4.6')})",
+        f"{strong}: j1 (line {_line('4.5')})",
+    ]
 
 
 def test_bounds_are_those_of_a_robot_file() -> None:
     """`decode` would refuse the value too, without the line of the URDF."""
-    motor = ("stiffness_nm_per_rad", "velocity_gain_nm_s_per_rad", "damping_nm_s_per_rad", "response_time_s")
+    motor = (
+        "stiffness_nm_per_rad",
+        "velocity_gain_nm_s_per_rad",
+        "damping_nm_s_per_rad",
+        "response_time_s",
+    )
     good: dict[str, tuple[type[msgspec.Struct], dict[str, float]]] = {
-        "limits": (MotionLimits, dict.fromkeys(("angle_rad", "acceleration_rad_s2", "torque_rate_nm_s"), 1.0)),
+        "limits": (
+            MotionLimits,
+            dict.fromkeys(("angle_rad", "acceleration_rad_s2", "torque_rate_nm_s"), 1.0),
+        ),
         "motor": (JointMotor, dict.fromkeys((*motor, "armature_kg_m2"), 0.5)),
     }
     for number in JOINT_NUMBERS:
         struct, values = good[number.section]
-        values = values | {other.key: 0.5 for other in JOINT_NUMBERS if other.section == number.section}
+        values = values | {
+            other.key: 0.5 for other in JOINT_NUMBERS if other.section == number.section
+        }
         msgspec.convert({**values, number.key: number.maximum}, struct)
         with pytest.raises(msgspec.ValidationError):
             msgspec.convert({**values, number.key: number.maximum * 1.001}, struct)
@@ -407,10 +452,14 @@ def test_urdf_report_edit_of_our_export_counts_or_is_listed(tmp_path: Path) -> N
     assert not back.changed
     assert not back.assumed
     assert not back.doubtful
-    assert all("a name of its own" in line for line in back.left_out), "the way there and back loses nothing"
+    assert all("a name of its own" in line for line in back.left_out), (
+        "the way there and back loses nothing"
+    )
     camera = text.replace("<width>160</width>", "<width>320</width>", 1)
     file.write_text(camera)
-    assert any("<width> left out: '320'" in line for line in import_urdf(file, ImportOptions()).left_out)
+    assert any(
+        "<width> left out: '320'" in line for line in import_urdf(file, ImportOptions()).left_out
+    )
     file.write_text(text.replace("</robot>", '<snakesim key="chain.modules" value="3"/></robot>'))
     with raises_error(ConfigError, code="urdf/invalid"):
         import_urdf(file, ImportOptions())
@@ -422,17 +471,26 @@ def test_urdf_report_edit_of_our_export_counts_or_is_listed(tmp_path: Path) -> N
 
 def test_urdf_report_check_of_another_robot_does_not_count(tmp_path: Path) -> None:
     like = tmp_path / "like.toml"
-    like.write_text('extends = "planar13"\n[checked]\nby = "me"\non = "today"\njoints = "abc"\nbackend = "can"\n')
+    like.write_text(
+        'extends = "planar13"\n[checked]\nby = "me"\non = "today"\njoints = "abc"\nbackend = "can"\n'
+    )
     (tmp_path / "robot.urdf").write_text(SNAKE)
     assert import_urdf(tmp_path / "robot.urdf", ImportOptions(like=str(like))).robot.checked is None
 
 
-def test_the_printed_length_is_that_of_the_whole_body(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_printed_length_is_that_of_the_whole_body(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """`length_m` of a robot leaves the rounded caps of tail and head out."""
     (tmp_path / "robot.urdf").write_text(SNAKE)
     import_robot(tmp_path / "robot.urdf", ImportOptions(), tmp_path / "robot.toml")
     printed = capsys.readouterr().out
     robot = import_urdf(tmp_path / "robot.urdf", ImportOptions()).robot
-    assert f"3 joints (yaw), {robot.length_m + 2 * robot.module.radius_m:.3f} m, 1.260 kg" in printed
+    assert (
+        f"3 joints (yaw), {robot.length_m + 2 * robot.module.radius_m:.3f} m, 1.260 kg" in printed
+    )
     assert "<material><color rgba>" not in printed, "values of looks are in the file only"
-    assert "<material><color rgba> left out: '0.5 0.6 0.7 1' (line 3)" in (tmp_path / "robot.toml").read_text()
+    assert (
+        "<material><color rgba> left out: '0.5 0.6 0.7 1' (line 3)"
+        in (tmp_path / "robot.toml").read_text()
+    )

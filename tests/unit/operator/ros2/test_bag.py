@@ -31,11 +31,15 @@ def read_bag(path: Path) -> dict[str, list[tuple[int, Any]]]:
     found: dict[str, list[tuple[int, Any]]] = {}
     with AnyReader([path]) as reader:
         for connection, time_ns, data in reader.messages():
-            found.setdefault(connection.topic, []).append((time_ns, reader.deserialize(data, connection.msgtype)))
+            found.setdefault(connection.topic, []).append(
+                (time_ns, reader.deserialize(data, connection.msgtype))
+            )
     return found
 
 
-def make_contact(link: int, position_l: tuple[float, float, float], force_l: tuple[float, float, float]) -> m.Contact:
+def make_contact(
+    link: int, position_l: tuple[float, float, float], force_l: tuple[float, float, float]
+) -> m.Contact:
     return m.Contact(
         link=link,
         obstacle="peg",
@@ -62,12 +66,22 @@ def test_wrench_of_a_link_is_the_sum_about_its_frame() -> None:
 def test_bag_has_the_run_in_the_types_of_ros(run: Path, tmp_path: Path) -> None:
     lines: list[str] = []
     assert convert_recording_to_rosbag(run, tmp_path / "bag", lines.append, wall_time=False) == 0
-    assert sorted(file.name for file in (tmp_path / "bag").iterdir()) == ["bag.mcap", "metadata.yaml"]
+    assert sorted(file.name for file in (tmp_path / "bag").iterdir()) == [
+        "bag.mcap",
+        "metadata.yaml",
+    ]
     found = read_bag(tmp_path / "bag")
     record = RunRecord.load(run)
     forces_l_n = compute_signals(record)["link_force_l_n"]
     names = [link.name for link in record.description.links]
-    assert {"/joint_states", "/tf", "/tf_static", "/robot_description", "/diagnostics", "/clock"} <= set(found)
+    assert {
+        "/joint_states",
+        "/tf",
+        "/tf_static",
+        "/robot_description",
+        "/diagnostics",
+        "/clock",
+    } <= set(found)
 
     by_stamp = {
         message.header.stamp.sec * 10**9 + message.header.stamp.nanosec: message

@@ -4,7 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion, yaw_from_rotation
+from snakesim_hal.model.kinematics import (
+    compute_link_frames,
+    rotation_from_quaternion,
+    yaw_from_rotation,
+)
 from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, RobotFrames, make_ros_name
 from snakesim_operator.features.ros2.messages import RosTransform
 from snakesim_operator.features.ros2.urdf import make_urdf
@@ -70,12 +74,16 @@ def test_ros_frame_names_are_valid() -> None:
 def test_the_urdf_is_read_by_mujoco(name: str) -> None:
     robot = of_robot(name)
     document = make_urdf(robot, "lab/")
-    assert "has neither inertia nor friction" in document, "what a reader would miss is said in the document"
+    assert "has neither inertia nor friction" in document, (
+        "what a reader would miss is said in the document"
+    )
     model = mujoco.MjModel.from_xml_string(document)
     assert model.njnt == len(robot.joints)
     for i, joint in enumerate(robot.joints):
         assert model.joint(i).name == joint.name
-        assert model.joint(i).range.tolist() == pytest.approx([joint.angle_min_rad, joint.angle_max_rad])
+        assert model.joint(i).range.tolist() == pytest.approx(
+            [joint.angle_min_rad, joint.angle_max_rad]
+        )
         assert model.joint(i).axis.tolist() == ([0, 0, 1] if joint.axis == "yaw" else [0, 1, 0])
     moving = sum(link.mass_kg for link in robot.links[1:])  # the first is welded to the world there
     assert model.body_mass.sum() == pytest.approx(moving)

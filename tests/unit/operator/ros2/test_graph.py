@@ -16,14 +16,29 @@ CHATTER = RosTopic("/chatter", messages.STRING, depth=7)
 
 
 def test_keys_and_tokens_of_the_design_document() -> None:
-    assert make_token(2, "aac3178e146ba6f1fc6e6a4085e77f21", 0, graph.NODE, NodeName("listener")) == LISTENER
-    assert make_token(2, "8b20917502ee955ac4476e0266340d5c", 10, graph.PUBLISHER, NodeName("talker"), CHATTER) == TALKER
-    assert make_topic_key(2, CHATTER) == f"2/chatter/std_msgs::msg::dds_::String_/{messages.STRING.type_hash}"
+    assert (
+        make_token(2, "aac3178e146ba6f1fc6e6a4085e77f21", 0, graph.NODE, NodeName("listener"))
+        == LISTENER
+    )
+    assert (
+        make_token(
+            2, "8b20917502ee955ac4476e0266340d5c", 10, graph.PUBLISHER, NodeName("talker"), CHATTER
+        )
+        == TALKER
+    )
+    assert (
+        make_topic_key(2, CHATTER)
+        == f"2/chatter/std_msgs::msg::dds_::String_/{messages.STRING.type_hash}"
+    )
 
 
 def test_namespaces_and_quality_of_service() -> None:
-    topic = RosTopic("/lab/planar13/tf", messages.TRANSFORMS, depth=1, best_effort=True, latched=True)
-    token = make_token(0, "abc", 3, graph.SUBSCRIPTION, NodeName("snakesim", "/lab/planar13"), topic)
+    topic = RosTopic(
+        "/lab/planar13/tf", messages.TRANSFORMS, depth=1, best_effort=True, latched=True
+    )
+    token = make_token(
+        0, "abc", 3, graph.SUBSCRIPTION, NodeName("snakesim", "/lab/planar13"), topic
+    )
     assert "/MS/%/%lab%planar13/snakesim/%lab%planar13%tf/" in token
     assert token.endswith("/2:1:,1:,:,:,,")
     assert make_topic_key(0, topic).startswith("0/lab/planar13/tf/")

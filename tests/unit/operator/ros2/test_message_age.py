@@ -25,7 +25,10 @@ class Sender:
         """Age of a message when it is read; all times by our clock."""
         sent_ns = round((sent_s + self._off_s) * SECOND)
         sample = RawSample(b"", make_attachment(1, sent_ns, self._gid), round(came_s * SECOND))
-        return self._clocks.estimate_age_ns(sample, round(read_s * SECOND), round(read_s * SECOND)) / SECOND
+        return (
+            self._clocks.estimate_age_ns(sample, round(read_s * SECOND), round(read_s * SECOND))
+            / SECOND
+        )
 
 
 @pytest.mark.parametrize("off_s", [0.0, -3600.0, 5.0])
@@ -37,7 +40,9 @@ def test_message_age_includes_network_delay(off_s: float) -> None:
     held_back = [sender.age_s(103.0 + 0.05 * number, 117.0, 117.0) for number in range(270)]
     assert held_back[0] == pytest.approx(14.0 - 0.02)
     assert held_back == sorted(held_back, reverse=True)
-    assert sum(age_s * SECOND <= MAX_AGE_NS for age_s in held_back) <= 1, "those that were sent just before"
+    assert sum(age_s * SECOND <= MAX_AGE_NS for age_s in held_back) <= 1, (
+        "those that were sent just before"
+    )
     assert sender.age_s(117.1, 117.12, 117.12) == pytest.approx(0.0, abs=0.01)
 
 
@@ -52,8 +57,12 @@ def test_message_age_recovers_two_minutes_after_clock_set_back() -> None:
 def test_message_age_includes_wait_in_bridge() -> None:
     clocks = SenderClocks()
     without = RawSample(b"", b"", SECOND)
-    assert clocks.estimate_age_ns(without, 0, 4 * SECOND) == 3 * SECOND, "a plain Zenoh client attaches nothing"
-    assert Sender(clocks, 0.0).age_s(1.0, 1.0, 4.0) == 3.0, "and nothing is known of this sender yet"
+    assert clocks.estimate_age_ns(without, 0, 4 * SECOND) == 3 * SECOND, (
+        "a plain Zenoh client attaches nothing"
+    )
+    assert Sender(clocks, 0.0).age_s(1.0, 1.0, 4.0) == 3.0, (
+        "and nothing is known of this sender yet"
+    )
 
 
 def test_each_sender_has_a_clock_of_its_own() -> None:
@@ -70,8 +79,12 @@ def test_message_age_of_late_arm_request_refuses_with_advice() -> None:
         return make_attachment(1, round(sent_s * SECOND), GID)
 
     assert find_request_age_problem(request(100.0), 103 * SECOND) == ""
-    assert "was sent 30 s ago, by the clock of its sender" in find_request_age_problem(request(100.0), 130 * SECOND)
-    assert "was sent 3600 s in the future" in find_request_age_problem(request(3700.0), 100 * SECOND)
+    assert "was sent 30 s ago, by the clock of its sender" in find_request_age_problem(
+        request(100.0), 130 * SECOND
+    )
+    assert "was sent 3600 s in the future" in find_request_age_problem(
+        request(3700.0), 100 * SECOND
+    )
     assert find_request_age_problem(b"", 0) == "the request has no time attached"
 
 

@@ -59,8 +59,14 @@ def test_ros_joint_states_omit_invalid_joints(joints: m.JointState) -> None:
     assert at(seen.header.stamp) == STAMP_NS
     assert seen.header.frame_id == ""
     assert seen.name == [name for name, valid in zip(names, joints.valid, strict=True) if valid]
-    for ours, theirs in (("angle_rad", "position"), ("velocity_rad_s", "velocity"), ("torque_nm", "effort")):
-        assert np.array_equal(getattr(seen, theirs), np.array(getattr(joints, ours), dtype=float)[kept])
+    for ours, theirs in (
+        ("angle_rad", "position"),
+        ("velocity_rad_s", "velocity"),
+        ("torque_nm", "effort"),
+    ):
+        assert np.array_equal(
+            getattr(seen, theirs), np.array(getattr(joints, ours), dtype=float)[kept]
+        )
 
 
 def test_ros_transforms_match_kinematics() -> None:
@@ -101,12 +107,23 @@ def read_obstacle_markers() -> list[Any]:
     quarter_turn_rad = np.pi / 2
     obstacles = [
         m.KnownObstacle(
-            name="c", shape="cylinder", position_w=(1, 2, 0.1), radius_m=0.05, height_m=0.2, confidence=0.5
+            name="c",
+            shape="cylinder",
+            position_w=(1, 2, 0.1),
+            radius_m=0.05,
+            height_m=0.2,
+            confidence=0.5,
         ),
         m.KnownObstacle(
-            name="b", shape="box", position_w=(3, 4, 0.1), yaw_rad=quarter_turn_rad, half_size_m=(0.1, 0.2, 0.3)
+            name="b",
+            shape="box",
+            position_w=(3, 4, 0.1),
+            yaw_rad=quarter_turn_rad,
+            half_size_m=(0.1, 0.2, 0.3),
         ),
-        m.KnownObstacle(name="s", shape="sphere", position_w=(5, 6, 0.1), radius_m=0.07, touched=True),
+        m.KnownObstacle(
+            name="s", shape="sphere", position_w=(5, 6, 0.1), radius_m=0.07, touched=True
+        ),
     ]
     world = m.WorldModel(
         tick=1,
@@ -127,7 +144,11 @@ def test_ros_obstacle_markers_have_shape_size_and_pose() -> None:
     assert [marker.type for marker in markers] == [ros.CYLINDER, ros.CUBE, ros.SPHERE]
     sizes_m = [(marker.scale.x, marker.scale.y, marker.scale.z) for marker in markers]
     assert sizes_m == [(0.1, 0.1, 0.2), (0.2, 0.4, 0.6), (0.14, 0.14, 0.14)]
-    assert [(marker.pose.position.x, marker.pose.position.y) for marker in markers] == [(1, 2), (3, 4), (5, 6)]
+    assert [(marker.pose.position.x, marker.pose.position.y) for marker in markers] == [
+        (1, 2),
+        (3, 4),
+        (5, 6),
+    ]
     box_orientation = markers[1].pose.orientation
     assert box_orientation.z == pytest.approx(np.sqrt(0.5))
     assert box_orientation.x == 0
@@ -144,16 +165,24 @@ def test_ros_obstacle_marker_of_touched_obstacle_is_redder() -> None:
 
 
 def image(kind: type[Any], **more: Any) -> Any:
-    pixels = {"depth": np.arange(12, dtype="<u2").tobytes()} if kind is m.DepthImage else {"rgb": bytes(range(36))}
+    pixels = (
+        {"depth": np.arange(12, dtype="<u2").tobytes()}
+        if kind is m.DepthImage
+        else {"rgb": bytes(range(36))}
+    )
     pose = {"position_l": (0.1, 0, 0), "orientation_l_wxyz": (1, 0, 0, 0)}
-    limits = {"range_min_m": 0.05, "range_max_m": 4.0, "scale_m": 0.001} if kind is m.DepthImage else {}
+    limits = (
+        {"range_min_m": 0.05, "range_max_m": 4.0, "scale_m": 0.001} if kind is m.DepthImage else {}
+    )
     size = {"width": 4, "height": 3, "fx_px": 80.0, "fy_px": 81.0, "cx_px": 1.5, "cy_px": 1.0}
     return kind(tick=0, timestamp_ns=0, link=1, **{**pose, **limits, **size, **pixels, **more})
 
 
 def test_ros_depth_image_with_1_mm_scale_is_sent_as_it_is() -> None:
     frame_id = "head_depth_optical_frame"
-    message = read(ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, frame_id, image(m.DepthImage)))
+    message = read(
+        ros.IMAGE, robot_in_ros.encode_depth_image(STAMP_NS, frame_id, image(m.DepthImage))
+    )
     assert message.header.frame_id == frame_id
     assert at(message.header.stamp) == STAMP_NS
     assert (message.width, message.height) == (4, 3)
@@ -195,7 +224,9 @@ def test_compressed_images_are_read_by_a_library_for_pictures() -> None:
     assert seen.format == "rgb8; png compressed bgr8"
     assert np.asarray(Image.open(BytesIO(seen.data.tobytes()))).tobytes() == color.rgb
     for scale_m in (0.001, 0.01):
-        sent = robot_in_ros.encode_compressed_depth(STAMP_NS, "f", image(m.DepthImage, scale_m=scale_m))
+        sent = robot_in_ros.encode_compressed_depth(
+            STAMP_NS, "f", image(m.DepthImage, scale_m=scale_m)
+        )
         seen = read(ros.COMPRESSED_IMAGE, sent)
         assert seen.format == "16UC1; compressedDepth png"
         assert seen.header.frame_id == "f"
@@ -240,7 +271,9 @@ def test_ros_scan_contains_the_ranges(sent: m.RangeScan) -> None:
     assert seen.intensities.size == 0
     assert seen.angle_min == np.float32(sent.angle_min_rad)
     assert seen.angle_increment == np.float32(sent.angle_step_rad)
-    assert seen.angle_max == np.float32(sent.angle_min_rad + sent.angle_step_rad * (len(expected) - 1))
+    assert seen.angle_max == np.float32(
+        sent.angle_min_rad + sent.angle_step_rad * (len(expected) - 1)
+    )
     assert seen.range_min == np.float32(sent.range_min_m)
     assert seen.range_max == np.float32(sent.range_max_m)
 
@@ -248,7 +281,9 @@ def test_ros_scan_contains_the_ranges(sent: m.RangeScan) -> None:
 def test_custom_sensor_numbers_have_field_and_unit() -> None:
     kind = parse_custom_message(make_message_schema(SkinSample, "skin"))
     sample: Any = kind.message(**PLACE, **GOOD)
-    seen = read(ros.FLOAT64_ARRAY, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample))
+    seen = read(
+        ros.FLOAT64_ARRAY, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample)
+    )
     assert seen.data.tolist() == pytest.approx([1.5, np.nan], nan_ok=True)
     (dimension,) = seen.layout.dim
     assert dimension.label == "pressed_n [N]"
@@ -274,9 +309,15 @@ def test_clock_of_any_robot_time(timestamp_ns: int) -> None:
 def test_text_and_marker_defaults() -> None:
     assert read(ros.STRING, ros.encode_string("<robot>ä</robot>")).data == "<robot>ä</robot>"
     (_, plain) = read(
-        ros.MARKERS, ros.encode_markers(0, "map", [RosMarker("n", ros.CUBE, (1, 2, 3), (1, 0, 0, 1))])
+        ros.MARKERS,
+        ros.encode_markers(0, "map", [RosMarker("n", ros.CUBE, (1, 2, 3), (1, 0, 0, 1))]),
     ).markers
-    assert (plain.lifetime.sec, plain.frame_locked, plain.text, plain.mesh_resource) == (0, False, "", "")
+    assert (plain.lifetime.sec, plain.frame_locked, plain.text, plain.mesh_resource) == (
+        0,
+        False,
+        "",
+        "",
+    )
 
 
 class TestSteering:
@@ -291,7 +332,12 @@ class TestSteering:
         steering = CmdVelSteering()
         first = steering.make_intent(self.twist(0.2, 1.0), 10**9, 0.5)
         assert first is not None
-        assert (first.speed_m_s, first.heading_w_rad, first.go, first.valid_for_ns) == (0.2, 0.5, True, 500_000_000)
+        assert (first.speed_m_s, first.heading_w_rad, first.go, first.valid_for_ns) == (
+            0.2,
+            0.5,
+            True,
+            500_000_000,
+        )
         later = steering.make_intent(self.twist(0.2, 1.0), 1_100_000_000, 0.5)
         assert later is not None
         assert later.heading_w_rad == pytest.approx(0.6)
@@ -340,7 +386,9 @@ class TestSteering:
         assert steering.make_intent(bad, 0, 0.0) is None
         assert steering.rejected_count == 1
 
-    @pytest.mark.parametrize(("x", "turn"), [(np.nan, 0.0), (0.0, np.inf), (11.0, 0.0), (0.0, -11.0)])
+    @pytest.mark.parametrize(
+        ("x", "turn"), [(np.nan, 0.0), (0.0, np.inf), (11.0, 0.0), (0.0, -11.0)]
+    )
     def test_ros_twist_impossible_for_a_snake_is_rejected(self, x: float, turn: float) -> None:
         steering = CmdVelSteering()
         assert steering.make_intent(self.twist(x, turn), 0, 0.0) is None

@@ -27,20 +27,30 @@ ADDER = (
 
 
 def test_a_service_of_the_design_document() -> None:
-    two_ints = types.define_service("example_interfaces/srv/AddTwoInts", "int64 a\nint64 b", "int64 sum")
+    two_ints = types.define_service(
+        "example_interfaces/srv/AddTwoInts", "int64 a\nint64 b", "int64 sum"
+    )
     topic = RosTopic("/add_two_ints", two_ints.type)
     zenoh_id = ADDER.split("/")[2]
-    assert make_token(2, zenoh_id, 10, graph.SERVER, NodeName("add_two_ints_server"), topic) == ADDER
+    assert (
+        make_token(2, zenoh_id, 10, graph.SERVER, NodeName("add_two_ints_server"), topic) == ADDER
+    )
 
 
 def test_hashes_are_those_that_others_have() -> None:
-    ours = {one.type.name: one.type.type_hash for one in vars(types).values() if isinstance(one, types.RosService)}
+    ours = {
+        one.type.name: one.type.type_hash
+        for one in vars(types).values()
+        if isinstance(one, types.RosService)
+    }
     assert ours == {name: f"RIHS01_{digits}" for name, digits in SERVICE_HASHES.items()}
 
 
 def test_an_answer_says_who_asked_what() -> None:
     gid = bytes(range(16))
-    assert graph.make_reply_attachment(graph.make_attachment(9, 1, gid))[:8] == (9).to_bytes(8, "little")  # pyright: ignore[reportOptionalSubscript]
+    reply = graph.make_reply_attachment(graph.make_attachment(9, 1, gid))
+    assert reply is not None
+    assert reply[:8] == (9).to_bytes(8, "little")
     assert graph.make_reply_attachment(b"") is None
     assert graph.make_reply_attachment(graph.make_attachment(-1, 1, gid)) is None
 
@@ -49,14 +59,25 @@ def test_an_answer_says_who_asked_what() -> None:
 def test_values_of_parameters_keep_their_type(value: Any) -> None:
     sent = _encode_value(value)
     kinds = {True: 1, 3: 2, 0.5: 3, "a": 4, None: 0}
-    assert sent.type == (kinds[value] if not isinstance(value, list) else 8 if value[0] == 1.0 else 9)
-    fields = ("bool_value", "integer_value", "double_value", "string_value", *[""] * 3, "double_array_value")
+    assert sent.type == (
+        kinds[value] if not isinstance(value, list) else 8 if value[0] == 1.0 else 9
+    )
+    fields = (
+        "bool_value",
+        "integer_value",
+        "double_value",
+        "string_value",
+        *[""] * 3,
+        "double_array_value",
+    )
     if sent.type not in (NOT_SET, 9):
         assert np.array_equal(getattr(sent, fields[sent.type - 1]), value)
 
 
 def test_a_parameter_is_described_with_unit_and_range() -> None:
-    lead = RobotParameter("speed_kp_s", 0.2, unit="s", description="how far ahead", minimum=0.0, maximum=1.0)
+    lead = RobotParameter(
+        "speed_kp_s", 0.2, unit="s", description="how far ahead", minimum=0.0, maximum=1.0
+    )
     seen = _make_descriptor("control.speed_kp_s", lead)
     assert seen.description == "how far ahead [s]"
     assert seen.additional_constraints == ">= 0, <= 1"
@@ -72,14 +93,21 @@ class TestJointTargets:
 
     def said(self, names: list[str], *, stamp_s: float = 0.0, **numbers: Any) -> bytes:
         kinds: Any = JAZZY.types
-        fields = [np.array(numbers.get(word, []), dtype=np.float64) for word in ("position", "velocity", "effort")]
+        fields = [
+            np.array(numbers.get(word, []), dtype=np.float64)
+            for word in ("position", "velocity", "effort")
+        ]
         seconds, nanoseconds = divmod(round(stamp_s * 1e9), 10**9)
-        header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](seconds, nanoseconds), "")
+        header = kinds["std_msgs/msg/Header"](
+            kinds["builtin_interfaces/msg/Time"](seconds, nanoseconds), ""
+        )
         kind = "sensor_msgs/msg/JointState"
         return bytes(JAZZY.serialize_cdr(kinds[kind](header, names, *fields), kind))
 
     def clock(self, timestamp_ns: int, lifecycle: LifecycleState = "armed") -> Clock:
-        return msgspec.structs.replace(rig.make_clock(1), arm_session=1, timestamp_ns=timestamp_ns, lifecycle=lifecycle)
+        return msgspec.structs.replace(
+            rig.make_clock(1), arm_session=1, timestamp_ns=timestamp_ns, lifecycle=lifecycle
+        )
 
     def joints(self, angle_rad: float) -> JointState:
         return rig.make_joint_state(self.robot, angle_rad)
@@ -101,7 +129,9 @@ class TestJointTargets:
         targets.accept_message(self.said(["joint_3"], velocity=[1.0]), 0)
         targets.make_setpoints(self.clock(TARGET_LIFETIME_NS), self.joints(0.3))
         for angle_rad in (0.4, 0.45):
-            points = targets.make_setpoints(self.clock(TARGET_LIFETIME_NS + 1), self.joints(angle_rad))
+            points = targets.make_setpoints(
+                self.clock(TARGET_LIFETIME_NS + 1), self.joints(angle_rad)
+            )
         assert points.mode[2] == JointMode.POSITION
         assert points.target[2] == 0.4
 
@@ -128,11 +158,15 @@ class TestJointTargets:
         taken = targets.accept_message(message, now_ns, ros_now_ns, round(age_s * 1e9))
         assert taken == (not why)
         assert why in targets.reason
-        assert targets.make_setpoints(self.clock(now_ns + 1), self.joints(0.1)).target[2] == (0.1 if why else 0.5)
+        assert targets.make_setpoints(self.clock(now_ns + 1), self.joints(0.1)).target[2] == (
+            0.1 if why else 0.5
+        )
 
     def test_a_command_ends_half_a_second_after_it_was_sent(self) -> None:
         targets = RosJointTargets(self.robot)
-        assert targets.accept_message(self.said(["joint_3"], position=[0.5]), 10**9, age_ns=400_000_000)
+        assert targets.accept_message(
+            self.said(["joint_3"], position=[0.5]), 10**9, age_ns=400_000_000
+        )
         assert targets.make_setpoints(self.clock(1_100_000_000), self.joints(0.1)).target[2] == 0.5
         assert targets.make_setpoints(self.clock(1_100_000_001), self.joints(0.1)).target[2] == 0.1
 
@@ -152,7 +186,9 @@ class TestJointTargets:
             (["joint_1"], {}, "has no position, velocity or effort"),
         ],
     )
-    def test_a_message_is_taken_whole_or_not_at_all(self, names: list[str], numbers: dict[str, Any], why: str) -> None:
+    def test_a_message_is_taken_whole_or_not_at_all(
+        self, names: list[str], numbers: dict[str, Any], why: str
+    ) -> None:
         targets = RosJointTargets(self.robot)
         assert not targets.accept_message(self.said(names, **numbers), 0)
         assert targets.rejected_count == 1

@@ -12,7 +12,12 @@ from snakesim_operator.recording import recorder_process as recorder
 
 @pytest.mark.parametrize(
     ("main", "given"),
-    [(host_process.main, ()), (router_process.main, ()), (recorder.main, ()), (serve.main, ("control",))],
+    [
+        (host_process.main, ()),
+        (router_process.main, ()),
+        (recorder.main, ()),
+        (serve.main, ("control",)),
+    ],
 )
 def test_a_scenario_that_is_not_there_is_wrong_input(
     main: Callable[[Sequence[str]], int], given: Sequence[str], capsys: pytest.CaptureFixture[str]

@@ -42,7 +42,9 @@ def test_processor_wait_in_progress_counts_before_kernel_reports_it() -> None:
 
 
 def test_who_sleeps_or_is_stopped_does_not_wait() -> None:
-    assert waits_of((0.1 * i, ThreadUsage(1.0, 2.0, False)) for i in range(20)).find_longest() is None
+    assert (
+        waits_of((0.1 * i, ThreadUsage(1.0, 2.0, False)) for i in range(20)).find_longest() is None
+    )
 
 
 def test_short_waits_at_any_time_are_nothing() -> None:
@@ -57,7 +59,9 @@ def test_processor_wait_long_ago_is_no_cause() -> None:
 
 def test_processor_waits_are_found_by_rare_sampling() -> None:
     """On a slow computer whoever looks is late, too."""
-    assert waits_of(waits((0.0, 0.0), (3.0, 2.9))).find_longest() == pytest.approx(("control", 2.9, 3.0))
+    assert waits_of(waits((0.0, 0.0), (3.0, 2.9))).find_longest() == pytest.approx(
+        ("control", 2.9, 3.0)
+    )
 
 
 def test_where_the_kernel_does_not_tell_nothing_is_said() -> None:

@@ -63,7 +63,12 @@ def test_run_files_are_written_in_order_after_settling(tmp_path: Path) -> None:
     assert (tmp_path / "whole.json").read_bytes() == b"{}"
     assert files.close() == ""
     assert warned == []
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a-1.log", "a.log", "b.log", "whole.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "a-1.log",
+        "a.log",
+        "b.log",
+        "whole.json",
+    ]
 
 
 def test_nothing_is_lost_when_a_full_disk_has_room_again(tmp_path: Path, disk: Disk) -> None:
@@ -137,7 +142,9 @@ def test_run_files_without_folder_are_not_kept() -> None:
     assert files.close() == ""
 
 
-def test_run_log_that_floods_is_cut_and_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_log_that_floods_is_cut_and_marked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(under_test, "MAX_LOG_BYTES", 2 * 2**20)
     files = RunFiles(tmp_path, lambda _: None)
     for _ in range(300):

@@ -5,7 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from docs.site.configuration_page import PAGE, documented_structs, fields_without_description, make_page
+from docs.site.configuration_page import (
+    PAGE,
+    documented_structs,
+    fields_without_description,
+    make_page,
+)
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.scenario import LoadedScenario, load_scenario, parse_set_option
 from snakesim_operator.this_computer.explain import explain_key
@@ -20,7 +25,9 @@ def explain(loaded: LoadedScenario, key: str, capsys: pytest.CaptureFixture[str]
     return capsys.readouterr().out
 
 
-def explain_as_json(loaded: LoadedScenario, key: str, capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+def explain_as_json(
+    loaded: LoadedScenario, key: str, capsys: pytest.CaptureFixture[str]
+) -> dict[str, object]:
     assert explain_key(loaded, key, as_json=True) == 0
     return json.loads(capsys.readouterr().out)
 
@@ -33,7 +40,9 @@ def test_every_field_of_every_file_has_a_description() -> None:
 
 
 def test_explain_page_is_current() -> None:
-    assert PAGE.read_text(encoding="utf-8") == make_page(), "run `make schemas` and commit what it changes"
+    assert PAGE.read_text(encoding="utf-8") == make_page(), (
+        "run `make schemas` and commit what it changes"
+    )
 
 
 def test_all_kinds_of_files_and_plugins_are_on_the_page() -> None:
@@ -48,7 +57,9 @@ def test_all_kinds_of_files_and_plugins_are_on_the_page() -> None:
 
 
 @pytest.mark.parametrize("scenario", PER_SCENARIO)
-def test_every_key_of_a_scenario_is_explained(scenario: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_key_of_a_scenario_is_explained(
+    scenario: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     loaded = load_scenario(scenario)
     keys = collect_keys(loaded)
     for name, value, origin in collect_values(loaded):
@@ -60,7 +71,9 @@ def test_every_key_of_a_scenario_is_explained(scenario: str, capsys: pytest.Capt
         assert explain(loaded, name, capsys)
 
 
-def test_a_value_has_its_documentation_and_where_it_comes_from(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_value_has_its_documentation_and_where_it_comes_from(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     loaded = load_scenario("triplet", [parse_set_option("control.propulsion_n=20")])
     lines = explain(loaded, "control.propulsion_n", capsys).splitlines()
     assert lines[0] == "controllers.obstacle_triplet.propulsion_n"
@@ -105,7 +118,9 @@ def test_a_table_has_one_line_for_each_key(capsys: pytest.CaptureFixture[str]) -
         "controllers.policy.model",
     ],
 )
-def test_keys_that_the_scenario_does_not_give_are_explained(key: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_keys_that_the_scenario_does_not_give_are_explained(
+    key: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert explain(load_scenario("triplet"), key, capsys).startswith(key)
 
 
@@ -113,7 +128,10 @@ def test_explain_lists_plugin_values_without_running_its_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "wave.py").write_text("class Wave: ...\nraise SystemExit")
-    overrides = [parse_set_option(f"controller={tmp_path}/wave.py:Wave"), parse_set_option("control.lag_rad=0.5")]
+    overrides = [
+        parse_set_option(f"controller={tmp_path}/wave.py:Wave"),
+        parse_set_option("control.lag_rad=0.5"),
+    ]
     lines = explain(load_scenario("triplet", overrides), "control.lag_rad", capsys).splitlines()
     assert lines[:2] == ["controllers.Wave.lag_rad", "  Checked by the code of its plugin."]
     assert "  value    0.5" in lines

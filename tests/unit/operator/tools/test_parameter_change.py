@@ -34,7 +34,9 @@ class Control:
         """reported: after a request; None: it is silent. gone: it publishes no parameters after it."""
         self._network = LocalNetwork()
         session = self._network.create_session()
-        self._settings = LiveParameters(HostClient(session, "control"), load_scenario("triplet", []).config)
+        self._settings = LiveParameters(
+            HostClient(session, "control"), load_scenario("triplet", []).config
+        )
         self._settings.configure(make_description())
         self._settings.answer_requests(CLOCK)
         self._states = session.declare_publisher(keys.CONTROL_STATE, ControlState)
@@ -53,7 +55,12 @@ class Control:
 
 def state(reason: str, *, failed: bool = False) -> ControlState:
     return ControlState(
-        tick=8, timestamp_ns=80, controller="obstacle_triplet", state="NotLocomoting", reason=reason, failed=failed
+        tick=8,
+        timestamp_ns=80,
+        controller="obstacle_triplet",
+        state="NotLocomoting",
+        reason=reason,
+        failed=failed,
     )
 
 
@@ -63,7 +70,9 @@ def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(parameters, name, 0.05)
 
 
-@pytest.mark.parametrize("reported", [state("standing still"), None], ids=["goes on", "time stands"])
+@pytest.mark.parametrize(
+    "reported", [state("standing still"), None], ids=["goes on", "time stands"]
+)
 def test_what_a_controller_goes_on_with_is_returned(reported: ControlState | None) -> None:
     before, now = parameters.change_parameters(Control(reported).operator, CHANGES, "ada")
     assert before.changes == 0
@@ -74,7 +83,9 @@ def test_what_a_controller_goes_on_with_is_returned(reported: ControlState | Non
 @pytest.mark.parametrize("gone", [False, True])
 def test_a_value_that_ends_control_is_named_with_the_reason(gone: bool) -> None:
     control = Control(state(WHY, failed=True), gone=gone)
-    with raises_error(ControllerError, code="controller/failed", field=("control.propulsion_n", WHY)):
+    with raises_error(
+        ControllerError, code="controller/failed", field=("control.propulsion_n", WHY)
+    ):
         parameters.change_parameters(control.operator, CHANGES, "ada")
 
 

@@ -32,23 +32,30 @@ if TYPE_CHECKING:
 
 REPOSITORY = Path(__file__).parents[4]
 PUBLISHED = REPOSITORY / "schemas"
-each_message = pytest.mark.parametrize("message", list(VERSIONS), ids=lambda message: message.__name__)
+each_message = pytest.mark.parametrize(
+    "message", list(VERSIONS), ids=lambda message: message.__name__
+)
 
 
 def files_under(folder: Path) -> dict[str, str]:
-    return {str(p.relative_to(folder)): p.read_text(encoding="utf-8") for p in folder.rglob("*") if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_text(encoding="utf-8")
+        for p in folder.rglob("*")
+        if p.is_file()
+    }
 
 
 def test_the_published_files_are_what_the_code_says() -> None:
     published, generated = files_under(PUBLISHED), dict(generate_contract_files())
-    published = {
-        name: text for name, text in published.items() if not name.startswith("can/")
-    }  # tests/unit/can_backend
+    # Tests/unit/can_backend.
+    published = {name: text for name, text in published.items() if not name.startswith("can/")}
     for by_hand in ("README.md", "protocol.md"):
         del published[by_hand]
     assert sorted(published) == sorted(generated), "run `make schemas` and commit what it changes"
     for name, text in generated.items():
-        assert published[name] == text, f"schemas/{name} is out of date; run `make schemas` and commit what it changes"
+        assert published[name] == text, (
+            f"schemas/{name} is out of date; run `make schemas` and commit what it changes"
+        )
 
 
 def test_writing_schemas_removes_files_outside_the_contract(tmp_path: Path) -> None:
@@ -104,7 +111,9 @@ def test_every_message_fits_its_schema(message: type[Message], data: st.DataObje
 
 @each_message
 def test_schema_and_decoder_agree_on_what_is_missing(message: type[Message]) -> None:
-    assert json.loads(published_contract()[schema_name(message)])["encoding"] == format_encoding(message)
+    assert json.loads(published_contract()[schema_name(message)])["encoding"] == format_encoding(
+        message
+    )
     example = make_plain_example(message)
     assert fits(example, schema_name(message))
     for field in example:
@@ -122,9 +131,13 @@ def test_schema_and_decoder_agree_on_what_is_out_of_bounds(message: type[Message
     example = make_plain_example(message)
     for at, info in iter_places(example, inspect.type_info(message)):
         for poison in list_invalid_values(info):
-            if isinstance(poison, bytes) or (isinstance(poison, float) and not math.isfinite(poison)):
+            if isinstance(poison, bytes) or (
+                isinstance(poison, float) and not math.isfinite(poison)
+            ):
                 continue  # JSON has no such value
-            assert not fits(replace_at(example, at, poison), schema_name(message)), f"{at} took {poison!r}"
+            assert not fits(replace_at(example, at, poison), schema_name(message)), (
+                f"{at} took {poison!r}"
+            )
 
 
 # --- the files that are shipped --------------------------------------------------------------------------------

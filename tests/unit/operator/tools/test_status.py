@@ -33,8 +33,16 @@ def test_one_attempt_is_enough_on_loopback(
 
     monkeypatch.setattr(status, "open_session", refuse)
     robot = LocalRobot(
-        namespace="planar13", robot="planar13", backend="sim", endpoint=HERE, stop_host="127.0.0.1", stop_port=9, pid=1
+        namespace="planar13",
+        robot="planar13",
+        backend="sim",
+        endpoint=HERE,
+        stop_host="127.0.0.1",
+        stop_port=9,
+        pid=1,
     )
-    monkeypatch.setattr(RobotSelection, "list_local_robots", lambda _self: [robot] if runs_here else [])
+    monkeypatch.setattr(
+        RobotSelection, "list_local_robots", lambda _self: [robot] if runs_here else []
+    )
     assert status.print_status(RobotSelection(endpoint)) == 1
     assert tried == [seconds]

@@ -30,7 +30,8 @@ class SlowPty(PseudoTerminal):
     def __init__(self) -> None:
         super().__init__()
         self.delay_s = 0.0  # of each answer
-        self.burst_s = 0.0  # answers are passed on together, at multiples of this time; 0: each alone
+        # Answers are passed on together, at multiples of this time; 0: each alone.
+        self.burst_s = 0.0
         self.min_waiting = 1  # answers that are passed on together
         self._waiting: deque[tuple[float, bytes]] = deque()
 
@@ -61,7 +62,9 @@ class SlowBench:
         )
         self._wire = SerialWire(self.pty.path, 1_000_000)
         self.port = DynamixelPort(self._wire, GAP_S)
-        self.servos = [make_servo(joint, self.port, SETTINGS) for joint in self._config.robot.joint_table]
+        self.servos = [
+            make_servo(joint, self.port, SETTINGS) for joint in self._config.robot.joint_table
+        ]
         self._runs = True
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -106,7 +109,9 @@ def test_late_answers_are_not_taken_for_those_of_a_second_servo(
     bench.bring_up()
 
 
-def test_servos_that_answer_later_than_the_driver_waits_are_not_called_duplicated(bench: SlowBench) -> None:
+def test_servos_that_answer_later_than_the_driver_waits_are_not_called_duplicated(
+    bench: SlowBench,
+) -> None:
     bench.pty.delay_s = 0.4
     try:
         bench.bring_up()
@@ -116,7 +121,9 @@ def test_servos_that_answer_later_than_the_driver_waits_are_not_called_duplicate
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.03])
-def test_a_second_servo_is_found_behind_a_slow_adapter_too(bench: SlowBench, delay_s: float) -> None:
+def test_a_second_servo_is_found_behind_a_slow_adapter_too(
+    bench: SlowBench, delay_s: float
+) -> None:
     bench.pty.delay_s = delay_s
     bench.duplicate(2)
     with raises_error(BackendError, code="drive/not-complete", field="joint_2") as raised:

@@ -21,7 +21,9 @@ from snakesim_serial_backend.dynamixel.packets import (
 )
 
 SDK = Protocol2PacketHandler()
-near_header = st.lists(st.sampled_from([0x00, 0xFD, 0xFE, 0xFF]), max_size=40).map(bytes) | st.binary(max_size=120)
+near_header = st.lists(st.sampled_from([0x00, 0xFD, 0xFE, 0xFF]), max_size=40).map(
+    bytes
+) | st.binary(max_size=120)
 
 
 class Line:
@@ -52,7 +54,9 @@ class Line:
 
 
 @given(id_=st.integers(0, 252), address=st.integers(0, 600), data=near_header.filter(bool))
-def test_packet_written_is_stuffed_and_checksummed_as_by_sdk(id_: int, address: int, data: bytes) -> None:
+def test_packet_written_is_stuffed_and_checksummed_as_by_sdk(
+    id_: int, address: int, data: bytes
+) -> None:
     inside = [DynamixelInstruction.WRITE, *address.to_bytes(2, "little"), *data]
     plain = [0xFF, 0xFF, 0xFD, 0, id_, len(inside) + 2, 0, *inside, 0, 0]
     # Its `txPacket` sends unstuffed what stuffing would make longer; so `addStuffing` itself is asked.
@@ -75,23 +79,35 @@ def test_questions_and_goals_of_several_are_those_of_the_sdk(ids: list[int], fas
     assert line.written == encode_sync_write(116, each)
 
 
-@given(id_=st.integers(0, 252), data=near_header, noise=st.binary(max_size=8), cut=st.integers(1, 30))
-def test_packet_answers_are_read_by_sdk_and_by_us(id_: int, data: bytes, noise: bytes, cut: int) -> None:
+@given(
+    id_=st.integers(0, 252), data=near_header, noise=st.binary(max_size=8), cut=st.integers(1, 30)
+)
+def test_packet_answers_are_read_by_sdk_and_by_us(
+    id_: int, data: bytes, noise: bytes, cut: int
+) -> None:
     status = encode_packet(id_, DynamixelInstruction.STATUS, bytes([ALERT]) + data)
     said, result = SDK.rxPacket(Line(status), False)
     assert result == COMM_SUCCESS
     assert bytes(said[9 : 9 + len(data)]) == data
     assert said[8] == ALERT
     decoder, stream = DynamixelDecoder(), noise + status
-    found = [packet for at in range(0, len(stream), cut) for packet in decoder.feed(stream[at : at + cut])]
+    found = [
+        packet
+        for at in range(0, len(stream), cut)
+        for packet in decoder.feed(stream[at : at + cut])
+    ]
     assert [(one.id, one.data, one.alert) for one in found] == [(id_, data, True)]
 
 
-@given(parts=st.lists(st.tuples(st.just(0), st.integers(1, 200), near_header), min_size=1, max_size=8))
+@given(
+    parts=st.lists(st.tuples(st.just(0), st.integers(1, 200), near_header), min_size=1, max_size=8)
+)
 def test_fast_answer_is_read_by_sdk_and_to_its_end(parts: list[Any]) -> None:
     size = min(len(data) for _, _, data in parts)
     ids = list(dict.fromkeys(id_ for _, id_, _ in parts))
-    parts = [(0, id_, bytes([id_, *data[:size]])) for id_, (_, _, data) in zip(ids, parts, strict=False)]
+    parts = [
+        (0, id_, bytes([id_, *data[:size]])) for id_, (_, _, data) in zip(ids, parts, strict=False)
+    ]
     size += 1
     answer = encode_fast_status(parts, len(parts))
     group = GroupSyncRead(Line(answer), SDK, 126, size)
@@ -101,13 +117,17 @@ def test_fast_answer_is_read_by_sdk_and_to_its_end(parts: list[Any]) -> None:
     assert [bytes(group.data_dict[id_]) for _, id_, _ in parts] == [data for _, _, data in parts]
     (packet,) = DynamixelDecoder().feed(answer)
     assert packet.id == BROADCAST_ID
-    assert [(one.id, one.data) for one in split_fast_status(packet, size)] == [(id_, data) for _, id_, data in parts]
+    assert [(one.id, one.data) for one in split_fast_status(packet, size)] == [
+        (id_, data) for _, id_, data in parts
+    ]
     ends_early = encode_fast_status(parts, len(parts) + 1) + b"\x00"
     assert list(DynamixelDecoder().feed(ends_early)) == []
     intact = [(id_, data) for _, id_, data in parts]
     assert [(one.id, one.data) for one in split_damaged_fast_status(ends_early, size)] == intact
     last_is_garbled = answer[:-1] + bytes([answer[-1] ^ 0x10])
-    assert [(one.id, one.data) for one in split_damaged_fast_status(b"\x00" + last_is_garbled, size)] == intact[:-1]
+    assert [
+        (one.id, one.data) for one in split_damaged_fast_status(b"\x00" + last_is_garbled, size)
+    ] == intact[:-1]
 
 
 @pytest.mark.parametrize("at", [4, 5, 8, 10, 12])

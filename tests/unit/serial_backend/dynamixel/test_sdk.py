@@ -115,7 +115,10 @@ def test_sdk_goals_move_all_servos_and_sync_reads_return_positions(bench: Bench)
         read.addParam(servo)
     for ask in (read.txRxPacket, read.fastSyncRead):
         assert ask() == COMM_SUCCESS
-        moved = [read.getData(servo, at.PRESENT + 6, 4) - was for servo, was in zip((1, 2, 3), before, strict=True)]
+        moved = [
+            read.getData(servo, at.PRESENT + 6, 4) - was
+            for servo, was in zip((1, 2, 3), before, strict=True)
+        ]
         assert moved == pytest.approx([100, 200, 300], abs=15)
 
 
@@ -132,12 +135,16 @@ def test_sdk_fast_read_ends_at_a_silent_servo(bench: Bench) -> None:
 def test_sdk_and_servo_refuse_the_same_writes(bench: Bench) -> None:
     port = bench.port
     assert SDK.write2ByteTxRx(port, 1, at.MODEL, 7) == (COMM_SUCCESS, DynamixelErrorCode.ACCESS)
-    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 9) == (COMM_SUCCESS, DynamixelErrorCode.RANGE)
+    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 9) == (
+        COMM_SUCCESS,
+        DynamixelErrorCode.RANGE,
+    )
     assert SDK.write2ByteTxRx(port, 1, at.GOALS, 3000) == (COMM_SUCCESS, DynamixelErrorCode.LIMIT)
     bench.enable()
-    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 3) == (COMM_SUCCESS, DynamixelErrorCode.ACCESS), (
-        "torque is on"
-    )
+    assert SDK.write1ByteTxRx(port, 1, at.OPERATING_MODE, 3) == (
+        COMM_SUCCESS,
+        DynamixelErrorCode.ACCESS,
+    ), "torque is on"
 
 
 def test_the_watchdog_stops_a_servo_until_it_is_cleared(bench: Bench) -> None:
@@ -151,7 +158,10 @@ def test_the_watchdog_stops_a_servo_until_it_is_cleared(bench: Bench) -> None:
     bench.pass_time(0.2)
     assert SDK.read1ByteTxRx(port, 1, at.WATCHDOG)[0] == at.TRIPPED
     stopped = bench.position(1)
-    assert SDK.write4ByteTxRx(port, 1, at.GOAL_POSITION, start) == (COMM_SUCCESS, DynamixelErrorCode.RANGE)
+    assert SDK.write4ByteTxRx(port, 1, at.GOAL_POSITION, start) == (
+        COMM_SUCCESS,
+        DynamixelErrorCode.RANGE,
+    )
     bench.pass_time(1.0)
     assert abs(bench.position(1) - stopped) < 200
     assert SDK.write1ByteTxRx(port, 1, at.WATCHDOG, 0) == (COMM_SUCCESS, 0)

@@ -29,7 +29,9 @@ class Robot(DriveRig):
     """The backend and its servos."""
 
     def __init__(self, settings: DynamixelSettings | None = None, **dotted: Any) -> None:
-        config = make_run_config(backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
+        config = make_run_config(
+            backend="dynamixel", robot__chain__modules=JOINTS, rate_hz=100, **dotted
+        )
         settings = settings or DynamixelSettings(physics_model="inertia", bring_up_limit_s=0.5)
         super().__init__(config, DynamixelBackend(config, settings))
 
@@ -124,14 +126,18 @@ def test_servo_id_model_and_setting_mismatches_are_named_at_start(
         (at.STARTUP, 3),
     ],
 )
-def test_servo_with_settings_that_would_move_it_is_refused(robot: Robot, register: int, value: int) -> None:
+def test_servo_with_settings_that_would_move_it_is_refused(
+    robot: Robot, register: int, value: int
+) -> None:
     robot.emulator.servos[2].table[register] = value
     with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
         drives_of(robot.backend).bring_up()
 
 
 def test_a_servo_outside_of_its_travel_is_refused() -> None:
-    elsewhere = DynamixelSettings(physics_model="inertia", mounted={"joint_1": MountedDrive(zero_rad=2.5)})
+    elsewhere = DynamixelSettings(
+        physics_model="inertia", mounted={"joint_1": MountedDrive(zero_rad=2.5)}
+    )
     with raises_error(BackendError, code="drive/unsupported-setting", field="joint_1"):
         Robot(elsewhere)
 
@@ -147,10 +153,17 @@ def test_a_servo_outside_of_its_travel_is_refused() -> None:
     ],
 )
 def test_what_servos_cannot_do_is_refused_before_the_start(dotted: dict[str, Any]) -> None:
-    config = make_run_config(**{"backend": "dynamixel", "robot__chain__modules": JOINTS, "rate_hz": 100, **dotted})
+    config = make_run_config(
+        **{"backend": "dynamixel", "robot__chain__modules": JOINTS, "rate_hz": 100, **dotted}
+    )
     with raises_error(
         ConfigError,
-        code=("bus/invalid-channel", "bus/overloaded", "drive/unsupported-setting", "drive/watchdog-too-short"),
+        code=(
+            "bus/invalid-channel",
+            "bus/overloaded",
+            "drive/unsupported-setting",
+            "drive/watchdog-too-short",
+        ),
     ):
         DynamixelBackend.check(config, DynamixelSettings())
 
@@ -180,11 +193,17 @@ def test_two_servos_of_one_id_are_refused_at_the_start(robot: Robot, delay: int)
     ("delay", "what", "words"),
     [
         (OTHER_DELAY, "duplicate_node", "joint_2 .* is duplicated: it answers one question twice"),
-        (SAME_DELAY, "drive_silent", "joint_2 .* sends garbled bytes: a second servo has its id, or the line is dist"),
+        (
+            SAME_DELAY,
+            "drive_silent",
+            "joint_2 .* sends garbled bytes: a second servo has its id, or the line is dist",
+        ),
     ],
     ids=["one after the other", "at the same time"],
 )
-def test_servo_with_duplicate_id_stops_the_robot(robot: Robot, delay: int, what: str, words: str) -> None:
+def test_servo_with_duplicate_id_stops_the_robot(
+    robot: Robot, delay: int, what: str, words: str
+) -> None:
     robot.run(20, "armed")
     robot.emulator.servos[1].table[at.DELAY] = delay
     robot.go_wrong("duplicate:joint_2@0-9")
@@ -197,7 +216,9 @@ def test_servo_with_duplicate_id_stops_the_robot(robot: Robot, delay: int, what:
 def test_emulated_servos_are_of_the_model_that_the_settings_name(model: str) -> None:
     robot = Robot(DynamixelSettings(physics_model="inertia", bring_up_limit_s=0.5, model=model))
     robot.run(40, "armed")
-    assert robot.joints is not None and robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+    assert robot.joints is not None and robot.joints.angle_rad == pytest.approx(
+        [0.1] * JOINTS, abs=0.02
+    )
     robot.backend.close()
 
 

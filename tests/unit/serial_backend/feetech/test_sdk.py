@@ -31,7 +31,9 @@ class Bench:
         self.clock = DriverClock(config)
         self.pty = PseudoTerminal()
         settings = FeetechSettings(physics_model="inertia")
-        self.emulator = FeetechBackend.make_robot_emulator(config, settings, [self.pty], self.clock, None)
+        self.emulator = FeetechBackend.make_robot_emulator(
+            config, settings, [self.pty], self.clock, None
+        )
         self.port = self._make_port()
         self.packets = sdk.PacketHandler(0)  # little-endian words, as STS servos have them
 
@@ -104,7 +106,10 @@ def test_sdk_goals_move_all_servos_and_sync_reads_return_positions(bench: Bench)
     for servo in (1, 2, 3):
         read.addParam(servo)
     assert read.txRxPacket() == sdk.COMM_SUCCESS
-    moved = [read.getData(servo, at.PRESENT, 2) - start for servo, start in zip((1, 2, 3), before, strict=True)]
+    moved = [
+        read.getData(servo, at.PRESENT, 2) - start
+        for servo, start in zip((1, 2, 3), before, strict=True)
+    ]
     assert moved == pytest.approx([50, 100, 150], abs=15)
 
 

@@ -30,7 +30,9 @@ class Robot(DriveRig):
     """The backend and its servos."""
 
     def __init__(self, settings: FeetechSettings | None = None, **dotted: Any) -> None:
-        config = make_run_config(backend="feetech", robot__chain__modules=JOINTS, rate_hz=100, **dotted)
+        config = make_run_config(
+            backend="feetech", robot__chain__modules=JOINTS, rate_hz=100, **dotted
+        )
         config = apply_backend_modes(config, FeetechBackend)
         settings = settings or FeetechSettings(physics_model="inertia", bring_up_limit_s=0.5)
         super().__init__(config, FeetechBackend(config, settings))
@@ -51,7 +53,9 @@ def robot() -> Iterator[Robot]:
 
 
 @pytest.fixture
-def delivered(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[list[EmulatedFeetechServo]], None]], None]:
+def delivered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> Callable[[Callable[[list[EmulatedFeetechServo]], None]], None]:
     """Change servos before the driver finds them."""
 
     def change(servos: Callable[[list[EmulatedFeetechServo]], None]) -> None:
@@ -67,7 +71,9 @@ def delivered(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[list[Emula
 
 
 def check(**settings: Any) -> None:
-    config = apply_backend_modes(make_run_config(backend="feetech", robot__chain__modules=JOINTS), FeetechBackend)
+    config = apply_backend_modes(
+        make_run_config(backend="feetech", robot__chain__modules=JOINTS), FeetechBackend
+    )
     FeetechBackend.check(config, FeetechSettings(**settings))
 
 
@@ -84,8 +90,13 @@ def test_every_joint_is_described_without_watchdog_and_without_torque(robot: Rob
     description = robot.backend.describe()
     assert [joint.watchdog for joint in description.joints] == [False] * JOINTS
     assert all("torque" not in joint.measures for joint in description.joints)
-    assert all(joint.modes == [JointMode.PASSIVE, JointMode.POSITION] for joint in description.joints)
-    assert "no joint has a watchdog: it holds its last angle if the host dies" in describe_what_moves(description)
+    assert all(
+        joint.modes == [JointMode.PASSIVE, JointMode.POSITION] for joint in description.joints
+    )
+    assert (
+        "no joint has a watchdog: it holds its last angle if the host dies"
+        in describe_what_moves(description)
+    )
 
 
 def test_mixed_robot_names_the_joints_without_watchdog() -> None:
@@ -113,7 +124,9 @@ def test_servos_hold_while_driver_is_away_and_are_off_once_it_runs(robot: Robot)
     robot.emulator()
     assert robot.torques_on() == [True] * JOINTS, "nothing stops a servo whose driver is away"
     faults = robot.run(NOTICED, "armed")
-    assert {(fault.what, fault.joint) for fault in faults} == {("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)}
+    assert {(fault.what, fault.joint) for fault in faults} == {
+        ("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)
+    }
     assert all("held its last angle for 1.0" in fault.cause for fault in faults), faults
     assert robot.torques_on() == [False] * JOINTS
     assert robot.run(5, "fault") == []
@@ -201,8 +214,16 @@ def test_registers_are_written_only_where_they_differ(robot: Robot, delivered: A
     [
         (at.ID, 9, "does not answer: it is off, or has another id or baud rate"),
         (at.MODEL, 5, "is of another model: model 773; the driver knows STS3215, STS3250"),
-        (at.MAX_POSITION, 100, "has position limits of 0 to 2148 (registers 9 and 11), and its joint travels from"),
-        (at.UNLOADING, 0, "keeps its torque on in spite of overheating, overload (register 19 is 0)"),
+        (
+            at.MAX_POSITION,
+            100,
+            "has position limits of 0 to 2148 (registers 9 and 11), and its joint travels from",
+        ),
+        (
+            at.UNLOADING,
+            0,
+            "keeps its torque on in spite of overheating, overload (register 19 is 0)",
+        ),
         (at.MAX_TEMPERATURE, 95, "allows itself 95 °C (register 13)"),
         (at.OVERLOAD_TORQUE, 0, "has the overload torque 0 (register 36)"),
         (at.PROTECTIVE_TORQUE, 90, "keeps a protective torque of 90 %"),
@@ -210,7 +231,9 @@ def test_registers_are_written_only_where_they_differ(robot: Robot, delivered: A
         (at.MAX_TORQUE, 0, "has a torque limit of 768 per mille (register 16)"),
     ],
 )
-def test_unsafe_register_is_named_at_start(delivered: Any, address: int, value: int, reason: str) -> None:
+def test_unsafe_register_is_named_at_start(
+    delivered: Any, address: int, value: int, reason: str
+) -> None:
     def change(servos: list[EmulatedFeetechServo]) -> None:
         servos[1].table[address] = value
         if address == at.MAX_POSITION:
@@ -235,7 +258,9 @@ def test_homing_offset_is_kept_and_another_one_is_refused(delivered: Any) -> Non
         Robot(FeetechSettings(physics_model="inertia", homing_offsets={"joint_1": 7}))
 
 
-@pytest.mark.parametrize("drive", [{"zero_rad": 3.0}, {"gear": 8.0}, {"zero_rad": -3.0, "sign": -1}])
+@pytest.mark.parametrize(
+    "drive", [{"zero_rad": 3.0}, {"gear": 8.0}, {"zero_rad": -3.0, "sign": -1}]
+)
 def test_travel_across_the_end_of_the_count_is_refused(drive: dict[str, Any]) -> None:
     config = make_run_config(backend="feetech", robot__chain__modules=JOINTS, robot__drive=drive)
     with raises_error(ConfigError, code="drive/unsupported-setting", field="zero_rad"):
@@ -243,7 +268,9 @@ def test_travel_across_the_end_of_the_count_is_refused(drive: dict[str, Any]) ->
 
 
 @pytest.mark.parametrize("answers", ["collide", "follow each other"])
-def test_second_servo_with_the_same_id_stops_the_robot_and_blocks_start(robot: Robot, answers: str) -> None:
+def test_second_servo_with_the_same_id_stops_the_robot_and_blocks_start(
+    robot: Robot, answers: str
+) -> None:
     if answers == "collide":
         robot.emulator._second_servo_delays[1] = 0
     robot.run(20, "armed")

@@ -34,7 +34,9 @@ class Device:
     def sends(self, kind: int, code: int, value: int, at_s: float = 1.000002) -> bool:
         seconds, microseconds = divmod(round(1e6 * at_s), 1_000_000)
         time = seconds, microseconds
-        os.write(self._write, EVENT.pack(*time, kind, code, value) + EVENT.pack(*time, EV_SYN, 0, 0))
+        os.write(
+            self._write, EVENT.pack(*time, kind, code, value) + EVENT.pack(*time, EV_SYN, 0, 0)
+        )
         return self.stick.read_events(1.0)
 
     def unplug(self) -> None:
@@ -81,7 +83,9 @@ def test_joystick_is_released_when_newest_event_is_old(device: Device) -> None:
     device.sends(EV_ABS, ABS_Y, 0, at_s=10.5)
     assert device.stick.forward == pytest.approx(1.0)
     assert not device.stick.is_silent(10.5 + STICK_AGE_S)
-    assert device.stick.is_silent(10.6 + STICK_AGE_S), "a receiver without its pad, or a program that was stopped"
+    assert device.stick.is_silent(10.6 + STICK_AGE_S), (
+        "a receiver without its pad, or a program that was stopped"
+    )
     device.sends(EV_ABS, ABS_Y, 1, at_s=20.0)
     assert not device.stick.is_silent(20.1)
 

@@ -6,7 +6,11 @@ import pytest
 
 from snakesim_operator.cli import main
 from snakesim_operator.robot_commands.teleop.keyboard import _split_keys  # pyright: ignore[reportPrivateUsage]
-from snakesim_operator.robot_commands.teleop.steering import INTENT_VALIDITY_NS, MAX_HEADING_OFFSET_RAD, SteeringState
+from snakesim_operator.robot_commands.teleop.steering import (
+    INTENT_VALIDITY_NS,
+    MAX_HEADING_OFFSET_RAD,
+    SteeringState,
+)
 
 
 def test_speed_goes_by_steps_and_never_beyond_the_fastest() -> None:
