@@ -149,7 +149,9 @@ class MyBackend(DriverTypeBackend):
         def open_drives(port, indices, readings):
             raise NotImplementedError("return your subclass of Drives")
 
-        return make_bus_specs_by_port(context.joints, context.settings, context.settings.ports, open_drives)
+        return make_bus_specs_by_port(
+            context.joints, context.settings, context.settings.ports, open_drives
+        )
 """
 
 PAGES = (
