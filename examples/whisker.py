@@ -18,7 +18,7 @@ import numpy as np
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.wire.messages import CustomSample
-from snakesim_hal.wire.quantities import about, bounded
+from snakesim_hal.wire.quantities import bounded, describe
 
 STEPS = 45  # to either side
 
@@ -29,10 +29,10 @@ class Whisker(CustomSample, frozen=True, kw_only=True):
     bend_rad: Annotated[
         float,
         bounded(-1.6, 1.6, "rad"),
-        about("from its rest, positive to the left; 0: it is free"),
+        describe("from its rest, positive to the left; 0: it is free"),
     ]
     bend_max_rad: Annotated[
-        float, bounded(0.1, 1.6, "rad"), about("it bends no further: there it is pressed flat")
+        float, bounded(0.1, 1.6, "rad"), describe("it bends no further: there it is pressed flat")
     ]
 
     def find_contradiction(self) -> str:

@@ -189,7 +189,7 @@ class Backend(ABC):
     def faults(self) -> list[Fault]:
         """Return the faults that were detected since the last call, each once until the operator's reset.
 
-        A fault with `reach="joint"` isolates its joint if the robot file allows that. One with `reach="none"` is only
+        A fault with `scope="joint"` isolates its joint if the robot file allows that. One with `scope="none"` is only
         noted. Any other stops the robot. The default is a robot that detects none.
         """
         return []

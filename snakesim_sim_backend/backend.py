@@ -193,7 +193,7 @@ class SimBackend(Backend):
         if not self._sensors.dropped_counts:
             return []
         return [
-            Fault(tick=self._tick, what="sample_late", cause=cause, reach="none")
+            Fault(tick=self._tick, what="sample_late", cause=cause, scope="none")
             for cause in self._sensors.describe_dropped_samples()
         ]
 

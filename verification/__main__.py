@@ -22,7 +22,7 @@ PYTEST = ("pytest", "-q", "--timeout", "1800")
 class CampaignPart:
     """One part of the campaign: Python's arguments behind `-m`, or a script of the repository."""
 
-    about: str
+    description: str
     minutes: float  # on two cores; what `--minutes` counts with
     command: tuple[str, ...]
     script: bool = False
@@ -135,7 +135,7 @@ def main() -> int:
     )
     if asked.list:
         for name in chosen:
-            print(f"{name:<14}{PARTS[name].minutes:>4g} min  {PARTS[name].about}")
+            print(f"{name:<14}{PARTS[name].minutes:>4g} min  {PARTS[name].description}")
         return 0
     failed = [name for name in chosen if not _run(name)]
     print(f"verification: {len(chosen) - len(failed)} of {len(chosen)} parts passed", flush=True)
@@ -160,7 +160,7 @@ def _fitting(names: list[str], minutes: float | None) -> list[str]:
 def _run(name: str) -> bool:
     """Run one part; whether it passed."""
     part = PARTS[name]
-    print(f"== {name}: {part.about}", flush=True)
+    print(f"== {name}: {part.description}", flush=True)
     began_s = time.monotonic()
     words = part.command if part.script else ("-m", *part.command)
     code = subprocess.run(

@@ -93,12 +93,12 @@ from typing import Annotated
 
 from snakesim_hal.model.sensor_model import SensorModel
 from snakesim_hal.wire.messages import CustomSample
-from snakesim_hal.wire.quantities import about, bounded
+from snakesim_hal.wire.quantities import bounded, describe
 from snakesim_sim_backend.sensors.mount import SensorMount
 
 
 class Height(CustomSample, frozen=True, kw_only=True):
-    height_m: Annotated[float, bounded(-100, 100, "m"), about("of the sensor above the ground")]
+    height_m: Annotated[float, bounded(-100, 100, "m"), describe("of the sensor above the ground")]
 
 
 class HeightModel(SensorModel):
@@ -267,7 +267,7 @@ PAGES = (
         {
             "snakesim_hal.model.sensor_model": ("SensorModel",),
             "snakesim_hal.wire.messages": ("CustomSample",),
-            "snakesim_hal.wire.quantities": ("bounded", "above", "from_zero", "about"),
+            "snakesim_hal.wire.quantities": ("bounded", "above", "from_zero", "describe"),
             "snakesim_sim_backend.sensors.scope": ("SensorScope",),
             "snakesim_sim_backend.sensors.mount": ("SensorMount",),
             "snakesim_sim_backend.sensors.rays": ("RayBundle",),

@@ -384,7 +384,7 @@ class ArmedRobots:
             self.reasons[robot_index] = cause
         else:
             fault = Fault(
-                tick=int(self.ticks[robot_index]), what="backend_failed", cause=cause, reach="robot"
+                tick=int(self.ticks[robot_index]), what="backend_failed", cause=cause, scope="robot"
             )
             client.core.latch_fault(fault)
             self.reasons[robot_index] = client.reason

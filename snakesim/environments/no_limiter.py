@@ -57,5 +57,5 @@ class NoLimiter:
 
     def latch_fault(self, fault: Fault) -> None:
         """Remember a fault of the whole robot; a fault of a joint changes nothing."""
-        if fault.reach == "robot":
+        if fault.scope == "robot":
             self._failure = fault.cause

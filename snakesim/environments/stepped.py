@@ -121,7 +121,7 @@ class SteppedRobot:
                 tick=self._tick,
                 what="backend_failed",
                 cause=str(error)[:MAX_REASON_LENGTH],
-                reach="robot",
+                scope="robot",
             )
             self._cycle.safety.latch_fault(fault)
 

@@ -73,14 +73,14 @@ def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_count_option(
-    parser: argparse.ArgumentParser, option: str, minimum: int, default: int, about: str
+    parser: argparse.ArgumentParser, option: str, minimum: int, default: int, help_text: str
 ) -> None:
     parser.add_argument(
         option,
         type=make_number_parser(minimum, 100_000),
         default=default,
         metavar="N",
-        help=f"{about} (default: {default})",
+        help=f"{help_text} (default: {default})",
     )
 
 

@@ -29,7 +29,7 @@ class LearnedParameter:
 
     start: float
     sigma: float
-    about: str
+    description: str
 
 
 WAVE = {

@@ -26,23 +26,23 @@ DRIVE_NOUNS: Commands = (
 )
 
 
-def add_channel(parser: argparse.ArgumentParser, about: str) -> None:
+def add_channel(parser: argparse.ArgumentParser, help_text: str) -> None:
     """Add the option `--channel`, the bus of emulated drives; `about` is its help text."""
     parser.add_argument(
-        "--channel", action="append", metavar="CHANNEL", help=f"{about} (may be repeated)"
+        "--channel", action="append", metavar="CHANNEL", help=f"{help_text} (may be repeated)"
     )
 
 
-def add_channels(parser: argparse.ArgumentParser, about: str) -> None:
+def add_channels(parser: argparse.ArgumentParser, help_text: str) -> None:
     """Add the arguments of a scan: the buses, with `about` as their help text, and `--json`."""
-    parser.add_argument("channel", nargs="+", metavar="CHANNEL", help=about)
+    parser.add_argument("channel", nargs="+", metavar="CHANNEL", help=help_text)
     add_json_argument(parser)
 
 
-def add_pose(parser: argparse.ArgumentParser, about: str, default: str | None = None) -> None:
+def add_pose(parser: argparse.ArgumentParser, help_text: str, default: str | None = None) -> None:
     """Add the option `--pose`, the receiver of emulated motion capture; `about` is added to its help text."""
     parser.add_argument(
-        "--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({about})"
+        "--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({help_text})"
     )
 
 
@@ -61,10 +61,10 @@ def add_control_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_emulation(parser: argparse.ArgumentParser, channel_about: str) -> None:
-    """Add all arguments of a command that emulates drives; `channel_about` is the help text of `--channel`."""
+def add_emulation(parser: argparse.ArgumentParser, channel_help: str) -> None:
+    """Add all arguments of a command that emulates drives; `channel_help` is the help text of `--channel`."""
     add_scenario_name_argument(parser)
-    add_channel(parser, channel_about)
+    add_channel(parser, channel_help)
     add_set_argument(parser)
     add_pose(parser, "default: nowhere")
     add_control_arguments(parser)

@@ -35,7 +35,7 @@ class FaultFinding:
             what=self.what,
             cause=self.cause[:MAX_CAUSE_CHARACTERS],
             joint=None if self.joint is None else joint_names[self.joint],
-            reach="joint" if self.affects_only_joint else "robot",
+            scope="joint" if self.affects_only_joint else "robot",
         )
 
 

@@ -2,7 +2,7 @@
 
 The meaning of a field is the string literal on the line after it. Python discards such a literal, so it costs nothing
 at run time. Only the functions here read it, from the source file of the Struct's class. A field without such a literal
-has the description of its type, if the type has one (`snakesim_hal.wire.quantities.about`).
+has the description of its type, if the type has one (`snakesim_hal.wire.quantities.describe`).
 """
 
 import ast

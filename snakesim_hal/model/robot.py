@@ -93,7 +93,7 @@ class RobotFile(FileStruct, frozen=True, kw_only=True):
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
     """Name of the robot: letters, digits, `_` and `-`. It is also the default namespace of its keys on the network."""
 
-    about: str = ""
+    description: str = ""
     """Description in one line, which lists of robots show."""
 
     # Body.

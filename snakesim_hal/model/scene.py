@@ -208,7 +208,7 @@ class SceneFile(FileStruct, frozen=True, kw_only=True):
     name: Annotated[str, Meta(min_length=1, max_length=40, pattern="^[A-Za-z0-9_-]+$")]
     """Name of the scene: letters, digits, `_` and `-`."""
 
-    about: str = ""
+    description: str = ""
     """Description in one line, which lists of scenes show."""
 
     ground: Ground

@@ -86,16 +86,20 @@ def add_scenario_name_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def add_set_argument(
-    parser: argparse.ArgumentParser, about: str = "change any value of the configuration"
+    parser: argparse.ArgumentParser, help_text: str = "change any value of the configuration"
 ) -> None:
     """Add the option --set, with a text for the help."""
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help=f"{about} (may be repeated)"
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help=f"{help_text} (may be repeated)",
     )
 
 
 def add_seed_argument(
-    parser: argparse.ArgumentParser, about: str, default: int | None = None
+    parser: argparse.ArgumentParser, help_text: str, default: int | None = None
 ) -> None:
     """Add the option --seed, which fixes every random number, with more text for the help."""
     parser.add_argument(
@@ -103,20 +107,20 @@ def add_seed_argument(
         type=int,
         default=default,
         metavar="SEED",
-        help=f"seed of all random numbers ({about})",
+        help=f"seed of all random numbers ({help_text})",
     )
 
 
 def add_output_argument(
-    parser: argparse.ArgumentParser, about: str, *, required: bool = False
+    parser: argparse.ArgumentParser, help_text: str, *, required: bool = False
 ) -> None:
     """Add the option --out, the file or folder that a command writes, with a text for the help."""
-    parser.add_argument("--out", type=Path, required=required, metavar="PATH", help=about)
+    parser.add_argument("--out", type=Path, required=required, metavar="PATH", help=help_text)
 
 
 def add_duration_argument(
     parser: argparse.ArgumentParser,
-    about: str,
+    help_text: str,
     parse: Callable[[str], float] = float,
     default: float | None = None,
 ) -> None:
@@ -128,11 +132,11 @@ def add_duration_argument(
         parse: Function that converts the text to a number, and checks the number.
         default: Default in seconds. None leaves the choice to the command.
     """
-    parser.add_argument("--duration", type=parse, default=default, metavar="S", help=about)
+    parser.add_argument("--duration", type=parse, default=default, metavar="S", help=help_text)
 
 
 def add_fields_argument(
-    parser: argparse.ArgumentParser, about: str, default: int | None = None
+    parser: argparse.ArgumentParser, help_text: str, default: int | None = None
 ) -> None:
     """Add the option --fields, the number of random fields, with more text for the help."""
     parser.add_argument(
@@ -140,7 +144,7 @@ def add_fields_argument(
         type=make_number_parser(1, 100_000),
         default=default,
         metavar="N",
-        help=f"number of random fields {about}",
+        help=f"number of random fields {help_text}",
     )
 
 
@@ -164,9 +168,9 @@ def add_workers_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_task_argument(parser: argparse.ArgumentParser, about: str) -> None:
+def add_task_argument(parser: argparse.ArgumentParser, help_text: str) -> None:
     """Add the option --task, which describes a demonstration, with a text for the help."""
-    parser.add_argument("--task", metavar="TEXT", help=about)
+    parser.add_argument("--task", metavar="TEXT", help=help_text)
 
 
 def load_scenario_from_arguments(arguments: argparse.Namespace) -> "LoadedScenario":

@@ -88,7 +88,7 @@ def run_host_program(options: ProcessOptions, on_network: Callable[[], None] = l
     )
     if host.ending_status == "reset":
         restart_process()
-    has_stopped = any(fault.reach == "robot" for fault in host.authority.faults_since_start.faults)
+    has_stopped = any(fault.scope == "robot" for fault in host.authority.faults_since_start.faults)
     return 1 if has_stopped or host.ending_status != "complete" else 0
 
 

@@ -278,21 +278,21 @@ class CommandAuthority:
     def latch_fault(self, fault: Fault, joints: JointMask | None = None) -> None:
         """Latch a fault: the robot is in the state `fault`, and its joints in the stop mode, until a reset.
 
-        A fault with the reach "none" is only logged. A fault with the reach "joint" isolates its joints instead of
+        A fault with the scope "none" is only logged. A fault with the scope "joint" isolates its joints instead of
         stopping the robot, if the robot file allows that.
 
         Args:
             fault: Fault to latch.
             joints: (n_joints,) mask of the joints that failed. None means the joint that the fault names.
         """
-        if fault.reach == "none":
+        if fault.scope == "none":
             self._add_to_fault_logs(fault, stops_robot=False)
             return
         if joints is None:
             joints = self._isolation.make_joint_mask(fault.joint)
-        if fault.reach == "joint" and self._try_isolate(fault, joints):
+        if fault.scope == "joint" and self._try_isolate(fault, joints):
             return
-        fault = msgspec.structs.replace(fault, reach="robot")
+        fault = msgspec.structs.replace(fault, scope="robot")
         # Only the first fault counts as the reason of the stop: later ones are usually its consequences.
         stops_robot = self.state not in ("fault", "estop")
         self._add_to_fault_logs(fault, stops_robot=stops_robot)
@@ -308,8 +308,8 @@ class CommandAuthority:
             precedes_stop: Whether a consequence of the fault will stop the robot. True when the process that holds the
                 lease ends.
         """
-        reach = "robot" if precedes_stop else "none"
-        self._add_to_fault_logs(msgspec.structs.replace(fault, reach=reach), stops_robot=False)
+        scope = "robot" if precedes_stop else "none"
+        self._add_to_fault_logs(msgspec.structs.replace(fault, scope=scope), stops_robot=False)
 
     def handle_lease_holder_exit(self, cause: str) -> None:
         """Free the lease after its holder's process has ended. An armed robot keeps the lease until it expires.
@@ -607,7 +607,7 @@ class CommandAuthority:
             self._implausible_state = self._make_unknown_state("no joint state since the reset")
 
     def _concerns_isolated_joint(self, fault: Fault) -> bool:
-        return fault.reach == "joint" and self._isolation.is_isolated(fault.joint)
+        return fault.scope == "joint" and self._isolation.is_isolated(fault.joint)
 
     def _make_unknown_state(self, cause: str) -> ImplausibleState:
         fault = Fault(tick=0, what="state_invalid", cause=cause)

@@ -246,14 +246,14 @@ class _LastReport:
                 f"the winding of {joint.name} is at {self.winding_temperature_c:.1f} °C; {limits}"
             )
             faults.append(
-                Fault(tick=tick, what="overheated", cause=cause, joint=joint.name, reach="joint")
+                Fault(tick=tick, what="overheated", cause=cause, joint=joint.name, scope="joint")
             )
         if not self.is_known(now_ns):
             return faults
         if self.has_leak:
             cause = f"{joint.name} reports water inside"
             faults.append(
-                Fault(tick=tick, what="leak", cause=cause, joint=joint.name, reach="robot")
+                Fault(tick=tick, what="leak", cause=cause, joint=joint.name, scope="robot")
             )
         if (
             self.undervoltage_since_ns is not None
@@ -262,6 +262,6 @@ class _LastReport:
             requirement = f"it needs {joint.min_voltage_v:g} V: {MIN_VOLTAGE_FIELD}"
             cause = f"the supply of {joint.name} is at {self.voltage_v:.1f} V, {requirement}"
             faults.append(
-                Fault(tick=tick, what="undervoltage", cause=cause, joint=joint.name, reach="robot")
+                Fault(tick=tick, what="undervoltage", cause=cause, joint=joint.name, scope="robot")
             )
         return faults

@@ -241,7 +241,7 @@ def _make_implausible_state(
     if len(names) == 1:
         joint = names[0]
     return ImplausibleState(
-        Fault(tick=tick, what=what, cause=cause, joint=joint, reach="joint"), joints
+        Fault(tick=tick, what=what, cause=cause, joint=joint, scope="joint"), joints
     )
 
 

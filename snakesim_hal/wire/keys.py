@@ -47,7 +47,7 @@ class KeyRow:
     writer: str
     kind: str  # stream, latched, query, liveliness
     when: str
-    about: str
+    description: str
 
 
 _TICK = "every tick"

@@ -64,7 +64,7 @@ def _normalize(number: float) -> float:
     return int(number) if number == int(number) else number
 
 
-def about(text: str) -> Meta:
+def describe(text: str) -> Meta:
     """Return the meaning of a field, for readers of the schema."""
     return Meta(description=text)
 
@@ -97,11 +97,11 @@ Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
 Tick = Annotated[
     int,
     Meta(ge=0, le=MAX_COUNT),
-    about("number of a control period, from 0 at the start of the host"),
+    describe("number of a control period, from 0 at the start of the host"),
 ]
 Nanoseconds = Annotated[int, Meta(ge=0, le=MAX_COUNT, extra_json_schema={"unit": "ns"})]
 Stamp = Annotated[
-    Nanoseconds, about("robot time: as in hal/clock, from 0 at the start of the host")
+    Nanoseconds, describe("robot time: as in hal/clock, from 0 at the start of the host")
 ]
 LinkIndex = Annotated[int, Meta(ge=0, le=MAX_JOINTS)]
 Name = Annotated[str, Meta(min_length=1, max_length=64)]

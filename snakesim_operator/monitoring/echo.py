@@ -34,7 +34,7 @@ def print_topics(*, as_json: bool) -> int:
     """Print the keys on which a robot publishes, with their content. Returns the exit code."""
     if as_json:
         rows = [
-            {"key": row.key, "kind": row.kind, "writer": row.writer, "about": row.about}
+            {"key": row.key, "kind": row.kind, "writer": row.writer, "description": row.description}
             for row in _list_published_topics()
         ]
         print_json({"topics": rows})
@@ -163,7 +163,7 @@ def _list_published_topics() -> list[keys.KeyRow]:
 def _format_key_list() -> list[str]:
     topics = _list_published_topics()
     width = max(len(topic.key) for topic in topics)
-    return [f"  {topic.key:<{width}}  {topic.about}" for topic in topics]
+    return [f"  {topic.key:<{width}}  {topic.description}" for topic in topics]
 
 
 class MeasuredRate(msgspec.Struct, frozen=True, kw_only=True):

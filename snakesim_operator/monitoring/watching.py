@@ -52,8 +52,8 @@ def _add_rate(parser: argparse.ArgumentParser) -> None:
     add_json_argument(parser)
 
 
-def _add_count(parser: argparse.ArgumentParser, about: str) -> None:
-    parser.add_argument("--count", type=make_number_parser(1, 10**9), metavar="N", help=about)
+def _add_count(parser: argparse.ArgumentParser, help_text: str) -> None:
+    parser.add_argument("--count", type=make_number_parser(1, 10**9), metavar="N", help=help_text)
 
 
 def _add_record(parser: argparse.ArgumentParser) -> None:

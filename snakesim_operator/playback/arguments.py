@@ -59,9 +59,9 @@ def _add_fps_option(
     parser: argparse.ArgumentParser,
     parse: Callable[[str], float],
     default: float | None,
-    about: str,
+    help_text: str,
 ) -> None:
-    parser.add_argument("--fps", type=parse, default=default, metavar="HZ", help=about)
+    parser.add_argument("--fps", type=parse, default=default, metavar="HZ", help=help_text)
 
 
 def _add_info_options(parser: argparse.ArgumentParser) -> None:

@@ -117,12 +117,12 @@ class RobotRecorder:
         Returns:
             The reason why the file is incomplete; empty if it is complete.
         """
-        about = {
+        metadata = {
             "version": version("snakesim"),
             "began": self._start_time.isoformat(),
             "dropped": dropped_count_by_key,
         }
-        self.writer.close(about)
+        self.writer.close(metadata)
         return self.writer.failure
 
     def _detect_new_host(self, payload: bytes) -> None:

@@ -181,7 +181,7 @@ class _RecordingCopy:
         if self._file.buffered_bytes > FLUSH_BYTES:
             self._mcap.flush()
 
-    def write_metadata_and_finish(self, about: dict[str, object], missing: list[str]) -> None:
+    def write_metadata_and_finish(self, metadata: dict[str, object], missing: list[str]) -> None:
         """Write the recorder's metadata and the index, which completes the file.
 
         Args:
@@ -192,8 +192,8 @@ class _RecordingCopy:
             OSError: The disk does not take the bytes.
         """
         if missing:
-            about = {**about, EARLIER_LOSSES_ENTRY: missing}
+            metadata = {**metadata, EARLIER_LOSSES_ENTRY: missing}
         self._mcap.add_metadata(
-            METADATA_NAME, {name: json.dumps(value) for name, value in about.items()}
+            METADATA_NAME, {name: json.dumps(value) for name, value in metadata.items()}
         )
         self._mcap.finish_file()

@@ -119,7 +119,7 @@ class RecordingWriter:
         except OSError as error:
             self._set_failure(error)
 
-    def close(self, about: dict[str, object]) -> None:
+    def close(self, metadata: dict[str, object]) -> None:
         """Write metadata and index, and close the file.
 
         Args:
@@ -128,7 +128,7 @@ class RecordingWriter:
         self._write_early_custom_samples()
         if not self.failure:
             self._mcap.add_metadata(
-                METADATA_NAME, {name: json.dumps(value) for name, value in about.items()}
+                METADATA_NAME, {name: json.dumps(value) for name, value in metadata.items()}
             )
             try:
                 self._mcap.finish_file()

@@ -40,7 +40,7 @@ def describe_recorded_end(
         COMPLETE, or a sentence.
     """
     for fault in host.faults:
-        if fault.reach == "robot":
+        if fault.scope == "robot":
             return fault.cause
     progress = f"after {recorded_s:.2f} of {config.duration_s:g} s"
     half_tick_s = 0.5 / config.rate_hz

@@ -107,7 +107,7 @@ def add_end_causes(
     """
     if not stay:
         for fault in host.faults:
-            if fault.reach == "robot":
+            if fault.scope == "robot":
                 ending.add_cause(fault.cause)
     early_end = describe_early_end(host, config)
     if early_end and (host.ended == "running" or ending.reason is None):

@@ -236,7 +236,7 @@ class RunMonitor:
 
     def _note_robot_fault(self, status: RobotStatus) -> None:
         """Note the first fault that stops the whole robot as the reason for the end of the run."""
-        fault = next((fault for fault in status.faults if fault.reach == "robot"), None)
+        fault = next((fault for fault in status.faults if fault.scope == "robot"), None)
         if fault is None:
             return
         self._ending.add_cause(fault.cause)

@@ -25,7 +25,12 @@ from snakesim_hal.model.plugins import (
 from snakesim_hal.model.scenario import LoadedScenario, RunConfig
 from snakesim_hal.programs.preflight import validate_and_complete_config
 
-DESCRIPTION_KEYS = {"scenarios": "title", "robots": "about", "scenes": "about", "suites": "title"}
+DESCRIPTION_KEYS = {
+    "scenarios": "title",
+    "robots": "description",
+    "scenes": "description",
+    "suites": "title",
+}
 MAX_VALUE_CHARACTERS = 48  # longer values are not aligned
 
 Row = tuple[str, Any, str]  # key, value, and the file or flag that it came from

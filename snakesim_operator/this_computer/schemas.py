@@ -103,7 +103,7 @@ def _format_key_space_page() -> str:
             name = row.message.__name__
             message = f"[{name}](messages/{name}.json) `{format_encoding(row.message).rpartition(';')[2]}`"
         rows.append(
-            f"| `{row.key}` | {message} | {row.writer} | {row.kind} | {row.when} | {row.about} |"
+            f"| `{row.key}` | {message} | {row.writer} | {row.kind} | {row.when} | {row.description} |"
         )
     rows += [
         "",

@@ -359,7 +359,7 @@ class BackendRig:
         name = self.robot.joints[joint_index].name
         cause = f"the contract tests isolate {name}"
         self.authority.latch_fault(
-            Fault(tick=self.tick, what="bench", cause=cause, joint=name, reach="joint")
+            Fault(tick=self.tick, what="bench", cause=cause, joint=name, scope="joint")
         )
 
     def arm_and_move_joint(self, joint_index: int = 0) -> RigRecord:

@@ -353,7 +353,7 @@ def test_duplicate_drive_ids_stop_the_robot_and_block_start(robot: Robot) -> Non
     [fault] = robot.run(SHOWN, "armed")
     assert fault.what == "duplicate_node"
     assert fault.joint == "joint_2"
-    assert fault.reach == "robot"
+    assert fault.scope == "robot"
     assert serials[1] in fault.cause
     assert robot.following() == [False] * JOINTS
     assert [fault.what for fault in robot.run(SHOWN, "disarmed")] == ["duplicate_node"], (

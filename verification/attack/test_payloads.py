@@ -133,7 +133,7 @@ def test_control_characters_of_who_holds_the_lease_reach_no_terminal(robot: Atta
 
 def test_control_characters_in_forged_streams_reach_no_terminal(robot: AttackedRobot) -> None:
     said, operator = robot.run.printed(), robot.operator
-    fault = {"tick": 1, "what": EVIL[:60], "cause": EVIL, "joint": EVIL[:60], "reach": "robot"}
+    fault = {"tick": 1, "what": EVIL[:60], "cause": EVIL, "joint": EVIL[:60], "scope": "robot"}
     status = {
         **operator.status(),
         "lifecycle": "fault",

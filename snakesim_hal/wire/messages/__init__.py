@@ -19,13 +19,13 @@ from snakesim_hal.wire.messages.actuators import (
 from snakesim_hal.wire.messages.base import (
     Axis,
     ClockMode,
+    FaultScope,
     JointMode,
     LifecycleState,
     LocomotionState,
     Measurement,
     Message,
     Modes,
-    Reach,
     StopMode,
 )
 from snakesim_hal.wire.messages.description import (
@@ -103,6 +103,7 @@ __all__ = [
     "EstopRequest",
     "Fault",
     "FaultRequest",
+    "FaultScope",
     "ImagePreview",
     "Imu",
     "JointCommand",
@@ -126,7 +127,6 @@ __all__ = [
     "Power",
     "ProcessInfo",
     "RangeScan",
-    "Reach",
     "RobotDescription",
     "RobotStatus",
     "RunConfiguration",

@@ -7,23 +7,25 @@ import msgspec
 from msgspec import Meta
 
 from snakesim_hal.wire import quantities as q
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import describe
 
 ClockMode = Literal["realtime", "lockstep", "free"]
 LifecycleState = Literal["disarmed", "armed", "fault", "estop"]
 LocomotionState = Literal["PowerOff", "Idle", "NotLocomoting", "Locomoting"]
 StopMode = Literal["passive", "damp", "hold"]
-Reach = Literal["robot", "joint", "none"]
+FaultScope = Literal["robot", "joint", "none"]
 Axis = Literal["yaw", "pitch"]
 Measurement = Literal["torque", "temperature", "voltage"]
 
 # Meanings of fields that several messages have.
 ONE_PER_JOINT = "one entry a joint"
-ABOUT_CLOCK_MODE = about(
+ABOUT_CLOCK_MODE = describe(
     "realtime: by the wall clock; lockstep: each tick waits for all services; free: without waiting"
 )
-ABOUT_LIFECYCLE = about("motors follow commands only in armed; fault and estop stay until a reset")
-ABOUT_HOST = about("random id of the host process, new at each start; null: unknown")
+ABOUT_LIFECYCLE = describe(
+    "motors follow commands only in armed; fault and estop stay until a reset"
+)
+ABOUT_HOST = describe("random id of the host process, new at each start; null: unknown")
 
 
 class JointMode(IntEnum):
@@ -41,7 +43,7 @@ class JointMode(IntEnum):
     TORQUE = 3
 
 
-Modes = Annotated[list[JointMode], Meta(max_length=q.MAX_JOINTS), about(ONE_PER_JOINT)]
+Modes = Annotated[list[JointMode], Meta(max_length=q.MAX_JOINTS), describe(ONE_PER_JOINT)]
 
 
 class Message(msgspec.Struct, frozen=True):

@@ -6,7 +6,7 @@ from msgspec import Meta
 
 from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.messages.base import LocomotionState, Message
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import describe
 
 
 class KnownObstacle(Message, frozen=True, kw_only=True):
@@ -14,80 +14,86 @@ class KnownObstacle(Message, frozen=True, kw_only=True):
 
     name: q.Name
     shape: Literal["cylinder", "box", "sphere"]
-    position_w: Annotated[q.Vector, about("center of the shape")]
+    position_w: Annotated[q.Vector, describe("center of the shape")]
     yaw_rad: q.Angle = 0.0
-    radius_m: Annotated[q.Length, about("of a cylinder or sphere")] = 0.0
-    half_size_m: Annotated[q.Vector, about("of a box")] = (0.0, 0.0, 0.0)
+    radius_m: Annotated[q.Length, describe("of a cylinder or sphere")] = 0.0
+    half_size_m: Annotated[q.Vector, describe("of a box")] = (0.0, 0.0, 0.0)
     height_m: q.Length = 0.0
-    confidence: Annotated[q.Fraction, about("1: measured (less: estimated)")] = 1.0
+    confidence: Annotated[q.Fraction, describe("1: measured (less: estimated)")] = 1.0
     position_sd_m: Annotated[
-        q.Distance, about("standard deviation of `position_w`, horizontally (0: exact)")
+        q.Distance, describe("standard deviation of `position_w`, horizontally (0: exact)")
     ] = 0.0
     size_sd_m: Annotated[
-        q.Distance, about("standard deviation of `radius_m` or `half_size_m` (0: exact)")
+        q.Distance, describe("standard deviation of `radius_m` or `half_size_m` (0: exact)")
     ] = 0.0
     last_seen_ns: Annotated[
         q.Stamp | None,
-        about("stamp of the newest measurement of it (null: from a map, not from a sensor)"),
+        describe("stamp of the newest measurement of it (null: from a map, not from a sensor)"),
     ] = None
-    touched: Annotated[bool, about("the body has touched it")] = False
+    touched: Annotated[bool, describe("the body has touched it")] = False
 
 
 class WorldContact(Message, frozen=True, kw_only=True):
     """A contact in the world frame, with its position along the body."""
 
-    link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
-    obstacle: Annotated[q.Name | None, about("touched obstacle (null: unknown)")]
-    body_s_m: Annotated[q.Length, about("arc length from the tail end along the chain")]
-    position_w: Annotated[q.Vector, about("where the body touches the obstacle")]
-    normal_w: Annotated[q.UnitVector, about("from the obstacle into the body")]
-    tangent_w: Annotated[q.UnitVector, about("across the normal, towards the head")]
-    force_w: Annotated[q.ForceVector, about("on the body")]
-    confidence: Annotated[q.Fraction, about("1: measured (less: estimated)")] = 1.0
+    link: Annotated[q.LinkIndex, describe("number of the link, from 0 at the tail")]
+    obstacle: Annotated[q.Name | None, describe("touched obstacle (null: unknown)")]
+    body_s_m: Annotated[q.Length, describe("arc length from the tail end along the chain")]
+    position_w: Annotated[q.Vector, describe("where the body touches the obstacle")]
+    normal_w: Annotated[q.UnitVector, describe("from the obstacle into the body")]
+    tangent_w: Annotated[q.UnitVector, describe("across the normal, towards the head")]
+    force_w: Annotated[q.ForceVector, describe("on the body")]
+    confidence: Annotated[q.Fraction, describe("1: measured (less: estimated)")] = 1.0
 
 
 class WorldModel(Message, frozen=True, kw_only=True):
     """`guidance/world`: pose of the body, contacts, obstacles nearby. Each part has its own stamp."""
 
-    tick: Annotated[q.Tick, about("of the clock that guidance acted on")]
-    timestamp_ns: Annotated[q.Stamp, about("of the joint state that it was computed from")]
-    base_position_w: Annotated[q.Vector, about("of the tail end")]
-    base_orientation_wxyz: Annotated[q.Quaternion, about("of the tail link")]
-    base_confidence: Annotated[q.Fraction, about("of the base's pose")]
+    tick: Annotated[q.Tick, describe("of the clock that guidance acted on")]
+    timestamp_ns: Annotated[q.Stamp, describe("of the joint state that it was computed from")]
+    base_position_w: Annotated[q.Vector, describe("of the tail end")]
+    base_orientation_wxyz: Annotated[q.Quaternion, describe("of the tail link")]
+    base_confidence: Annotated[q.Fraction, describe("of the base's pose")]
     contacts: Annotated[
-        list[WorldContact], Meta(max_length=q.MAX_CONTACTS), about("of the body with obstacles")
+        list[WorldContact], Meta(max_length=q.MAX_CONTACTS), describe("of the body with obstacles")
     ]
     obstacles: Annotated[
-        list[KnownObstacle], Meta(max_length=4096), about("in the neighborhood of the body")
+        list[KnownObstacle], Meta(max_length=4096), describe("in the neighborhood of the body")
     ]
-    pose_timestamp_ns: Annotated[q.Stamp | None, about("of the pose in it (null: unknown)")] = None
+    pose_timestamp_ns: Annotated[q.Stamp | None, describe("of the pose in it (null: unknown)")] = (
+        None
+    )
     contacts_timestamp_ns: Annotated[
-        q.Stamp | None, about("of the contacts in it (null: no sample yet, and no estimate)")
+        q.Stamp | None, describe("of the contacts in it (null: no sample yet, and no estimate)")
     ] = None
-    center_w: Annotated[q.Vector | None, about("center of mass of the body (null: unknown)")] = None
+    center_w: Annotated[q.Vector | None, describe("center of mass of the body (null: unknown)")] = (
+        None
+    )
     base_position_sd_m: Annotated[
         q.Distance | None,
-        about(
+        describe(
             "standard deviation of `base_position_w`, horizontally (null: not estimated). If it is, the base's pose is "
             "of `timestamp_ns`, by dead reckoning since `pose_timestamp_ns`"
         ),
     ] = None
     base_yaw_sd_rad: Annotated[
-        q.Angle | None, about("standard deviation of the base's heading (null: not estimated)")
+        q.Angle | None, describe("standard deviation of the base's heading (null: not estimated)")
     ] = None
     depth_timestamp_ns: Annotated[
         q.Stamp | None,
-        about("of the newest image or ranges in `obstacles` (null: none, or a map that is known)"),
+        describe(
+            "of the newest image or ranges in `obstacles` (null: none, or a map that is known)"
+        ),
     ] = None
     pose_from: Annotated[
         Literal["sensor", "dead_reckoning"] | None,
-        about(
+        describe(
             "present source of the base's pose, measured at `pose_timestamp_ns` or `timestamp_ns` (null: unknown)"
         ),
     ] = None
     contacts_from: Annotated[
         Literal["sensor", "joint_torques"] | None,
-        about(
+        describe(
             "what `contacts` are of: measured, or estimated, at `contacts_timestamp_ns` (null: none)"
         ),
     ] = None
@@ -96,52 +102,54 @@ class WorldModel(Message, frozen=True, kw_only=True):
 class PathRise(Message, frozen=True, kw_only=True):
     """A stretch of a path that lies on a platform."""
 
-    from_s_m: Annotated[q.Distance, about("where it begins, arc length from the begin of the path")]
-    to_s_m: Annotated[q.Distance, about("where it ends")]
-    height_m: Annotated[q.Distance, about("of the platform's top above the ground")]
+    from_s_m: Annotated[
+        q.Distance, describe("where it begins, arc length from the begin of the path")
+    ]
+    to_s_m: Annotated[q.Distance, describe("where it ends")]
+    height_m: Annotated[q.Distance, describe("of the platform's top above the ground")]
 
 
 class Trajectory(Message, frozen=True, kw_only=True):
     """`navigation/trajectory`: path, speed, and the push-points expected along it."""
 
-    tick: Annotated[q.Tick, about("of the clock that navigation acted on")]
+    tick: Annotated[q.Tick, describe("of the clock that navigation acted on")]
     timestamp_ns: Annotated[
-        q.Stamp | None, about("of the world model that it was planned from (null: without one)")
+        q.Stamp | None, describe("of the world model that it was planned from (null: without one)")
     ]
-    path_id: Annotated[q.Count, about("changes when `path_w` does")]
+    path_id: Annotated[q.Count, describe("changes when `path_w` does")]
     path_w: Annotated[
-        list[tuple[q.Length, q.Length]], Meta(min_length=2, max_length=20000), about("x and y")
+        list[tuple[q.Length, q.Length]], Meta(min_length=2, max_length=20000), describe("x and y")
     ]
-    speed_m_s: Annotated[q.Velocity, about("along the path (0: stop)")]
+    speed_m_s: Annotated[q.Velocity, describe("along the path (0: stop)")]
     push_points: Annotated[
         list[q.Name],
         Meta(max_length=512),
-        about("obstacles within reach of the path, in the order along it"),
+        describe("obstacles within reach of the path, in the order along it"),
     ]
-    finished: Annotated[bool, about("the end of the path is reached")]
+    finished: Annotated[bool, describe("the end of the path is reached")]
     reason: Annotated[
-        q.Reason, about("why the speed is not that of the mission (empty: it is)")
+        q.Reason, describe("why the speed is not that of the mission (empty: it is)")
     ] = ""
     searching: Annotated[
         q.Reason,
-        about("why another path is being searched, while this one is followed (empty: none is)"),
+        describe("why another path is being searched, while this one is followed (empty: none is)"),
     ] = ""
     searched_nodes: Annotated[
-        q.Count, about("nodes that this search expanded since the last message")
+        q.Count, describe("nodes that this search expanded since the last message")
     ] = 0
     assumed_obstacle_friction: Annotated[
         float,
         q.from_zero(2, "1 (Coulomb coefficient)"),
-        about("of the obstacles, as the path is planned with it"),
+        describe("of the obstacles, as the path is planned with it"),
     ] = 0.0
     goal_w: Annotated[
         tuple[q.Length, q.Length] | None,
-        about("x and y to which the mission leads the head (null: along the path)"),
+        describe("x and y to which the mission leads the head (null: along the path)"),
     ] = None
     rises: Annotated[
         list[PathRise],
         Meta(max_length=64),
-        about("where the path leads over platforms of a map (elsewhere ground is level)"),
+        describe("where the path leads over platforms of a map (elsewhere ground is level)"),
     ] = []
 
 
@@ -151,61 +159,61 @@ class ControlState(Message, frozen=True, kw_only=True):
     Values that a controller does not know or have are null or empty.
     """
 
-    tick: Annotated[q.Tick, about("of the clock that control acted on")]
+    tick: Annotated[q.Tick, describe("of the clock that control acted on")]
     timestamp_ns: q.Stamp
     controller: q.Name
     state: Annotated[
         LocomotionState,
-        about("PowerOff: the HAL is silent; Idle: not armed, or the speed is to be 0"),
+        describe("PowerOff: the HAL is silent; Idle: not armed, or the speed is to be 0"),
     ]
     reason: q.Reason
     path_s_m: Annotated[
-        q.Length | None, about("arc length of the tail along the path (null: unknown)")
+        q.Length | None, describe("arc length of the tail along the path (null: unknown)")
     ] = None
-    propulsion_joint: Annotated[q.Name | None, about("the joint that pushes (null: none does)")] = (
-        None
-    )
+    propulsion_joint: Annotated[
+        q.Name | None, describe("the joint that pushes (null: none does)")
+    ] = None
     propulsion_n: Annotated[
-        q.Force | None, about("commanded force along the path (null: none)")
+        q.Force | None, describe("commanded force along the path (null: none)")
     ] = None
     push_points: Annotated[
-        list[WorldContact], Meta(max_length=64), about("obstacles that the body pushes off")
+        list[WorldContact], Meta(max_length=64), describe("obstacles that the body pushes off")
     ] = []
     desired_force_n: Annotated[
-        list[q.Force], Meta(max_length=64), about("expected at each of `push_points`")
+        list[q.Force], Meta(max_length=64), describe("expected at each of `push_points`")
     ] = []
     measured_force_n: Annotated[
         list[q.Force | None],
         Meta(max_length=64),
-        about(
+        describe(
             "measured at the obstacle of each of `push_points`, mean over 50 ms; null: that has no name; or empty: no "
             "sensor of contacts"
         ),
     ] = []
     propulsion_torque_nm: Annotated[
-        q.Torque | None, about("of `propulsion_joint` (null: none pushes)")
+        q.Torque | None, describe("of `propulsion_joint` (null: none pushes)")
     ] = None
     bending_torque_nm: Annotated[
-        q.Torques, about("of every joint, for the desired forces; or empty")
+        q.Torques, describe("of every joint, for the desired forces; or empty")
     ] = []
-    reference_rad: Annotated[q.Angles, about("of every joint, from the path; or empty")] = []
+    reference_rad: Annotated[q.Angles, describe("of every joint, from the path; or empty")] = []
     condition: Annotated[
-        q.Scalar | None, about("condition number of the equations (null: none were solved)")
+        q.Scalar | None, describe("condition number of the equations (null: none were solved)")
     ] = None
     torque_headroom_nm: Annotated[
-        q.Torque | None, about("left below its limit at full push (null: none pushes)")
+        q.Torque | None, describe("left below its limit at full push (null: none pushes)")
     ] = None
-    saturated: Annotated[bool, about("the push is at its torque limit")] = False
-    jammed: Annotated[bool, about("the body is stuck although a joint pushes")] = False
+    saturated: Annotated[bool, describe("the push is at its torque limit")] = False
+    jammed: Annotated[bool, describe("the body is stuck although a joint pushes")] = False
     custom: Annotated[
-        dict[q.Name, q.Scalar], Meta(max_length=32), about("numbers that the controller defines")
+        dict[q.Name, q.Scalar], Meta(max_length=32), describe("numbers that the controller defines")
     ] = {}
     failed: Annotated[
-        bool, about("the last message of a controller that cannot continue; `reason` is why")
+        bool, describe("the last message of a controller that cannot continue; `reason` is why")
     ] = False
     too_slow: Annotated[
         q.Reason,
-        about(
+        describe(
             "in real time: what shows that the controller misses its deadlines (empty: nothing does)"
         ),
     ] = ""
@@ -214,33 +222,38 @@ class ControlState(Message, frozen=True, kw_only=True):
 class ParametersRequest(Message, frozen=True, kw_only=True):
     """Query payload on `control/parameters`: set the parameters of the running controller."""
 
-    requester: Annotated[q.Name, about("name of the requester, for log and record")]
-    controller: Annotated[q.Name, about("`ControlParameters.controller`; another one is refused")]
+    requester: Annotated[q.Name, describe("name of the requester, for log and record")]
+    controller: Annotated[
+        q.Name, describe("`ControlParameters.controller`; another one is refused")
+    ]
     parameters: Annotated[
         str,
         Meta(max_length=q.MAX_PARAMETERS_JSON),
-        about("a JSON object; fields that it leaves out get their defaults"),
+        describe("a JSON object; fields that it leaves out get their defaults"),
     ]
 
 
 class ControlParameters(Message, frozen=True, kw_only=True):
     """`control/parameters_in_force`, latched: what the controller runs with, and what it could."""
 
-    tick: Annotated[q.Tick, about("since when")]
+    tick: Annotated[q.Tick, describe("since when")]
     timestamp_ns: q.Stamp
     controller: q.Name
     parameters: Annotated[
-        str, Meta(max_length=q.MAX_PARAMETERS_JSON), about("all of them, as a JSON object")
+        str, Meta(max_length=q.MAX_PARAMETERS_JSON), describe("all of them, as a JSON object")
     ]
     schema: Annotated[
         str,
         Meta(max_length=q.MAX_SCHEMA),
-        about("JSON Schema of `parameters`, with bounds and units"),
+        describe("JSON Schema of `parameters`, with bounds and units"),
     ]
     requester: Annotated[
-        q.Name | None, about("name of the requester of them (null: the configuration of the run)")
+        q.Name | None,
+        describe("name of the requester of them (null: the configuration of the run)"),
     ] = None
-    changes: Annotated[q.Count, about("how often they have been changed since control started")] = 0
+    changes: Annotated[
+        q.Count, describe("how often they have been changed since control started")
+    ] = 0
 
 
 class LocomotionIntent(Message, frozen=True, kw_only=True):
@@ -250,14 +263,16 @@ class LocomotionIntent(Message, frozen=True, kw_only=True):
     mission.
     """
 
-    timestamp_ns: Annotated[q.Stamp, about("robot time of the request, from hal/clock")]
+    timestamp_ns: Annotated[q.Stamp, describe("robot time of the request, from hal/clock")]
     requester: q.Name
-    speed_m_s: Annotated[q.Velocity | None, about("null: that of the mission")] = None
-    go: Annotated[bool, about("false: stop")] = True
+    speed_m_s: Annotated[q.Velocity | None, describe("null: that of the mission")] = None
+    go: Annotated[bool, describe("false: stop")] = True
     valid_for_ns: Annotated[
-        q.Nanoseconds, about("valid for this long from `timestamp_ns`, at most 5 s")
+        q.Nanoseconds, describe("valid for this long from `timestamp_ns`, at most 5 s")
     ] = 1_000_000_000
     heading_w_rad: Annotated[
         q.Angle | None,
-        about("direction of travel in the world, from its x axis (null: the mission's own goal)"),
+        describe(
+            "direction of travel in the world, from its x axis (null: the mission's own goal)"
+        ),
     ] = None

@@ -6,7 +6,7 @@ from msgspec import Meta
 
 from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.messages.base import Message
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import describe
 
 RANGE_SLACK_FRACTION = 0.05  # of the stated range of a camera or lidar: room for noise at its ends
 
@@ -15,10 +15,12 @@ class MountedSample(Message, frozen=True, kw_only=True):
     """Base of the samples of sensors that are mounted on a link."""
 
     tick: q.Tick
-    timestamp_ns: Annotated[q.Stamp, about("of the measurement (`tick` is later by the delay)")]
-    link: Annotated[q.LinkIndex, about("that carries the sensor, from 0 at the tail")]
-    position_l: Annotated[q.Vector, about("of the sensor")]
-    orientation_l_wxyz: Annotated[q.Quaternion, about("of the sensor's frame in that of the link")]
+    timestamp_ns: Annotated[q.Stamp, describe("of the measurement (`tick` is later by the delay)")]
+    link: Annotated[q.LinkIndex, describe("that carries the sensor, from 0 at the tail")]
+    position_l: Annotated[q.Vector, describe("of the sensor")]
+    orientation_l_wxyz: Annotated[
+        q.Quaternion, describe("of the sensor's frame in that of the link")
+    ]
 
     def find_contradiction(self) -> str:
         """Describe what is impossible although each number is within its bounds; empty if nothing is.
@@ -31,8 +33,8 @@ class MountedSample(Message, frozen=True, kw_only=True):
 class CameraImage(MountedSample, frozen=True, kw_only=True):
     """Base of the images of a pinhole camera. DepthImage describes its frame."""
 
-    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row")]
-    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows")]
+    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), describe("pixels in a row")]
+    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), describe("rows")]
     fx_px: q.FocalLength
     fy_px: q.FocalLength
     cx_px: q.Pixels
@@ -47,16 +49,16 @@ class DepthImage(CameraImage, frozen=True, kw_only=True):
     """
 
     range_min_m: Annotated[
-        q.Distance, about("along the optical axis; what is nearer is 0 in `depth`")
+        q.Distance, describe("along the optical axis; what is nearer is 0 in `depth`")
     ]
     range_max_m: Annotated[
-        q.Distance, about("along the optical axis; what is further is 0 in `depth`")
+        q.Distance, describe("along the optical axis; what is further is 0 in `depth`")
     ]
-    scale_m: Annotated[float, Meta(gt=0, le=1), about("meters per count of `depth`")]
+    scale_m: Annotated[float, Meta(gt=0, le=1), describe("meters per count of `depth`")]
     depth: Annotated[
         bytes,
         Meta(max_length=2 * q.MAX_PIXELS),
-        about(
+        describe(
             "uint16, little endian, row by row from the top: distance along the optical axis in counts; "
             "0: nothing within range, or the pixel dropped out"
         ),
@@ -75,7 +77,7 @@ class ColorImage(CameraImage, frozen=True, kw_only=True):
     rgb: Annotated[
         bytes,
         Meta(max_length=3 * q.MAX_PIXELS),
-        about("red, green and blue of each pixel, row by row from the top"),
+        describe("red, green and blue of each pixel, row by row from the top"),
     ]
 
 
@@ -86,14 +88,14 @@ class RangeScan(MountedSample, frozen=True, kw_only=True):
     positive to the left.
     """
 
-    angle_min_rad: Annotated[q.Angle, about("of the first beam")]
-    angle_step_rad: Annotated[q.Angle, about("from one beam to the next")]
-    range_min_m: Annotated[q.Distance, about("along the beam; what is nearer is null")]
-    range_max_m: Annotated[q.Distance, about("along the beam; what is further is null")]
+    angle_min_rad: Annotated[q.Angle, describe("of the first beam")]
+    angle_step_rad: Annotated[q.Angle, describe("from one beam to the next")]
+    range_min_m: Annotated[q.Distance, describe("along the beam; what is nearer is null")]
+    range_max_m: Annotated[q.Distance, describe("along the beam; what is further is null")]
     range_m: Annotated[
         list[q.Distance | None],
         Meta(min_length=1, max_length=q.MAX_BEAMS),
-        about("one entry a beam; null: nothing within range, or the beam dropped out"),
+        describe("one entry a beam; null: nothing within range, or the beam dropped out"),
     ]
 
     def find_contradiction(self) -> str:
@@ -122,16 +124,18 @@ class ImagePreview(Message, frozen=True, kw_only=True):
     """`preview/depth/<camera>` or `preview/color/<camera>`: a small, compressed copy of an image."""
 
     tick: q.Tick
-    timestamp_ns: Annotated[q.Stamp, about("of the image that it was made from")]
-    width: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), about("pixels in a row of this copy")]
-    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), about("rows of this copy")]
+    timestamp_ns: Annotated[q.Stamp, describe("of the image that it was made from")]
+    width: Annotated[
+        int, Meta(ge=1, le=q.MAX_IMAGE_WIDTH), describe("pixels in a row of this copy")
+    ]
+    height: Annotated[int, Meta(ge=1, le=q.MAX_IMAGE_HEIGHT), describe("rows of this copy")]
     format: Annotated[
-        Literal["jpeg", "png"], about("of `data`: jpeg in color, png of 16 bits for depth")
+        Literal["jpeg", "png"], describe("of `data`: jpeg in color, png of 16 bits for depth")
     ]
     scale_m: Annotated[
         Annotated[float, Meta(gt=0, le=1)] | None,
-        about(
+        describe(
             "meters per count of depth, which is 0 for nothing within range; null: it is in color"
         ),
     ] = None
-    data: Annotated[bytes, Meta(max_length=q.MAX_PREVIEW_BYTES), about("the file")]
+    data: Annotated[bytes, Meta(max_length=q.MAX_PREVIEW_BYTES), describe("the file")]

@@ -7,7 +7,7 @@ from msgspec import Meta
 from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.messages.base import ABOUT_HOST, ABOUT_LIFECYCLE, LifecycleState, Message
 from snakesim_hal.wire.messages.description import RobotDescription
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import describe
 
 
 class LeaseRequest(Message, frozen=True, kw_only=True):
@@ -15,18 +15,18 @@ class LeaseRequest(Message, frozen=True, kw_only=True):
 
     action: Annotated[
         Literal["acquire", "renew", "release"],
-        about("renew works only while disarmed: an armed robot needs commands"),
+        describe("renew works only while disarmed: an armed robot needs commands"),
     ]
     holder: Annotated[
-        q.Name, about("name of the requester; a service of the run uses its own name")
+        q.Name, describe("name of the requester; a service of the run uses its own name")
     ]
     epoch: Annotated[
-        q.Count, about("of the lease that is renewed or released; acquire needs none")
+        q.Count, describe("of the lease that is renewed or released; acquire needs none")
     ] = 0
     priority: Annotated[
         int,
         Meta(ge=0, le=255),
-        about("a live lease is taken over only by a greater one, which disarms an armed robot"),
+        describe("a live lease is taken over only by a greater one, which disarms an armed robot"),
     ] = 100
 
 
@@ -35,25 +35,26 @@ class LifecycleRequest(Message, frozen=True, kw_only=True):
 
     action: Annotated[
         Literal["arm", "disarm", "reset", "finish"],
-        about("reset leads from fault or estop to disarmed; finish disarms, and ends the run"),
+        describe("reset leads from fault or estop to disarmed; finish disarms, and ends the run"),
     ]
-    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")] = (
+    requester: Annotated[q.Name, describe("name of the requester, for status, log and summary")] = (
         "an unnamed client"
     )
-    host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
+    host: Annotated[q.Name | None, describe("id of the addressed host process; null: any")] = None
     robot: Annotated[
-        q.Name | None, about("`RobotDescription.robot`; arm needs it, others may leave it null")
+        q.Name | None, describe("`RobotDescription.robot`; arm needs it, others may leave it null")
     ] = None
     backend: Annotated[
-        q.Name | None, about("`RobotDescription.backend`; arm needs it, others may leave it null")
+        q.Name | None,
+        describe("`RobotDescription.backend`; arm needs it, others may leave it null"),
     ] = None
     config_hash: Annotated[
         q.Name | None,
-        about("`RobotDescription.config_hash`; arm needs it, others may leave it null"),
+        describe("`RobotDescription.config_hash`; arm needs it, others may leave it null"),
     ] = None
     unchecked: Annotated[
         bool,
-        about(
+        describe(
             "arm also if `RobotStatus.unchecked` gives a reason why the joints do not count as checked"
         ),
     ] = False
@@ -83,7 +84,7 @@ def make_arm_request(
 class EstopRequest(Message, frozen=True, kw_only=True):
     """Query payload on `hal/estop`; needs no lease. Latched until `reset` on `hal/lifecycle`."""
 
-    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")]
+    requester: Annotated[q.Name, describe("name of the requester, for status, log and summary")]
 
 
 class SimulatorRequest(Message, frozen=True, kw_only=True):
@@ -91,43 +92,45 @@ class SimulatorRequest(Message, frozen=True, kw_only=True):
 
     action: Annotated[
         Literal["pause", "resume", "step", "speed", "reset"],
-        about(
+        describe(
             "step: some ticks, then paused; reset: another host, at the start and disarmed, takes the place of this"
         ),
     ]
-    requester: Annotated[q.Name, about("name of the requester, for status, log and summary")] = (
+    requester: Annotated[q.Name, describe("name of the requester, for status, log and summary")] = (
         "an unnamed client"
     )
-    host: Annotated[q.Name | None, about("id of the addressed host process; null: any")] = None
-    ticks: Annotated[int, Meta(ge=1, le=1_000_000), about("of a step")] = 1
-    speed: Annotated[q.Speed, about("robot time per wall time, in real time; 1: as the wall")] = 1.0
+    host: Annotated[q.Name | None, describe("id of the addressed host process; null: any")] = None
+    ticks: Annotated[int, Meta(ge=1, le=1_000_000), describe("of a step")] = 1
+    speed: Annotated[
+        q.Speed, describe("robot time per wall time, in real time; 1: as the wall")
+    ] = 1.0
 
 
 class FaultRequest(Message, frozen=True, kw_only=True):
     """Query payload on `fault/<part>`: inject a fault now, or end it. Only in runs that allow it."""
 
-    kind: Annotated[q.Name, about("kind of fault: `snakesim fault list` prints all")]
-    target: Annotated[q.Name, about("a process, key, joint or bus, such as joint_3")]
+    kind: Annotated[q.Name, describe("kind of fault: `snakesim fault list` prints all")]
+    target: Annotated[q.Name, describe("a process, key, joint or bus, such as joint_3")]
     for_s: Annotated[
         Annotated[float, Meta(gt=0, le=86400)] | None,
-        about("seconds of robot time; null: until it is ended"),
+        describe("seconds of robot time; null: until it is ended"),
     ] = None
     amount: Annotated[
-        q.Scalar | None, about("amount, in the unit of the kind; null: the default of this kind")
+        q.Scalar | None, describe("amount, in the unit of the kind; null: the default of this kind")
     ] = None
-    end: Annotated[bool, about("true: end it")] = False
+    end: Annotated[bool, describe("true: end it")] = False
 
 
 class Answer(Message, frozen=True, kw_only=True):
     """Reply to every query: whether it was done, and if not, why, as a text and as one stable word."""
 
-    ok: Annotated[bool, about("whether it was done")]
+    ok: Annotated[bool, describe("whether it was done")]
     reason: Annotated[
-        q.Reason, about("a text: why not, or if it was done why the robot is in its state")
+        q.Reason, describe("a text: why not, or if it was done why the robot is in its state")
     ]
     refusal: Annotated[
-        q.Name | None, about("why not, as one word: see protocol.md; null: it was done")
+        q.Name | None, describe("why not, as one word: see protocol.md; null: it was done")
     ] = None
-    epoch: Annotated[q.Count, about("of the lease, or of the last one when it is free")] = 0
+    epoch: Annotated[q.Count, describe("of the lease, or of the last one when it is free")] = 0
     lifecycle: Annotated[LifecycleState, ABOUT_LIFECYCLE] = "disarmed"
     host: Annotated[q.Name | None, ABOUT_HOST] = None

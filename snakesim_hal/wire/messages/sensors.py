@@ -6,7 +6,7 @@ from msgspec import Meta
 
 from snakesim_hal.wire import quantities as q
 from snakesim_hal.wire.messages.base import ONE_PER_JOINT, Message
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import describe
 
 
 class JointState(Message, frozen=True, kw_only=True):
@@ -15,17 +15,17 @@ class JointState(Message, frozen=True, kw_only=True):
     tick: q.Tick
     timestamp_ns: q.Stamp
     angle_rad: Annotated[
-        q.Angles, about("positive: yaw to the left, pitch downwards, seen towards the head")
+        q.Angles, describe("positive: yaw to the left, pitch downwards, seen towards the head")
     ]
-    velocity_rad_s: Annotated[q.AngularVelocities, about(ONE_PER_JOINT)]
+    velocity_rad_s: Annotated[q.AngularVelocities, describe(ONE_PER_JOINT)]
     torque_nm: Annotated[
         q.Torques,
-        about(
+        describe(
             "of the motor, positive towards positive angles (0 of a joint that does not measure it)"
         ),
     ]
-    valid: Annotated[q.Flags, about("false: its numbers are outdated, and must not be used")]
-    age_ns: Annotated[q.Ages, about("how long before `timestamp_ns` each joint was measured")]
+    valid: Annotated[q.Flags, describe("false: its numbers are outdated, and must not be used")]
+    age_ns: Annotated[q.Ages, describe("how long before `timestamp_ns` each joint was measured")]
 
     def has_joint_count(self, joint_count: int) -> bool:
         """Return whether every list has an entry for each of so many joints."""
@@ -41,16 +41,16 @@ class JointState(Message, frozen=True, kw_only=True):
 class Contact(Message, frozen=True, kw_only=True):
     """One contact of a link with an obstacle (not the ground); all vectors in the link's frame."""
 
-    link: Annotated[q.LinkIndex, about("number of the link, from 0 at the tail")]
+    link: Annotated[q.LinkIndex, describe("number of the link, from 0 at the tail")]
     obstacle: Annotated[
-        q.Name | None, about("touched obstacle; null: the sensor does not identify it")
+        q.Name | None, describe("touched obstacle; null: the sensor does not identify it")
     ]
     position_l: q.Vector
-    normal_l: Annotated[q.UnitVector, about("from the obstacle into the body")]
-    tangent_1_l: Annotated[q.UnitVector, about("across the normal, towards the head")]
-    tangent_2_l: Annotated[q.UnitVector, about("across both")]
-    force_l: Annotated[q.ForceVector, about("on the body")]
-    torque_l: Annotated[q.TorqueVector, about("on the body about the contact point")]
+    normal_l: Annotated[q.UnitVector, describe("from the obstacle into the body")]
+    tangent_1_l: Annotated[q.UnitVector, describe("across the normal, towards the head")]
+    tangent_2_l: Annotated[q.UnitVector, describe("across both")]
+    force_l: Annotated[q.ForceVector, describe("on the body")]
+    torque_l: Annotated[q.TorqueVector, describe("on the body about the contact point")]
 
 
 class Contacts(Message, frozen=True, kw_only=True):
@@ -61,7 +61,7 @@ class Contacts(Message, frozen=True, kw_only=True):
     contacts: Annotated[list[Contact], Meta(max_length=q.MAX_CONTACTS)]
     measured_force_n: Annotated[
         q.Force | None,
-        about(
+        describe(
             "largest force of one obstacle on one link, as a mean over the last 50 ms; null: not measured"
         ),
     ] = None
@@ -75,7 +75,7 @@ class Imu(Message, frozen=True, kw_only=True):
     link: Annotated[
         list[q.LinkIndex],
         Meta(max_length=q.MAX_JOINTS + 1),
-        about("their numbers, from 0 at the tail"),
+        describe("their numbers, from 0 at the tail"),
     ]
     angular_velocity_rad_s: Annotated[
         list[q.AngularVelocityVector], Meta(max_length=q.MAX_JOINTS + 1)
@@ -83,7 +83,7 @@ class Imu(Message, frozen=True, kw_only=True):
     acceleration_m_s2: Annotated[
         list[q.AccelerationVector],
         Meta(max_length=q.MAX_JOINTS + 1),
-        about("specific force: at rest 1 g upwards"),
+        describe("specific force: at rest 1 g upwards"),
     ]
 
 
@@ -105,9 +105,11 @@ class Power(Message, frozen=True, kw_only=True):
     timestamp_ns: q.Stamp
     voltage_v: Annotated[list[q.Voltage], Meta(max_length=q.MAX_JOINTS)]
     current_a: Annotated[list[q.Current], Meta(max_length=q.MAX_JOINTS)]
-    motor_c: Annotated[list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the winding")]
-    board_c: Annotated[
-        list[q.Temperature], Meta(max_length=q.MAX_JOINTS), about("of the electronics")
+    motor_c: Annotated[
+        list[q.Temperature], Meta(max_length=q.MAX_JOINTS), describe("of the winding")
     ]
-    leak: Annotated[q.Flags, about("true: water inside")]
-    valid: Annotated[q.Flags, about("false: the state of this module is unknown")]
+    board_c: Annotated[
+        list[q.Temperature], Meta(max_length=q.MAX_JOINTS), describe("of the electronics")
+    ]
+    leak: Annotated[q.Flags, describe("true: water inside")]
+    valid: Annotated[q.Flags, describe("false: the state of this module is unknown")]

@@ -10,11 +10,11 @@ from snakesim_hal.wire.messages.base import (
     ABOUT_HOST,
     ABOUT_LIFECYCLE,
     ClockMode,
+    FaultScope,
     LifecycleState,
     Message,
-    Reach,
 )
-from snakesim_hal.wire.quantities import about
+from snakesim_hal.wire.quantities import describe
 
 
 class Clock(Message, frozen=True, kw_only=True):
@@ -24,25 +24,25 @@ class Clock(Message, frozen=True, kw_only=True):
     """
 
     tick: q.Tick
-    timestamp_ns: Annotated[q.Stamp, about("robot time: `tick` x `period_ns`")]
+    timestamp_ns: Annotated[q.Stamp, describe("robot time: `tick` x `period_ns`")]
     period_ns: q.Nanoseconds
     clock_mode: Annotated[ClockMode, ABOUT_CLOCK_MODE]
     lifecycle: Annotated[LifecycleState, ABOUT_LIFECYCLE]
     arm_session: Annotated[
         q.Count,
-        about(
+        describe(
             "how often the robot has been armed since its host started; a new number: reset the controller"
         ),
     ]
-    lease_epoch: Annotated[q.Count, about("of the live lease (0: there is none)")]
+    lease_epoch: Annotated[q.Count, describe("of the live lease (0: there is none)")]
     newest: Annotated[
         dict[q.Name, q.Tick],
         Meta(max_length=64),
-        about("sensor key or service -> tick of its newest sample that is valid now"),
+        describe("sensor key or service -> tick of its newest sample that is valid now"),
     ]
     paused: Annotated[
         bool,
-        about(
+        describe(
             "true: not a new tick; the last clock is repeated as a sign of life while robot time is paused"
         ),
     ] = False
@@ -53,13 +53,13 @@ class Fault(Message, frozen=True, kw_only=True):
 
     tick: q.Tick
     what: Annotated[
-        q.Name, about("a short word to count by: lease_expired, service_lost, diverged, ...")
+        q.Name, describe("a short word to count by: lease_expired, service_lost, diverged, ...")
     ]
-    cause: Annotated[q.Reason, about("in words, for the operator")]
-    joint: Annotated[q.Name | None, about("null: it is not about one joint")] = None
-    reach: Annotated[
-        Reach,
-        about(
+    cause: Annotated[q.Reason, describe("in words, for the operator")]
+    joint: Annotated[q.Name | None, describe("null: it is not about one joint")] = None
+    scope: Annotated[
+        FaultScope,
+        describe(
             "joint: no other is affected, and the robot may continue if its file allows it (none: it stops nothing)"
         ),
     ] = "robot"
@@ -68,15 +68,15 @@ class Fault(Message, frozen=True, kw_only=True):
 class TimingStatistics(Message, frozen=True, kw_only=True):
     """How long something took, many times: percentiles to 5 %, and a histogram on a logarithmic scale."""
 
-    count: Annotated[q.Count, about("how many were measured")]
+    count: Annotated[q.Count, describe("how many were measured")]
     median_us: q.Microseconds
-    p99_us: Annotated[q.Microseconds, about("99 % took no longer")]
+    p99_us: Annotated[q.Microseconds, describe("99 % took no longer")]
     max_us: q.Microseconds
     low_us: Annotated[
-        q.Microseconds, about("where the first bin begins; it counts all that is below, too")
+        q.Microseconds, describe("where the first bin begins; it counts all that is below, too")
     ]
     bin_decades: Annotated[
-        float, q.from_zero(8.0, "1"), about("width of a bin: log10 of its end over its begin")
+        float, q.from_zero(8.0, "1"), describe("width of a bin: log10 of its end over its begin")
     ]
     bins: Annotated[list[q.Count], Meta(max_length=64)]
 
@@ -100,80 +100,86 @@ class RobotStatus(Message, frozen=True, kw_only=True):
     rate_hz: Annotated[float, Meta(gt=0, le=1e5)]
     lifecycle: Annotated[LifecycleState, ABOUT_LIFECYCLE]
     reason: Annotated[
-        q.Reason, about("why it is in this state, and while disarmed what prevents arming")
+        q.Reason, describe("why it is in this state, and while disarmed what prevents arming")
     ]
-    lease_holder: Annotated[q.Name | None, about("null: the lease is free")]
-    lease_epoch: Annotated[q.Count, about("of the lease, or of the last one when it is free")]
-    commands_accepted: Annotated[q.Count, about("commands that the limiter accepted while armed")]
+    lease_holder: Annotated[q.Name | None, describe("null: the lease is free")]
+    lease_epoch: Annotated[q.Count, describe("of the lease, or of the last one when it is free")]
+    commands_accepted: Annotated[
+        q.Count, describe("commands that the limiter accepted while armed")
+    ]
     commands_standby: Annotated[
-        q.Count, about("valid commands while disarmed: received, not enacted")
+        q.Count, describe("valid commands while disarmed: received, not enacted")
     ]
     commands_rejected: Annotated[
-        dict[q.Name, q.Count], Meta(max_length=64), about("how many, by reason")
+        dict[q.Name, q.Count], Meta(max_length=64), describe("how many, by reason")
     ]
     commands_limited: Annotated[
-        dict[q.Name, q.Count], Meta(max_length=64), about("how many targets, by limit")
+        dict[q.Name, q.Count], Meta(max_length=64), describe("how many targets, by limit")
     ]
     faults: Annotated[
         list[Fault],
         Meta(max_length=64),
-        about("since the last reset; not all of them stop the robot"),
+        describe("since the last reset; not all of them stop the robot"),
     ]
     alive: Annotated[
-        list[q.Name], Meta(max_length=64), about("services of the run with a liveliness token")
+        list[q.Name], Meta(max_length=64), describe("services of the run with a liveliness token")
     ]
     waiting_for: Annotated[
-        list[q.Name], Meta(max_length=64), about("services that arming waits for")
+        list[q.Name], Meta(max_length=64), describe("services that arming waits for")
     ]
-    overruns: Annotated[q.Count, about("ticks that were late, while armed in real time")]
+    overruns: Annotated[q.Count, describe("ticks that were late, while armed in real time")]
     ready_to_arm: Annotated[
-        bool, about("whether a request to arm that names the right robot would be granted now")
+        bool, describe("whether a request to arm that names the right robot would be granted now")
     ]
     injected: Annotated[
-        list[q.Reason], Meta(max_length=64), about("injected faults that are active now")
+        list[q.Reason], Meta(max_length=64), describe("injected faults that are active now")
     ] = []
     realtime_warnings: Annotated[
-        list[q.Reason], Meta(max_length=16), about("real-time measures that the system refused")
+        list[q.Reason], Meta(max_length=16), describe("real-time measures that the system refused")
     ] = []
     derated: Annotated[
         dict[q.Name, q.Fraction],
         Meta(max_length=q.MAX_JOINTS),
-        about("joint -> share of its torque left by derating"),
+        describe("joint -> share of its torque left by derating"),
     ] = {}
     isolated: Annotated[
         list[q.Name],
         Meta(max_length=q.MAX_JOINTS),
-        about("joints that failed, and are passive until a reset"),
+        describe("joints that failed, and are passive until a reset"),
     ] = []
     host: Annotated[q.Name | None, ABOUT_HOST] = None
-    faults_left_out: Annotated[q.Count, about("of `faults`, between the first and the newest")] = 0
+    faults_left_out: Annotated[
+        q.Count, describe("of `faults`, between the first and the newest")
+    ] = 0
     paused_by: Annotated[
-        q.Name | None, about("client that paused the simulator (null: it is not paused)")
+        q.Name | None, describe("client that paused the simulator (null: it is not paused)")
     ] = None
-    speed: Annotated[q.Speed, about("requested speed in real time: robot time per wall time")] = 1.0
+    speed: Annotated[
+        q.Speed, describe("requested speed in real time: robot time per wall time")
+    ] = 1.0
     real_time_factor: Annotated[
         Annotated[float, q.from_zero(1e6, "1")] | None,
-        about(
+        describe(
             "robot time per wall time over the last second (null: not measured, such as in a pause)"
         ),
     ] = None
     tick_times: Annotated[
         dict[q.Name, TimingStatistics],
         Meta(max_length=8),
-        about(
+        describe(
             "while armed. cycle: from the begin of a tick to the next one's; late: begin of a tick after its deadline, "
             "in real time; read, write: the backend's calls"
         ),
     ] = {}
     unchecked: Annotated[
         q.Reason,
-        about(
+        describe(
             "why arming needs the flag `unchecked`: its joints were not checked as they are now (empty: it does not)"
         ),
     ] = ""
     held_up: Annotated[
         q.Reason,
-        about(
+        describe(
             "which answer to which tick lockstep has been waiting for, if longer than half a second"
         ),
     ] = ""
@@ -188,26 +194,28 @@ class TickDone(Message, frozen=True, kw_only=True):
 class ProcessInfo(Message, frozen=True, kw_only=True):
     """`process/<name>-<id>`, latched: one process of the robot's network; valid while a token at the same key lives."""
 
-    name: Annotated[q.Name, about("its role: host, a service of the scenario, recorder, ...")]
-    machine: Annotated[q.Name, about("host name of its computer")]
-    user: Annotated[q.Name, about("the user who started it")]
-    pid: Annotated[q.Count, about("its process id there")]
-    version: Annotated[q.Name, about("of SnakeSIM, or of the program that writes this")]
-    started_unix_s: Annotated[q.Count, about("when it started, by the wall clock of its machine")]
+    name: Annotated[q.Name, describe("its role: host, a service of the scenario, recorder, ...")]
+    machine: Annotated[q.Name, describe("host name of its computer")]
+    user: Annotated[q.Name, describe("the user who started it")]
+    pid: Annotated[q.Count, describe("its process id there")]
+    version: Annotated[q.Name, describe("of SnakeSIM, or of the program that writes this")]
+    started_unix_s: Annotated[
+        q.Count, describe("when it started, by the wall clock of its machine")
+    ]
     settings: Annotated[
         dict[q.Name, q.Name],
         Meta(max_length=q.MAX_SHARED_SETTINGS),
-        about(
+        describe(
             "settings that host and services must share: values, and hashes of long ones (empty: it uses none)"
         ),
     ] = {}
     messages: Annotated[
-        dict[q.Name, Annotated[q.Count, about("version of that message")]],
+        dict[q.Name, Annotated[q.Count, describe("version of that message")]],
         Meta(max_length=64),
-        about("messages that it knows (empty: unknown)"),
+        describe("messages that it knows (empty: unknown)"),
     ] = {}
     waits_for: Annotated[
         list[q.Name],
         Meta(max_length=16),
-        about("keys whose first message it waits for; it publishes nothing before"),
+        describe("keys whose first message it waits for; it publishes nothing before"),
     ] = []

@@ -18,14 +18,14 @@ PAPER_NAMES = ("a4", "a3", "letter")
 ROBOT_FILE_HELP = "the robot file that the host was started with, into which the values are written"
 
 
-def add_write_option(parser: argparse.ArgumentParser, about: str) -> None:
+def add_write_option(parser: argparse.ArgumentParser, help_text: str) -> None:
     """Add the option `--write` with the robot file that a command changes.
 
     Args:
         parser: The parser of the command.
         about: Help text about what is written into the file.
     """
-    parser.add_argument("--write", type=Path, metavar="FILE", help=f"your robot file: {about}")
+    parser.add_argument("--write", type=Path, metavar="FILE", help=f"your robot file: {help_text}")
 
 
 def _add_robot_file_argument(parser: argparse.ArgumentParser) -> None:

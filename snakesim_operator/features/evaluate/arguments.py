@@ -89,17 +89,19 @@ def _add_optimize_arguments(parser: argparse.ArgumentParser) -> None:
     add_workers_argument(parser)
 
 
-def _add_rows(parser: argparse.ArgumentParser, about: str) -> None:
-    parser.add_argument("--rows", metavar="1,2,...", help=about)
+def _add_rows(parser: argparse.ArgumentParser, help_text: str) -> None:
+    parser.add_argument("--rows", metavar="1,2,...", help=help_text)
 
 
-def _add_vary(parser: argparse.ArgumentParser, about: str) -> None:
-    parser.add_argument("--vary", action="append", required=True, metavar="KEY=RANGE", help=about)
-
-
-def _add_seeds(parser: argparse.ArgumentParser, about: str) -> None:
+def _add_vary(parser: argparse.ArgumentParser, help_text: str) -> None:
     parser.add_argument(
-        "--seeds", type=make_number_parser(1, 100_000), default=1, metavar="N", help=about
+        "--vary", action="append", required=True, metavar="KEY=RANGE", help=help_text
+    )
+
+
+def _add_seeds(parser: argparse.ArgumentParser, help_text: str) -> None:
+    parser.add_argument(
+        "--seeds", type=make_number_parser(1, 100_000), default=1, metavar="N", help=help_text
     )
 
 

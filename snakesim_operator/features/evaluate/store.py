@@ -38,7 +38,7 @@ class _StoredCase(msgspec.Struct, frozen=True):
 
     id: str
     outcome: CaseOutcome
-    about: dict[str, Number] = {}
+    numbers: dict[str, Number] = {}
 
 
 class ResultStore:

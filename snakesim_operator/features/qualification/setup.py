@@ -30,7 +30,7 @@ EMULATED_DRAG_NM = 0.35
 ROBOT = """\
 extends = "planar13"
 name = "one_drive"
-about = "One clamped drive, with low limits, for its first hour."
+description = "One clamped drive, with low limits, for its first hour."
 
 [chain]
 modules = 1

@@ -35,7 +35,7 @@ from snakesim_operator.features.robots.xml_tree import XmlElement, parse_xml
 
 SECTION_ORDER = {field.name: place for place, field in enumerate(msgspec.structs.fields(RobotFile))}
 UNSHARED_SECTIONS = ("links", "joints", "checked")  # of `--like`: they do not describe this one
-SECTIONS_FROM_URDF = ("name", "about", "chain", "module")
+SECTIONS_FROM_URDF = ("name", "description", "chain", "module")
 
 
 def import_urdf(file: Path, options: ImportOptions) -> ImportResult:
@@ -122,7 +122,7 @@ def _read_values_of_similar_robot(urdf: XmlElement, options: ImportOptions) -> C
         table.values.pop(section, None)
     for mounted in ("depth", "range"):  # their places fit another body
         table.values.get("sensors", {}).pop(mounted, None)
-    table.set_value("about", f"Imported from {Path(urdf.source).name}.", urdf.source)
+    table.set_value("description", f"Imported from {Path(urdf.source).name}.", urdf.source)
     return table
 
 

@@ -66,11 +66,11 @@ def describe_trouble(summary: RunSummary) -> str:
     phrases: list[str] = []
     lost_joints: list[str] = []
     for fault in summary.faults:
-        if fault.joint and fault.reach == "joint" and fault.joint not in lost_joints:
+        if fault.joint and fault.scope == "joint" and fault.joint not in lost_joints:
             lost_joints.append(fault.joint)
     if lost_joints:
         phrases.append(f"went on without {', '.join(lost_joints)}")
-    other_faults = [fault for fault in summary.faults if fault.reach == "none"]
+    other_faults = [fault for fault in summary.faults if fault.scope == "none"]
     if other_faults:
         count = "a fault" if len(other_faults) == 1 else f"{len(other_faults)} faults"
         cause = end_with_full_stop(other_faults[0].cause)[:-1]

@@ -71,7 +71,7 @@ def _judge_run(record: RunRecord, summary: RunSummary) -> RunVerdict:
         return RunVerdict(
             "bad", f"Nothing was recorded: the robot was never armed ({summary.ended})."
         )
-    stopping_faults = [fault for fault in summary.faults if fault.reach == "robot"]
+    stopping_faults = [fault for fault in summary.faults if fault.scope == "robot"]
     if stopping_faults:
         return _judge_stopped_run(record, summary, stopping_faults[0])
     command = JUDGING_COMMANDS.get(record.config.controller)

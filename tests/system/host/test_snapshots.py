@@ -139,7 +139,7 @@ def test_snapshot_late_in_real_time_is_dropped_and_reported_rarely(tmp_path):
         run.advance()
     run.sim.close()
     assert run.sim._sensors.dropped_counts == {HEAD: 39}  # pyright: ignore[reportPrivateUsage]
-    assert {(fault.what, fault.reach) for fault in reported} == {("sample_late", "none")}
+    assert {(fault.what, fault.scope) for fault in reported} == {("sample_late", "none")}
     assert [int(fault.cause.split()[1]) for fault in reported] == [1, 2, 4, 8, 16, 32]
 
 

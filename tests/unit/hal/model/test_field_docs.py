@@ -14,7 +14,7 @@ from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import JointExceptions, MotionLimits
 from snakesim_hal.model.json_schema import list_structs, make_schema
 from snakesim_hal.model.plugins import CONTROLLERS, load_plugin
-from snakesim_hal.wire.quantities import about, above
+from snakesim_hal.wire.quantities import above, describe
 
 
 class Wheel(FileStruct, frozen=True, kw_only=True):
@@ -26,7 +26,7 @@ class Wheel(FileStruct, frozen=True, kw_only=True):
     """
 
     spokes: Annotated[int, Meta(ge=0, lt=100)] = 36  # no description
-    slip_m_s: Annotated[float | None, about("speed at the ground")] = None
+    slip_m_s: Annotated[float | None, describe("speed at the ground")] = None
 
 
 class Kart(FileStruct, frozen=True, kw_only=True, tag="kart", tag_field="kind"):

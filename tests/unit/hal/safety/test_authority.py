@@ -381,7 +381,7 @@ def test_faults_of_a_full_log_include_the_first_stop(stop: str) -> None:
             rig.authority.handle_estop_request(ESTOP, 17)
     rig.authority.latch_fault(Fault(tick=18, what="hot", cause="hot"))
     for tick in range(19, 60):
-        rig.authority.latch_fault(Fault(tick=tick, what="late", cause="late", reach="none"))
+        rig.authority.latch_fault(Fault(tick=tick, what="late", cause="late", scope="none"))
     for tick in range(60, 100):
         rig.authority.log_fault(Fault(tick=tick, what="late", cause="late"))
     assert [fault.tick for fault in rig.authority.faults][:17] == [*range(17)]
@@ -464,7 +464,7 @@ def test_reset_without_a_fault_is_refused_with_its_reason() -> None:
 
 def test_fault_that_reaches_nothing_is_recorded_and_stops_nothing() -> None:
     rig = make_armed_rig()
-    rig.authority.latch_fault(Fault(tick=1, what="noted", cause="a test", reach="none"))
+    rig.authority.latch_fault(Fault(tick=1, what="noted", cause="a test", scope="none"))
     assert rig.authority.state == "armed"
     assert [fault.what for fault in rig.authority.faults] == ["noted"]
 

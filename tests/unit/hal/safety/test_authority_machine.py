@@ -433,29 +433,29 @@ class Everything(AuthorityModel):
 
     @rule(
         cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]),
-        reach=often("robot", "joint", "none"),
+        scope=often("robot", "joint", "none"),
         joint=st.none() | st.integers(0, JOINTS),
     )
-    def backend_fault(self, cause: str, reach: Any, joint: int | None) -> None:
+    def backend_fault(self, cause: str, scope: Any, joint: int | None) -> None:
         name = None if joint is None else f"joint_{joint + 1}"
         self.authority.latch_fault(
-            Fault(tick=self.tick, what="hot", cause=cause, joint=name, reach=reach)
+            Fault(tick=self.tick, what="hot", cause=cause, joint=name, scope=scope)
         )
-        if reach == "none":
+        if scope == "none":
             self.note_fault()
             return
-        self.lose_or_fail({joint} if reach == "joint" and joint in ALL else None)
+        self.lose_or_fail({joint} if scope == "joint" and joint in ALL else None)
 
     @rule(precedes_stop=st.booleans())
     def record_fault(self, precedes_stop: bool) -> None:
         """A fault that is only recorded, so that it is not taken for the reason of a stop."""
-        fault = Fault(tick=self.tick, what="service_lost", cause="guidance is gone", reach="robot")
+        fault = Fault(tick=self.tick, what="service_lost", cause="guidance is gone", scope="robot")
         if precedes_stop:
             self.authority.log_fault(fault, precedes_stop=True)
         else:
             self.authority.log_fault(fault)
         self.note_fault()
-        assert self.authority.faults[-1].reach == ("robot" if precedes_stop else "none")
+        assert self.authority.faults[-1].scope == ("robot" if precedes_stop else "none")
 
     @rule()
     def holder_gone(self) -> None:

@@ -285,13 +285,13 @@ def test_a_long_list_of_silent_modules_fits_into_a_message() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reported", "reach"),
+    ("reported", "scope"),
     [({"motor_c": 110.0}, "joint"), ({"leak": True}, "robot"), ({"voltage_v": 12.0}, "robot")],
 )
 def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(
-    reported: dict[str, Any], reach: str
+    reported: dict[str, Any], scope: str
 ) -> None:
     bench = Bench()
     bench.receive(**reported)
     bench.look(50 * MS)
-    assert [fault.reach for fault in bench.derating.current_faults] == [reach] * JOINTS
+    assert [fault.scope for fault in bench.derating.current_faults] == [scope] * JOINTS

@@ -29,9 +29,9 @@ def armed_without_joint_2(**robot: Any) -> AuthorityRig:
     return rig
 
 
-def fault_in(joint: str | None = "joint_2", reach: Any = "joint") -> Fault:
+def fault_in(joint: str | None = "joint_2", scope: Any = "joint") -> Fault:
     return Fault(
-        tick=3, what="module_frozen", cause=f"{joint} repeats itself", joint=joint, reach=reach
+        tick=3, what="module_frozen", cause=f"{joint} repeats itself", joint=joint, scope=scope
     )
 
 
@@ -43,7 +43,7 @@ def test_by_default_one_joint_stops_the_robot() -> None:
     assert rig.authority.isolated_joints == []
     (fault,) = rig.authority.faults
     assert fault.joint == "joint_2"
-    assert fault.reach == "robot"
+    assert fault.scope == "robot"
 
 
 def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
@@ -51,7 +51,7 @@ def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
     (fault,) = rig.authority.faults
     assert fault.what == "state_invalid"
     assert fault.joint == "joint_2"
-    assert fault.reach == "joint"
+    assert fault.scope == "joint"
     assert rig.authority.reason == "armed, without joint_2: no valid and fresh state of joint_2"
     for _ in range(20):
         rig.observe(0.1, valid=SAYS_NO)
@@ -87,7 +87,7 @@ def test_one_joint_too_many_stops_the_robot(known: bool) -> None:
         rig.observe(0.1, valid=[True, False, False])
         rig.pass_tick()
     assert rig.authority.state == "fault"
-    assert [(fault.joint, fault.reach) for fault in rig.authority.faults] == [
+    assert [(fault.joint, fault.scope) for fault in rig.authority.faults] == [
         ("joint_2", "joint"),
         ("joint_3", "robot"),
     ]
@@ -108,7 +108,7 @@ def test_two_that_fail_at_once_are_two() -> None:
 
 @pytest.mark.parametrize(
     "fault",
-    [fault_in(reach="robot"), fault_in(joint=None), fault_in(joint="joint_9")],
+    [fault_in(scope="robot"), fault_in(joint=None), fault_in(joint="joint_9")],
     ids=["robot", "nobody", "unknown"],
 )
 def test_what_concerns_more_than_a_joint_stops_the_robot(fault: Fault) -> None:
@@ -250,7 +250,7 @@ def test_isolation_fault_in_a_full_log_is_dropped_like_others() -> None:
     for tick in range(16):
         rig.authority.log_fault(Fault(tick=tick, what="noted", cause=""))
     rig.authority.latch_fault(
-        Fault(tick=16, what="module_frozen", cause="", joint="joint_2", reach="joint")
+        Fault(tick=16, what="module_frozen", cause="", joint="joint_2", scope="joint")
     )
     assert rig.authority.isolated_joints == ["joint_2"]
     for tick in range(17, 100):

@@ -246,11 +246,11 @@ def test_plausibility_fault_reaches_joints_or_the_whole_robot() -> None:
     bench = Bench()
     fault = bench.see(valid=[True, False, False])
     assert fault is not None
-    assert fault.reach == "joint"
+    assert fault.scope == "joint"
     assert bench.doubted == [1, 2]
     fault = bench.see(valid=[])
     assert fault is not None
-    assert fault.reach == "robot"
+    assert fault.scope == "robot"
     assert bench.doubted == [0, 1, 2]
     assert fault.tick == 7
     assert fault.what == WORD

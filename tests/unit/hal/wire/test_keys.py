@@ -24,7 +24,7 @@ def test_every_key_of_the_space_parses_back(row: keys.KeyRow) -> None:
     assert keys.split_namespace(key) is None  # without a namespace there is nothing to split off
     assert row.kind in ("stream", "latched", "query", "liveliness")
     assert row.writer
-    assert row.about
+    assert row.description
 
 
 def test_keys_are_unique_without_outer_slashes() -> None:

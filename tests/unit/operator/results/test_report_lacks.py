@@ -162,7 +162,7 @@ def test_report_of_run_with_isolated_joint_names_it(record: RunRecord) -> None:
         what="joint_frozen",
         cause="joint_3 repeats itself",
         joint="joint_3",
-        reach="joint",
+        scope="joint",
     )
     page = read(
         changed(

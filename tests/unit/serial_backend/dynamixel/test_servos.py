@@ -209,7 +209,7 @@ def test_servo_with_duplicate_id_stops_the_robot(
     robot.go_wrong("duplicate:joint_2@0-9")
     fault = robot.run(NOTICED, "armed")[0]
     assert (fault.what, fault.joint) == (what, "joint_2") and re.search(words, fault.cause), fault
-    assert fault.reach == ("robot" if what == "duplicate_node" else "joint")
+    assert fault.scope == ("robot" if what == "duplicate_node" else "joint")
 
 
 @pytest.mark.parametrize("model", ["XM430-W350", "XL330-M288"])
