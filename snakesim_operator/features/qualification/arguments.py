@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from snakesim_drivers.kit.commands import DRIVE_NOUNS
+from snakesim_hal.base.terminal import tolerate_failed_output
 from snakesim_hal.programs.arguments import add_json_argument, add_output_argument, add_set_argument
 from snakesim_hal.programs.commands import Command, Commands
 
@@ -75,7 +76,10 @@ def _qualify(arguments: argparse.Namespace) -> int:
     extras.require_extra("lab", "snakesim drive qualify")
     from snakesim_operator.features.qualification.command import qualify
 
-    return qualify(arguments)
+    with (
+        tolerate_failed_output()
+    ):  # a terminal that is gone must not keep the command from stopping
+        return qualify(arguments)
 
 
 def _verify(arguments: argparse.Namespace) -> int:

@@ -1,7 +1,9 @@
 """Who acts at the bench: a person, or for emulated drives a program."""
 
+import contextlib
 import select
 import sys
+import termios
 import time
 from abc import ABC, abstractmethod
 from typing import Literal
@@ -41,6 +43,7 @@ TYPED_FAULTS: dict[Action, str] = {
     "restart_drive": "reboot joint_1",
 }
 BOOT_S = 1.0  # after which an emulated drive has started again
+SKIP = "skip"  # what the operator types to leave a step out
 
 
 class Assistant(ABC):
@@ -50,8 +53,16 @@ class Assistant(ABC):
     source: Source  # of its answers
 
     @abstractmethod
-    def pause(self, text: str) -> None:
-        """Wait until the operator is ready for a step."""
+    def confirm_step(self, text: str) -> bool:
+        """Wait until the operator is ready for a step, and return False if the operator skips it.
+
+        Args:
+            text: What will happen in the step; empty: nothing moves.
+        """
+
+    @abstractmethod
+    def wait_for_enter(self, text: str) -> None:
+        """Wait until the operator presses Enter in the middle of a step, for what a text says."""
 
     @abstractmethod
     def perform(self, action: Action) -> int | None:
@@ -79,15 +90,24 @@ class Person(Assistant):
     def __init__(self, print_text: PrintLine) -> None:
         self._print = print_text
 
-    def pause(self, text: str) -> None:
+    def confirm_step(self, text: str) -> bool:
         if text:
             self._print(f"       > {text}")
-        self._print("       > Press Enter when you are ready.")
-        _read_answer()
+        question = f'Press Enter when you are ready, or type "{SKIP}" to leave this step out:'
+        while True:
+            match self._ask(question).lower():
+                case "":
+                    return True
+                case "skip":
+                    return False
+                case _:
+                    self._print(f'         Press Enter or type "{SKIP}".')
+
+    def wait_for_enter(self, text: str) -> None:
+        self._ask(text)
 
     def perform(self, action: Action) -> int | None:
-        self._print(f"       > {INSTRUCTIONS[action]} Then press Enter.")
-        _read_answer()
+        self._ask(f"{INSTRUCTIONS[action]} Then press Enter:")
         return None
 
     def ask_turned_positive(self, start_ns: int) -> str:
@@ -100,8 +120,7 @@ class Person(Assistant):
     def read_yes_or_no(self, question: str) -> str:
         """Return "yes", "no", or an empty text if the operator does not know."""
         while True:
-            self._print(f"       > {question} y, n, or Enter if you do not know:")
-            match _read_answer().lower():
+            match self._ask(f"{question} y, n, or Enter if you do not know:").lower():
                 case "y" | "yes":
                     return "yes"
                 case "n" | "no":
@@ -110,6 +129,15 @@ class Person(Assistant):
                     return ""
                 case _:
                     self._print("         Type y or n.")
+
+    def _ask(self, question: str) -> str:
+        """Print a question, and return the line that the operator types after it.
+
+        What was typed before the question is discarded: it answers another one.
+        """
+        _discard_typed_input()
+        self._print(f"       > {question}")
+        return _read_answer()
 
 
 class EmulatedBench(Assistant):
@@ -130,12 +158,17 @@ class EmulatedBench(Assistant):
         self._print = print_text
         self._should_pause = should_pause
 
-    def pause(self, text: str) -> None:
+    def confirm_step(self, text: str) -> bool:
         if self._should_pause:
+            _discard_typed_input()
             self._print(
                 "       > Press Enter for this step. The drive is emulated: a program acts for you."
             )
             _read_answer()
+        return True
+
+    def wait_for_enter(self, text: str) -> None:
+        pass  # the program presses it at once
 
     def perform(self, action: Action) -> int | None:
         text = TYPED_FAULTS.get(action)
@@ -163,11 +196,24 @@ class EmulatedBench(Assistant):
         return "no" if states[-1].is_enabled else "yes"
 
 
+def _discard_typed_input() -> None:
+    """Discard what was typed at the terminal and was not read yet."""
+    with contextlib.suppress(termios.error):  # a terminal that is gone has no input
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+
+
 def _read_answer() -> str:
-    """Return a line from the terminal; it can be interrupted by Ctrl-C."""
+    """Return a line from the terminal; it can be interrupted by Ctrl-C.
+
+    Raises:
+        KeyboardInterrupt: The terminal is gone, or the operator has pressed Ctrl-D: end as with Ctrl-C.
+    """
     while not select.select([sys.stdin], [], [], 0.2)[0]:
         pass
-    line = sys.stdin.readline()
+    try:
+        line = sys.stdin.readline()
+    except OSError as error:
+        raise KeyboardInterrupt from error
     if not line:
-        raise KeyboardInterrupt  # the terminal is gone: end as with Ctrl-C
+        raise KeyboardInterrupt
     return line.strip()

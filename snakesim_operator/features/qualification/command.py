@@ -68,7 +68,7 @@ def qualify(arguments: argparse.Namespace) -> int:
             record = qualify_drive(request, options, print_text)
     except KeyboardInterrupt:
         print_text("")
-        print_text("Interrupted. The motor is off. The same command continues with the next step.")
+        print_text("Interrupted. The motor is off. The same command continues with this step.")
         return INTERRUPTED
     _print_result(record, request.folder, print_text)
     if arguments.json:

@@ -15,7 +15,11 @@ from snakesim_hal.base.terminal import PrintLine
 from snakesim_operator.features.qualification.assistant import Assistant, EmulatedBench, Person
 from snakesim_operator.features.qualification.emulated_drive import SNAKESIM_MODULE, EmulatedDrive
 from snakesim_operator.features.qualification.procedures import PROCEDURES
-from snakesim_operator.features.qualification.protocol.checks import describe_check, judge_check
+from snakesim_operator.features.qualification.protocol.checks import (
+    Check,
+    describe_check,
+    judge_check,
+)
 from snakesim_operator.features.qualification.protocol.record import (
     PROGRESS,
     RECORD,
@@ -54,6 +58,7 @@ CONFIRMATIONS = (
     "A switch that cuts the motor supply is within reach.",
 )
 MAX_REPETITIONS = 3  # of a step with an emulated drive, whose process a busy computer delays
+SKIPPED = "the operator has left this step out"
 MARKS = {"confirmed": "ok", "refuted": "NO", "unknown": "??"}
 
 
@@ -206,30 +211,35 @@ def _run_steps(
         if step.key in done:
             print_text("       done before")
             continue
-        if step.key != "estop_key":
-            assistant.pause(step.instruction)
-        result = _run_step(step, criterion, rig, assistant)
-        for _ in range(MAX_REPETITIONS if record.subject.emulated else 0):
-            if not result.problem:
-                break
-            print_text(
-                f"       repeated, because an emulated drive needs a computer with time: {result.problem}"
-            )
+        if assistant.confirm_step(step.instruction):
             result = _run_step(step, criterion, rig, assistant)
-        for check in result.checks:
-            print_text(f"       {MARKS[judge_check(check)]}  {describe_check(check)}")
-        if result.problem:
-            print_text(f"       ??  {result.problem}")
-        print_text(f"       {result.verdict}")
+            for _ in range(MAX_REPETITIONS if record.subject.emulated else 0):
+                if not result.problem:
+                    break
+                print_text(
+                    f"       repeated, because an emulated drive needs a computer with time: {result.problem}"
+                )
+                result = _run_step(step, criterion, rig, assistant)
+        else:
+            result = _make_result(step, criterion, assistant, [], SKIPPED)
         record = replace_step(record, result)
         write_record(record, folder / PROGRESS)
+        _print_step(result, print_text)
     return record
+
+
+def _print_step(result: StepResult, print_text: PrintLine) -> None:
+    for check in result.checks:
+        print_text(f"       {MARKS[judge_check(check)]}  {describe_check(check)}")
+    if result.problem:
+        print_text(f"       ??  {result.problem}")
+    print_text(f"       {result.verdict}")
 
 
 def _run_step(step: Step, criterion: str, rig: Rig, assistant: Assistant) -> StepResult:
     """Carry out one step; an error makes it unknown. The robot is disarmed afterwards."""
     problem = ""
-    checks = []
+    checks: list[Check] = []
     try:
         if rig.wait_for_lifecycle("disarmed", timeout_s=1.0) != "disarmed":
             rig.disarm()
@@ -238,6 +248,12 @@ def _run_step(step: Step, criterion: str, rig: Rig, assistant: Assistant) -> Ste
     except SnakesimError as error:
         problem = str(error)
         _restart_host(rig)
+    return _make_result(step, criterion, assistant, checks, problem)
+
+
+def _make_result(
+    step: Step, criterion: str, assistant: Assistant, checks: Sequence[Check], problem: str
+) -> StepResult:
     result = StepResult(
         key=step.key,
         title=step.title,

@@ -148,7 +148,8 @@ def check_unplug(rig: Rig, assistant: Assistant) -> list[Check]:
     if bounds.has_watchdog and cut_ns is not None:
         checks.append(_check_torque_off(timeline, cut_ns, bounds.torque_off_s, claim))
     elif bounds.has_watchdog:
-        checks = [_add_claim(check, claim) for check in checks]
+        note = "The time of the cut is not known"
+        checks = [_add_claim(_add_note(check, note), claim) for check in checks]
     else:
         checks.append(_check_torque_off(timeline, plugged_ns, steps.WATCHED_S, claim))
     return [
@@ -164,22 +165,24 @@ def check_supply(rig: Rig, assistant: Assistant) -> list[Check]:
     lowered_ns = assistant.perform("lower_supply")
     state = rig.wait_for_lifecycle("fault", timeout_s=DRIVE_FAULT_TIMEOUT_S)
     faults = _check_faults(rig)
+    watched_ns = time.monotonic_ns()
     readings = rig.watch_torque(0.5)
     timeline = rig.make_timeline(readings)
+    stays_off = _check_stays_off(timeline, watched_ns)
     assistant.perform("restore_supply")
     checks = [
         _check_state(state, "fault"),
         faults,
     ]
     if lowered_ns is None:
-        return [*checks, _check_stays_off(timeline, time.monotonic_ns() - 1)]
+        return [*checks, _add_note(stays_off, "The time of the drop is not known")]
     return [*checks, _check_torque_off(timeline, lowered_ns, steps.SUPPLY_LIMIT_S)]
 
 
 def check_estop_key(rig: Rig, assistant: Assistant) -> list[Check]:
     """Stop by a key: a datagram to the host's stop port, which needs no Zenoh."""
     _swing(rig)
-    assistant.pause("Stop the motor with the next key.")
+    assistant.wait_for_enter("Press Enter to stop the motor:")
     host, port = find_stop_address(rig.endpoint, listens=True)
     pressed_ns = time.monotonic_ns()
     request_stop(host, port, make_requester(), 2.0)
@@ -317,6 +320,10 @@ def _check_operator_sees_no_torque(assistant: Assistant) -> list[Check]:
 
 def _add_claim(check: Check, claim: str) -> Check:
     return msgspec.structs.replace(check, claims=(*check.claims, claim))
+
+
+def _add_note(check: Check, note: str) -> Check:
+    return msgspec.structs.replace(check, note=note)
 
 
 def _yes_or_no(count: int | None) -> str:

@@ -154,8 +154,10 @@ def judge_claims(driver_type: str, steps: tuple[StepResult, ...]) -> tuple[Claim
 
 def replace_step(record: Record, result: StepResult) -> Record:
     """Return the record with the result of a step, in place of an earlier one of the same step."""
-    others = [step for step in record.steps if step.key != result.key]
-    return msgspec.structs.replace(record, steps=(*others, result))
+    if result.key not in {step.key for step in record.steps}:
+        return msgspec.structs.replace(record, steps=(*record.steps, result))
+    steps = tuple(result if step.key == result.key else step for step in record.steps)
+    return msgspec.structs.replace(record, steps=steps)
 
 
 def find_resume_conflict(record: Record, subject: Subject) -> str:

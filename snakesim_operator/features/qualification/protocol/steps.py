@@ -60,7 +60,8 @@ class Step:
 
     key: StepKey
     title: str
-    instruction: str  # for the person at the bench; empty: nothing to do
+    # For the person at the bench, before the robot is armed. Empty: nothing moves.
+    instruction: str
     criterion: str
     criterion_without_watchdog: str = ""  # empty: the same
 
@@ -111,20 +112,20 @@ STEPS = (
     Step(
         key="torque",
         title="Torque limit",
-        instruction="Block the shaft: hold the lever against a stop.",
+        instruction="The motor holds the joint. You will be asked to block its shaft.",
         criterion="Against the block, torque reaches at least half of the limit and at most {torque} times the limit.",
     ),
     Step(
         key="watchdog",
         title="Watchdog: the host ends, and a second program keeps polling",
-        instruction="",
+        instruction="The joint moves slowly. Keep hands away.",
         criterion="Torque is off at most {torque_off} after the host's last setpoint.",
         criterion_without_watchdog="The drive has no watchdog: it still holds {frozen} after the host's last setpoint.",
     ),
     Step(
         key="freeze",
         title="Host frozen for 1 s (SIGSTOP)",
-        instruction="",
+        instruction="The joint moves slowly. Keep hands away.",
         criterion="Torque is off at most {torque_off} after the freeze. The host reports it. Without reset and arm, "
         "the drive stays off for {watched} after the host continues.",
         criterion_without_watchdog="Torque is off at most {torque_off} after the host continues, and stays off for "
@@ -133,39 +134,40 @@ STEPS = (
     Step(
         key="unplug",
         title="Bus unplugged",
-        instruction="Unplug the bus cable from the drive.",
+        instruction="The joint moves slowly. You will be asked to unplug the bus cable from the drive.",
         criterion="Torque goes off by the watchdog, at most {torque_off} after the cut, and stays off once the bus is "
-        "back.",
+        "back. If the time of the cut is not known, torque is off {frozen} after your Enter.",
         criterion_without_watchdog="The drive is off once the bus is back, and stays off for {watched}.",
     ),
     Step(
         key="supply",
         title="Supply sags",
-        instruction="Lower the supply below `min_voltage_v` of the robot file.",
-        criterion="The host reports a fault, and torque is off at most {supply} after the drop.",
+        instruction="The joint moves slowly. You will be asked to lower the supply.",
+        criterion="The host reports a fault, and torque is off at most {supply} after the drop. If the time of the "
+        "drop is not known, torque is off once the host has reported the fault.",
     ),
     Step(
         key="estop_key",
         title="Emergency stop by a key",
-        instruction="Press Enter to stop.",
+        instruction="The joint moves slowly. You will be asked to stop it by a key.",
         criterion="Torque is off at most {estop} after the key.",
     ),
     Step(
         key="estop_network",
         title="Emergency stop over the network",
-        instruction="",
+        instruction="The joint moves slowly. Keep hands away.",
         criterion="Torque is off at most {estop} after the request.",
     ),
     Step(
         key="estop_relay",
         title="Emergency stop by the relay",
-        instruction="Press the red button that cuts the motor supply.",
+        instruction="The joint moves slowly. You will be asked to press the red button that cuts the motor supply.",
         criterion="The motor has no torque, and the drive stays off for {watched} once the supply is back.",
     ),
     Step(
         key="restart",
         title="Drive restarted while it moves",
-        instruction="Switch the drive's supply off and on again while the joint moves.",
+        instruction="The joint moves slowly. You will be asked to switch the drive's supply off and on again.",
         criterion="The host reports a fault. The drive stays off for {watched} without reset and arm.",
     ),
 )
