@@ -226,7 +226,9 @@ class JointSupply(FileStruct, frozen=True, kw_only=True):
     """Current that the electronics of one joint draw without a motor current."""
 
 
-class _DriveId(FileStruct, frozen=True, kw_only=True):
+class _SingleJointFields(FileStruct, frozen=True, kw_only=True):
+    """Fields that only single joints have: no section for all joints contains them."""
+
     id: Annotated[int, Meta(ge=0, lt=MAX_ID)] | None = None
     """Id of the drive on its bus. None: the joint's number, from 1 at the tail."""
 
@@ -240,7 +242,11 @@ _exception_fields = [
     if field.name != "ambient_c"
 ]
 _exceptions_base: Any = msgspec.defstruct(
-    "_OfOne", _exception_fields, bases=(_DriveId,), frozen=True, kw_only=True
+    "_JointExceptionsBase",
+    _exception_fields,
+    bases=(_SingleJointFields,),
+    frozen=True,
+    kw_only=True,
 )
 
 

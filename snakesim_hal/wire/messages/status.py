@@ -90,7 +90,10 @@ TICK_TIMES = {  # of `RobotStatus.tick_times`
 
 
 class RobotStatus(Message, frozen=True, kw_only=True):
-    """`hal/status`, latched: the state of the robot, and its reason."""
+    """`hal/status`, latched: the state of the robot, and its reason.
+
+    `StatusReporter` in the host fills it in. A new field needs a default, so that older messages remain valid.
+    """
 
     tick: q.Tick
     timestamp_ns: q.Stamp

@@ -37,7 +37,7 @@ class Robot(DriveRig):
 
     def __init__(self, **settings: Any) -> None:
         config = self.configuration()
-        fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": 0.3}
+        fixed: dict[str, Any] = {"physics_model": "inertia", "bring_up_limit_s": 3.0}
         super().__init__(config, OdriveBackend(config, OdriveSettings(**fixed | settings)))
         self.sent: list[CanFrame] = []
         send = self.drives.wire.send
@@ -230,7 +230,7 @@ def test_odrive_axis_without_readable_configuration_is_refused(
         "snakesim_can_backend.odrive.emulator.EmulatedOdrive._answer_setting", lambda *_: None
     )
     with raises_error(BackendError, code="drive/not-complete", field="joint_1"):
-        Robot()
+        Robot(bring_up_limit_s=0.3)
 
 
 def test_questions_and_answers_are_those_of_odrives_examples() -> None:
