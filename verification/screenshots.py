@@ -88,11 +88,16 @@ def main() -> None:
         )
         time.sleep(given.after if recorded or given.scroll else 0.0)
         taken = tab.picture()
+        save_picture(taken, given.out)
+
+
+def save_picture(taken: bytes, out: Path) -> None:
+    """Write a picture with 256 colors, which needs a quarter of the bytes."""
     with Image.open(io.BytesIO(taken)) as picture:
         few = picture.convert("RGB").quantize(
             256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
         )
-        few.save(given.out, optimize=True)  # a quarter of the bytes
+        few.save(out, optimize=True)
 
 
 @contextlib.contextmanager
@@ -115,7 +120,7 @@ def commissioning(arguments: str, file: str) -> Iterator[str]:
     with tempfile.TemporaryDirectory() as state:
         own = {**os.environ, "XDG_STATE_HOME": state}
         host = subprocess.Popen(
-            [*snakesim, "host", *shlex.split(arguments), "--endpoint", endpoint], env=own
+            [*snakesim, "start", "host", *shlex.split(arguments), "--endpoint", endpoint], env=own
         )
         words = ["console", "--endpoint", endpoint, "--commission", file]
         try:
