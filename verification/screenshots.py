@@ -25,6 +25,7 @@ from snakesim_testing.operator.browser import open_chromium
 from snakesim_testing.runs.command import running_snakesim
 
 PHONE = 400, 800
+STOP_FAILURE = "THE STOP"
 
 
 def main() -> None:
@@ -77,6 +78,7 @@ def main() -> None:
         if given.dark:
             tab.click("Dark page")
         for label in [*given.click, *(["Signals"] if given.signals else [])]:
+            tab.wait_for(label)
             tab.click(label)
             time.sleep(1.0)
         if given.signals:
@@ -87,6 +89,9 @@ def main() -> None:
             f"document.querySelectorAll('[class*=viewport]').forEach(e => {{ e.scrollTop += {given.scroll}; }})"
         )
         time.sleep(given.after if recorded or given.scroll else 0.0)
+        if not recorded:
+            # On a busy computer a self-test of the stop may come too late, and the page reports it.
+            wait_until(lambda: STOP_FAILURE not in tab.text(), "a stop that answers")
         taken = tab.picture()
         save_picture(taken, given.out)
 
