@@ -25,6 +25,7 @@ from snakesim_testing.operator.browser import open_chromium
 from snakesim_testing.runs.command import running_snakesim
 
 PHONE = 400, 800
+STOP_FAILURE = "THE STOP"
 
 
 def main() -> None:
@@ -77,6 +78,7 @@ def main() -> None:
         if given.dark:
             tab.click("Dark page")
         for label in [*given.click, *(["Signals"] if given.signals else [])]:
+            tab.wait_for(label)
             tab.click(label)
             time.sleep(1.0)
         if given.signals:
@@ -87,12 +89,20 @@ def main() -> None:
             f"document.querySelectorAll('[class*=viewport]').forEach(e => {{ e.scrollTop += {given.scroll}; }})"
         )
         time.sleep(given.after if recorded or given.scroll else 0.0)
+        if not recorded:
+            # On a busy computer a self-test of the stop may come too late, and the page reports it.
+            wait_until(lambda: STOP_FAILURE not in tab.text(), "a stop that answers")
         taken = tab.picture()
+        save_picture(taken, given.out)
+
+
+def save_picture(taken: bytes, out: Path) -> None:
+    """Write a picture with 256 colors, which needs a quarter of the bytes."""
     with Image.open(io.BytesIO(taken)) as picture:
         few = picture.convert("RGB").quantize(
             256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
         )
-        few.save(given.out, optimize=True)  # a quarter of the bytes
+        few.save(out, optimize=True)
 
 
 @contextlib.contextmanager
@@ -115,7 +125,7 @@ def commissioning(arguments: str, file: str) -> Iterator[str]:
     with tempfile.TemporaryDirectory() as state:
         own = {**os.environ, "XDG_STATE_HOME": state}
         host = subprocess.Popen(
-            [*snakesim, "host", *shlex.split(arguments), "--endpoint", endpoint], env=own
+            [*snakesim, "start", "host", *shlex.split(arguments), "--endpoint", endpoint], env=own
         )
         words = ["console", "--endpoint", endpoint, "--commission", file]
         try:
