@@ -65,6 +65,11 @@ PARTS = {
         16,
         (*PYTEST, "tests", "--ignore", "tests/system/can", "-n", "3", "-m", "slow and not quiet"),
     ),
+    "trials": CampaignPart(
+        "all random trials, of which each change makes a tenth",
+        4,
+        (*PYTEST, "tests/unit", "-n", "2", "-m", "(hypothesis or trials) and not (slow or quiet)"),
+    ),
     "can": CampaignPart(
         "all CAN tests and the contract on a kernel's bus",
         7,
@@ -164,7 +169,10 @@ def _run(name: str) -> bool:
     began_s = time.monotonic()
     words = part.command if part.script else ("-m", *part.command)
     code = subprocess.run(
-        make_python_command(*words), cwd=ROOT, env=make_child_environment(), check=False
+        make_python_command(*words),
+        cwd=ROOT,
+        env={"SNAKESIM_HYPOTHESIS": "full", **make_child_environment()},
+        check=False,
     ).returncode
     print(
         f"== {name}: exit code {code} after {(time.monotonic() - began_s) / 60:.1f} min", flush=True

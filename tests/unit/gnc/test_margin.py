@@ -13,6 +13,7 @@ from snakesim_gnc.navigation.path_search.margin import MAX_CONTACT_FORCE_N, comp
 from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, compute_body_points, make_stage
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 SEEDS = st.integers(0, 2**31)
 
@@ -38,7 +39,7 @@ def angles_of(nodes: np.ndarray) -> np.ndarray:
 
 
 @given(seed=SEEDS, count=st.integers(3, 8))
-@settings(max_examples=50)
+@settings(max_examples=choose_trial_count(50))
 def test_the_margin_is_that_of_the_best_three_contacts(seed: int, count: int) -> None:
     random = np.random.default_rng(seed)
     contacts, drag = random.normal(size=(2, count, 3)), random.normal(size=(2, 3))
@@ -92,7 +93,7 @@ def test_a_push_is_in_balance_and_only_pushes(tail_s_m: float) -> None:
 
 
 @given(seed=SEEDS)
-@settings(max_examples=30)
+@settings(max_examples=choose_trial_count(30))
 def test_whatever_touches_it_a_balanced_push_has_no_pull(seed: int) -> None:
     random = np.random.default_rng(seed)
     pegs = [peg for peg in make_stage().pegs if random.uniform() < 0.6]

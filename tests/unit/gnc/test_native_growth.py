@@ -95,7 +95,9 @@ def assert_equal_bits(
 
 
 @needs_library
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize(
+    "seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 12))]
+)
 @pytest.mark.parametrize("kind", ["ahead", "whole body", "whole body beside failed paths"])
 def test_paths_equal_those_of_the_specification_to_the_last_bit(kind: str, seed: int) -> None:
     random = np.random.default_rng(seed)

@@ -14,6 +14,7 @@ from snakesim_sim_backend.laws.directional import (
     combine_coefficients,
 )
 from snakesim_sim_backend.settings import SimSettings
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 from snakesim_testing.sim.simulator_rig import make_config, make_resting_body
 
 HU = (0.11, 0.14, 0.19)  # forward, backward, sideways
@@ -67,6 +68,7 @@ def test_viscous_force_is_normal_force_times_coefficient_times_speed() -> None:
     assert force == pytest.approx((-NORMAL_N * 3.0 * 0.3, NORMAL_N * 0.5 * 0.2, 0.0))
 
 
+@pytest.mark.trials
 @pytest.mark.parametrize("coefficients", [HU, (0.01, 0.01, 0.6), (0.5, 0.1, 0.1), (0.1, 0.3, 0.2)])
 def test_friction_never_gives_more_energy_than_its_spring_has(
     coefficients: tuple[float, float, float],
@@ -80,7 +82,7 @@ def test_friction_never_gives_more_energy_than_its_spring_has(
         stretch, work_j, heading, highest_j, slid_m = np.zeros(2), 0.0, 0.0, 0.0, 0.0
         velocity = np.zeros(2)
         last_force = np.zeros(2)
-        for _ in range(5_000):
+        for _ in range(choose_trial_count(5_000)):
             velocity += 0.3 * (random.normal(0.0, 2e-5, 2) - velocity)
             slip = velocity * random.choice([0.1, 1.0, 1.0, 3.0])
             heading += turning * random.normal()

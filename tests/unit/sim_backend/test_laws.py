@@ -19,9 +19,10 @@ from snakesim_sim_backend.laws.version import LawsVersion
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, SimModel, build_sim_model
 from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.settings import SimSettings
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 from snakesim_testing.sim.simulator_rig import make_config
 
-STATES = 100  # in each scene
+STATES = choose_trial_count(100)  # in each scene
 MANY_STATES = 2000  # in each scene: ten thousand together
 BATCH_SIZE = 9
 BATCH_STEPS = 20
@@ -254,6 +255,7 @@ def library() -> None:
         pytest.skip(loaded.problem)
 
 
+@pytest.mark.trials
 @pytest.mark.parametrize("scene", list(SCENES))
 def test_the_c_version_computes_the_bits_of_the_python_version(scene: str) -> None:
     compare(scene, STATES)

@@ -32,6 +32,7 @@ from snakesim_testing.can.module_rig import (
     parameter,
     setpoint,
 )
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 WITHOUT_KEY = load_layouts()[Opcode.COMMAND].encode(BROADCAST, action=CommandAction.ARM)
 
@@ -257,7 +258,7 @@ def give(module: ModuleFirmware, frame, now_us: float) -> None:
         module.receive(frame, now_us)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=choose_trial_count(100), deadline=None)
 @given(st.lists(st.tuples(ANYTHING, PAUSES, st.booleans()), max_size=60))
 def test_firmware_drives_only_when_armed_with_valid_setpoints(sent):
     module, now_us = booted(), BOOTED

@@ -23,6 +23,7 @@ from snakesim_can_backend.protocol.definitions import (
     parse_node,
     parse_opcode,
 )
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 from snakesim_testing.messages import raises_error
 
 DATABASE = load_database()
@@ -39,7 +40,7 @@ each_signal = pytest.mark.parametrize(
 LAYOUTS = list(load_layouts().values())
 each_layout = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
 any_layout, any_signal = st.sampled_from(LAYOUTS), st.sampled_from(EVERY_SIGNAL)
-often = settings(max_examples=400)
+often = settings(max_examples=choose_trial_count(400))
 nodes = st.integers(1, LAST_NODE)
 
 

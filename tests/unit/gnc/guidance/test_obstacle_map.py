@@ -12,6 +12,7 @@ from snakesim_gnc.guidance.obstacle_map import FORGET_DISTANCE_M, ObstacleMap
 from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.rendered import make_box, make_cylinder, make_lidar_scan
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 S = 1_000_000_000
 BODY_M = 0.04
@@ -49,7 +50,7 @@ def test_map_obstacle_seen_repeatedly_gains_confidence():
 
 
 @given(st.floats(0.03, 0.07), st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=12))
-@settings(max_examples=40)
+@settings(max_examples=choose_trial_count(40))
 def test_touches_all_around_find_a_thing_that_was_never_seen(radius, angles):
     map_ = ObstacleMap()
     for angle in angles:

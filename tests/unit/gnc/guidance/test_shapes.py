@@ -13,6 +13,7 @@ from snakesim_gnc.guidance.surfaces import MAX_CELLS, MAX_INFORMATION, SurfaceCe
 from snakesim_gnc.guidance.tracks import ObstacleTrack, fit_shapes
 from snakesim_hal.model.outlines import compute_outline_distance_m
 from snakesim_testing.gnc.rendered import make_box, make_cylinder, make_lidar_scan
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 NOISE_M = 0.002
 
@@ -60,7 +61,7 @@ def test_a_concave_corner_is_two_things():
 
 
 @given(st.floats(0.03, 0.08), st.floats(0.3, 1.2), st.floats(-0.5, 0.5), st.integers(0, 1000))
-@settings(max_examples=60)
+@settings(max_examples=choose_trial_count(60))
 def test_a_cylinder_is_found_as_well_as_its_covariance_says(radius, x, y, seed):
     track = track_shape(make_cylinder("it", x, y, radius), random=np.random.default_rng(seed))
     off = math.dist(track.center_w, (x, y))
@@ -71,7 +72,7 @@ def test_a_cylinder_is_found_as_well_as_its_covariance_says(radius, x, y, seed):
 
 
 @given(st.floats(0.08, 0.3), st.floats(0.08, 0.3), st.floats(0.35, 1.2), st.integers(0, 1000))
-@settings(max_examples=60)
+@settings(max_examples=choose_trial_count(60))
 def test_a_box_seen_at_two_faces_is_found_whole(length, width, yaw, seed):
     truth = make_box("it", 0.8, 0.1, (length, width), yaw)
     track = track_shape(

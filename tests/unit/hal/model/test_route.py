@@ -16,6 +16,7 @@ from snakesim_hal.model.route import (
     place_chain_on_route,
     sample_sine_curve,
 )
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 from snakesim_testing.messages import raises_error
 
 
@@ -81,7 +82,7 @@ def test_heading_of_a_circle() -> None:
 
 
 @given(route=gentle(), x=st.floats(-0.3, 6), y=st.floats(-0.6, 0.6))
-@settings(max_examples=60)
+@settings(max_examples=choose_trial_count(60))
 def test_projection_is_the_nearest_point(route: Route, x: float, y: float) -> None:
     s = route.project_point(np.array([x, y]))
     found = math.dist(route.compute_point(s), (x, y))

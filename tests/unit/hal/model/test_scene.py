@@ -21,6 +21,7 @@ from snakesim_hal.model.placement import (
 from snakesim_hal.model.scene import SceneFile, make_route
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.hal.small_robots import SCENE
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 from snakesim_testing.messages import raises_error
 
 SINE = {"kind": "sine", "amplitude_m": 0.1, "wavelength_m": 0.8, "length_m": 4.0}
@@ -206,7 +207,7 @@ def test_too_many_pegs_and_pegs_without_a_route_are_refused() -> None:
 @given(
     seed=st.integers(0, 2**31), clearance_m=st.floats(0, 0.1), route_clearance_m=st.floats(0, 0.1)
 )
-@settings(max_examples=20)
+@settings(max_examples=choose_trial_count(20))
 def test_a_random_field_keeps_its_clearances(
     seed: int, clearance_m: float, route_clearance_m: float
 ) -> None:

@@ -1,6 +1,6 @@
 """The authority under everything that can happen to it, in any order, against a plain model of what may be.
 
-200 sequences a run; as many as one likes with
+20 sequences with each change and 200 in the campaign; as many as one likes with
 `SNAKESIM_SEQUENCES=10000 python -m pytest -n 2 tests/unit/hal/safety/test_authority_machine.py`.
 """
 
@@ -50,8 +50,9 @@ from snakesim_testing.hal.small_robots import (
     make_joint_state,
     make_power,
 )
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 
-SEQUENCES = int(os.environ.get("SNAKESIM_SEQUENCES", "200"))
+SEQUENCES = int(os.environ.get("SNAKESIM_SEQUENCES", choose_trial_count(200)))
 PER_TEST = 200
 STEPS = 50
 KEPT = 4  # commands: fewer than in earnest, so that a few are a flood
@@ -620,6 +621,7 @@ class Everything(AuthorityModel):
         )
 
 
+@pytest.mark.trials
 @pytest.mark.timeout(600)  # a busy computer may take minutes, which is no failure
 @pytest.mark.parametrize("batch", range(-(-SEQUENCES // PER_TEST)))
 def test_whatever_happens_the_robot_does_only_what_it_may(batch: int) -> None:

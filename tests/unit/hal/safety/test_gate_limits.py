@@ -36,6 +36,7 @@ from snakesim_testing.hal.limiter_rig import (
     words,
 )
 from snakesim_testing.hal.small_robots import make_description, make_joint_command
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 
 def ends(mode: JointMode, measured: MeasuredState, i: int) -> tuple[float, float]:
@@ -83,7 +84,7 @@ def situations(draw: st.DrawFn) -> tuple[JointCommand, MeasuredState, AppliedSet
 
 
 @given(situations())
-@settings(max_examples=300)
+@settings(max_examples=choose_trial_count(300))
 def test_whatever_is_asked_what_is_applied_is_inside_every_limit(
     case: tuple[JointCommand, MeasuredState, AppliedSetpoints],
 ) -> None:

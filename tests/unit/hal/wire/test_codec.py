@@ -34,6 +34,7 @@ from snakesim_testing.hal.strategies import (
     make_strategy,
     replace_at,
 )
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 from snakesim_testing.messages import raises_error
 
 ALL = list(VERSIONS)
@@ -56,7 +57,7 @@ def take(message: type[Message], payload: bytes) -> Message | None:
 
 @each_message
 @given(data=st.data())
-@settings(max_examples=25)
+@settings(max_examples=choose_trial_count(25))
 def test_codec_round_trip_returns_an_equal_message(
     message: type[Message], data: st.DataObject
 ) -> None:

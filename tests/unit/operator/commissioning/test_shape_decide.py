@@ -27,8 +27,9 @@ from snakesim_operator.features.commissioning.shape.design import (
     ShapePose,
     design_poses,
 )
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 
-TRIALS = 100
+TRIALS = choose_trial_count(100)  # at least one with each fault
 SMALLEST_ZERO_RAD = 2.02 * PLACEMENT_TOLERANCE_RAD  # that is always found
 GEAR_ERRORS = (0.25, 0.5, 2 / 3, 0.87, 1.14, 1.5, 2.0, 4.0)
 FAULTS = (
@@ -134,8 +135,9 @@ def list_states(verdicts: Sequence[ShapeVerdict], state: str) -> dict[int, set[J
     return states
 
 
+@pytest.mark.trials
 @pytest.mark.parametrize("at_the_tolerance", [False, True])
-def test_shapes_name_the_fault_of_each_of_100_robots_and_no_other(at_the_tolerance: bool) -> None:
+def test_shapes_name_the_fault_of_each_random_robot_and_no_other(at_the_tolerance: bool) -> None:
     for trial in range(TRIALS):
         fault = FAULTS[trial % len(FAULTS)]
         robot, rng = make_robot(trial, fault)
@@ -146,8 +148,9 @@ def test_shapes_name_the_fault_of_each_of_100_robots_and_no_other(at_the_toleran
         assert list_states(verdicts, "unknown") == {}, f"trial {trial}, {fault}: {verdicts}"
 
 
+@pytest.mark.trials
 @pytest.mark.parametrize("at_the_tolerance", [False, True])
-def test_shapes_confirm_each_of_100_robots_that_are_as_their_file(at_the_tolerance: bool) -> None:
+def test_shapes_confirm_each_random_robot_that_is_as_their_file(at_the_tolerance: bool) -> None:
     for trial in range(1000, 1000 + TRIALS):
         robot, rng = make_robot(trial, None)
         verdicts = judge_shapes(
@@ -247,11 +250,12 @@ def test_a_robot_that_lay_on_its_back_gets_a_hint() -> None:
     assert find_placement_hint(judge_shapes(robot.file, robot.poses, reading_rad)) == ""
 
 
+@pytest.mark.trials
 @pytest.mark.parametrize("limit_rad", [0.5, 0.7])
 def test_no_fault_of_robots_that_bend_less_is_confirmed_and_no_sound_joint_is_blamed(
     limit_rad: float,
 ) -> None:
-    for trial in range(TRIALS // 4):
+    for trial in range(max(TRIALS // 4, len(FAULTS))):
         robot, rng = make_robot(trial, FAULTS[trial % len(FAULTS)])
         file = [shorten_travel(joint, limit_rad) for joint in robot.file]
         built = [shorten_travel(joint, limit_rad) for joint in robot.built]

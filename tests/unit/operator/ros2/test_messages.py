@@ -19,10 +19,11 @@ from snakesim_operator.features.ros2.messages import RosMarker, RosTransform
 from snakesim_operator.features.ros2.steering import CmdVelSteering
 from snakesim_testing.hal.custom_sample import GOOD, PLACE, SkinSample
 from snakesim_testing.hal.strategies import make_strategy
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 STAMP_NS = 12_345_678_901
-FEW = settings(max_examples=25)
+FEW = settings(max_examples=choose_trial_count(25))
 
 
 def read(kind: RosType, payload: bytes) -> Any:
