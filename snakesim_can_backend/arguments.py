@@ -21,7 +21,7 @@ DEFAULT_POSE = "127.0.0.1:7450"
 EXPANDED_DBC_FILENAME = "snakesim-expanded.dbc"
 MIN_RATE_HZ = 20.0
 MAX_RATE_HZ = 5000.0  # of a scenario
-CHANNEL_ABOUT = "SocketCAN interface such as can0, or INTERFACE:CHANNEL such as slcan:/dev/ttyACM0"
+CHANNEL_ABOUT = "SocketCAN interface such as can0, INTERFACE:CHANNEL such as slcan:/dev/ttyACM0, or local:FOLDER"
 
 
 def add_scan(parser: argparse.ArgumentParser) -> None:
@@ -110,12 +110,14 @@ def add_module_emulation(parser: argparse.ArgumentParser) -> None:
     add_scenario_name_argument(parser)
     add_channel(
         parser,
-        f"interface, or INTERFACE:CHANNEL of python-can, tail to head (default: {DEFAULT_CHANNEL})",
+        "interface, INTERFACE:CHANNEL of python-can, or local:FOLDER, tail to head (default: "
+        f"{DEFAULT_CHANNEL})",
     )
     parser.add_argument(
         "--firmware",
         action="store_true",
-        help="run the reference firmware in C, each module with a simulated joint of its own, on --channel unix:PATH",
+        help="run the reference firmware in C, each module with a simulated joint of its own, on --channel "
+        "local:FOLDER",
     )
     parser.add_argument(
         "--physics-model",

@@ -1,6 +1,7 @@
 """What `snakesim drive` does for joint modules: bus load, scan, replay of a log, the expanded DBC file."""
 
 import argparse
+import contextlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from math import ceil
@@ -23,9 +24,13 @@ from snakesim_can_backend.bus.load import (
     plan_reports_at,
     suggest_alternatives,
 )
+from snakesim_can_backend.bus.local_wire import LOCAL, LocalWire
 from snakesim_can_backend.bus.read_log import BusLog
-from snakesim_can_backend.bus.unix_wire import UNIX
-from snakesim_can_backend.bus.unknown_frames import UnknownFrames, listen_for_unknown_frames
+from snakesim_can_backend.bus.unknown_frames import (
+    LocalBusReader,
+    UnknownFrames,
+    listen_for_unknown_frames,
+)
 from snakesim_can_backend.driver.bring_up import ModuleBus, ModuleIdentity, find_modules
 from snakesim_can_backend.driver.modules import compute_response_timeout_s
 from snakesim_can_backend.driver.offline import LogReplay, compare_with_run_log
@@ -199,6 +204,7 @@ def scan_channels(arguments: argparse.Namespace) -> int:
     channels_in_use: list[str] = []
     print_text = discard_line if arguments.json else print_line
     for channel in arguments.channel:
+        validate_channel(channel)
         unknown_senders: list[UnknownFrames] = []
         if not arguments.anyway:
             unknown_senders = find_unknown_senders(channel, arguments.bit_rate)
@@ -225,14 +231,11 @@ def scan_channels(arguments: argparse.Namespace) -> int:
 
 
 def find_unknown_senders(channel: str, bit_rate: int) -> list[UnknownFrames]:
-    """Listen to a bus without sending, and return the frames that are not from joint modules, by sender.
-
-    A Unix socket connects two programs only, so that no other sender can be there.
-    """
-    validate_channel(channel)
-    interface, _ = split_channel(channel)
-    if interface == UNIX:
-        return []
+    """Listen to a bus without sending, and return the frames that are not from joint modules, by sender."""
+    interface, name = split_channel(channel)
+    if interface == LOCAL:
+        with contextlib.closing(LocalWire(name, fd=True)) as wire:
+            return listen_for_unknown_frames(LocalBusReader(wire), LISTEN_DURATION_S)
     bus = open_bus(channel, bit_rate)
     try:
         return listen_for_unknown_frames(bus, LISTEN_DURATION_S)

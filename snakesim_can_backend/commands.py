@@ -89,7 +89,8 @@ def _load_cia402(arguments: argparse.Namespace) -> int:
 def _add_emulation(parser: argparse.ArgumentParser) -> None:
     add_emulation(
         parser,
-        f"interface, or INTERFACE:CHANNEL of python-can (default: {options.DEFAULT_CHANNEL})",
+        "interface, INTERFACE:CHANNEL of python-can, or local:FOLDER (default: "
+        f"{options.DEFAULT_CHANNEL})",
     )
 
 

@@ -26,7 +26,7 @@ class CanSettings(FileStruct, frozen=True, kw_only=True):
     channels: Annotated[
         list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)
     ] = []
-    """CAN buses, tail to head: SocketCAN interfaces such as can0, INTERFACE:CHANNEL of python-can, or unix:PATH of
+    """CAN buses, tail to head: SocketCAN interfaces such as can0, INTERFACE:CHANNEL of python-can, or local:FOLDER for
     emulated modules. Empty: a virtual bus in this process with emulated joint modules.
     """
 

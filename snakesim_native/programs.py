@@ -1,6 +1,6 @@
 """The programs in C that are compiled when they are first needed: the reference firmware of a joint module.
 
-`joint_modules`         emulates the modules of a robot, on a Unix socket
+`joint_modules`         emulates the modules of a robot, on a local bus
 `joint_module_replay`   runs the firmware of one module on events from its standard input
 
 Both contain the same firmware, without change: `joint_module/firmware`. A program is compiled once for its sources and
@@ -25,7 +25,7 @@ from snakesim_native.load import choose_writable_folder
 
 # The firmware is C99 without extensions, so that every compiler for microcontrollers accepts it.
 STRICT_FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion")
-# The emulation of a robot uses sockets and clocks of POSIX.
+# The emulation of a robot uses pipes and clocks of POSIX.
 POSIX_FLAGS = ("-D_POSIX_C_SOURCE=200809L",)
 SANITIZER_FLAGS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
 

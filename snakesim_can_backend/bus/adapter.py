@@ -3,8 +3,7 @@
 A channel is a SocketCAN interface (`can0`), or `INTERFACE:CHANNEL` of python-can: `slcan:/dev/ttyACM0`,
 `pcan:PCAN_USBBUS1`, `kvaser:0`, `gs_usb:0`, `udp_multicast:239.74.163.2`. Its adapter is configured to the bit rate; a
 kernel interface has that of `ip link`. A bus of CAN FD has a second bit rate, for data, and frames of up to 64 bytes
-with ids of 11 or 29 bits. Two kinds of bus need no adapter: `unix:PATH`, a socket of emulated modules in another
-process, and `loopback:FOLDER`, a bus of emulated drives between processes.
+with ids of 11 or 29 bits. `local:FOLDER` needs no adapter: it is a bus of emulated drives between processes.
 """
 
 import contextlib
@@ -28,17 +27,15 @@ from snakesim_can_backend.bus.bus import (
 )
 from snakesim_can_backend.bus.bus_errors import BusError, decode_error_frame
 from snakesim_can_backend.bus.load import BIT_RATE
-from snakesim_can_backend.bus.loopback_wire import INTERFACE as LOOPBACK
-from snakesim_can_backend.bus.loopback_wire import LoopbackWire
-from snakesim_can_backend.bus.unix_wire import UNIX, UnixWire, validate_socket
+from snakesim_can_backend.bus.local_wire import LOCAL, LocalWire, validate_local_bus
 from snakesim_can_backend.protocol.definitions import NODE_BITS, CanFrame, Opcode
 from snakesim_hal.base.errors import BackendError, ConfigError, suggest_word
 
-OWN_INTERFACES = (UNIX, LOOPBACK)  # implemented here, not by python-can
-# They have no bit rate, either.
-INTERFACES_WITHOUT_ADAPTER = "udp_multicast", "virtual", *OWN_INTERFACES
+# All interfaces that a channel may name. Only LOCAL is implemented here.
+INTERFACES = frozenset({*can.VALID_INTERFACES, LOCAL})
+INTERFACES_WITHOUT_ADAPTER = "udp_multicast", "virtual", LOCAL  # they have no bit rate, either
 # Interfaces through which this driver supports CAN FD.
-FD_INTERFACES = "socketcan", "kvaser", "udp_multicast", "virtual", LOOPBACK
+FD_INTERFACES = "socketcan", "kvaser", "udp_multicast", "virtual", LOCAL
 # Only Linux keeps multicast groups on one UDP port apart.
 ARE_MULTICAST_GROUPS_SEPARATE = sys.platform == "linux"
 IP_MULTICAST_ALL = 49  # linux/in.h
@@ -82,10 +79,11 @@ def open_wire(
     bit_rate: int = BIT_RATE,
     data_bit_rate: int | None = None,
 ) -> Wire:
-    """Open one end of a bus: a SocketCAN interface of the kernel, or an adapter of python-can.
+    """Open one end of a bus: a SocketCAN interface of the kernel, an adapter of python-can, or a local bus.
 
     Args:
-        channel: SocketCAN interface such as can0, or INTERFACE:CHANNEL of python-can.
+        channel: SocketCAN interface such as can0, INTERFACE:CHANNEL of python-can, or local:FOLDER, which is created
+            if it does not exist.
         only: Opcodes of the messages to receive; None for all messages.
         bit_rate: Bit rate in bit/s; not used by an interface of the kernel.
         data_bit_rate: Second bit rate in bit/s, for the data of CAN FD; None for classic CAN.
@@ -95,12 +93,10 @@ def open_wire(
         BackendError: The channel cannot be opened.
     """
     interface, name = split_channel(channel)
-    if interface == LOOPBACK:
-        return LoopbackWire(channel, name, only)
+    if interface == LOCAL:
+        return LocalWire(name, only, fd=data_bit_rate is not None)
     if interface == "socketcan" and data_bit_rate is None:
         return SocketCanWire(name, only)
-    if interface == UNIX:
-        return UnixWire(name)
     return AdapterWire(channel, only, bit_rate, data_bit_rate)
 
 
@@ -109,11 +105,11 @@ def split_channel(channel: str) -> tuple[str, str]:
     interface, colon, name = channel.partition(":")
     if not colon:
         return "socketcan", channel
-    if interface not in (*can.VALID_INTERFACES, *OWN_INTERFACES):
-        interfaces = sorted((*can.VALID_INTERFACES, *OWN_INTERFACES))
+    if interface not in INTERFACES:
+        interfaces = sorted(INTERFACES)
         raise ConfigError(
-            f"channel {channel!r}: python-can has no interface {interface!r}; "
-            f"{suggest_word(interface, interfaces)}it has {', '.join(interfaces)}",
+            f"channel {channel!r}: there is no interface {interface!r}; "
+            f"{suggest_word(interface, interfaces)}the interfaces are {', '.join(interfaces)}",
             code="bus/invalid-channel",
         )
     if not name:
@@ -124,15 +120,16 @@ def split_channel(channel: str) -> tuple[str, str]:
     return interface, name
 
 
-def validate_channel(channel: str, *, fd: bool = False) -> None:
-    """Check that python-can has the interface of a channel, and that an interface of the kernel is up.
+def validate_channel(channel: str, *, fd: bool = False, is_emulator: bool = False) -> None:
+    """Check that there is the interface of a channel, and that an interface of the kernel or a local bus is in use.
 
     Args:
-        channel: SocketCAN interface such as can0, or INTERFACE:CHANNEL of python-can.
+        channel: SocketCAN interface such as can0, INTERFACE:CHANNEL of python-can, or local:FOLDER.
         fd: Whether the channel must support CAN FD.
+        is_emulator: Whether drives will be emulated there: they may be the first program on a local bus.
 
     Raises:
-        ConfigError: The channel does not exist, is down, or does not support CAN FD.
+        ConfigError: The channel does not exist, is down, does not support CAN FD, or is a local bus without a program.
     """
     interface, name = split_channel(channel)
     if fd and interface not in FD_INTERFACES:
@@ -143,23 +140,26 @@ def validate_channel(channel: str, *, fd: bool = False) -> None:
         )
     if interface == "socketcan":
         validate_interface(name)
-    if interface == UNIX:
-        validate_socket(name)
+    if interface == LOCAL and not is_emulator:
+        validate_local_bus(name)
 
 
-def validate_channels(channels: Sequence[str], *, fd: bool = False) -> None:
-    """Check every channel of a robot, and that no two of them are the same bus.
+def validate_channels(
+    channels: Sequence[str], *, fd: bool = False, is_emulator: bool = False
+) -> None:
+    """Check every channel of a robot as `validate_channel` does, and that no two of them are the same bus.
 
     Args:
-        channels: SocketCAN interfaces, or INTERFACE:CHANNEL of python-can.
+        channels: SocketCAN interfaces, INTERFACE:CHANNEL of python-can, or local:FOLDER.
         fd: Whether the channels must support CAN FD.
+        is_emulator: Whether drives will be emulated there.
 
     Raises:
-        ConfigError: A channel does not exist, is down, does not support CAN FD, or is named twice.
+        ConfigError: A channel cannot be used, or is named twice.
     """
     channel_by_bus: dict[tuple[str, str], str] = {}
     for channel in channels:
-        validate_channel(channel, fd=fd)
+        validate_channel(channel, fd=fd, is_emulator=is_emulator)
         bus = split_channel(channel)
         if bus in channel_by_bus:
             raise ConfigError(

@@ -5,11 +5,13 @@ is "as" the one that is named.
 """
 
 import time
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import can
 
+from snakesim_can_backend.bus.bus import to_python_can, wait
+from snakesim_can_backend.bus.local_wire import MAX_CLASSIC_BYTES, LocalWire
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import (
     LAST_NODE,
@@ -52,11 +54,37 @@ class UnknownFrames:
         return f"{digits}  {self.length} B  {self.frames} frames  {self.origin or 'unknown'}"
 
 
-def listen_for_unknown_frames(bus: can.BusABC, duration_s: float) -> list[UnknownFrames]:
+class LocalBusReader:
+    """Reads an open local bus as python-can reads the other buses."""
+
+    def __init__(self, wire: LocalWire) -> None:
+        """Begin to read.
+
+        Args:
+            wire: Open end of the bus, for CAN FD, so that it receives all frames.
+        """
+        self.channel_info = wire.channel
+        self._wire = wire
+        self._frames: deque[CanFrame] = deque()
+
+    def recv(self, timeout: float) -> can.Message | None:
+        """Return the next frame; None if there is none within the timeout in s."""
+        if not self._frames:
+            wait([self._wire], timeout)
+            self._frames.extend(self._wire.receive())
+        if not self._frames:
+            return None
+        frame = self._frames.popleft()
+        return to_python_can(frame, fd=len(frame.data) > MAX_CLASSIC_BYTES)
+
+
+def listen_for_unknown_frames(
+    bus: can.BusABC | LocalBusReader, duration_s: float
+) -> list[UnknownFrames]:
     """Collect the frames on a bus that do not belong to the protocol of joint modules, without sending anything.
 
     Args:
-        bus: An open bus of python-can.
+        bus: An open bus.
         duration_s: How long to listen; it ends earlier after MAX_FRAMES frames.
 
     Returns:

@@ -40,8 +40,8 @@ class CanDriveSettings(DriveSettings, frozen=True, kw_only=True):
     channels: Annotated[
         list[Annotated[str, Meta(min_length=1, max_length=127)]], Meta(max_length=8)
     ] = []
-    """CAN buses: SocketCAN interfaces such as can0, or INTERFACE:CHANNEL of python-can. Empty: emulated drives in this
-    process.
+    """CAN buses: SocketCAN interfaces such as can0, INTERFACE:CHANNEL of python-can, or local:FOLDER for emulated
+    drives. Empty: emulated drives in this process.
     """
 
     bit_rate: Annotated[int, Meta(ge=10_000, le=1_000_000, extra_json_schema={"unit": "bit/s"})] = (

@@ -44,7 +44,7 @@ def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> in
                 f"--channel {channel}: emulated drives beside real ones of the same ids are dangerous",
                 code="bus/not-virtual",
             )
-    validate_channels(settings.channels, fd=settings.fd_rate is not None)
+    validate_channels(settings.channels, fd=settings.fd_rate is not None, is_emulator=True)
     config = msgspec.structs.replace(config, clock_mode="realtime")
     wires = [
         open_wire(channel, None, settings.bit_rate, settings.fd_rate)

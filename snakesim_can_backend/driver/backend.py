@@ -67,7 +67,7 @@ class CanBackend(DriveBackend):
         validate_pose_settings(config, settings.pose_listen)
         validate_emulator_settings(config, settings)
         validate_fault_plan(config, settings)
-        validate_channels(settings.channels)
+        validate_channels(settings.channels, is_emulator=settings.emulators_run == "process")
         if has_emulators:
             return ("lockstep", "realtime")
         return ("realtime",)

@@ -1,4 +1,4 @@
-"""The reference firmware in C as a child of the driver, on a socket of its own."""
+"""The reference firmware in C as a child of the driver, on a local bus of its own."""
 
 import subprocess
 from pathlib import Path
@@ -8,7 +8,7 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.emulator_child import EmulatorChild
 from snakesim_hal.model.scenario import RunConfig
 
-SOCKET_NAME = "bus.sock"
+BUS_FOLDER_NAME = "bus"
 MODULES_NAME = "modules.txt"
 
 
@@ -31,7 +31,7 @@ class FirmwareProcess(EmulatorProcess):
     @property
     def channel(self) -> str:
         """Channel of the bus with the modules."""
-        return f"unix:{self._folder.name}/{SOCKET_NAME}"
+        return f"local:{self._folder.name}/{BUS_FOLDER_NAME}"
 
     def _start(
         self,
@@ -52,7 +52,7 @@ class FirmwareProcess(EmulatorProcess):
         modules_path = folder / MODULES_NAME
         modules_path.write_text(describe_modules(config, settings), encoding="utf-8")
         arguments = make_program_arguments(
-            str(folder / SOCKET_NAME), str(modules_path), stepped=stepped
+            str(folder / BUS_FOLDER_NAME), str(modules_path), stepped=stepped
         )
         with output_path.open("wb") as output:
             process = subprocess.Popen(

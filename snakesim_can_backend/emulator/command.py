@@ -20,7 +20,7 @@ from snakesim_can_backend.bus.adapter import (
 )
 from snakesim_can_backend.bus.bus import Wire, inject_into, wait
 from snakesim_can_backend.bus.load import count_joints_per_bus, format_bit_rate
-from snakesim_can_backend.bus.unix_wire import UNIX
+from snakesim_can_backend.bus.local_wire import LOCAL
 from snakesim_can_backend.emulator.bus_time import BusTraffic, traffic_by_opcode
 from snakesim_can_backend.emulator.chain import ModuleChain
 from snakesim_can_backend.emulator.faults import parse_fault, validate_fault
@@ -49,6 +49,7 @@ TOOL = "snakesim drive emulate can"
 NO_POSE = "none"
 STATS_PERIOD_S = 1.0
 MAX_PAUSE_S = 0.5  # until a stop signal is checked
+LOST_FRAME_KINDS = ("receive_overflow", "queue_full")  # of bus errors
 DRIVING_STATES = (ModuleState.ARMED, ModuleState.STOPPING)
 
 
@@ -88,7 +89,7 @@ def emulate(arguments: argparse.Namespace) -> int:
         send_pose = None
         if arguments.pose != NO_POSE:
             send_pose = exit_stack.enter_context(closing(PoseSender(arguments.pose)))
-        validate_channels(settings.channels)
+        validate_channels(settings.channels, is_emulator=True)
         wires: list[Wire] = []
         for channel in settings.channels:
             wire = open_wire(channel, FROM_HOST, settings.bit_rate)
@@ -113,19 +114,19 @@ def _run_reference_firmware(
 ) -> NoReturn:
     """Run the reference firmware in C instead of this process. Raises ConfigError, and BackendError."""
     validate_firmware_settings(settings)
-    sockets = [
-        name for interface, name in map(split_channel, settings.channels) if interface == UNIX
+    folders = [
+        name for interface, name in map(split_channel, settings.channels) if interface == LOCAL
     ]
-    if len(settings.channels) != 1 or not sockets:
+    if len(settings.channels) != 1 or not folders:
         raise ConfigError(
-            f"--firmware: the reference firmware has one bus, which is a Unix socket, not {settings.channels}; add "
-            "--channel unix:PATH, such as unix:/tmp/modules.sock",
+            f"--firmware: the reference firmware has one bus, which is local, not {settings.channels}; add "
+            "--channel local:FOLDER, such as local:/tmp/modules",
             code="bus/invalid-channel",
         )
     replace_this_process(
         loaded.config,
         settings,
-        sockets[0],
+        folders[0],
         duration_s=arguments.duration,
         stepped=arguments.stepped,
     )
@@ -160,7 +161,8 @@ def _validate_virtual_channels(channels: Sequence[str], *, on_real_bus: bool) ->
         if not is_emulated(channel) and not on_real_bus:
             raise ConfigError(
                 f"--channel {channel}: this does not look like a virtual bus, and emulated modules beside real ones "
-                "with the same node ids are dangerous. Use an interface called vcan..., or add --on-real-bus",
+                "with the same node ids are dangerous. Use an interface called vcan..., or local:FOLDER, or add "
+                "--on-real-bus",
                 code="bus/not-virtual",
             )
 
@@ -233,6 +235,12 @@ class EmulatorLoop:
             lines += self._describe_traffic(wire.channel, before, after)
         if self._server.unsent:
             lines.append(f"{self._server.unsent} frames were not accepted by their interface")
+        for wire in self._server.wires:
+            lines += [
+                f"{error.channel}: {error.detail}"
+                for error in wire.errors()
+                if error.kind in LOST_FRAME_KINDS
+            ]
         if self._chain.skipped_us:
             lines.append(
                 f"{self._chain.skipped_us / 1e3:.0f} ms skipped: this computer was too busy"

@@ -53,17 +53,17 @@ def build_program() -> Path:
 
 
 def make_program_arguments(
-    socket_path: str, modules_path: str, duration_s: float | None = None, *, stepped: bool
+    bus_folder: str, modules_path: str, duration_s: float | None = None, *, stepped: bool
 ) -> list[str]:
     """Return the arguments of the program.
 
     Args:
-        socket_path: Path of the socket at which it listens.
+        bus_folder: Folder of its bus, as in the channel local:FOLDER.
         modules_path: Path of the file that describes the modules.
         duration_s: Time in s after which it ends; None for never.
         stepped: Whether time advances only from Sync to Sync.
     """
-    arguments = ["--socket", socket_path, "--modules", modules_path]
+    arguments = ["--bus", bus_folder, "--modules", modules_path]
     if stepped:
         arguments.append("--stepped")
     if duration_s is not None:
@@ -74,7 +74,7 @@ def make_program_arguments(
 def replace_this_process(
     config: RunConfig,
     settings: CanSettings,
-    socket_path: str,
+    bus_folder: str,
     *,
     duration_s: float | None,
     stepped: bool,
@@ -84,7 +84,7 @@ def replace_this_process(
     Args:
         config: Configuration of the run, with the robot.
         settings: Settings of the backend.
-        socket_path: Path of the socket at which the program listens.
+        bus_folder: Folder of the bus of the program, as in the channel local:FOLDER.
         duration_s: Time in s after which it ends; None for never.
         stepped: Whether time advances only from Sync to Sync.
 
@@ -96,7 +96,7 @@ def replace_this_process(
     descriptor = os.memfd_create("modules", 0)
     os.write(descriptor, describe_modules(config, settings).encode())
     modules_path = f"/proc/self/fd/{descriptor}"
-    arguments = make_program_arguments(socket_path, modules_path, duration_s, stepped=stepped)
+    arguments = make_program_arguments(bus_folder, modules_path, duration_s, stepped=stepped)
     os.execv(program, [str(program), *arguments])
 
 

@@ -181,7 +181,7 @@ ERROR_CODES = {
     # --- buses and drives
     "bus/not-available": ErrorCode(
         "The bus does not exist on this computer.",
-        "The adapter is not plugged in, the interface is down, or the kernel has no CAN.",
+        "The adapter is not plugged in, the interface is down, the kernel has no CAN, or no program is on a local bus.",
         "Run the command that the message names, and see `snakesim doctor`.",
         page="troubleshooting/no-can.md",
     ),

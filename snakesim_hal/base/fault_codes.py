@@ -133,7 +133,9 @@ FAULT_CODES = {
     ),
     # --- buses
     "interface_down": ErrorCode(
-        "A bus went down.", "Unplugged, or brought down.", "Bring it up, clear, arm."
+        "A bus went down.",
+        "Unplugged, or brought down. On a local bus, no other program is left.",
+        "Bring it up, clear, arm.",
     ),
     "bus_off": ErrorCode(
         "The CAN controller left the bus after too many errors.",

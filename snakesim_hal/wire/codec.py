@@ -3,7 +3,8 @@
 `encode` and `MessageDecoder` are pure; the session puts the encoding string on the sample.
 """
 
-from typing import Generic, TypeVar
+from functools import cache
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
@@ -79,6 +80,14 @@ class MessageDecoder(Generic[MessageT]):
         except UNDECODABLE as error:
             detail = str(error)[:MAX_DETAIL_LENGTH]  # it may quote what the sender wrote
             raise WireError("malformed", f"{self.message.__name__}: {detail}") from None
+
+
+_make_decoder = cache(MessageDecoder[Any])
+
+
+def get_decoder(message: type[MessageT]) -> MessageDecoder[MessageT]:
+    """Return the decoder of a message type. Each is made once in a process, because that takes long."""
+    return _make_decoder(message)
 
 
 def _classify_foreign(received: str, expected: str) -> str:

@@ -5,14 +5,13 @@ stop without an error.
 """
 
 import re
-from functools import cache
 from typing import Any
 
 import msgspec
 
 from snakesim_hal.base.errors import WireError, shorten, suggest_word
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import EncodedMessage, MessageDecoder, encode
+from snakesim_hal.wire.codec import EncodedMessage, encode, get_decoder
 from snakesim_hal.wire.custom_sample import CustomMessage
 from snakesim_hal.wire.messages import VERSIONS, CustomSample, Message
 
@@ -21,8 +20,6 @@ MAX_VALUE_LENGTH = 100  # characters of a value that an error quotes
 # One step of the path in an error of msgspec, such as `.angle_rad` or `[3]`.
 PATH_STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
 ANY_KEY = "[...]"  # in such a path: an entry of a table, without its key
-
-_make_decoder = cache(MessageDecoder[Any])
 
 
 def encode_checked(
@@ -44,7 +41,7 @@ def encode_checked(
     expected_type = _find_message_type(key, message, custom)
     payload = encode_unchecked(message)
     try:
-        decoded = _make_decoder(expected_type).decode_payload(payload)
+        decoded = get_decoder(expected_type).decode_payload(payload)
     except WireError as error:
         raise WireError(error.reason, describe_invalid_field(message) or error.detail) from None
     return EncodedMessage(payload, decoded)

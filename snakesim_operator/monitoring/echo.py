@@ -22,9 +22,9 @@ from snakesim_hal.network.session import (
 )
 from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
+from snakesim_hal.wire.codec import get_decoder
 from snakesim_hal.wire.messages import CustomSample
 from snakesim_operator.base.targets import RobotSelection, open_sessions
-from snakesim_operator.monitoring.traffic import get_decoder
 
 RATE_PERIOD_S = 1.0
 MAX_QUEUED_BYTES = 64 * 1024 * 1024  # while the terminal or pipe is slower than the network

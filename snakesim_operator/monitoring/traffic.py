@@ -7,7 +7,6 @@ import itertools
 import statistics
 import threading
 from collections import deque
-from functools import cache
 from typing import Any
 
 import msgspec
@@ -15,7 +14,7 @@ import msgspec
 from snakesim_hal.base.errors import WireError
 from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import MessageDecoder, MessageT
+from snakesim_hal.wire.codec import MessageT, get_decoder
 from snakesim_hal.wire.messages import (
     AppliedCommand,
     Clock,
@@ -37,8 +36,6 @@ LATENCY_MESSAGE_TYPES: dict[str, type[Message]] = {
 }
 MAX_LATENCY_MESSAGES = 1024  # newest states and commands, from which the latency is computed
 MAX_LATENCY_MESSAGE_BYTES = 16384  # larger ones are dropped; a command of 256 joints has 4 kB
-
-get_decoder = cache(MessageDecoder)
 
 
 class KeyTraffic(msgspec.Struct, frozen=True, kw_only=True):

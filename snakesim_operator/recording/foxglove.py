@@ -6,7 +6,6 @@ a second, when it is due by the robot's clock. The topics are listed in `foxglov
 
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import cache
 from typing import Any
 
 import msgspec
@@ -18,12 +17,12 @@ from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message as Protobuf
 
-from snakesim_hal.base.errors import SnakesimError
+from snakesim_hal.base.errors import SnakesimError, WireError
 from snakesim_hal.model.placement import place_scene_obstacles
 from snakesim_hal.model.scenario import RunConfig, make_start_capsules
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import UNDECODABLE
+from snakesim_hal.wire.codec import UNDECODABLE, get_decoder
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import (
     ColorImage,
@@ -68,8 +67,6 @@ _CACHED_KEYS = (
 # Position (3,) in m and orientation wxyz (4,) of link 0.
 BasePose = tuple[Sequence[float], Sequence[float]]
 
-_get_decoder: Any = cache(msgspec.msgpack.Decoder)  # by message type
-
 
 class PoseAndContacts(msgspec.Struct, frozen=True):
     """The part of a world model that is shown at MOTION_PERIOD_NS: not its obstacles, which may be many."""
@@ -77,6 +74,9 @@ class PoseAndContacts(msgspec.Struct, frozen=True):
     base_position_w: tuple[float, float, float]
     base_orientation_wxyz: tuple[float, float, float, float]
     contacts: list[WorldContact]
+
+
+_pose_and_contacts_decoder = msgspec.msgpack.Decoder(PoseAndContacts)
 
 
 class FoxgloveConverter:
@@ -149,7 +149,7 @@ class FoxgloveConverter:
 
     def _set_robot(self, payload: bytes) -> None:
         with suppress(SnakesimError, *UNDECODABLE):
-            robot: RobotDescription = _get_decoder(RobotDescription).decode(payload)
+            robot = get_decoder(RobotDescription).decode_payload(payload)
             if len(robot.links) == len(robot.joints) + 1:
                 frames = BodyMessageEncoder(robot)
                 custom_types = find_custom_messages(robot)
@@ -160,7 +160,7 @@ class FoxgloveConverter:
     def _set_true_obstacles(self, payload: bytes) -> None:
         """Compute the obstacles of the run from its configuration, placed as the simulator places them."""
         with suppress(SnakesimError, *UNDECODABLE):
-            content = _get_decoder(RunConfiguration).decode(payload).content
+            content = get_decoder(RunConfiguration).decode_payload(payload).content
             config = msgspec.json.decode(content, type=RunConfig)
             # Checked when the run began.
             placed = place_scene_obstacles(config.scene, make_start_capsules(config))
@@ -205,6 +205,15 @@ class FoxgloveConverter:
         if payload is None:
             return None
         return _decode(message_type, payload)
+
+    def _decode_recent_pose_and_contacts(self, time_ns: int) -> PoseAndContacts | None:
+        """Return this part of the newest world model; None if there is no recent one that can be decoded."""
+        payload = self._get_recent_payload(keys.WORLD, time_ns)
+        if payload is None:
+            return None
+        with suppress(*UNDECODABLE):
+            return _pose_and_contacts_decoder.decode(payload)
+        return None
 
     # --- one message for each sample
 
@@ -268,7 +277,7 @@ class FoxgloveConverter:
             The messages; empty if the sample cannot be decoded, or if its link is unknown.
         """
         robot = self._robot
-        sample = _decode_custom_sample(self._custom_message_by_key[key], payload)
+        sample = _decode(self._custom_message_by_key[key].message, payload)
         if robot is None or sample is None or sample.link >= len(robot.links):
             return []
         name = make_name_part(key.rpartition("/")[2])
@@ -335,7 +344,7 @@ class FoxgloveConverter:
         robot = self._robot
         frames = self._body_encoder
         joints: JointState | None = self._decode_recent(keys.JOINTS, JointState, time_ns)
-        world: PoseAndContacts | None = self._decode_recent(keys.WORLD, PoseAndContacts, time_ns)
+        world = self._decode_recent_pose_and_contacts(time_ns)
         if robot is None or frames is None:
             return []
         if joints is None or not joints.has_joint_count(len(robot.joints)):
@@ -412,15 +421,8 @@ class FoxgloveConverter:
 
 def _decode(message_type: type[Any], payload: bytes) -> Any:
     """Return a decoded message, or None if the payload does not fit its type."""
-    with suppress(*UNDECODABLE):
-        return _get_decoder(message_type).decode(payload)
-    return None
-
-
-def _decode_custom_sample(custom_message: CustomMessage, payload: bytes) -> Any:
-    """Return the decoded sample of a custom sensor, or None if the payload does not fit its type."""
-    with suppress(*UNDECODABLE):
-        return msgspec.msgpack.decode(payload, type=custom_message.message)
+    with suppress(WireError):
+        return get_decoder(message_type).decode_payload(payload)
     return None
 
 

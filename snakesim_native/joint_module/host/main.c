@@ -1,6 +1,6 @@
-/* Emulates the joint modules of a robot with the reference firmware, on a Unix socket.
+/* Emulates the joint modules of a robot with the reference firmware, on a local bus.
  *
- *     joint_modules --socket PATH --modules FILE [--stepped] [--duration SECONDS] [--until-input-ends]
+ *     joint_modules --bus FOLDER --modules FILE [--stepped] [--duration SECONDS] [--until-input-ends]
  *
  * It prints a line when its modules are on the bus, and one whenever the torque of a joint is switched on or off. It
  * reads these lines from its standard input:
@@ -31,7 +31,7 @@ enum {
 };
 
 typedef struct {
-    const char *socket_path;
+    const char *bus_folder;
     const char *modules_path;
     bool is_stepped;
     bool should_end_with_input;
@@ -69,8 +69,8 @@ static bool read_options(options *o, int count, char **arguments)
             o->is_stepped = true;
         } else if (strcmp(arguments[i], "--until-input-ends") == 0) {
             o->should_end_with_input = true;
-        } else if (strcmp(arguments[i], "--socket") == 0 && has_value) {
-            o->socket_path = arguments[++i];
+        } else if (strcmp(arguments[i], "--bus") == 0 && has_value) {
+            o->bus_folder = arguments[++i];
         } else if (strcmp(arguments[i], "--modules") == 0 && has_value) {
             o->modules_path = arguments[++i];
         } else if (strcmp(arguments[i], "--duration") == 0 && has_value) {
@@ -79,7 +79,7 @@ static bool read_options(options *o, int count, char **arguments)
             return false;
         }
     }
-    return o->socket_path != NULL && o->modules_path != NULL;
+    return o->bus_folder != NULL && o->modules_path != NULL;
 }
 
 /* Executes one line of the standard input. */
@@ -139,19 +139,15 @@ static void process_received_frames(robot *r)
 /* Waits until something arrives, or until the next step is due. Faults are executed before frames. */
 static void wait_for_events(robot *r, input_lines *input)
 {
-    struct pollfd events[3] = {
+    struct pollfd events[2] = {
         {.fd = input->is_open ? STDIN_FILENO : -1, .events = POLLIN},
-        {.fd = r->bus->client, .events = POLLIN},
-        {.fd = r->bus->client < 0 ? r->bus->listener : -1, .events = POLLIN},
+        {.fd = r->bus->inbox, .events = POLLIN},
     };
-    if (poll(events, 3, r->is_stepped ? STOP_CHECK_MS : STEP_MS) <= 0) {
+    if (poll(events, 2, r->is_stepped ? STOP_CHECK_MS : STEP_MS) <= 0) {
         return;
     }
     if (events[0].revents != 0) {
         read_input(r, input);
-    }
-    if (events[2].revents != 0) {
-        accept_driver(r->bus);
     }
 }
 
@@ -192,27 +188,40 @@ static void handle_stop_signals(void)
     action.sa_handler = handle_stop_signal;
     sigaction(SIGINT, &action, NULL);
     sigaction(SIGTERM, &action, NULL);
+    action.sa_handler = SIG_IGN;
+    sigaction(SIGPIPE, &action, NULL); /* which writing to the inbox of an ended program sends */
+}
+
+static void print_lost_frames(const local_bus *bus)
+{
+    if (bus->lost_by_modules > 0) {
+        printf("%llu frames were lost: the modules read too slowly\n", (unsigned long long)bus->lost_by_modules);
+    }
+    if (bus->lost_by_others > 0) {
+        printf("%llu frames were lost by programs that do not read\n", (unsigned long long)bus->lost_by_others);
+    }
 }
 
 int main(int count, char **arguments)
 {
     static robot r;
-    static bus_socket bus;
+    static local_bus bus;
     options o;
     if (!read_options(&o, count, arguments)) {
-        fprintf(stderr, "usage: %s --socket PATH --modules FILE [--stepped] [--duration SECONDS] [--until-input-ends]\n",
+        fprintf(stderr, "usage: %s --bus FOLDER --modules FILE [--stepped] [--duration SECONDS] [--until-input-ends]\n",
                 arguments[0]);
         return WRONG_INPUT;
     }
     r.module_count = read_robot_file(o.modules_path, r.descriptions, MAX_MODULES);
-    if (r.module_count == 0 || !open_bus(&bus, o.socket_path)) {
+    if (r.module_count == 0 || !open_bus(&bus, o.bus_folder)) {
         return WRONG_INPUT;
     }
     handle_stop_signals();
     start_robot(&r, &bus, o.is_stepped);
-    printf("modules ready: %d on unix:%s\n", r.module_count, o.socket_path);
+    printf("modules ready: %d on local:%s\n", r.module_count, o.bus_folder);
     fflush(stdout);
     run(&r, &o);
-    close_bus(&bus, o.socket_path);
+    close_bus(&bus);
+    print_lost_frames(&bus);
     return 0;
 }

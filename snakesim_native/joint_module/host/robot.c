@@ -19,7 +19,7 @@ static void poll_all(robot *r)
 }
 
 /* The firmware subtracts times. The clock of the modules begins at BOOT_US, so that a module may have booted. */
-void start_robot(robot *r, bus_socket *bus, bool is_stepped)
+void start_robot(robot *r, local_bus *bus, bool is_stepped)
 {
     r->bus = bus;
     r->is_stepped = is_stepped;

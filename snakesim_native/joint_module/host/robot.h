@@ -2,7 +2,7 @@
 #ifndef ROBOT_H
 #define ROBOT_H
 
-#include "bus_socket.h"
+#include "local_bus.h"
 #include "emulated_module.h"
 
 enum {
@@ -12,7 +12,7 @@ enum {
 };
 
 typedef struct {
-    bus_socket *bus;
+    local_bus *bus;
     bool is_stepped; /* Time advances only from Sync to Sync. */
     int module_count;
     int on_bus_count; /* modules, then duplicates */
@@ -29,7 +29,7 @@ typedef struct {
 } robot;
 
 /* Starts to boot all modules. In stepped time they have booted already. */
-void start_robot(robot *r, bus_socket *bus, bool is_stepped);
+void start_robot(robot *r, local_bus *bus, bool is_stepped);
 
 /* Advances joints and modules to a time since the start. */
 void advance_robot(robot *r, uint64_t until_us);

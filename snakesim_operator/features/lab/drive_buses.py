@@ -12,10 +12,10 @@ from typing import Literal
 from snakesim_hal.base.errors import ConfigError, suggest_word
 from snakesim_operator.features.lab.lab_robot import LabRobot
 
-# Any other bus on CAN is INTERFACE:CHANNEL of python-can.
+# Any other bus on CAN is INTERFACE:CHANNEL of python-can, or local:FOLDER.
 KERNEL_INTERFACE = re.compile(r"v?can[0-9]{1,3}")
 # No real drive can be on such a bus.
-EMULATED_BUS_PREFIXES = "vcan", "udp_multicast:", "virtual:", "/dev/pts/"
+EMULATED_BUS_PREFIXES = "vcan", "local:", "udp_multicast:", "virtual:", "/dev/pts/"
 SIMULATOR_BACKEND = "sim"
 MIXED_BACKEND = "mixed"  # each joint's drive type is in the robot file
 

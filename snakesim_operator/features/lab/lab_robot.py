@@ -10,7 +10,7 @@ from snakesim_hal.model.files import FileStruct
 MAX_NAME_LENGTH = 24
 
 Name = Annotated[str, Meta(pattern=f"^[a-z][a-z0-9_]{{0,{MAX_NAME_LENGTH - 1}}}$")]
-# An interface of the kernel, or INTERFACE:CHANNEL of python-can.
+# An interface of the kernel, INTERFACE:CHANNEL of python-can, or local:FOLDER.
 CanBus = Annotated[
     str, Meta(pattern=r"^(v?can[0-9]{1,3}|[a-z][a-z0-9_]*:[A-Za-z0-9_./@+-]+)$", max_length=127)
 ]

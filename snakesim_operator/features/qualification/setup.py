@@ -157,7 +157,7 @@ def make_emulated_channel(port_key: str, folder: Path) -> str:
     """Return the channel or port of an emulated drive, in the folder of the record."""
     if port_key == "ports":
         return str(folder / SERIAL_BUS)
-    return f"loopback:{folder / 'bus'}"
+    return f"local:{folder / 'bus'}"
 
 
 def write_scenario(folder: Path) -> Path:

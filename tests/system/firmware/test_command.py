@@ -19,7 +19,7 @@ COMMAND = "snakesim_can_backend.emulator.command"
 @contextlib.contextmanager
 def emulate(folder: Path) -> Iterator[tuple[str, list[str]]]:
     """The modules of a robot in a process of their own: their channel, and at the end what they have printed."""
-    channel = f"unix:{folder}/bus.sock"
+    channel = f"local:{folder}/bus"
     printed: list[str] = []
     modules = subprocess.Popen(
         [sys.executable, "-m", COMMAND, "triplet", "--firmware", "--channel", channel],
@@ -29,7 +29,7 @@ def emulate(folder: Path) -> Iterator[tuple[str, list[str]]]:
         text=True,
     )
     try:
-        wait_until(Path(folder, "bus.sock").is_socket, "the socket of the modules")
+        wait_until(lambda: any(Path(folder).glob("bus/*.can")), "the bus of the modules")
         yield channel, printed
     finally:
         modules.terminate()
@@ -61,14 +61,14 @@ def test_a_run_drives_the_modules_of_another_process(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--firmware"], "--channel unix:PATH"),
-        (["--firmware", "--channel", "vcan0"], "--channel unix:PATH"),
-        (["--firmware", "--channel", "unix:a.sock", "--fault", "mute:joint_1@1"], "planned faults"),
+        (["--firmware"], "--channel local:FOLDER"),
+        (["--firmware", "--channel", "vcan0"], "--channel local:FOLDER"),
+        (["--firmware", "--channel", "local:a", "--fault", "mute:joint_1@1"], "planned faults"),
         (
             [
                 "--firmware",
                 "--channel",
-                "unix:a.sock",
+                "local:a",
                 "--set",
                 "backend.mounted.joint_1.connected=false",
             ],
