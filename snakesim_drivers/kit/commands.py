@@ -26,20 +26,22 @@ DRIVE_NOUNS: Commands = (
 )
 
 
-def add_channel(parser: argparse.ArgumentParser, about: str) -> None:
+def add_channel_argument(parser: argparse.ArgumentParser, about: str) -> None:
     """Add the option `--channel`, the bus of emulated drives; `about` is its help text."""
     parser.add_argument(
         "--channel", action="append", metavar="CHANNEL", help=f"{about} (may be repeated)"
     )
 
 
-def add_channels(parser: argparse.ArgumentParser, about: str) -> None:
+def add_channels_arguments(parser: argparse.ArgumentParser, about: str) -> None:
     """Add the arguments of a scan: the buses, with `about` as their help text, and `--json`."""
     parser.add_argument("channel", nargs="+", metavar="CHANNEL", help=about)
     add_json_argument(parser)
 
 
-def add_pose(parser: argparse.ArgumentParser, about: str, default: str | None = None) -> None:
+def add_pose_argument(
+    parser: argparse.ArgumentParser, about: str, default: str | None = None
+) -> None:
     """Add the option `--pose`, the receiver of emulated motion capture; `about` is added to its help text."""
     parser.add_argument(
         "--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({about})"
@@ -61,11 +63,11 @@ def add_control_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_emulation(parser: argparse.ArgumentParser, channel_about: str) -> None:
+def add_emulation_arguments(parser: argparse.ArgumentParser, channel_about: str) -> None:
     """Add all arguments of a command that emulates drives; `channel_about` is the help text of `--channel`."""
     add_scenario_name_argument(parser)
-    add_channel(parser, channel_about)
+    add_channel_argument(parser, channel_about)
     add_set_argument(parser)
-    add_pose(parser, "default: nowhere")
+    add_pose_argument(parser, "default: nowhere")
     add_control_arguments(parser)
     add_parent_argument(parser)

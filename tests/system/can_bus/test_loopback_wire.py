@@ -77,7 +77,7 @@ def test_cut_end_neither_sends_nor_receives_until_the_end_of_the_fault(tmp_path:
 
 def test_loopback_is_a_bus_of_emulated_drives_and_needs_a_folder(tmp_path: Path):
     assert is_emulated(channel(tmp_path))
-    validate_channels([channel(tmp_path)], fd=True)
+    validate_channels([channel(tmp_path)], needs_fd=True)
     blocked = tmp_path / "file"
     blocked.touch()
     with pytest.raises(BackendError, match="cannot be opened"):
