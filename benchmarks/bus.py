@@ -115,7 +115,7 @@ def _make_driver_receiver(source: socket.socket) -> ReceiveFrames:
     buffer = bytearray(RAW_FRAME.size)
 
     def receive_frames(sync: int) -> int:
-        reports.start_sync(sync, contacts=True, tail=False)
+        reports.start_sync(sync, has_contacts=True, has_tail_contact=False)
         frames = []
         drain_socket(source, buffer, frames, lambda _identifier, _data: None)
         for frame in frames:

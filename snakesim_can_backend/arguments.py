@@ -4,7 +4,12 @@ import argparse
 from pathlib import Path
 
 from snakesim_can_backend.protocol.definitions import LAST_NODE
-from snakesim_drivers.kit.commands import add_channel, add_channels, add_control_arguments, add_pose
+from snakesim_drivers.kit.commands import (
+    add_channel_argument,
+    add_channels_arguments,
+    add_control_arguments,
+    add_pose_argument,
+)
 from snakesim_hal.programs.arguments import (
     add_duration_argument,
     add_json_argument,
@@ -24,10 +29,10 @@ MAX_RATE_HZ = 5000.0  # of a scenario
 CHANNEL_ABOUT = "SocketCAN interface such as can0, INTERFACE:CHANNEL such as slcan:/dev/ttyACM0, or local:FOLDER"
 
 
-def add_scan(parser: argparse.ArgumentParser) -> None:
+def add_scan_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a scan of a CAN bus."""
-    add_channels(parser, CHANNEL_ABOUT)
-    _add_bit_rate(parser)
+    add_channels_arguments(parser, CHANNEL_ABOUT)
+    _add_bit_rate_argument(parser)
     add_duration_argument(
         parser,
         "seconds to listen on each bus (default: 1)",
@@ -39,13 +44,13 @@ def add_scan(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_canopen_scan(parser: argparse.ArgumentParser) -> None:
+def add_canopen_scan_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of a scan of a CANopen bus."""
-    add_channels(parser, CHANNEL_ABOUT)
-    _add_bit_rate(parser)
+    add_channels_arguments(parser, CHANNEL_ABOUT)
+    _add_bit_rate_argument(parser)
 
 
-def _add_bit_rate(parser: argparse.ArgumentParser) -> None:
+def _add_bit_rate_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--bit-rate",
         type=make_number_parser(10_000, 1_000_000, "bit/s"),
@@ -55,7 +60,7 @@ def _add_bit_rate(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_module_load(parser: argparse.ArgumentParser) -> None:
+def add_module_load_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim drive load can`, which computes the bus load of joint modules."""
     add_scenario_name_argument(parser)
     add_set_argument(parser)
@@ -76,15 +81,15 @@ def add_module_load(parser: argparse.ArgumentParser) -> None:
     add_json_argument(parser)
 
 
-def add_load(parser: argparse.ArgumentParser) -> None:
+def add_load_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the bus load of drives."""
     add_scenario_name_argument(parser)
-    add_channel(parser, f"bus of the drives (default: {DEFAULT_CHANNEL})")
+    add_channel_argument(parser, f"bus of the drives (default: {DEFAULT_CHANNEL})")
     add_set_argument(parser)
     add_json_argument(parser)
 
 
-def add_replay(parser: argparse.ArgumentParser) -> None:
+def add_replay_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that read a log of the bus of joint modules."""
     parser.add_argument(
         "run",
@@ -100,15 +105,15 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_dbc(parser: argparse.ArgumentParser) -> None:
+def add_dbc_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that write the DBC file."""
     add_output_argument(parser, f"the DBC file (default: {EXPANDED_DBC_FILENAME})")
 
 
-def add_module_emulation(parser: argparse.ArgumentParser) -> None:
+def add_module_emulation_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim drive emulate can`, which emulates joint modules on a bus."""
     add_scenario_name_argument(parser)
-    add_channel(
+    add_channel_argument(
         parser,
         "interface, INTERFACE:CHANNEL of python-can, or local:FOLDER, tail to head (default: "
         f"{DEFAULT_CHANNEL})",
@@ -138,7 +143,7 @@ def add_module_emulation(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="advance time only from Sync to Sync, for a host in lockstep",
     )
-    add_pose(parser, f"or none, default: {DEFAULT_POSE}", DEFAULT_POSE)
+    add_pose_argument(parser, f"or none, default: {DEFAULT_POSE}", DEFAULT_POSE)
     add_duration_argument(parser, "end after this many seconds")
     add_seed_argument(parser, "of noise and serial numbers, default: the scenario's")
     parser.add_argument(

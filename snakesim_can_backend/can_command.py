@@ -14,8 +14,8 @@ from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.bus.load import (
     MAX_LOAD,
     ReportSchedule,
-    busiest_period_s,
     compute_bus_load,
+    compute_busiest_period_s,
     explain_load,
     format_bit_rate,
     is_feasible,
@@ -63,11 +63,17 @@ UNKNOWN = "-"
 # --- load --------------------------------------------------------------------------------------------------
 
 
-def print_load(arguments: argparse.Namespace) -> int:
+def print_module_load(arguments: argparse.Namespace) -> int:
     """Run `snakesim drive load can`: print the worst-case load of the buses of joint modules.
 
+    Without `--joints` and `--hz` it prints the load of each bus of the scenario. With one of them it prints a table,
+    which is an answer for any numbers, so its exit code is 0.
+
+    Args:
+        arguments: Parsed command line, with the options of `add_module_load_arguments`.
+
     Returns:
-        Exit code 0; 1 if a bus of the scenario cannot carry its load.
+        Exit code: OK, or FAILED if a bus of the scenario cannot carry its load.
     """
     overrides = [
         KeyOverride("backend", "can", "drive load can"),
@@ -77,29 +83,31 @@ def print_load(arguments: argparse.Namespace) -> int:
     settings = load_can_settings(loaded)
     config = loaded.config
     if arguments.joints is None and arguments.hz is None:
-        return _print_scenario_load(config, settings, as_json=arguments.json)
-    joints = arguments.joints or [config.robot.chain.modules]
+        return _print_load_of_scenario(config, settings, as_json=arguments.json)
+    joint_counts = arguments.joints or [config.robot.chain.modules]
     if arguments.json:
-        print_json({"loads": list(_list_loads(config, settings, joints, arguments.hz))})
+        print_json({"loads": list(_list_loads(config, settings, joint_counts, arguments.hz))})
         return OK
-    for line in format_load_table(config, settings, joints, arguments.hz):
+    for line in format_load_table(config, settings, joint_counts, arguments.hz):
         print_line(line)
     return OK
 
 
-def _print_scenario_load(config: RunConfig, settings: CanSettings, *, as_json: bool) -> int:
-    """Print the load of every bus of a scenario. Returns the exit code."""
+def _print_load_of_scenario(config: RunConfig, settings: CanSettings, *, as_json: bool) -> int:
+    """Print the load of every bus of a scenario. Return the exit code: FAILED if a bus cannot carry its load."""
     lines, all_fit = describe_bus_loads(config, settings)
     if as_json:
         channels = settings.channels or ["one bus"]
         buses = [
             {
                 "channel": channel,
-                "joints": bus[0],
-                "load": compute_bus_load(*bus),
-                "fits": is_feasible(*bus),
+                "joints": joint_count,
+                "load": compute_bus_load(joint_count, reports),
+                "fits": is_feasible(joint_count, reports),
             }
-            for channel, bus in zip(channels, plan_buses(config, settings), strict=True)
+            for channel, (joint_count, reports) in zip(
+                channels, plan_buses(config, settings), strict=True
+            )
         ]
         print_json({"rate_hz": config.rate_hz, "buses": buses, "fits": all_fit})
     else:
@@ -111,20 +119,20 @@ def _print_scenario_load(config: RunConfig, settings: CanSettings, *, as_json: b
 def _list_loads(
     config: RunConfig,
     settings: CanSettings,
-    joints: Sequence[int],
+    joint_counts: Sequence[int],
     rates_hz: Sequence[float] | None,
 ) -> Iterator[dict[str, Any]]:
-    """Yield the load of the bus with the most joints for every number of joints and every rate."""
-    buses = max(len(settings.channels), 1)
-    for count in joints:
-        on_fullest = ceil(count / buses)
+    """Yield the load of the bus with the most joints, for every number of joints of a robot and every control rate."""
+    bus_count = max(len(settings.channels), 1)
+    for joint_count in joint_counts:
+        max_joints_per_bus = ceil(joint_count / bus_count)
         for rate_hz in rates_hz or [config.rate_hz]:
             reports = plan_reports_at(rate_hz, config, settings)
             yield {
-                "joints": count,
+                "joints": joint_count,
                 "rate_hz": rate_hz,
-                "load": compute_bus_load(on_fullest, reports),
-                "fits": is_feasible(on_fullest, reports),
+                "load": compute_bus_load(max_joints_per_bus, reports),
+                "fits": is_feasible(max_joints_per_bus, reports),
             }
 
 
@@ -137,25 +145,28 @@ def load_can_settings(loaded: LoadedScenario) -> CanSettings:
 
 def describe_bus_loads(config: RunConfig, settings: CanSettings) -> tuple[list[str], bool]:
     """Return the load of every bus as lines of text, and whether every bus can carry it."""
-    buses, period_ms, lines = plan_buses(config, settings), 1e3 / config.rate_hz, list[str]()
-    for name, bus in zip(settings.channels or ["one bus"], buses, strict=True):
-        lines += [f"{name}: {bus[0]} joints at {config.rate_hz:g} Hz", *explain_load(*bus)]
-        busiest_ms = 1e3 * busiest_period_s(*bus)
+    buses = plan_buses(config, settings)
+    period_ms = 1e3 / config.rate_hz
+    lines: list[str] = []
+    channels = settings.channels or ["one bus"]
+    for channel, (joint_count, reports) in zip(channels, buses, strict=True):
+        lines.append(f"{channel}: {joint_count} joints at {config.rate_hz:g} Hz")
+        lines += explain_load(joint_count, reports)
+        busiest_ms = 1e3 * compute_busiest_period_s(joint_count, reports)
         lines.append(
             f"  Sync, answers, forces and setpoints of one period: {busiest_ms:.2f} of {period_ms:.2f} ms"
         )
-    if all(is_feasible(*bus) for bus in buses):
+    if all(is_feasible(joint_count, reports) for joint_count, reports in buses):
         return lines, True
-    return [
-        *lines,
-        f"Refused. {suggest_alternatives([joints for joints, _ in buses], config, settings)}",
-    ], False
+    joint_counts = [joint_count for joint_count, _ in buses]
+    lines.append(f"Refused. {suggest_alternatives(joint_counts, config, settings)}")
+    return lines, False
 
 
 def format_load_table(
     config: RunConfig,
     settings: CanSettings,
-    joints: Sequence[int],
+    joint_counts: Sequence[int],
     rates_hz: Sequence[float] | None = None,
 ) -> Iterator[str]:
     """Yield the lines of a table with the load of the bus with the most joints.
@@ -163,21 +174,22 @@ def format_load_table(
     Args:
         config: Configuration of the run.
         settings: Settings of the backend.
-        joints: Numbers of joints, one for each row.
+        joint_counts: Numbers of joints of a robot, one for each row.
         rates_hz: Control rates, one for each column; None for the rate of the scenario.
     """
-    buses = max(len(settings.channels), 1)
-    rates = rates_hz or [config.rate_hz]
-    yield "joints" + "".join(f"{f'{rate:g} Hz':>16}" for rate in rates)
-    for count in joints:
+    bus_count = max(len(settings.channels), 1)
+    columns_hz = rates_hz or [config.rate_hz]
+    yield "joints" + "".join(f"{f'{rate_hz:g} Hz':>16}" for rate_hz in columns_hz)
+    for joint_count in joint_counts:
+        max_joints_per_bus = ceil(joint_count / bus_count)
         cells = [
-            _format_load_cell(ceil(count / buses), plan_reports_at(rate, config, settings))
-            for rate in rates
+            _format_load_cell(max_joints_per_bus, plan_reports_at(rate_hz, config, settings))
+            for rate_hz in columns_hz
         ]
-        yield f"{count:6}" + "".join(f"{cell:>16}" for cell in cells)
-    on = "one bus" if buses == 1 else f"the fullest of {buses} buses"
-    of = format_bit_rate(settings.bit_rate)
-    yield f"Worst-case load of {on}, {of}; above {MAX_LOAD:.0%}, or with too long a period, it is refused."
+        yield f"{joint_count:6}" + "".join(f"{cell:>16}" for cell in cells)
+    bus = "one bus" if bus_count == 1 else f"the fullest of {bus_count} buses"
+    bit_rate = format_bit_rate(settings.bit_rate)
+    yield f"Worst-case load of {bus}, {bit_rate}; above {MAX_LOAD:.0%}, or with too long a period, it is refused."
 
 
 def _format_load_cell(joint_count: int, reports: ReportSchedule) -> str:
@@ -268,30 +280,30 @@ def _make_scan_row(identity: ModuleIdentity, reading: ModuleReports) -> dict[str
         identity: Response of the module to the request for its identity.
         reading: Reports of all modules that arrived during the scan.
     """
-    if identity.stepped:
+    if identity.is_stepped:
         emulated = "stepped"
-    elif identity.emulated:
+    elif identity.is_emulated:
         emulated = "yes"
     else:
         emulated = "no"
     row = dict.fromkeys(COLUMNS, UNKNOWN) | {
         "channel": identity.channel,
-        "node": str(identity.node),
+        "node": str(identity.node_id),
         "serial": f"{identity.serial:08X}",
         "firmware": identity.firmware,
         "protocol": str(identity.protocol),
         "emulated": emulated,
     }
-    if not FIRST_NODE <= identity.node <= LAST_NODE:
+    if not FIRST_NODE <= identity.node_id <= LAST_NODE:
         return row
-    i = identity.node - 1
+    i = identity.node_id - 1
     module = reading.modules[i]
-    health = reading.health()[i]
+    health = reading.list_health_reports()[i]
     shaft_torque = reading.shaft_raw[i]
     has_sent_heartbeat = module.uptime_ms >= 0
     if has_sent_heartbeat:
         row["state"] = module.state.name.lower()
-        row["faults"] = "+".join(module.fault_names()) or "none"
+        row["faults"] = "+".join(module.list_fault_names()) or "none"
         row["uptime"] = f"{module.uptime_ms / 1000:.1f} s"
     if health is not None:
         signals = load_layouts()[Opcode.HEALTH].signals

@@ -4,7 +4,7 @@ import argparse
 
 from snakesim_can_backend import arguments as options
 from snakesim_can_backend.emulator.faults import describe_faults
-from snakesim_drivers.kit.commands import DRIVE_NOUNS, add_emulation
+from snakesim_drivers.kit.commands import DRIVE_NOUNS, add_emulation_arguments
 from snakesim_hal.programs.commands import Command, Commands
 
 
@@ -15,15 +15,15 @@ def _scan_modules(arguments: argparse.Namespace) -> int:
 
 
 def _emulate_modules(arguments: argparse.Namespace) -> int:
-    from snakesim_can_backend.emulator.command import emulate
+    from snakesim_can_backend.emulator.command import emulate_modules
 
-    return emulate(arguments)
+    return emulate_modules(arguments)
 
 
 def _load_modules(arguments: argparse.Namespace) -> int:
-    from snakesim_can_backend.can_command import print_load
+    from snakesim_can_backend.can_command import print_module_load
 
-    return print_load(arguments)
+    return print_module_load(arguments)
 
 
 def _replay_modules(arguments: argparse.Namespace) -> int:
@@ -39,31 +39,31 @@ def _write_dbc(arguments: argparse.Namespace) -> int:
 
 
 def _emulate_odrive(arguments: argparse.Namespace) -> int:
-    from snakesim_can_backend.can_drives.command import emulate
+    from snakesim_can_backend.can_drives.command import emulate_drives
     from snakesim_can_backend.odrive.backend import OdriveBackend
 
-    return emulate(OdriveBackend, arguments)
+    return emulate_drives(OdriveBackend, arguments)
 
 
 def _load_odrive(arguments: argparse.Namespace) -> int:
-    from snakesim_can_backend.can_drives.command import print_load
+    from snakesim_can_backend.can_drives.command import print_drive_load
     from snakesim_can_backend.odrive.backend import OdriveBackend
 
-    return print_load(OdriveBackend, arguments)
+    return print_drive_load(OdriveBackend, arguments)
 
 
 def _emulate_moteus(arguments: argparse.Namespace) -> int:
-    from snakesim_can_backend.can_drives.command import emulate
+    from snakesim_can_backend.can_drives.command import emulate_drives
     from snakesim_can_backend.moteus.backend import MoteusBackend
 
-    return emulate(MoteusBackend, arguments)
+    return emulate_drives(MoteusBackend, arguments)
 
 
 def _load_moteus(arguments: argparse.Namespace) -> int:
-    from snakesim_can_backend.can_drives.command import print_load
+    from snakesim_can_backend.can_drives.command import print_drive_load
     from snakesim_can_backend.moteus.backend import MoteusBackend
 
-    return print_load(MoteusBackend, arguments)
+    return print_drive_load(MoteusBackend, arguments)
 
 
 def _scan_cia402(arguments: argparse.Namespace) -> int:
@@ -73,21 +73,21 @@ def _scan_cia402(arguments: argparse.Namespace) -> int:
 
 
 def _emulate_cia402(arguments: argparse.Namespace) -> int:
-    from snakesim_can_backend.can_drives.command import emulate
+    from snakesim_can_backend.can_drives.command import emulate_drives
     from snakesim_can_backend.cia402.backend import Cia402Backend
 
-    return emulate(Cia402Backend, arguments)
+    return emulate_drives(Cia402Backend, arguments)
 
 
 def _load_cia402(arguments: argparse.Namespace) -> int:
-    from snakesim_can_backend.can_drives.command import print_load
+    from snakesim_can_backend.can_drives.command import print_drive_load
     from snakesim_can_backend.cia402.backend import Cia402Backend
 
-    return print_load(Cia402Backend, arguments)
+    return print_drive_load(Cia402Backend, arguments)
 
 
-def _add_emulation(parser: argparse.ArgumentParser) -> None:
-    add_emulation(
+def _add_emulation_arguments(parser: argparse.ArgumentParser) -> None:
+    add_emulation_arguments(
         parser,
         "interface, INTERFACE:CHANNEL of python-can, or local:FOLDER (default: "
         f"{options.DEFAULT_CHANNEL})",
@@ -99,7 +99,7 @@ COMMANDS: Commands = (
     Command(
         name="drive scan can",
         help="List every joint module that answers. Sends only identify, and nothing where others use the bus.",
-        add=options.add_scan,
+        add=options.add_scan_arguments,
         run=_scan_modules,
         details="Exit code: 0 a module answers, 1 none does, 2 wrong input.",
         examples=("drive scan can can0", "drive scan can can0 can1 --duration 3 --json"),
@@ -107,7 +107,7 @@ COMMANDS: Commands = (
     Command(
         name="drive emulate can",
         help="Emulate the joint modules of a robot, as a process on SocketCAN interfaces.",
-        add=options.add_module_emulation,
+        add=options.add_module_emulation_arguments,
         run=_emulate_modules,
         details=f"faults:\n{describe_faults()}",
         examples=(
@@ -118,7 +118,7 @@ COMMANDS: Commands = (
     Command(
         name="drive load can",
         help="Print the worst-case load of the buses of a scenario with joint modules.",
-        add=options.add_module_load,
+        add=options.add_module_load_arguments,
         run=_load_modules,
         details="Exit code: 0 it fits, 1 it does not, 2 wrong input.",
         examples=(
@@ -129,7 +129,7 @@ COMMANDS: Commands = (
     Command(
         name="drive replay can",
         help="Read a log of a bus as the driver does, and compare its joint states with the run's record.",
-        add=options.add_replay,
+        add=options.add_replay_arguments,
         run=_replay_modules,
         details="Exit code: 0 all joint states are the same to the bit, 1 otherwise, 2 wrong input.",
         examples=(
@@ -140,14 +140,14 @@ COMMANDS: Commands = (
     Command(
         name="drive dbc",
         help="Write the DBC file with every message of every joint module.",
-        add=options.add_dbc,
+        add=options.add_dbc_arguments,
         run=_write_dbc,
         examples=("drive dbc", "drive dbc --out modules.dbc"),
     ),
     Command(
         name="drive emulate odrive",
         help="Emulate the ODrive axes of a robot, as a process on CAN buses.",
-        add=_add_emulation,
+        add=_add_emulation_arguments,
         run=_emulate_odrive,
         examples=(
             "drive emulate odrive triplet",
@@ -157,14 +157,14 @@ COMMANDS: Commands = (
     Command(
         name="drive load odrive",
         help="Print the load of a bus with the ODrive axes of a scenario.",
-        add=options.add_load,
+        add=options.add_load_arguments,
         run=_load_odrive,
         examples=("drive load odrive triplet", "drive load odrive triplet --set rate_hz=50 --json"),
     ),
     Command(
         name="drive emulate moteus",
         help="Emulate the moteus controllers of a robot, as a process on CAN FD buses.",
-        add=_add_emulation,
+        add=_add_emulation_arguments,
         run=_emulate_moteus,
         examples=(
             "drive emulate moteus triplet",
@@ -174,14 +174,14 @@ COMMANDS: Commands = (
     Command(
         name="drive load moteus",
         help="Print the load of a bus with the moteus controllers of a scenario.",
-        add=options.add_load,
+        add=options.add_load_arguments,
         run=_load_moteus,
         examples=("drive load moteus triplet", "drive load moteus triplet --set rate_hz=50 --json"),
     ),
     Command(
         name="drive scan cia402",
         help="List every CANopen node that answers; only reads objects, and enables nothing.",
-        add=options.add_canopen_scan,
+        add=options.add_canopen_scan_arguments,
         run=_scan_cia402,
         details="Exit code: 0 a node answers, 1 none does, 2 wrong input.",
         examples=("drive scan cia402 can0", "drive scan cia402 can0 --bit-rate 500000 --json"),
@@ -189,7 +189,7 @@ COMMANDS: Commands = (
     Command(
         name="drive emulate cia402",
         help="Emulate the CiA 402 drives of a robot, as a process on CAN buses.",
-        add=_add_emulation,
+        add=_add_emulation_arguments,
         run=_emulate_cia402,
         examples=(
             "drive emulate cia402 triplet",
@@ -199,7 +199,7 @@ COMMANDS: Commands = (
     Command(
         name="drive load cia402",
         help="Print the load of a bus with the CiA 402 drives of a scenario.",
-        add=options.add_load,
+        add=options.add_load_arguments,
         run=_load_cia402,
         examples=("drive load cia402 triplet", "drive load cia402 triplet --set rate_hz=50 --json"),
     ),

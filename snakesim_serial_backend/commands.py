@@ -2,15 +2,19 @@
 
 import argparse
 
-from snakesim_drivers.kit.commands import DRIVE_NOUNS, add_channels, add_emulation
+from snakesim_drivers.kit.commands import (
+    DRIVE_NOUNS,
+    add_channels_arguments,
+    add_emulation_arguments,
+)
 from snakesim_hal.programs.arguments import add_json_argument
 from snakesim_hal.programs.commands import Command, Commands
 from snakesim_serial_backend.dynamixel.registers import RATE
 from snakesim_serial_backend.feetech.registers import RATE as FEETECH_RATE
 
 
-def _add_scan(parser: argparse.ArgumentParser) -> None:
-    add_channels(parser, "serial port, such as /dev/ttyUSB0")
+def _add_scan_arguments(parser: argparse.ArgumentParser) -> None:
+    add_channels_arguments(parser, "serial port, such as /dev/ttyUSB0")
     parser.add_argument(
         "--baud",
         type=int,
@@ -20,8 +24,8 @@ def _add_scan(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_emulation(parser: argparse.ArgumentParser) -> None:
-    add_emulation(parser, "a name for the port, which is made (default: ./servos)")
+def _add_emulation_arguments(parser: argparse.ArgumentParser) -> None:
+    add_emulation_arguments(parser, "a name for the port, which is made (default: ./servos)")
 
 
 def _scan(arguments: argparse.Namespace) -> int:
@@ -67,7 +71,7 @@ COMMANDS: Commands = (
     Command(
         name="drive scan dynamixel",
         help="List every Dynamixel that answers. Reads only, and moves nothing.",
-        add=_add_scan,
+        add=_add_scan_arguments,
         run=_scan,
         details="Exit code: 0 a servo answers, 1 none does, 2 wrong input.",
         examples=(
@@ -78,7 +82,7 @@ COMMANDS: Commands = (
     Command(
         name="drive emulate dynamixel",
         help="Emulate the Dynamixel servos of a robot, as a process at the other end of pseudo terminals.",
-        add=_add_emulation,
+        add=_add_emulation_arguments,
         run=_emulate,
         examples=(
             "drive emulate dynamixel triplet",
@@ -95,7 +99,7 @@ COMMANDS: Commands = (
     Command(
         name="drive scan feetech",
         help="List every Feetech STS servo that answers; reads only, and moves nothing.",
-        add=_add_scan,
+        add=_add_scan_arguments,
         run=_scan_feetech,
         details="Exit code: 0 a servo answers, 1 none does, 2 wrong input.",
         examples=(
@@ -106,7 +110,7 @@ COMMANDS: Commands = (
     Command(
         name="drive emulate feetech",
         help="Emulate the Feetech servos of a robot, as a process at the other end of pseudo terminals.",
-        add=_add_emulation,
+        add=_add_emulation_arguments,
         run=_emulate_feetech,
         examples=(
             "drive emulate feetech triplet",

@@ -84,7 +84,7 @@ def print_port_load(arguments: argparse.Namespace, load: PortLoad) -> int:
                 "servos": servos,
                 "baud": baud,
                 "bytes": load.count_cycle_bytes(servos),
-                "cycle_s": load.cycle_s(servos, baud),
+                "cycle_s": load.compute_cycle_duration_s(servos, baud),
                 "max_rate_hz": load.compute_max_rate_hz(servos, baud),
             }
             for servos in TABLE_SERVOS
@@ -102,7 +102,7 @@ def format_load_table(load: PortLoad) -> Iterator[str]:
     yield "servos   bytes" + "".join(f"{_format_baud(baud):>19}" for baud in load.rates)
     for servos in TABLE_SERVOS:
         cells = [
-            f"{1e3 * load.cycle_s(servos, baud):.1f} ms, {load.compute_max_rate_hz(servos, baud)} Hz"
+            f"{1e3 * load.compute_cycle_duration_s(servos, baud):.1f} ms, {load.compute_max_rate_hz(servos, baud)} Hz"
             for baud in load.rates
         ]
         yield f"{servos:6}{load.count_cycle_bytes(servos):8}" + "".join(

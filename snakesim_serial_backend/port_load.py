@@ -27,13 +27,13 @@ class PortLoad:
             f"rate at which it takes {MAX_LOAD:.0%} of a period"
         )
 
-    def cycle_s(self, servo_count: int, baud: int) -> float:
+    def compute_cycle_duration_s(self, servo_count: int, baud: int) -> float:
         """Return how long a port is busy, or waits, in a cycle."""
         return self.count_cycle_bytes(servo_count) * BITS_PER_BYTE / baud + REQUESTS * USB_LATENCY_S
 
     def compute_max_rate_hz(self, servo_count: int, baud: int) -> int:
         """Return the fastest possible control rate, in whole Hz."""
-        return int(MAX_LOAD / self.cycle_s(servo_count, baud))
+        return int(MAX_LOAD / self.compute_cycle_duration_s(servo_count, baud))
 
     def check(self, servo_count: int, rate_hz: float, baud: int, section: str) -> None:
         """Check that a port can carry its servos.
@@ -47,7 +47,7 @@ class PortLoad:
         Raises:
             ConfigError: A cycle takes more than `MAX_LOAD` of a control period.
         """
-        busy_s = self.cycle_s(servo_count, baud)
+        busy_s = self.compute_cycle_duration_s(servo_count, baud)
         if busy_s * rate_hz > MAX_LOAD:
             raise ConfigError(
                 f"{servo_count} servos at {rate_hz:g} Hz: a cycle of {self.count_cycle_bytes(servo_count)} bytes takes "

@@ -4,6 +4,7 @@ A driver type derives from `ServoBackend`, and adds how its servos are operated 
 """
 
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
@@ -13,7 +14,7 @@ from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_settings import (
-    assign_ports,
+    assign_port_indices,
     compute_response_timeout_s,
     make_emulated_body,
 )
@@ -113,7 +114,8 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
         """
         joints = config.robot.joint_table
         body = make_emulated_body(config, settings, cls.name, pose_address)
-        pty_by_joint = [ptys[bus] for bus in assign_ports(joints, settings.ports)]
+        port_indices = assign_port_indices(joints, settings.ports)  # of each joint
+        pty_by_joint = [ptys[port_index] for port_index in port_indices]
         return cls.make_emulator(joints, settings, body, pty_by_joint, clock)
 
     @classmethod
@@ -129,8 +131,9 @@ class ServoBackend(DriverTypeBackend, Generic[EmulatorT]):
     @classmethod
     def validate_port_load(cls, config: RunConfig, settings: Any, joints: Sequence[Joint]) -> None:
         """Raise ConfigError when a port cannot carry its servos."""
-        bus_by_joint = assign_ports(joints, settings.ports)
-        max_servo_count = max(bus_by_joint.count(bus) for bus in set(bus_by_joint))
+        port_indices = assign_port_indices(joints, settings.ports)  # of each joint
+        servo_count_by_port = Counter(port_indices)
+        max_servo_count = max(servo_count_by_port.values())
         cls.port_load.check(
             max_servo_count,
             config.rate_hz / settings.decimation,

@@ -216,7 +216,7 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
 
     # --- faults -----------------------------------------------------------------------------------------------
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return what is wrong now with the port and its servos."""
         findings: list[FaultFinding] = []
         error = self._port.wire.error()

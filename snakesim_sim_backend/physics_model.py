@@ -72,6 +72,7 @@ class MujocoPhysicsModel(PhysicsModel):
 
         # Detection of divergence.
         self._step_count = 0
+        # Steps since the last check of the whole state, which is made at the latest after STEPS_PER_CHECK.
         self._unchecked_steps = 0
         self._has_diverged = False
         self._divergence_watch = DivergenceWatch(
@@ -118,13 +119,15 @@ class MujocoPhysicsModel(PhysicsModel):
             BackendError: The simulation has diverged, in this step or before. Its state is the last good one.
         """
         if self._has_diverged:
-            self._divergence_watch.check(self._step_count)  # raises the same error again
+            # The watch raises the error of the divergence again, so nothing below runs.
+            self._divergence_watch.check(self._step_count)
         self._motor_torques[:] = torque_nm
         self._velocities_before_step[:] = self._all_velocities
         self._step_count += 1
         try:
             self._physics.step(1)
         except mujoco.FatalError as error:
+            # `_has_diverged` is for states that the watch has rejected. After this error, the next call steps again.
             raise BackendError(
                 f"MuJoCo cannot go on at step {self._step_count}: {error}",
                 code="simulator/diverged",
@@ -173,10 +176,10 @@ class MujocoPhysicsModel(PhysicsModel):
         """
         torque_nm = self._motor_torques + self._viscous_torques
         torque_nm -= self._armature * self._joint_accelerations
-        if self._joints_with_friction:
-            torque_nm[self._joints_with_friction] += self._data.efc_force[
-                : len(self._joints_with_friction)
-            ]
+        # MuJoCo lists dry friction as the first constraints, one for each joint that has some.
+        friction_joints = self._joints_with_friction
+        if friction_joints:
+            torque_nm[friction_joints] += self._data.efc_force[: len(friction_joints)]
         return torque_nm
 
     def loads(self) -> list[LinkLoad]:

@@ -75,7 +75,7 @@ POLL_PERIOD_S = 0.0005  # pause between two looks at an adapter that has no file
 
 def open_wire(
     channel: str,
-    only: Iterable[Opcode] | None = None,
+    received_opcodes: Iterable[Opcode] | None = None,
     bit_rate: int = BIT_RATE,
     data_bit_rate: int | None = None,
 ) -> Wire:
@@ -84,7 +84,7 @@ def open_wire(
     Args:
         channel: SocketCAN interface such as can0, INTERFACE:CHANNEL of python-can, or local:FOLDER, which is created
             if it does not exist.
-        only: Opcodes of the messages to receive; None for all messages.
+        received_opcodes: Opcodes of the messages to receive; None for all messages.
         bit_rate: Bit rate in bit/s; not used by an interface of the kernel.
         data_bit_rate: Second bit rate in bit/s, for the data of CAN FD; None for classic CAN.
 
@@ -94,10 +94,10 @@ def open_wire(
     """
     interface, name = split_channel(channel)
     if interface == LOCAL:
-        return LocalWire(name, only, fd=data_bit_rate is not None)
+        return LocalWire(name, received_opcodes, fd=data_bit_rate is not None)
     if interface == "socketcan" and data_bit_rate is None:
-        return SocketCanWire(name, only)
-    return AdapterWire(channel, only, bit_rate, data_bit_rate)
+        return SocketCanWire(name, received_opcodes)
+    return AdapterWire(channel, received_opcodes, bit_rate, data_bit_rate)
 
 
 def split_channel(channel: str) -> tuple[str, str]:
@@ -120,19 +120,19 @@ def split_channel(channel: str) -> tuple[str, str]:
     return interface, name
 
 
-def validate_channel(channel: str, *, fd: bool = False, is_emulator: bool = False) -> None:
+def validate_channel(channel: str, *, needs_fd: bool = False, is_emulator: bool = False) -> None:
     """Check that there is the interface of a channel, and that an interface of the kernel or a local bus is in use.
 
     Args:
         channel: SocketCAN interface such as can0, INTERFACE:CHANNEL of python-can, or local:FOLDER.
-        fd: Whether the channel must support CAN FD.
+        needs_fd: Whether the channel must support CAN FD.
         is_emulator: Whether drives will be emulated there: they may be the first program on a local bus.
 
     Raises:
         ConfigError: The channel does not exist, is down, does not support CAN FD, or is a local bus without a program.
     """
     interface, name = split_channel(channel)
-    if fd and interface not in FD_INTERFACES:
+    if needs_fd and interface not in FD_INTERFACES:
         raise ConfigError(
             f"channel {channel!r}: CAN FD is driven through {', '.join(FD_INTERFACES)}; on Linux most adapters are "
             f"interfaces of the kernel, such as can0",
@@ -145,13 +145,13 @@ def validate_channel(channel: str, *, fd: bool = False, is_emulator: bool = Fals
 
 
 def validate_channels(
-    channels: Sequence[str], *, fd: bool = False, is_emulator: bool = False
+    channels: Sequence[str], *, needs_fd: bool = False, is_emulator: bool = False
 ) -> None:
     """Check every channel of a robot as `validate_channel` does, and that no two of them are the same bus.
 
     Args:
         channels: SocketCAN interfaces, INTERFACE:CHANNEL of python-can, or local:FOLDER.
-        fd: Whether the channels must support CAN FD.
+        needs_fd: Whether the channels must support CAN FD.
         is_emulator: Whether drives will be emulated there.
 
     Raises:
@@ -159,7 +159,7 @@ def validate_channels(
     """
     channel_by_bus: dict[tuple[str, str], str] = {}
     for channel in channels:
-        validate_channel(channel, fd=fd, is_emulator=is_emulator)
+        validate_channel(channel, needs_fd=needs_fd, is_emulator=is_emulator)
         bus = split_channel(channel)
         if bus in channel_by_bus:
             raise ConfigError(
@@ -189,7 +189,17 @@ def _is_multicast(channel: str) -> bool:
 
 
 def open_bus(channel: str, bit_rate: int, data_bit_rate: int | None = None) -> can.BusABC:
-    """Open a channel as a bus of python-can. Raises ConfigError and BackendError."""
+    """Open a channel as a bus of python-can.
+
+    Args:
+        channel: SocketCAN interface such as can0, or INTERFACE:CHANNEL of python-can.
+        bit_rate: Bit rate in bit/s; not used by an interface of the kernel.
+        data_bit_rate: Second bit rate in bit/s, for the data of CAN FD; None for classic CAN.
+
+    Raises:
+        ConfigError: There is no such interface.
+        BackendError: The channel cannot be opened. The message names what the interface needs, if that is known.
+    """
     interface, name = split_channel(channel)
     settings = _make_bus_arguments(interface, bit_rate, data_bit_rate)
     try:
@@ -249,20 +259,36 @@ class AdapterWire:
     def __init__(
         self,
         channel: str,
-        only: Iterable[Opcode] | None,
+        received_opcodes: Iterable[Opcode] | None,
         bit_rate: int,
         data_bit_rate: int | None = None,
     ) -> None:
-        """Open the adapter. `open_wire` explains the arguments. Raises ConfigError and BackendError."""
+        """Open the adapter.
+
+        Args:
+            channel: INTERFACE:CHANNEL of python-can.
+            received_opcodes: Opcodes of the messages to receive; None for all messages.
+            bit_rate: Bit rate in bit/s.
+            data_bit_rate: Second bit rate in bit/s, for the data of CAN FD; None for classic CAN.
+
+        Raises:
+            ConfigError: python-can has no such interface.
+            BackendError: The channel cannot be opened.
+        """
         self.channel = channel
         self._uses_fd = data_bit_rate is not None
-        self._received_opcodes = None if only is None else frozenset(int(opcode) for opcode in only)
+        self._received_opcodes = (
+            None
+            if received_opcodes is None
+            else frozenset(int(opcode) for opcode in received_opcodes)
+        )
         self._bus = open_bus(channel, bit_rate, data_bit_rate)
         self._descriptor = self._find_file_descriptor()
-        # UDP multicast returns the frames that this end sends: how many of each are still to come back.
-        self._pending_echo_counts: Counter[CanFrame] | None = (
-            Counter() if _is_multicast(channel) else None
-        )
+        # UDP multicast also delivers the frames that this end sends to this end. To drop these echoes, count how many
+        # of each frame were sent and have not come back. None: the adapter returns no echoes.
+        self._pending_echo_counts: Counter[CanFrame] | None = None
+        if _is_multicast(channel):
+            self._pending_echo_counts = Counter()
         self._errors: list[BusError] = []
 
     def send(self, frame: CanFrame) -> bool:

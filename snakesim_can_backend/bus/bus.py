@@ -97,12 +97,13 @@ class Wire(Protocol):
 class SocketCanWire:
     """One end of a bus, as an interface of the kernel."""
 
-    def __init__(self, channel: str, only: Iterable[Opcode] | None = None) -> None:
+    def __init__(self, channel: str, received_opcodes: Iterable[Opcode] | None = None) -> None:
         """Open a SocketCAN interface of the kernel for sending and receiving without blocking.
 
         Args:
             channel: Name of the interface.
-            only: Opcodes of the messages to receive, filtered in the kernel; None for all frames with 11-bit ids.
+            received_opcodes: Opcodes of the messages to receive, filtered in the kernel; None for all frames with
+                11-bit ids.
 
         Raises:
             ConfigError: There is no such interface, or it is down.
@@ -110,7 +111,7 @@ class SocketCanWire:
         """
         validate_interface(channel)
         self.channel = channel
-        self._received_opcodes = None if only is None else list(only)
+        self._received_opcodes = None if received_opcodes is None else list(received_opcodes)
         try:
             self._bus = SocketcanBus(channel=channel, ignore_rx_error_frames=False)
             self._socket = self._bus.socket
@@ -120,6 +121,7 @@ class SocketCanWire:
             raise BackendError(
                 f"{channel}: cannot be opened: {error}", code="bus/cannot-open"
             ) from error
+        # A kernel that refuses a larger buffer only drops frames earlier, and `errors` reports dropped frames.
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self._buffer = bytearray(RAW_FRAME_FORMAT.size)
@@ -359,12 +361,13 @@ def drain_socket(
         frames: List to which the data frames are appended.
         on_error: Function that is called with id and data of each error frame of the kernel.
     """
-    # This loop runs for every frame: local names, and a Frame that is made without its argument handling.
+    # This loop runs for every frame, so it uses local names. `tuple.__new__` makes a CanFrame, which is a named tuple,
+    # without the argument handling of its constructor.
     receive_into = source.recv_into
     unpack = RAW_FRAME_FORMAT.unpack
     append = frames.append
     new_tuple = tuple.__new__
-    with contextlib.suppress(BlockingIOError):
+    with contextlib.suppress(BlockingIOError):  # raised by `recv_into` when the socket is empty
         for _ in range(MAX_AT_ONCE):
             receive_into(buffer)
             identifier, length, data = unpack(buffer)
@@ -444,10 +447,11 @@ def validate_interface(channel: str) -> None:
     """Check that a SocketCAN interface exists and is up.
 
     Raises:
-        ConfigError: The kernel has no CAN, or the interface does not exist or is down. The message
+        ConfigError: The kernel has no CAN, or the interface does not exist or is down. For the last two, the message
             contains the command that brings it up.
     """
-    if not hasattr(socket, "AF_CAN") or not _kernel_has_can():
+    does_python_support_can = hasattr(socket, "AF_CAN")
+    if not does_python_support_can or not _kernel_has_can():
         raise ConfigError(
             f"channel {channel!r}: this kernel has no CAN. Leave `backends.can.channels` empty for a virtual bus, or "
             f"run in a VM that has CAN: see docs/hardware/joint-modules.md",

@@ -126,7 +126,7 @@ def compute_bus_load(joint_count: int, reports: ReportSchedule) -> float:
     )
 
 
-def busiest_period_s(joint_count: int, reports: ReportSchedule) -> float:
+def compute_busiest_period_s(joint_count: int, reports: ReportSchedule) -> float:
     """Return the bus time of a period with force reports: Sync, all answers and all setpoints, at worst."""
     one_period = ReportSchedule(1.0, min(reports.contact_every, 1), 0, reports.tail)
     in_each_period = (
@@ -147,13 +147,13 @@ def busiest_period_s(joint_count: int, reports: ReportSchedule) -> float:
 def is_feasible(joint_count: int, reports: ReportSchedule) -> bool:
     """Return whether a bus can carry this many joints, on average and in the longest period."""
     fits_on_average = compute_bus_load(joint_count, reports) <= MAX_LOAD
-    return fits_on_average and busiest_period_s(joint_count, reports) * reports.rate_hz <= 1
+    return fits_on_average and compute_busiest_period_s(joint_count, reports) * reports.rate_hz <= 1
 
 
 # --- the reports of a run -----------------------------------------------------------------------------------------
 
 
-def syncs_per_report(rate_hz: float, report_hz: float) -> int:
+def compute_syncs_per_report(rate_hz: float, report_hz: float) -> int:
     """Return the number of Syncs between reports at about `report_hz`; 0 for never."""
     if report_hz <= 0:
         return 0
@@ -178,8 +178,8 @@ def plan_reports_at(rate_hz: float, config: RunConfig, settings: CanSettings) ->
         imu_hz = min(settings.imu_rate_hz, sensors.imu.rate_hz)
     return ReportSchedule(
         rate_hz,
-        contact_every=syncs_per_report(rate_hz, contact_hz),
-        imu_every=syncs_per_report(rate_hz, imu_hz),
+        contact_every=compute_syncs_per_report(rate_hz, contact_hz),
+        imu_every=compute_syncs_per_report(rate_hz, imu_hz),
         bit_rate=settings.bit_rate,
     )
 
@@ -228,12 +228,18 @@ def count_joints_per_bus(config: RunConfig, settings: CanSettings) -> list[int]:
 
 
 def plan_buses(config: RunConfig, settings: CanSettings) -> list[tuple[int, ReportSchedule]]:
-    """Return joints and reports of every bus, tail to head. Only the first carries TailContact. Raises ConfigError."""
+    """Return the number of joints and the reports of every bus, tail to head.
+
+    Only the first bus carries TailContact.
+
+    Raises:
+        ConfigError: A channel is named twice, or the numbers do not fit the robot.
+    """
     reports = plan_reports(config, settings)
     buses: list[tuple[int, ReportSchedule]] = []
-    for bus, joints in enumerate(count_joints_per_bus(config, settings)):
-        has_tail = reports.tail and bus == 0
-        buses.append((joints, replace(reports, tail=has_tail)))
+    for bus_index, joint_count in enumerate(count_joints_per_bus(config, settings)):
+        has_tail = reports.tail and bus_index == 0
+        buses.append((joint_count, replace(reports, tail=has_tail)))
     return buses
 
 
@@ -255,25 +261,25 @@ def validate_bus_load(config: RunConfig, settings: CanSettings) -> list[float]:
             lists the load by kind of frame, and alternatives that fit.
     """
     buses = plan_buses(config, settings)
-    joints = [count for count, _ in buses]
+    joint_counts = [joint_count for joint_count, _ in buses]
     loads = [compute_bus_load(*bus) for bus in buses]
     fullest_bus = max(range(len(loads)), key=lambda i: loads[i])
     if loads[fullest_bus] > MAX_LOAD:
         raise ConfigError(
-            f"{joints[fullest_bus]} joints at {config.rate_hz:g} Hz do not fit on "
+            f"{joint_counts[fullest_bus]} joints at {config.rate_hz:g} Hz do not fit on "
             f"{_describe_bus(settings, fullest_bus)}:",
             *explain_load(*buses[fullest_bus]),
-            suggest_alternatives(joints, config, settings),
+            suggest_alternatives(joint_counts, config, settings),
             code="bus/overloaded",
         )
-    periods_s = [busiest_period_s(*bus) for bus in buses]
+    periods_s = [compute_busiest_period_s(*bus) for bus in buses]
     longest_period_bus = max(range(len(buses)), key=lambda i: periods_s[i])
     if periods_s[longest_period_bus] * config.rate_hz > 1:
         raise ConfigError(
-            f"{joints[longest_period_bus]} joints at {config.rate_hz:g} Hz do not fit on "
+            f"{joint_counts[longest_period_bus]} joints at {config.rate_hz:g} Hz do not fit on "
             f"{_describe_bus(settings, longest_period_bus)}: a period with force reports takes "
             f"{periods_s[longest_period_bus] * 1000:.2f} ms of bus time and lasts {1000 / config.rate_hz:.2f} ms.",
-            suggest_alternatives(joints, config, settings),
+            suggest_alternatives(joint_counts, config, settings),
             code="bus/overloaded",
         )
     return loads
@@ -304,37 +310,50 @@ def explain_load(joint_count: int, reports: ReportSchedule) -> list[str]:
     return lines
 
 
-def suggest_alternatives(joints: Sequence[int], config: RunConfig, settings: CanSettings) -> str:
-    """Return a sentence with alternatives that fit: a lower control rate, more buses, or fewer contact reports.
+def suggest_alternatives(
+    joint_counts: Sequence[int], config: RunConfig, settings: CanSettings
+) -> str:
+    """Suggest what would fit where buses are overloaded.
 
     Args:
-        joints: Number of joints on each bus.
+        joint_counts: Number of joints on each bus.
         config: Configuration of the run, with the robot and the settings of its backend.
         settings: Settings of the backend.
+
+    Returns:
+        A sentence with a lower control rate, a higher number of buses, and a lower rate of contact reports; without
+        those that would not help.
     """
-    fullest_bus = max(joints)
-    total = sum(joints)
+    max_joint_count = max(joint_counts)  # on one bus
+    total_joint_count = sum(joint_counts)
+    bus_count = len(joint_counts)
     reports = plan_reports(config, settings)
     alternatives: list[str] = []
 
-    rate_hz = max_rate_hz(fullest_bus, config, settings)
+    # A lower control rate, if any lower rate fits.
+    rate_hz = find_max_rate_hz(max_joint_count, config, settings)
     if rate_hz is not None:
-        buses = f"{len(joints)} bus" if len(joints) == 1 else f"{len(joints)} buses"
+        buses = "1 bus" if bus_count == 1 else f"{bus_count} buses"
         alternatives.append(f"rate_hz = {rate_hz} on {buses}")
 
-    for channels in range(len(joints) + 1, min(total, MAX_PROPOSED_BUSES) + 1):
-        joints_each = ceil(total / channels)
-        if is_feasible(joints_each, reports):
-            alternatives.append(f"{channels} channels with up to {joints_each} joints each")
+    # More buses.
+    max_bus_count = min(total_joint_count, MAX_PROPOSED_BUSES)
+    for proposed_bus_count in range(bus_count + 1, max_bus_count + 1):
+        joints_per_bus = ceil(total_joint_count / proposed_bus_count)
+        if is_feasible(joints_per_bus, reports):
+            alternatives.append(
+                f"{proposed_bus_count} channels with up to {joints_per_bus} joints each"
+            )
             break
 
+    # Contact reports at half or a quarter of their rate. 0 Syncs per report means that there are none.
     for factor in (2, 4):
-        contact_every = factor * reports.contact_every
-        if not 0 < contact_every <= MAX_SYNCS_PER_REPORT:
+        syncs_per_report = factor * reports.contact_every
+        if not 0 < syncs_per_report <= MAX_SYNCS_PER_REPORT:
             continue
-        if is_feasible(fullest_bus, replace(reports, contact_every=contact_every)):
+        if is_feasible(max_joint_count, replace(reports, contact_every=syncs_per_report)):
             alternatives.append(
-                f"backends.can.contact_rate_hz = {config.rate_hz / contact_every:g}"
+                f"backends.can.contact_rate_hz = {config.rate_hz / syncs_per_report:g}"
             )
             break
 
@@ -342,7 +361,7 @@ def suggest_alternatives(joints: Sequence[int], config: RunConfig, settings: Can
     return f"What would fit: {text}."
 
 
-def max_rate_hz(joint_count: int, config: RunConfig, settings: CanSettings) -> int | None:
+def find_max_rate_hz(joint_count: int, config: RunConfig, settings: CanSettings) -> int | None:
     """Return the highest integer rate below the run's at which this many joints fit on a bus; None if there is none.
 
     Bisection does not work: at some lower rate reports may come at every Sync instead of every second one.

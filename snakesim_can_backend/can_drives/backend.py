@@ -17,7 +17,7 @@ from snakesim_drivers.kit.bus import BusSpec
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_settings import (
     DriveSettings,
-    assign_ports,
+    assign_port_indices,
     compute_response_timeout_s,
     make_emulated_body,
     make_joint_label,
@@ -111,7 +111,7 @@ class CanDriveBackend(DriverTypeBackend):
         Raises:
             ConfigError: A channel, an id, a joint or the load of a bus does not suit this driver type.
         """
-        validate_channels(settings.channels, fd=settings.fd_rate is not None)
+        validate_channels(settings.channels, needs_fd=settings.fd_rate is not None)
         for joint in joints:
             if not cls.first_id <= joint.id <= cls.last_id:
                 raise ConfigError(
@@ -145,7 +145,10 @@ class CanDriveBackend(DriverTypeBackend):
             return compute_max_frame_duration_s(length, settings.bit_rate, settings.fd_rate)
 
         return compute_load(
-            cls.traffic, assign_ports(joints, settings.channels), rate_hz, compute_frame_duration_s
+            cls.traffic,
+            assign_port_indices(joints, settings.channels),
+            rate_hz,
+            compute_frame_duration_s,
         )
 
     @staticmethod
@@ -169,14 +172,15 @@ class CanDriveBackend(DriverTypeBackend):
 
         Args:
             config: Configuration of the run, with the robot and the settings of its backend.
-            settings: Settings of the driver type.
-            wires: Open buses, in the order of the channels.
+            settings: Settings of the driver type, an instance of its class `Settings`.
+            wires: Ends of the open buses, one for each of `settings.channels`.
             clock: Clock of the drives.
             pose_address: HOST:PORT to which emulated motion capture sends poses; None if it does not send.
         """
         body = make_emulated_body(config, settings, cls.name, pose_address)
         joints = config.robot.joint_table
-        wire_by_joint = [wires[bus] for bus in assign_ports(joints, settings.channels)]
+        channel_indices = assign_port_indices(joints, settings.channels)  # of each joint
+        wire_by_joint = [wires[channel_index] for channel_index in channel_indices]
         return cls.emulator_class(
             CanEmulatorContext(joints, settings, body, wire_by_joint, clock.now_ns)
         )

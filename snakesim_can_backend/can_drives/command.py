@@ -22,7 +22,7 @@ from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario, p
 from snakesim_hal.programs.preflight import decode_backend_settings
 
 
-def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> int:
+def emulate_drives(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> int:
     """Run `snakesim drive emulate`: emulate the drives of a driver type until a stop signal arrives.
 
     Args:
@@ -44,7 +44,7 @@ def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> in
                 f"--channel {channel}: emulated drives beside real ones of the same ids are dangerous",
                 code="bus/not-virtual",
             )
-    validate_channels(settings.channels, fd=settings.fd_rate is not None, is_emulator=True)
+    validate_channels(settings.channels, needs_fd=settings.fd_rate is not None, is_emulator=True)
     config = msgspec.structs.replace(config, clock_mode="realtime")
     wires = [
         open_wire(channel, None, settings.bit_rate, settings.fd_rate)
@@ -63,7 +63,7 @@ def emulate(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> in
     return 0
 
 
-def print_load(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> int:
+def print_drive_load(backend: type[CanDriveBackend], arguments: argparse.Namespace) -> int:
     """Run `snakesim drive load`: print the bus load of a driver type, and the highest control rate that fits.
 
     Args:
@@ -101,7 +101,9 @@ def print_load(backend: type[CanDriveBackend], arguments: argparse.Namespace) ->
 def _load_settings(
     backend: type[CanDriveBackend], command: str, arguments: argparse.Namespace
 ) -> tuple[RunConfig, Any]:
-    """Load the scenario of a command line for a backend, with the channels that the command line names.
+    """Load the scenario of a command line for a backend.
+
+    The channels are those of the command line; else those of the scenario; else DEFAULT_CHANNEL.
 
     Args:
         backend: Class of the driver type.
@@ -109,10 +111,10 @@ def _load_settings(
         arguments: Parsed command line.
 
     Returns:
-        The configuration of the run and the settings of the backend.
+        The configuration of the run, and the settings of the backend: an instance of its class `Settings`.
     """
     overrides = [
-        KeyOverride("backend", backend.name, f"{command} {backend.name}"),
+        KeyOverride("backend", backend.name, flag=f"{command} {backend.name}"),
         *map(parse_set_option, arguments.set),
     ]
     loaded = load_scenario(arguments.scenario, overrides)

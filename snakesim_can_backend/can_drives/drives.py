@@ -95,7 +95,7 @@ class CanDrives(Drives):
         self._last_health_request_index = 0  # index of the drive whose health was requested last
         # Other nodes on the bus.
         self._frame_count_by_unknown_node: Counter[int] = Counter()  # frames, by node
-        self._other_controller_seen = False  # whether another program has commanded drives
+        self._has_seen_other_controller = False  # whether another program has commanded drives
 
     # --- the protocol of a driver type: frames that arrive ----------------------------------------------------
 
@@ -211,7 +211,7 @@ class CanDrives(Drives):
             for i in drives
             for problem in self._find_identity_problems(i)
         ]
-        if self._other_controller_seen:
+        if self._has_seen_other_controller:
             raise BackendError(
                 "another program commands drives on this bus; end it first. Nothing was sent",
                 code="bus/second-host",
@@ -327,13 +327,13 @@ class CanDrives(Drives):
         self._emulator.inject(injection, begins=begins)
         return True
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return what is wrong with the bus, with other nodes on it, and with its drives."""
         return [
             *self._find_bus_errors(),
             *self._find_unauthorized_nodes(),
             *self._find_duplicates(),
-            *self.states.findings(),
+            *self.states.list_findings(),
         ]
 
     def handle_frame(self, frame: CanFrame) -> None:
@@ -348,7 +348,7 @@ class CanDrives(Drives):
             except (ValueError, LookupError, struct.error):
                 return
         elif sender == HOST:
-            self._other_controller_seen = True
+            self._has_seen_other_controller = True
         else:
             self._frame_count_by_unknown_node[sender] += 1
 
@@ -365,13 +365,13 @@ class CanDrives(Drives):
     def _find_unauthorized_nodes(self) -> list[FaultFinding]:
         """Return findings for another host and for unknown nodes."""
         findings: list[FaultFinding] = []
-        if self._other_controller_seen:
+        if self._has_seen_other_controller:
             findings.append(
                 FaultFinding(
                     "second_host", "another program commands drives on this bus; end one of the two"
                 )
             )
-            self._other_controller_seen = False
+            self._has_seen_other_controller = False
         for node, frame_count in self._frame_count_by_unknown_node.items():
             if frame_count >= MIN_UNKNOWN_NODE_FRAMES:
                 findings.append(

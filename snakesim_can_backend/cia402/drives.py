@@ -520,9 +520,9 @@ class Cia402Drives(CanDrives):
             case "stop":
                 self._send_disable(i, ControlwordCommand.QUICK_STOP)
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return what is wrong, including drives that answer SYNC but have stopped to send heartbeats."""
-        findings = super().findings()
+        findings = super().list_findings()
         timeout_ns = MAX_MISSED_HEARTBEATS * self._settings.heartbeat_s * 1e9
         for i, servo in enumerate(self.servos):
             if servo.phase != "ready" or self.readings.count_unanswered_requests(i):

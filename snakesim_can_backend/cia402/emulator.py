@@ -102,7 +102,7 @@ DRIVE_MODES: dict[int, JointMode] = {
 class EmulatedCia402Drive:
     """One drive: its objects, and its state."""
 
-    node: int  # id
+    node_id: int  # id
     objects: Cia402Node
     scaling: UnitScaling
     state: PowerState = PowerState.SWITCH_ON_DISABLED
@@ -158,9 +158,9 @@ class EmulatedCia402(CanEmulator):
 
     def restart(self, i: int) -> None:
         """Restart a drive: it loses all settings that it has not saved, and sends its boot-up message later."""
-        node = self.drives[i].node
+        node = self.drives[i].node_id
         self.drives[i] = self._make_drive(i)
-        self.drives[i].node = node
+        self.drives[i].node_id = node
         self._drive_motor(i)
 
     def handle_frame(self, i: int, frame: CanFrame) -> None:
@@ -178,12 +178,12 @@ class EmulatedCia402(CanEmulator):
             return
         if frame.id == SYNC_ID:
             for cob_id, data in drive.objects.list_synchronous_pdos():
-                self.send_frame(i, CanFrame(cob_id & ~0x7F | drive.node, data))
+                self.send_frame(i, CanFrame(cob_id & ~0x7F | drive.node_id, data))
         elif frame.id == FunctionCode.NMT:
             self._execute_nmt_command(i, frame.data[0])
         elif function == FunctionCode.SDO_REQUEST:
             response = drive.objects.handle_sdo_request(decode_sdo(frame.data))
-            self.send_frame(i, CanFrame(FunctionCode.SDO_RESPONSE | drive.node, response))
+            self.send_frame(i, CanFrame(FunctionCode.SDO_RESPONSE | drive.node_id, response))
         elif function == FunctionCode.HEARTBEAT:
             if node == self._get_consumer_heartbeat(drive)[0]:
                 drive.last_host_heartbeat_us = self.body.now_us
@@ -201,7 +201,7 @@ class EmulatedCia402(CanEmulator):
             if drive.is_booting:
                 drive.is_booting = False
                 drive.last_heartbeat_us = now_us
-                self.send_frame(i, encode_heartbeat(drive.node, NmtState.BOOT_UP))
+                self.send_frame(i, encode_heartbeat(drive.node_id, NmtState.BOOT_UP))
             self._check_host_heartbeat(i, now_us)
             if self.body.is_too_hot(i) and drive.state not in FAULT_STATES:
                 self._fail(i, OVER_TEMPERATURE)
@@ -209,7 +209,7 @@ class EmulatedCia402(CanEmulator):
             period_us = drive.objects.get(_get_address(PRODUCER_HEARTBEAT)) * 1000
             if period_us and now_us - drive.last_heartbeat_us >= period_us:
                 drive.last_heartbeat_us = now_us
-                self.send_frame(i, encode_heartbeat(drive.node, drive.objects.nmt_state))
+                self.send_frame(i, encode_heartbeat(drive.node_id, drive.objects.nmt_state))
 
     # --- what happens to a drive ------------------------------------------------------------------------------
 
@@ -222,7 +222,7 @@ class EmulatedCia402(CanEmulator):
         joint = self._joints[i]
         node = Cia402Node(
             eds=self._eds,
-            node=self.body.joints[i].id,
+            node_id=self.body.joints[i].id,
             on_write=lambda address, value: self._handle_write(i, address, value),
             compute_live_value=lambda address: self._compute_live_value(i, address),
         )
@@ -246,7 +246,7 @@ class EmulatedCia402(CanEmulator):
         for entry, value in saved_values.items():
             if _get_address(entry) in node.values:
                 node.values[_get_address(entry)] = int.from_bytes(entry.encode(value), "little")
-        return EmulatedCia402Drive(node.node, node, scaling, saved_values=saved_values)
+        return EmulatedCia402Drive(node.node_id, node, scaling, saved_values=saved_values)
 
     def _execute_nmt_command(self, i: int, command: int) -> None:
         drive = self.drives[i]
@@ -260,7 +260,7 @@ class EmulatedCia402(CanEmulator):
             drive.objects.values[_get_address(entry)] = drive.saved_values[entry]
         drive.objects.nmt_state = NmtState.PRE_OPERATIONAL
         drive.last_host_heartbeat_us = None
-        self.send_frame(i, encode_heartbeat(drive.node, NmtState.BOOT_UP))
+        self.send_frame(i, encode_heartbeat(drive.node_id, NmtState.BOOT_UP))
 
     def _receive_pdo(self, i: int, frame: CanFrame) -> None:
         drive = self.drives[i]
@@ -278,7 +278,7 @@ class EmulatedCia402(CanEmulator):
             drive.controlword = value
             if was_fault and drive.state != PowerState.FAULT:
                 drive.error = None
-                self.send_frame(i, encode_emergency(drive.node, EmergencyMessage(0, 0)))
+                self.send_frame(i, encode_emergency(drive.node_id, EmergencyMessage(0, 0)))
         elif address == _get_address(CONSUMER_HEARTBEAT):
             drive.last_host_heartbeat_us = None  # the watch begins with the next heartbeat
         self._end_quick_stop(i)
@@ -309,7 +309,7 @@ class EmulatedCia402(CanEmulator):
         drive = self.drives[i]
         drive.state = PowerState.FAULT
         drive.error = error
-        self.send_frame(i, encode_emergency(drive.node, error))
+        self.send_frame(i, encode_emergency(drive.node_id, error))
         self._drive_motor(i)
 
     def _end_quick_stop(self, i: int) -> None:

@@ -62,7 +62,7 @@ class Cia402Node:
     """One node. Values are whole numbers without a sign, as they are sent."""
 
     eds: EdsFile
-    node: int
+    node_id: int
     on_write: Callable[[Address, int], None]  # gets every value that a host has written
     # Returns a value that changes by itself; None: the stored one counts.
     compute_live_value: Callable[[Address], int | None]
@@ -72,7 +72,7 @@ class Cia402Node:
     def __post_init__(self) -> None:
         """Set every object to its default."""
         for address, description in self.eds.objects.items():
-            self.values[address] = description.default_value(self.node)
+            self.values[address] = description.default_value(self.node_id)
 
     # --- values -----------------------------------------------------------------------------------------------
 
@@ -89,7 +89,7 @@ class Cia402Node:
         """Set the communication objects to their defaults."""
         for address, description in self.eds.objects.items():
             if address[0] in COMMUNICATION_OBJECTS:
-                self.values[address] = description.default_value(self.node)
+                self.values[address] = description.default_value(self.node_id)
 
     # --- NMT --------------------------------------------------------------------------------------------------
 

@@ -33,13 +33,13 @@ DUPLICATE_WAIT_S = 0.06  # after the last module is found: a second one with its
 class ModuleIdentity:
     """A module's answer to `identify`."""
 
-    node: int
+    node_id: int
     channel: str
     serial: int
     firmware: str
     protocol: int
-    emulated: bool
-    stepped: bool
+    is_emulated: bool
+    is_stepped: bool
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ModuleBus:
     """One wire, and the nodes that belong on it."""
 
     wire: Wire
-    nodes: range
+    node_ids: range
 
 
 # --- finding modules ----------------------------------------------------------------------------------------------
@@ -64,15 +64,16 @@ def find_modules(
         on_frame: Function that is called with all frames that are not responses to the request; None to ignore them.
 
     Returns:
-        Every identity that was received, sorted by node. Two modules may have the same id.
+        Every identity that was received, sorted by node id. Two modules may have the same node id.
     """
-    # By channel, node and serial number.
+    # By channel, node id and serial number.
     identities: dict[tuple[str, int, int], ModuleIdentity] = {}
-    missing = {(bus.wire.channel, node) for bus in buses for node in bus.nodes}
+    # Channel and node id of each expected module that has not responded.
+    missing = {(bus.wire.channel, node_id) for bus in buses for node_id in bus.node_ids}
     wires = [bus.wire for bus in buses]
     deadline_s = time.monotonic() + timeout_s
-    next_request_s = 0.0
-    is_complete = False
+    next_request_s = 0.0  # the first request is sent at once
+    has_shortened_deadline = False
     now_s = time.monotonic()
     while now_s < deadline_s:
         if now_s >= next_request_s:
@@ -82,17 +83,18 @@ def find_modules(
         for wire, frame in receive_frames(wires, deadline_s - now_s):
             identity = _parse_identity(wire.channel, frame)
             if identity is not None:
-                identities[identity.channel, identity.node, identity.serial] = identity
-                missing.discard((identity.channel, identity.node))
+                identities[identity.channel, identity.node_id, identity.serial] = identity
+                missing.discard((identity.channel, identity.node_id))
             elif on_frame is not None:
                 on_frame(frame)
-        if not is_complete and not missing:
-            is_complete = True
-            # A second module with the same id may still answer.
+        if not missing and not has_shortened_deadline:
+            has_shortened_deadline = True
+            # All have responded. Wait a little longer: a second module with the same node id may still respond.
             deadline_s = min(deadline_s, time.monotonic() + DUPLICATE_WAIT_S)
         now_s = time.monotonic()
     return sorted(
-        identities.values(), key=lambda identity: (identity.node, identity.channel, identity.serial)
+        identities.values(),
+        key=lambda identity: (identity.node_id, identity.channel, identity.serial),
     )
 
 
@@ -106,41 +108,41 @@ def _parse_identity(channel: str, frame: CanFrame) -> ModuleIdentity | None:
 
 def _make_identity(channel: str, node_id: int, values: Mapping[str, float]) -> ModuleIdentity:
     return ModuleIdentity(
-        node=node_id,
+        node_id=node_id,
         channel=channel,
         serial=int(values["serial"]),
         firmware=f"{values['firmware_major']:.0f}.{values['firmware_minor']:.0f}",
         protocol=int(values["protocol"]),
-        emulated=bool(values["emulated"]),
-        stepped=bool(values["stepped"]),
+        is_emulated=bool(values["emulated"]),
+        is_stepped=bool(values["stepped"]),
     )
 
 
 def find_discovery_errors(
     buses: Sequence[ModuleBus],
     identities: Sequence[ModuleIdentity],
-    joints: Sequence[str],
+    joint_names: Sequence[str],
     *,
-    lockstep: bool,
+    is_lockstep: bool,
 ) -> list[str]:
     """Compare the modules that responded with the joints of the robot.
 
     Args:
         buses: The buses, with the nodes that are expected there.
         identities: Identities of the modules that responded.
-        joints: Names of the joints, from tail to head.
-        lockstep: Whether the run is in lockstep, which only stepped emulators support.
+        joint_names: Names of the joints, from tail to head.
+        is_lockstep: Whether the run is in lockstep, which only stepped emulators support.
 
     Returns:
         The errors as text; empty if the robot is complete.
     """
     errors: list[str] = []
-    channel_by_node = {node: bus.wire.channel for bus in buses for node in bus.nodes}
+    channel_by_node = {node: bus.wire.channel for bus in buses for node in bus.node_ids}
     identities_by_node: dict[int, list[ModuleIdentity]] = defaultdict(list)
     for identity in identities:
-        identities_by_node[identity.node].append(identity)
+        identities_by_node[identity.node_id].append(identity)
     for node, channel in channel_by_node.items():
-        subject = f"{joints[node - 1]} (node {node} on {channel})"
+        subject = f"{joint_names[node - 1]} (node {node} on {channel})"
         identities_on_channel: list[ModuleIdentity] = []
         identities_on_other_channels: list[ModuleIdentity] = []
         for identity in identities_by_node[node]:
@@ -150,12 +152,12 @@ def find_discovery_errors(
                 identities_on_other_channels.append(identity)
         errors += _find_node_errors(subject, identities_on_channel, identities_on_other_channels)
         for identity in identities_on_channel:
-            errors += _find_identity_errors(subject, identity, lockstep=lockstep)
+            errors += _find_identity_errors(subject, identity, is_lockstep=is_lockstep)
     for identity in identities:
-        if identity.node not in channel_by_node:
+        if identity.node_id not in channel_by_node:
             errors.append(
-                f"node {identity.node} with serial {identity.serial:08X} on {identity.channel} is not a joint of this "
-                f"robot"
+                f"node {identity.node_id} with serial {identity.serial:08X} on {identity.channel} "
+                f"is not a joint of this robot"
             )
     return errors
 
@@ -170,7 +172,7 @@ def _find_node_errors(
         hint = ""
         if identities_on_other_channels:
             hint = (
-                f"; a node {identities_on_other_channels[0].node} answers on "
+                f"; a node {identities_on_other_channels[0].node_id} answers on "
                 f"{identities_on_other_channels[0].channel}"
             )
         return [f"{subject} does not answer{hint}"]
@@ -188,16 +190,18 @@ def _find_node_errors(
     return errors
 
 
-def _find_identity_errors(subject: str, identity: ModuleIdentity, *, lockstep: bool) -> list[str]:
+def _find_identity_errors(
+    subject: str, identity: ModuleIdentity, *, is_lockstep: bool
+) -> list[str]:
     """Return errors of a module whose protocol or clock does not match this driver's."""
     errors: list[str] = []
     if identity.protocol != PROTOCOL_VERSION:
         errors.append(
             f"{subject} has protocol version {identity.protocol}, this driver {PROTOCOL_VERSION}: update one"
         )
-    if lockstep and not identity.stepped:
+    if is_lockstep and not identity.is_stepped:
         errors.append(f"{subject} does not support lockstep: use --clock-mode realtime")
-    if identity.stepped and not lockstep:
+    if identity.is_stepped and not is_lockstep:
         errors.append(
             f"{subject} is an emulator whose time is paused between Syncs: start it without --stepped"
         )
@@ -229,7 +233,7 @@ def configure_modules(
     Raises:
         BackendError: A module did not respond in time, or refused a value.
     """
-    wire_by_node = {node: bus.wire for bus in buses for node in bus.nodes}
+    wire_by_node = {node: bus.wire for bus in buses for node in bus.node_ids}
     wires = [bus.wire for bus in buses]
     response_layout = load_layouts()[Opcode.PARAMETER_ANSWER]
     # Not answered yet.

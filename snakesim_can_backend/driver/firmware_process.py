@@ -15,18 +15,18 @@ MODULES_NAME = "modules.txt"
 class FirmwareProcess(EmulatorProcess):
     """The program `joint_modules` as a child that ends when this process closes its input."""
 
-    def __init__(self, config: RunConfig, settings: CanSettings, *, stepped: bool) -> None:
+    def __init__(self, config: RunConfig, settings: CanSettings, *, is_stepped: bool) -> None:
         """Compile the program if necessary, start it, and wait until its modules are on the bus.
 
         Args:
             config: Configuration of the run, with the robot.
             settings: Settings of the backend.
-            stepped: Whether time advances only from Sync to Sync.
+            is_stepped: Whether time advances only from Sync to Sync.
 
         Raises:
             BackendError: The program cannot be compiled or started, ended at once, or was not ready in time.
         """
-        super().__init__(config, settings, None, stepped=stepped)
+        super().__init__(config, settings, None, is_stepped=is_stepped)
 
     @property
     def channel(self) -> str:
@@ -40,7 +40,7 @@ class FirmwareProcess(EmulatorProcess):
         pose_address: str | None,
         output_path: Path,
         *,
-        stepped: bool,
+        is_stepped: bool,
     ) -> EmulatorChild:
         from snakesim_can_backend.emulator.reference_firmware import (
             build_program,
@@ -52,7 +52,7 @@ class FirmwareProcess(EmulatorProcess):
         modules_path = folder / MODULES_NAME
         modules_path.write_text(describe_modules(config, settings), encoding="utf-8")
         arguments = make_program_arguments(
-            str(folder / BUS_FOLDER_NAME), str(modules_path), stepped=stepped
+            str(folder / BUS_FOLDER_NAME), str(modules_path), is_stepped=is_stepped
         )
         with output_path.open("wb") as output:
             process = subprocess.Popen(

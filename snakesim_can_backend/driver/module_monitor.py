@@ -39,24 +39,24 @@ class ModuleMonitor:
     """Finds what is wrong with modules and buses, and remembers which findings it has reported."""
 
     def __init__(
-        self, joints: Sequence[str], channel_by_joint: Sequence[str], period_s: float
+        self, joint_names: Sequence[str], channel_by_joint: Sequence[str], period_s: float
     ) -> None:
         """Create the monitor of a robot's modules, before the first Sync.
 
         Args:
-            joints: Names of all joints, from tail to head.
+            joint_names: Names of all joints, from tail to head.
             channel_by_joint: Channel of every joint's module, from tail to head.
             period_s: Duration from one Sync to the next.
         """
-        self._joint_names = joints
+        self._joint_names = joint_names
         self._channels = channel_by_joint
         self._period_s = period_s
         self._reported_findings = ReportedFindings()
 
         # By joint.
-        self._restart_counts = [0] * len(joints)  # uptime decreases that were seen before
+        self._restart_counts = [0] * len(joint_names)  # uptime decreases that were seen before
         # Consecutive Syncs in which a module did not follow the robot's arming.
-        self._unarmed_sync_counts = [0] * len(joints)
+        self._unarmed_sync_counts = [0] * len(joint_names)
         # Sync at which a module's uptime decreased.
         self._restart_sync_by_joint: dict[int, int] = {}
         self._restarted_joints: set[int] = set()  # modules that restarted since the last reset
@@ -91,9 +91,9 @@ class ModuleMonitor:
         module_reports: ModuleReports,
         lifecycle: LifecycleState,
         errors: Iterable[BusError] = (),
-        unsent: Iterable[str] = (),
-        unconfigured: Iterable[int] = (),
-        isolated: Set[int] = frozenset(),
+        rejecting_channels: Iterable[str] = (),
+        unconfigured_joints: Iterable[int] = (),
+        isolated_joints: Set[int] = frozenset(),
     ) -> list[FaultFinding]:
         """Check all modules and buses once in a control cycle, and return the findings that are new.
 
@@ -103,14 +103,14 @@ class ModuleMonitor:
             module_reports: Newest reports of the modules. Its counts of frames from other senders are reset.
             lifecycle: Lifecycle state of the robot.
             errors: Bus errors since the last call.
-            unsent: Channels of the buses that rejected a frame in this cycle.
-            unconfigured: Joints that must not be armed, because their parameters may be wrong.
-            isolated: Isolated joints; findings that concern only an isolated joint are ignored.
+            rejecting_channels: Channels of the buses that rejected a frame in this cycle.
+            unconfigured_joints: Joints that must not be armed, because their parameters may be wrong.
+            isolated_joints: Isolated joints; findings that concern only an isolated joint are ignored.
 
         Returns:
             The findings that were not reported since the last reset.
         """
-        unsent_channels = set(unsent)
+        unsent_channels = set(rejecting_channels)
         self._update_arm_session(lifecycle, module_reports.sync)
         for channel in unsent_channels:
             self._last_rejected_sync_by_channel[channel] = module_reports.sync
@@ -122,18 +122,18 @@ class ModuleMonitor:
         for joint, module in enumerate(module_reports.modules):
             findings += self._find_frame_faults(joint, module, module_reports)
             findings += self._find_state_faults(
-                joint, module, module_reports, lifecycle, isolated=joint in isolated
+                joint, module, module_reports, lifecycle, is_isolated=joint in isolated_joints
             )
         if lifecycle == "armed":
             findings += [
                 self._make_unconfigured_finding(joint)
-                for joint in unconfigured
-                if joint not in isolated
+                for joint in unconfigured_joints
+                if joint not in isolated_joints
             ]
         relevant = [
             finding
             for finding in findings
-            if not (finding.affects_only_joint and finding.joint in isolated)
+            if not (finding.affects_only_joint and finding.joint in isolated_joints)
         ]
         return self._reported_findings.filter_new(relevant)
 
@@ -162,7 +162,7 @@ class ModuleMonitor:
         also: Sequence[str] = (),
     ) -> FaultFinding:
         """Return a finding about a module; `also` names further kinds that apply."""
-        subject = f"{self._joint_names[joint_index]} (node {module.node} on {self._channels[joint_index]})"
+        subject = f"{self._joint_names[joint_index]} (node {module.node_id} on {self._channels[joint_index]})"
         concerns_only_this_joint = ROBOT_FAULT_KINDS.isdisjoint((what, *also))
         return FaultFinding(
             what, f"{subject} {cause}", joint_index, affects_only_joint=concerns_only_this_joint
@@ -251,7 +251,7 @@ class ModuleMonitor:
         module_reports: ModuleReports,
         lifecycle: LifecycleState,
         *,
-        isolated: bool,
+        is_isolated: bool,
     ) -> list[FaultFinding]:
         """Return a finding if the module reports a fault, or does not follow the robot's arming."""
         # An emergency stop is no reason to report a module that had no fault before it.
@@ -261,7 +261,7 @@ class ModuleMonitor:
         may_report = module_reports.sync >= self._grace_end_sync
         if module.is_clear_required and not stopped_on_command and may_report:
             return [self._make_fault_finding(joint_index, module)]
-        if isolated or not self._has_failed_to_arm(joint_index, module, module_reports):
+        if is_isolated or not self._has_failed_to_arm(joint_index, module, module_reports):
             return []
         state = module.state.name.lower()
         if joint_index in self._armed_joints:
@@ -276,7 +276,7 @@ class ModuleMonitor:
     def _make_fault_finding(self, joint_index: int, module: ModuleStatus) -> FaultFinding:
         """Return the finding about a module that is in a latched state."""
         state = module.state.name.lower()
-        faults = module.fault_names()
+        faults = module.list_fault_names()
         kinds = [f"module_{name}" for name in (*faults, state)]
         reported = ", ".join(faults) or state
         cause = f"reports {reported}; it stopped because of {module.last_stop.name.lower()}"

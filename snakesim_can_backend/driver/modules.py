@@ -135,7 +135,7 @@ class JointModules(Drives):
         except BaseException:
             self.close()
             raise
-        self._wire_by_joint = [bus.wire for bus in self._buses for _ in bus.nodes]  # by joint
+        self._wire_by_joint = [bus.wire for bus in self._buses for _ in bus.node_ids]  # by joint
         channels = [wire.channel for wire in self._wire_by_joint]
         self.monitor = ModuleMonitor(self._joint_names, channels, config.period_ns * 1e-9)
 
@@ -157,7 +157,7 @@ class JointModules(Drives):
                 code="bus/second-host",
             )
         errors = find_discovery_errors(
-            self._buses, identities, self._joint_names, lockstep=self._lockstep
+            self._buses, identities, self._joint_names, is_lockstep=self._lockstep
         )
         if errors:
             raise BackendError(
@@ -166,9 +166,9 @@ class JointModules(Drives):
                 code="drive/not-complete",
             )
         self._is_only_host = True
-        self.emulated = all(identity.emulated for identity in identities)
+        self.emulated = all(identity.is_emulated for identity in identities)
         for identity in identities:
-            joint = identity.node - 1
+            joint = identity.node_id - 1
             self._readings.set_identity(
                 joint, serial=f"{identity.serial:08X}", firmware=identity.firmware
             )
@@ -190,7 +190,10 @@ class JointModules(Drives):
         sync = module_reports.sync + 1
         contacts = are_contacts_due(self._reports, sync)
         module_reports.start_sync(
-            sync, contacts=contacts, tail=self._reports.tail, questions=len(queries)
+            sync,
+            has_contacts=contacts,
+            has_tail_contact=self._reports.tail,
+            query_count=len(queries),
         )
         frame = commands.make_sync(sync, time_us)
         self._rejecting_channels = [wire.channel for wire in self.wires if not wire.send(frame)]
@@ -229,7 +232,7 @@ class JointModules(Drives):
 
         frames = commands.make_transition_frames(previous_lifecycle, lifecycle)
         self._is_arm_due = any(commands.is_arm_command(frame) for frame in frames)
-        self._was_clear_broadcast = previous_lifecycle in commands.LATCHED
+        self._was_clear_broadcast = previous_lifecycle in commands.LATCHED_LIFECYCLE_STATES
         for frame in frames:
             if not commands.is_arm_command(frame):
                 self._broadcast(frame)
@@ -286,7 +289,7 @@ class JointModules(Drives):
             else:  # the queue is full or the interface down: the next setpoint replaces this one
                 self._rejecting_channels.append(wire.channel)
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return the new faults that modules and buses report, or that the monitor detects."""
         errors = [error for wire in self.wires for error in wire.errors()]
         findings = self.monitor.find_faults(
@@ -354,10 +357,10 @@ class JointModules(Drives):
         channels = settings.channels
         if settings.emulators_run == "process":
             self._emulator_process = EmulatorProcess(
-                self._config, settings, pose_address, stepped=self._lockstep
+                self._config, settings, pose_address, is_stepped=self._lockstep
             )
         if settings.emulators_run == "firmware":
-            firmware_process = FirmwareProcess(self._config, settings, stepped=self._lockstep)
+            firmware_process = FirmwareProcess(self._config, settings, is_stepped=self._lockstep)
             self._emulator_process = firmware_process
             channels = [firmware_process.channel]
         if channels:
@@ -366,7 +369,7 @@ class JointModules(Drives):
         else:
             channel = make_virtual_channel()
             self.local_emulators = start_in_process_emulators(
-                self._config, settings, channel, pose_address, stepped=self._lockstep
+                self._config, settings, channel, pose_address, is_stepped=self._lockstep
             )
             self.wires.append(VirtualWire(channel, self.local_emulators))
         if settings.log:
@@ -430,11 +433,11 @@ class JointModules(Drives):
             time.sleep(FIRST_STATE_PAUSE_S)
             self.read()
         for joint, module in enumerate(self.module_reports.modules):
-            faults = module.fault_names()
+            faults = module.list_fault_names()
             has_only_such_faults = bool(faults) and set(faults) <= FAULTS_OF_KILLED_DRIVER
             if module.state == ModuleState.FAULT and has_only_such_faults:
                 _log.warning(
-                    "node %d: clearing an earlier fault: %s", module.node, ", ".join(faults)
+                    "node %d: clearing an earlier fault: %s", module.node_id, ", ".join(faults)
                 )
                 self._send_command(CommandAction.CLEAR, joint)
 
@@ -458,7 +461,7 @@ class JointModules(Drives):
         for module, wire in zip(self.module_reports.modules, self._wire_by_joint, strict=True):
             answered_newest_sync = module.sync >= 0 and module.sync == self.module_reports.sync
             if answered_newest_sync:
-                queries.setdefault(wire.channel, (wire, commands.make_query(module.node)))
+                queries.setdefault(wire.channel, (wire, commands.make_query(module.node_id)))
         return list(queries.values())
 
     # --- sending ----------------------------------------------------------------------------------------------
@@ -514,7 +517,7 @@ class JointModules(Drives):
     def _repeat_command(
         self, lifecycle: LifecycleState, joint_index: int, module: ModuleStatus
     ) -> None:
-        frame = commands.make_repeated_command(lifecycle, module.state, module.node)
+        frame = commands.make_repeated_command(lifecycle, module.state, module.node_id)
         if frame is not None:
             self._wire_by_joint[joint_index].send(frame)
 

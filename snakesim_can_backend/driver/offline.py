@@ -32,19 +32,19 @@ class LogReplay:
     """Reads a log frame by frame as the driver reads a bus, and collects the joint states of every Sync."""
 
     def __init__(
-        self, mounting: DriveMounting, schedule: ReportSchedule, answer_limit_s: float
+        self, mounting: DriveMounting, schedule: ReportSchedule, response_timeout_s: float
     ) -> None:
         """Prepare to read the log of a bus as the driver would have read the bus.
 
         Args:
             mounting: Sign, gear and zero of every joint, to convert values at the modules' shafts to the joints.
             schedule: Which reports the modules send, and how often.
-            answer_limit_s: How long the driver waits for the answers to a Sync.
+            response_timeout_s: How long the driver waits for the answers to a Sync.
         """
         joints = len(mounting.sign)
         self._mounting = mounting
         self._schedule = schedule
-        self._response_timeout_s = answer_limit_s
+        self._response_timeout_s = response_timeout_s
         # Log time at which the wait for the answers to the newest Sync ends; None: its sample has been taken.
         self._response_deadline_s: float | None = None
         self.reports = ModuleReports(joints)
@@ -107,7 +107,9 @@ class LogReplay:
             self._take_sample()
         sync = self.reports.sync + 1
         self.reports.start_sync(
-            sync, contacts=are_contacts_due(self._schedule, sync), tail=self._schedule.tail
+            sync,
+            has_contacts=are_contacts_due(self._schedule, sync),
+            has_tail_contact=self._schedule.tail,
         )
         self._response_deadline_s = time_s + self._response_timeout_s
 

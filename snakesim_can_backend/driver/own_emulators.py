@@ -98,7 +98,7 @@ def start_in_process_emulators(
     channel: str,
     pose_address: str | None,
     *,
-    stepped: bool,
+    is_stepped: bool,
 ) -> VirtualPeer:
     """Start emulators of all joint modules at the other end of a virtual bus, in this process.
 
@@ -107,21 +107,26 @@ def start_in_process_emulators(
         settings: Settings of the backend.
         channel: Name of the virtual bus.
         pose_address: HOST:PORT to which they send motion capture; None if they do not send.
-        stepped: Whether their time advances only from Sync to Sync.
+        is_stepped: Whether their time advances only from Sync to Sync.
 
     Returns:
         The other end of the bus; calling it runs the emulators.
     """
     from snakesim_can_backend.emulator.server import make_in_process_emulators
 
-    return make_in_process_emulators(config, settings, channel, pose_address, stepped=stepped)
+    return make_in_process_emulators(config, settings, channel, pose_address, is_stepped=is_stepped)
 
 
 class EmulatorProcess:
     """`snakesim drive emulate can` as a child that dies with this process."""
 
     def __init__(
-        self, config: RunConfig, settings: CanSettings, pose_address: str | None, *, stepped: bool
+        self,
+        config: RunConfig,
+        settings: CanSettings,
+        pose_address: str | None,
+        *,
+        is_stepped: bool,
     ) -> None:
         """Start `snakesim drive emulate can` as a child process, and wait until its modules are on the bus.
 
@@ -129,7 +134,7 @@ class EmulatorProcess:
             config: Configuration of the run, with the robot.
             settings: Settings of the backend, which replace those in the configuration.
             pose_address: HOST:PORT to which the child sends motion capture; None if it does not send.
-            stepped: Whether the emulators' time advances only from Sync to Sync.
+            is_stepped: Whether the emulators' time advances only from Sync to Sync.
 
         Raises:
             BackendError: The child cannot be started, ended at once, or was not ready in time.
@@ -139,7 +144,9 @@ class EmulatorProcess:
                 prefix="snakesim-emulators-", ignore_cleanup_errors=True
             )
             output_path = Path(self._folder.name, "modules.log")
-            self._child = self._start(config, settings, pose_address, output_path, stepped=stepped)
+            self._child = self._start(
+                config, settings, pose_address, output_path, is_stepped=is_stepped
+            )
         except OSError as error:
             raise BackendError(
                 f"the emulated joint modules cannot be started: {error}",
@@ -159,7 +166,7 @@ class EmulatorProcess:
         pose_address: str | None,
         output_path: Path,
         *,
-        stepped: bool,
+        is_stepped: bool,
     ) -> EmulatorChild:
         """Write the configuration for the child, and start it. Raises OSError."""
         backends = {**config.backends, "can": msgspec.to_builtins(settings)}
@@ -168,7 +175,7 @@ class EmulatorProcess:
         arguments = ["--parent", str(os.getpid()), "--pose", pose_address or "none"]
         for channel in settings.channels:
             arguments += ["--channel", channel]
-        if stepped:
+        if is_stepped:
             arguments.append("--stepped")
         module = "snakesim_can_backend.emulator.command"
         return start_python_emulator(

@@ -62,7 +62,7 @@ LATCHED_STATES = ModuleState.FAULT, ModuleState.EMERGENCY
 class ModuleStatus:
     """What the driver knows of one module. Numbers of Syncs count from the start, without wrapping around."""
 
-    node: int
+    node_id: int
 
     # Newest joint state.
     sync: int = -1  # the Sync that the newest good state answers; -1: none yet
@@ -103,7 +103,7 @@ class ModuleStatus:
             return 0
         return self.double_answers
 
-    def fault_names(self) -> list[str]:
+    def list_fault_names(self) -> list[str]:
         """Return the names of the active fault bits, in lower case."""
         return [fault.name.lower() for fault in ModuleFault if self.faults >> fault & 1]
 
@@ -170,33 +170,35 @@ class ModuleReports:
             Opcode.HEALTH: ModuleReports._handle_health,
         }
         self._handlers = {
-            frame_id(opcode, module.node): (handler, module, layouts[opcode].length)
+            frame_id(opcode, module.node_id): (handler, module, layouts[opcode].length)
             for opcode, handler in handlers.items()
             for module in self.modules
         }
 
     # --- one Sync ---------------------------------------------------------------------------------------------
 
-    def start_sync(self, sync: int, *, contacts: bool, tail: bool, questions: int = 0) -> None:
+    def start_sync(
+        self, sync: int, *, has_contacts: bool, has_tail_contact: bool, query_count: int = 0
+    ) -> None:
         """Start to count the responses to a Sync. Only modules that have responded recently are waited for.
 
         Args:
             sync: Number of this Sync.
-            contacts: Whether the modules report contact forces at this Sync.
-            tail: Whether the tail link sends a contact report of its own, too.
-            questions: Number of parameter requests that are sent with this Sync.
+            has_contacts: Whether the modules report contact forces at this Sync.
+            has_tail_contact: Whether the tail link sends a contact report of its own, too.
+            query_count: Number of parameter requests that are sent with this Sync.
         """
         self.sync = sync
         for module in self.modules:
             module.is_awaited = module.sync >= sync - 1 - MAX_LATE_SYNCS or module.sync < 0
         self.states_missing = sum(module.is_awaited for module in self.modules)
         self.contacts_missing = 0
-        if contacts:
+        if has_contacts:
             # The first module also reports for the tail link.
-            is_tail_awaited = tail and self.modules[0].is_awaited
+            is_tail_awaited = has_tail_contact and self.modules[0].is_awaited
             self.contacts_missing = self.states_missing + is_tail_awaited
             self._contacts = [None] * len(self._contacts)
-        self.answers_missing = questions
+        self.answers_missing = query_count
         self.reset_frame_counts()
 
     @property
@@ -283,7 +285,7 @@ class ModuleReports:
             self._acceleration[joint] = None
         return reports
 
-    def health(self) -> list[tuple[int, ...] | None]:
+    def list_health_reports(self) -> list[tuple[int, ...] | None]:
         """Return the raw numbers of HEALTH_SIGNALS of every module; None where no report has arrived yet."""
         return self._health
 
@@ -329,7 +331,7 @@ class ModuleReports:
             module.stopped_syncs += 1
         else:
             module.stopped_syncs = 0
-        self._raw_shaft_values[module.node - 1] = raw_values
+        self._raw_shaft_values[module.node_id - 1] = raw_values
         if lateness_syncs == 0:
             self.states_missing -= module.is_awaited
 
@@ -344,10 +346,10 @@ class ModuleReports:
         module.double_answer_sync = self.sync
 
     def _handle_contact(self, module: ModuleStatus, frame: CanFrame) -> None:
-        self._store_contact(module, module.node, frame.data)
+        self._store_contact(module, module.node_id, frame.data)
 
     def _handle_tail_contact(self, module: ModuleStatus, frame: CanFrame) -> None:
-        self._store_contact(module, module.node - 1, frame.data)
+        self._store_contact(module, module.node_id - 1, frame.data)
 
     def _store_contact(self, module: ModuleStatus, link_index: int, data: bytes) -> None:
         """Store the first contact report of a link that answers the newest Sync."""
@@ -377,17 +379,17 @@ class ModuleReports:
         module.uptime_ms = uptime_ms
 
     def _handle_gyro(self, module: ModuleStatus, frame: CanFrame) -> None:
-        self._gyro[module.node - 1] = self._read_gyro(frame.data)
+        self._gyro[module.node_id - 1] = self._read_gyro(frame.data)
 
     def _handle_acceleration(self, module: ModuleStatus, frame: CanFrame) -> None:
-        self._acceleration[module.node - 1] = self._read_acceleration(frame.data)
+        self._acceleration[module.node_id - 1] = self._read_acceleration(frame.data)
 
     def _handle_shaft_load(self, module: ModuleStatus, frame: CanFrame) -> None:
         (torque,) = self._read_shaft_load(frame.data)
-        self.shaft_raw[module.node - 1] = torque
+        self.shaft_raw[module.node_id - 1] = torque
 
     def _handle_health(self, module: ModuleStatus, frame: CanFrame) -> None:
-        self._health[module.node - 1] = self._read_health(frame.data)
+        self._health[module.node_id - 1] = self._read_health(frame.data)
         module.health_sync = self.sync
 
 

@@ -79,7 +79,7 @@ class SampleBuilder:
         layouts = load_layouts()
         contact = layouts[Opcode.CONTACT].signals
         health = layouts[Opcode.HEALTH].signals
-        self._force_step_n = contact["force_x"].scale
+        self._newtons_per_count = contact["force_x"].scale
         self._axial_position_step_m = contact["along"].scale
         self._bearing_step_rad = contact["bearing"].scale
         self._rate_step_rad_s = layouts[Opcode.GYRO].signals["rate_x"].scale
@@ -158,16 +158,21 @@ class SampleBuilder:
 
         Args:
             link_index: Index of the link, 0 at the tail.
-            raw: Raw numbers of the contact report: force x, y and z, position along the link, and bearing.
+            raw: Raw numbers of the contact report: force x, y and z, position along the link, and bearing, which is
+                the angle about its axis.
+
+        Returns:
+            The contact, with all vectors in the frame of the link.
         """
-        force_x, force_y, force_z, along, bearing = raw
-        step_n = self._force_step_n
+        raw_force_x, raw_force_y, raw_force_z, raw_axial_position, raw_bearing = raw
+        newtons_per_count = self._newtons_per_count
         outward, position = locate_on_capsule(
-            along * self._axial_position_step_m,
-            bearing * self._bearing_step_rad,
+            raw_axial_position * self._axial_position_step_m,
+            raw_bearing * self._bearing_step_rad,
             self._lengths_m[link_index],
             self._radius_m,
         )
+        # The normal of a contact points from the obstacle into the link, as the force on the link does.
         normal = (-outward[0], -outward[1], -outward[2])
         tangent_1, tangent_2 = compute_contact_tangents(normal)
         return Contact(
@@ -177,7 +182,11 @@ class SampleBuilder:
             normal_l=normal,
             tangent_1_l=tangent_1,
             tangent_2_l=tangent_2,
-            force_l=(force_x * step_n, force_y * step_n, force_z * step_n),
+            force_l=(
+                raw_force_x * newtons_per_count,
+                raw_force_y * newtons_per_count,
+                raw_force_z * newtons_per_count,
+            ),
             torque_l=NO_TORQUE,
         )
 
@@ -206,7 +215,7 @@ class SampleBuilder:
             tick: Number of the control cycle.
             timestamp_ns: Robot time of the cycle.
         """
-        rows = self._module_reports.health()
+        rows = self._module_reports.list_health_reports()
         columns: list[list[float]] = []
         for i, signal in enumerate(self._health_signals):
             columns.append([0.0 if row is None else signal.decode(row[i]) for row in rows])

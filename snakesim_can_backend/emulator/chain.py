@@ -62,7 +62,7 @@ class ModuleChain:
         settings: CanSettings,
         physics_model: PhysicsModel,
         *,
-        stepped: bool,
+        is_stepped: bool,
         send_pose: Callable[[bytes], None] | None = None,
     ) -> None:
         """Create all modules; they boot.
@@ -71,7 +71,7 @@ class ModuleChain:
             config: Configuration of the run, with the robot.
             settings: Settings of the backend: buses, faults, and how the modules are really mounted.
             physics_model: Physics model that the motors move.
-            stepped: Whether time advances only from Sync to Sync.
+            is_stepped: Whether time advances only from Sync to Sync.
             send_pose: Function that sends a MocapSample as JSON, after every Sync and before the joint states; None
                 without motion capture.
 
@@ -81,7 +81,7 @@ class ModuleChain:
         robot = config.robot
 
         # Modules and buses.
-        self.stepped = stepped
+        self.is_stepped = is_stepped
         self.module_count = robot.chain.modules
         self.modules_per_bus = count_joints_per_bus(config, settings)
         self.buses = [BusTime(settings.bit_rate) for _ in self.modules_per_bus]
@@ -110,7 +110,7 @@ class ModuleChain:
         self._last_sync_time: int | None = None  # time in the newest Sync; None: none yet
 
         # Frames.
-        self.refused = 0  # frames that no host sends
+        self.refused_frame_count = 0  # frames that no host sends
         # By bus, in stepped time.
         self._outgoing: list[list[CanFrame]] = [[] for _ in self.modules_per_bus]
 
@@ -140,7 +140,7 @@ class ModuleChain:
             joints = range(first, first + count)
             for joint in joints:
                 serial = crc32(f"{config.seed}:{joint + 1}".encode())
-                self._add_module(joint, channel, serial, -BOOT_US if stepped else 0.0)
+                self._add_module(joint, channel, serial, -BOOT_US if is_stepped else 0.0)
             mounting = DriveMounting(self._joints[first : first + count])
             self._sensors.append(
                 ModuleSensors(robot, physics_model, mounting, first, (config.seed, channel))
@@ -163,7 +163,7 @@ class ModuleChain:
             ),
             self.thermal.limits[joint_index],
             min_voltage_v=limits.min_voltage_v,
-            stepped=self.stepped,
+            is_stepped=self.is_stepped,
             now_us=now_us,
         )
         has_motor = drives and joint_index not in self._unconnected_joints
@@ -186,9 +186,9 @@ class ModuleChain:
             due_steps = int(now_us / self._step_us)
             self._run_physics(now_us, due_steps - self._step_count)
 
-    def next_us(self) -> float:
+    def find_next_due_us(self) -> float:
         """Return the module time at which a frame is sent or a module is due; inf for a stepped chain."""
-        if self.stepped:
+        if self.is_stepped:
             return inf
         return min(self._next_poll_us, *(bus.next_us() for bus in self.buses))
 
@@ -260,7 +260,7 @@ class ModuleChain:
         for slot, since_us in self._babble_start_us_by_slot.items():
             frame_us = self.buses[slot.channel].frame_duration_us_by_length[HEARTBEAT_BYTES]
             frames = int((now_us - since_us) / frame_us)
-            self._outgoing[slot.channel].extend([slot.module.heartbeat(now_us)] * frames)
+            self._outgoing[slot.channel].extend([slot.module.make_heartbeat(now_us)] * frames)
             self._babble_start_us_by_slot[slot] = since_us + frames * frame_us
 
     # --- frames from the bus -------------------------------------------------------------------------------
@@ -279,9 +279,9 @@ class ModuleChain:
         has_wrong_length = opcode != Opcode.EMERGENCY and len(frame.data) != LENGTHS.get(opcode)
         is_sync_to_one_node = opcode == Opcode.SYNC and node != BROADCAST
         if opcode not in FROM_HOST or has_wrong_length or is_sync_to_one_node:
-            self.refused += 1
+            self.refused_frame_count += 1
             return
-        if self.stepped:
+        if self.is_stepped:
             self.buses[channel].count_frame(frame)
         else:
             self.buses[channel].record_host_frame(frame, self.now_us)
@@ -305,7 +305,7 @@ class ModuleChain:
 
     def pop_frames(self, channel: int) -> list[CanFrame]:
         """Return the frames that are on a bus by now, in the order of arbitration, each once."""
-        if not self.stepped:
+        if not self.is_stepped:
             return self.buses[channel].pop_sent_frames(self.now_us)
         frames = self._outgoing[channel]
         self._outgoing[channel] = []
@@ -313,7 +313,7 @@ class ModuleChain:
             self.buses[channel].count_frame(frame)
         return frames
 
-    def traffic(self) -> list[BusTraffic]:
+    def read_traffic(self) -> list[BusTraffic]:
         """Return the traffic of each bus until now."""
         return [bus.traffic(self.now_us) for bus in self.buses]
 
@@ -329,7 +329,7 @@ class ModuleChain:
             slots.append(self.slots[self._node_ids.index(node_id)])
         if len(self.slots) > self.module_count:
             slots += [
-                slot for slot in self.slots[self.module_count :] if slot.module.node == node_id
+                slot for slot in self.slots[self.module_count :] if slot.module.node_id == node_id
             ]
         return [slot for slot in slots if slot.channel == channel]
 
@@ -347,7 +347,7 @@ class ModuleChain:
         count, time_us = read_sync(frame.data)
         outgoing = self._outgoing[channel]
         sent_before = len(outgoing)
-        if self.stepped:
+        if self.is_stepped:
             self._advance_to_sync(time_us)
         self._send_pose_once(time_us)
 
@@ -393,7 +393,7 @@ class ModuleChain:
     def _apply_module_outputs(self, slot: ModuleSlot) -> None:
         """Send a module's frames, and apply its demand to its motor."""
         for frame in slot.pop_frames():
-            if self.stepped:
+            if self.is_stepped:
                 self._outgoing[slot.channel].append(frame)
             else:
                 self.buses[slot.channel].enqueue(slot.sender, frame, self.now_us)
@@ -466,10 +466,10 @@ class ModuleChain:
 
     def _set_babbling(self, slot: ModuleSlot, begins: bool, now_us: float) -> None:
         """Let a module send heartbeats without a pause, or end that."""
-        if self.stepped:
+        if self.is_stepped:
             self._babble_start_us_by_slot.pop(slot, None)
             if begins:
                 self._babble_start_us_by_slot[slot] = now_us
             return
-        frame = slot.module.heartbeat(now_us) if begins else None
+        frame = slot.module.make_heartbeat(now_us) if begins else None
         self.buses[slot.channel].set_babbling(slot.sender, frame, now_us)

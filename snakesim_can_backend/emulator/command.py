@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import msgspec
 
-from snakesim_can_backend.arguments import DEFAULT_CHANNEL, add_module_emulation
+from snakesim_can_backend.arguments import DEFAULT_CHANNEL, add_module_emulation_arguments
 from snakesim_can_backend.bus.adapter import (
     is_emulated,
     open_wire,
@@ -60,12 +60,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0 when stopped or done, 1 after a fault, 2 for wrong input, when nothing was started.
     """
     parser = argparse.ArgumentParser(description=__doc__)
-    add_module_emulation(parser)
+    add_module_emulation_arguments(parser)
     arguments = parser.parse_args(argv)
-    return run_tool(TOOL, lambda: emulate(arguments))
+    return run_tool(TOOL, lambda: emulate_modules(arguments))
 
 
-def emulate(arguments: argparse.Namespace) -> int:
+def emulate_modules(arguments: argparse.Namespace) -> int:
     """Run `snakesim drive emulate can`: check everything, open the buses, and serve the emulators until a stop signal.
 
     Args:
@@ -96,7 +96,11 @@ def emulate(arguments: argparse.Namespace) -> int:
             wires.append(exit_stack.enter_context(closing(wire)))
         physics_model = make_physics_model(loaded.config, settings, "can")
         chain = ModuleChain(
-            loaded.config, settings, physics_model, stepped=arguments.stepped, send_pose=send_pose
+            loaded.config,
+            settings,
+            physics_model,
+            is_stepped=arguments.stepped,
+            send_pose=send_pose,
         )
         loop = EmulatorLoop(EmulatorServer(wires, chain), arguments, settings.bit_rate)
         control = EmulatorControl(arguments, loop.inject_typed, loop.read_true_state, exit_stack)
@@ -104,7 +108,7 @@ def emulate(arguments: argparse.Namespace) -> int:
         tune_garbage_collector()
         print_line(f"modules ready: {module_count} on {', '.join(settings.channels)}")
         loop.run(control)
-        for line in loop.summary():
+        for line in loop.list_summary_lines():
             print_line(line)
         return 0
 
@@ -128,7 +132,7 @@ def _run_reference_firmware(
         settings,
         folders[0],
         duration_s=arguments.duration,
-        stepped=arguments.stepped,
+        is_stepped=arguments.stepped,
     )
 
 
@@ -191,7 +195,7 @@ class EmulatorLoop:
 
         # Statistics.
         self._start_s = time.monotonic()
-        self._start_traffic = self._chain.traffic()
+        self._start_traffic = self._chain.read_traffic()
         self._max_lateness_s = 0.0  # of a wake-up
 
     def stop(self) -> None:
@@ -216,21 +220,21 @@ class EmulatorLoop:
                 last_printed_traffic = self._print_loads(last_printed_traffic, now_s)
                 last_printed_s = now_s
             control.run()
-            if idle_duration_s is None:  # stepped: only a frame can make something due
+            if idle_duration_s is None:  # is_stepped: only a frame can make something due
                 wait(self._server.wires, MAX_PAUSE_S)
                 continue
             wait(self._server.wires, idle_duration_s)
             lateness_s = time.monotonic() - now_s - idle_duration_s
             self._max_lateness_s = max(self._max_lateness_s, lateness_s)
 
-    def summary(self) -> list[str]:
+    def list_summary_lines(self) -> list[str]:
         """Return lines about the traffic of the buses, the timing accuracy, and injected faults."""
         duration_s = time.monotonic() - self._start_s
         lines = [
             f"{duration_s:.1f} s; latest wake-up {1e3 * self._max_lateness_s:.1f} ms after its time"
         ]
         for wire, before, after in zip(
-            self._server.wires, self._start_traffic, self._chain.traffic(), strict=True
+            self._server.wires, self._start_traffic, self._chain.read_traffic(), strict=True
         ):
             lines += self._describe_traffic(wire.channel, before, after)
         if self._server.unsent:
@@ -261,7 +265,7 @@ class EmulatorLoop:
 
     def _print_loads(self, before: list[BusTraffic], now_s: float) -> list[BusTraffic]:
         """Print the load of every bus since an earlier point; return the traffic until now."""
-        after = self._chain.traffic()
+        after = self._chain.read_traffic()
         loads: list[str] = []
         for wire, bus_before, bus_after in zip(self._server.wires, before, after, strict=True):
             loads.append(f"{wire.channel} {bus_after.load_since(bus_before):.1%}")

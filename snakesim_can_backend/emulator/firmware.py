@@ -88,10 +88,10 @@ class ModuleFirmware:
         heat: HeatLimits,
         *,
         min_voltage_v: float = 18.0,
-        stepped: bool = False,
+        is_stepped: bool = False,
         now_us: float = 0.0,
     ) -> None:
-        """Start to boot the firmware of one emulated module.
+        """Create the firmware of one emulated module, in its state BOOT. `poll` ends the boot after BOOT_US.
 
         Args:
             node_id: Node id of the module on its bus.
@@ -99,16 +99,16 @@ class ModuleFirmware:
             parameters: Parameters of the module, and its flash.
             heat: Winding temperature that stops the module, and the one below which a clear is possible again.
             min_voltage_v: Supply voltage below which the module stops.
-            stepped: Whether time advances only from Sync to Sync; reported in Identity.
+            is_stepped: Whether time advances only from Sync to Sync; reported in Identity.
             now_us: Current time.
         """
         # What the module is.
-        self.node = node_id
+        self.node_id = node_id
         self.serial = serial
         self.parameters = parameters
         self.heat = heat
         self._min_voltage_v = min_voltage_v
-        self._stepped = stepped
+        self._is_stepped = is_stepped
 
         # What the caller exchanges with it.
         self.frames: list[CanFrame] = []  # to send
@@ -117,8 +117,9 @@ class ModuleFirmware:
         self.is_hanging = False
         self.rejected_frame_count = 0  # frames with a wrong checksum, count or length
 
-        self._last_joint_state: CanFrame | None = None
+        self._last_joint_state: CanFrame | None = None  # JointState frame that was sent last
         self._reset_state(now_us)
+        # Not part of `_reset_state`: `reboot` sets another reason.
         self.last_stop = LastStop.NONE
 
     # --- frames from the bus -------------------------------------------------------------------------------
@@ -144,7 +145,7 @@ class ModuleFirmware:
             self.rejected_frame_count += 1
         elif opcode == Opcode.PARAMETER_REQUEST:
             driven = self.state in DRIVEN_STATES
-            self.frames.append(self.parameters.handle_request(self.node, frame.data, driven))
+            self.frames.append(self.parameters.handle_request(self.node_id, frame.data, driven))
         elif opcode == Opcode.COMMAND and has_valid_checksum(frame):
             action, key = read_command(frame.data)
             if key == COMMAND_KEY:
@@ -245,7 +246,7 @@ class ModuleFirmware:
     def is_imu_due(self) -> bool:
         """Return whether gyro, accelerometer and shaft load answer the next Sync; neighbors do so in turn."""
         every = int(self.parameters.values[ModuleParameter.IMU_EVERY])
-        return every > 0 and (self._sync_count + self.node) % every == 0
+        return every > 0 and (self._sync_count + self.node_id) % every == 0
 
     # --- time ----------------------------------------------------------------------------------------------
 
@@ -277,11 +278,11 @@ class ModuleFirmware:
                 pass
         if now_us >= self._next_heartbeat_us:
             self._next_heartbeat_us = max(self._next_heartbeat_us + HEARTBEAT_US, now_us)
-            self.frames.append(self.heartbeat(now_us))
+            self.frames.append(self.make_heartbeat(now_us))
         if now_us >= self._next_health_us:
             self._next_health_us = max(self._next_health_us + HEALTH_US, now_us)
-            self.frames.append(write_health(self.node, encode_health(self.health)))
-        return self._next_due_us(now_us)
+            self.frames.append(write_health(self.node_id, encode_health(self.health)))
+        return self._compute_next_due_us(now_us)
 
     @property
     def watchdog_us(self) -> int:
@@ -297,10 +298,12 @@ class ModuleFirmware:
 
     def _finish_boot(self, now_us: float) -> None:
         self._next_heartbeat_us = now_us + HEARTBEAT_US
-        self._next_health_us = now_us + HEALTH_US * (1 + self.node % HEALTH_PHASES) / HEALTH_PHASES
+        self._next_health_us = (
+            now_us + HEALTH_US * (1 + self.node_id % HEALTH_PHASES) / HEALTH_PHASES
+        )
         self._enter_state(self._state_after_boot, now_us)
 
-    def _next_due_us(self, now_us: float) -> float:
+    def _compute_next_due_us(self, now_us: float) -> float:
         report_us = min(self._next_heartbeat_us, self._next_health_us)
         match self.state:
             case ModuleState.ARMED:
@@ -374,7 +377,7 @@ class ModuleFirmware:
         self._pending_demand = None
         self._expected_count = None
         self._wrong_counts = 0
-        self.frames.append(self.heartbeat(now_us))
+        self.frames.append(self.make_heartbeat(now_us))
 
     def _arm(self, now_us: float) -> None:
         if self.state == ModuleState.DISARMED and not self._detect_present_faults():
@@ -415,7 +418,7 @@ class ModuleFirmware:
         """Latch a fault; an emergency is latched more strongly, and stays."""
         self.faults |= 1 << fault
         if self.state == ModuleState.EMERGENCY:
-            self.frames.append(self.heartbeat(now_us))
+            self.frames.append(self.make_heartbeat(now_us))
         else:
             self._enter_state(ModuleState.FAULT, now_us, STOP_OF_FAULT[fault])
 
@@ -441,17 +444,17 @@ class ModuleFirmware:
 
     # --- reports -------------------------------------------------------------------------------------------
 
-    def heartbeat(self, now_us: float) -> CanFrame:
+    def make_heartbeat(self, now_us: float) -> CanFrame:
         """Return the present heartbeat."""
         uptime_ms = min(round(now_us - self._boot_start_us) // 1000, MAX_UPTIME_MS)
         fault_bits = [self.faults >> fault & 1 for fault in ModuleFault]
         return write_heartbeat(
-            self.node, (self.state, self.demand.mode, self.last_stop, *fault_bits, uptime_ms)
+            self.node_id, (self.state, self.demand.mode, self.last_stop, *fault_bits, uptime_ms)
         )
 
     def _send_identity(self) -> None:
-        identity = (self.serial, *FIRMWARE_VERSION, PROTOCOL_VERSION, IS_EMULATED, self._stepped)
-        self.frames.append(write_identity(self.node, identity))
+        identity = (self.serial, *FIRMWARE_VERSION, PROTOCOL_VERSION, IS_EMULATED, self._is_stepped)
+        self.frames.append(write_identity(self.node_id, identity))
 
     def _report_joint_state(self, count: int, reading: ModuleReadings) -> None:
         raw_values = (
@@ -462,7 +465,7 @@ class ModuleFirmware:
             self.state,
             reading.derated,
         )
-        self._last_joint_state = write_joint_state(self.node, raw_values)
+        self._last_joint_state = write_joint_state(self.node_id, raw_values)
         self.frames.append(self._last_joint_state)
 
     def _report_contacts(self, count: int, reading: ModuleReadings) -> None:
@@ -470,13 +473,13 @@ class ModuleFirmware:
         every = int(values[ModuleParameter.CONTACT_EVERY])
         if every == 0 or count % every != 0:
             return
-        self.frames.append(write_contact(self.node, (*reading.contact, count)))
+        self.frames.append(write_contact(self.node_id, (*reading.contact, count)))
         if values[ModuleParameter.TAIL]:
-            self.frames.append(write_tail_contact(self.node, (*reading.tail_contact, count)))
+            self.frames.append(write_tail_contact(self.node_id, (*reading.tail_contact, count)))
 
     def _report_imu(self, count: int, reading: ModuleReadings) -> None:
         if reading.gyro is not None and reading.acceleration is not None:
-            self.frames.append(write_gyro(self.node, (*reading.gyro, count)))
-            self.frames.append(write_acceleration(self.node, (*reading.acceleration, count)))
+            self.frames.append(write_gyro(self.node_id, (*reading.gyro, count)))
+            self.frames.append(write_acceleration(self.node_id, (*reading.acceleration, count)))
         if reading.shaft_load is not None:
-            self.frames.append(write_shaft_load(self.node, (reading.shaft_load, count)))
+            self.frames.append(write_shaft_load(self.node_id, (reading.shaft_load, count)))

@@ -32,39 +32,39 @@ class ModuleSlot:
     driven: MotorDemand | None = None  # the demand that was last applied to the motor
 
     # Injected faults.
-    mute: bool = False
+    is_mute: bool = False
     has_wrong_counter: bool = False
-    wrong_checksum: bool = False
+    has_wrong_checksum: bool = False
 
     def __post_init__(self) -> None:
         """Switch the supply on."""
         self.module.health.voltage_v = self.joint_model.supply.voltage_v
 
-    def set_fault(self, kind: str, active: bool, now_us: float) -> None:
+    def set_fault(self, kind: str, is_active: bool, now_us: float) -> None:
         """Start or end an injected fault of this module; a kind that is no fault of a single module has no effect.
 
         Args:
             kind: Kind of the fault, such as "mute" or "leak".
-            active: True to start the fault, False to end it.
+            is_active: True to start the fault, False to end it.
             now_us: Current time.
         """
         health = self.module.health
         match kind:
             case "mute":
-                self.mute = active
+                self.is_mute = is_active
             case "freeze":
-                self.module.is_hanging = active
+                self.module.is_hanging = is_active
             case "counter":
-                self.has_wrong_counter = active
+                self.has_wrong_counter = is_active
             case "checksum":
-                self.wrong_checksum = active
+                self.has_wrong_checksum = is_active
             case "leak":
-                health.leak = active
-            case "undervoltage" if active:
+                health.leak = is_active
+            case "undervoltage" if is_active:
                 health.voltage_v = SAGGED_FRACTION * self.joint_model.limits.min_voltage_v
             case "undervoltage":
                 health.voltage_v = self.joint_model.supply.voltage_v
-            case "reboot" if active:
+            case "reboot" if is_active:
                 self.module.reboot(now_us)
             case _:
                 pass
@@ -85,9 +85,9 @@ class ModuleSlot:
         if not frames:
             return frames
         self.module.frames = []
-        if self.mute:
+        if self.is_mute:
             return []
-        if self.has_wrong_counter or self.wrong_checksum:
+        if self.has_wrong_counter or self.has_wrong_checksum:
             return [self._corrupt(frame) for frame in frames]
         return frames
 
@@ -101,7 +101,7 @@ class ModuleSlot:
             has_wrong_counter = (count_byte + WRONG_COUNT_OFFSET) & COUNT_MASK
             data[COUNT_BYTE] = (count_byte & ~COUNT_MASK) | has_wrong_counter
             data[CHECKSUM_BYTE] = checksum(frame.id, bytes(data[:CHECKSUM_BYTE]))
-        if self.wrong_checksum:
+        if self.has_wrong_checksum:
             data[CHECKSUM_BYTE] ^= WRONG_CHECKSUM_MASK
         return CanFrame(frame.id, bytes(data))
 

@@ -53,7 +53,7 @@ def build_program() -> Path:
 
 
 def make_program_arguments(
-    bus_folder: str, modules_path: str, duration_s: float | None = None, *, stepped: bool
+    bus_folder: str, modules_path: str, duration_s: float | None = None, *, is_stepped: bool
 ) -> list[str]:
     """Return the arguments of the program.
 
@@ -61,10 +61,10 @@ def make_program_arguments(
         bus_folder: Folder of its bus, as in the channel local:FOLDER.
         modules_path: Path of the file that describes the modules.
         duration_s: Time in s after which it ends; None for never.
-        stepped: Whether time advances only from Sync to Sync.
+        is_stepped: Whether time advances only from Sync to Sync.
     """
     arguments = ["--bus", bus_folder, "--modules", modules_path]
-    if stepped:
+    if is_stepped:
         arguments.append("--stepped")
     if duration_s is not None:
         arguments += ["--duration", f"{duration_s:g}"]
@@ -77,7 +77,7 @@ def replace_this_process(
     bus_folder: str,
     *,
     duration_s: float | None,
-    stepped: bool,
+    is_stepped: bool,
 ) -> NoReturn:
     """Run the program instead of this process. The description of its modules is a file in memory.
 
@@ -86,7 +86,7 @@ def replace_this_process(
         settings: Settings of the backend.
         bus_folder: Folder of the bus of the program, as in the channel local:FOLDER.
         duration_s: Time in s after which it ends; None for never.
-        stepped: Whether time advances only from Sync to Sync.
+        is_stepped: Whether time advances only from Sync to Sync.
 
     Raises:
         BackendError: The program cannot be compiled.
@@ -96,7 +96,7 @@ def replace_this_process(
     descriptor = os.memfd_create("modules", 0)
     os.write(descriptor, describe_modules(config, settings).encode())
     modules_path = f"/proc/self/fd/{descriptor}"
-    arguments = make_program_arguments(bus_folder, modules_path, duration_s, stepped=stepped)
+    arguments = make_program_arguments(bus_folder, modules_path, duration_s, is_stepped=is_stepped)
     os.execv(program, [str(program), *arguments])
 
 

@@ -49,7 +49,7 @@ class EmulatorServer:
             Seconds until the next run is due; None for a stepped chain, which only reacts to frames.
         """
         received = [wire.receive() for wire in self.wires]
-        if self.chain.stepped:
+        if self.chain.is_stepped:
             for channel, frames in enumerate(received):
                 for frame in frames:
                     self.chain.receive(channel, frame)
@@ -61,7 +61,7 @@ class EmulatorServer:
         self._receive_at_arrival_times(received, clock_us)
         self.chain.advance_to(clock_us)
         self._send()
-        pause_us = min(self.chain.next_us() - self.chain.now_us, MAX_LAG_US)
+        pause_us = min(self.chain.find_next_due_us() - self.chain.now_us, MAX_LAG_US)
         return max(pause_us, MIN_PAUSE_US) * 1e-6
 
     def _receive_at_arrival_times(
@@ -135,7 +135,7 @@ def make_in_process_emulators(
     channel: str,
     pose_address: str | None = None,
     *,
-    stepped: bool,
+    is_stepped: bool,
 ) -> InProcessEmulators:
     """Create the emulators of all joint modules on one virtual bus, in this process.
 
@@ -144,7 +144,7 @@ def make_in_process_emulators(
         settings: Settings of the backend.
         channel: Name of the virtual bus, which the driver opens, too.
         pose_address: HOST:PORT to which they send motion capture; None if they do not send.
-        stepped: Whether time advances only from Sync to Sync (for lockstep).
+        is_stepped: Whether time advances only from Sync to Sync (for lockstep).
 
     Raises:
         ConfigError: The physics model is unknown, the address is malformed, or the settings name several buses, or
@@ -152,6 +152,8 @@ def make_in_process_emulators(
     """
     pose_sender = None if pose_address is None else PoseSender(pose_address)
     physics_model = make_physics_model(config, settings, "can")
-    chain = ModuleChain(config, settings, physics_model, stepped=stepped, send_pose=pose_sender)
+    chain = ModuleChain(
+        config, settings, physics_model, is_stepped=is_stepped, send_pose=pose_sender
+    )
     server = EmulatorServer([VirtualWire(channel)], chain)
     return InProcessEmulators(server, pose_sender, time.monotonic_ns)

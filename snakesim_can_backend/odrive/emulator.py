@@ -68,7 +68,7 @@ class AxisConfiguration:
 class EmulatedAxis:
     """One axis: settings, inputs, state."""
 
-    node: int
+    node_id: int
     torque_constant: float  # N·m/A
     saved: AxisConfiguration
     # State.
@@ -122,7 +122,7 @@ class EmulatedOdrive(CanEmulator):
                 break
         self.axes = [
             EmulatedAxis(
-                node=true_joint.id,
+                node_id=true_joint.id,
                 torque_constant=true_joint.motor.torque_constant_nm_per_a
                 or EMULATED_CONSTANT_NM_PER_A,
                 saved=make_configuration(joint, settings),
@@ -150,7 +150,7 @@ class EmulatedOdrive(CanEmulator):
     def restart(self, i: int) -> None:
         """Restart an axis. It loses the settings that were not saved."""
         axis = self.axes[i]
-        self.axes[i] = EmulatedAxis(axis.node, axis.torque_constant, axis.saved)
+        self.axes[i] = EmulatedAxis(axis.node_id, axis.torque_constant, axis.saved)
         self._drive_motor(i, self.axes[i])
 
     def handle_frame(self, i: int, frame: CanFrame) -> None:
@@ -231,7 +231,7 @@ class EmulatedOdrive(CanEmulator):
         axis = self.axes[i]
         if setting is not None and opcode == READ_SETTING:
             value = VALUE_FORMATS[SETTING_TYPES[setting]].pack(axis.read_setting(setting))
-            self.send_frame(i, encode_setting_answer(axis.node, endpoint, value))
+            self.send_frame(i, encode_setting_answer(axis.node_id, endpoint, value))
 
     def _make_report(self, i: int, axis: EmulatedAxis, message_id: MessageId) -> CanFrame:
         """Return a frame in which an axis reports values of its state.
@@ -250,7 +250,7 @@ class EmulatedOdrive(CanEmulator):
             case MessageId.VERSION:
                 values = VERSION
             case MessageId.ADDRESS:
-                values = (axis.node, (FIRST_SERIAL + i).to_bytes(6, "little"), 0)
+                values = (axis.node_id, (FIRST_SERIAL + i).to_bytes(6, "little"), 0)
             case MessageId.HEARTBEAT:
                 values = (axis.errors, axis.state, 0, 0)
             case MessageId.ERROR:
@@ -267,13 +267,14 @@ class EmulatedOdrive(CanEmulator):
             case MessageId.SUPPLY:
                 values = self.body.read_supply(i)
             case _:
-                return encode_request(axis.node, message_id)
-        return encode_message(axis.node, message_id, *values)
+                return encode_request(axis.node_id, message_id)
+        return encode_message(axis.node_id, message_id, *values)
 
     def _drive_motor(self, i: int, axis: EmulatedAxis) -> None:
-        """Apply state, control mode and setpoints of an axis to its motor.
+        """Apply state, control mode, setpoints, gains and limits of an axis to its motor.
 
-        An unknown control mode counts as torque control. The motor is passive unless the axis is in closed loop.
+        An unknown control mode counts as torque control. The motor is passive unless the axis is in closed loop. An
+        axis counts angles in turns, and the motor in rad.
 
         Args:
             i: Index of the axis.
@@ -286,15 +287,20 @@ class EmulatedOdrive(CanEmulator):
         target = 0.0
         if axis.state == AxisState.CLOSED_LOOP:
             mode = MODE_BY_CONTROL_MODE[control_mode]
-            unit = 1.0 if control_mode == ControlMode.TORQUE else REVOLUTION_RAD
-            target = axis.setpoints[control_mode - 1] * unit
-        damping = axis.velocity_gain / REVOLUTION_RAD
+            setpoint = axis.setpoints[control_mode - 1]  # N·m, turns/s or turns
+            target = setpoint
+            if control_mode != ControlMode.TORQUE:
+                target = setpoint * REVOLUTION_RAD  # rad/s or rad
+        # The position controller of an axis demands a velocity, in turns/s for each turn of error, which is 1/s. The
+        # velocity controller demands a torque. So the stiffness of the two is the product of their gains.
+        damping = axis.velocity_gain / REVOLUTION_RAD  # N·m per turn/s -> N·m per rad/s
+        stiffness = axis.position_gain * damping  # N·m/rad
         self.body.drive_motor(
             i,
             mode,
             target,
             limit_nm=axis.current_soft_max_a * axis.torque_constant,
-            stiffness=axis.position_gain * damping,
+            stiffness=stiffness,
             damping=damping,
             speed_rad_s=axis.vel_limit_turns_s * REVOLUTION_RAD,
         )

@@ -26,7 +26,8 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import JointMode, LifecycleState
 
-LATCHED: tuple[LifecycleState, ...] = ("fault", "estop")
+# States that a robot leaves only by a reset.
+LATCHED_LIFECYCLE_STATES: tuple[LifecycleState, ...] = ("fault", "estop")
 # Of a signed number of 16 bits; -32768 is not used, so that the range is symmetric.
 MAX_TARGET_RAW = 32767
 MAX_TORQUE_LIMIT_RAW = 65535  # of an unsigned number of 16 bits
@@ -90,10 +91,11 @@ def make_transition_frames(before: LifecycleState, now: LifecycleState) -> list[
     if now == "estop":
         return [make_emergency()]
     if before == "armed":
+        # CLEAR is for modules in a latched state, and neither STOP nor DISARM leads to one.
         action = CommandAction.STOP if now == "fault" else CommandAction.DISARM
         return [make_command(action)]
     frames: list[CanFrame] = []
-    if before in LATCHED and now not in LATCHED:
+    if before in LATCHED_LIFECYCLE_STATES and now not in LATCHED_LIFECYCLE_STATES:
         frames.append(make_command(CommandAction.CLEAR))
     if now == "armed":
         frames.append(make_command(CommandAction.ARM))

@@ -32,10 +32,13 @@ class BendingHand:
         self._modified_ns = -1
         self._target_rad: Floats | None = None  # None: the hand has released the joints
 
-    def bend(
+    def bend_passive_joints(
         self, angle_rad: Floats, velocity_rad_s: Floats, torque_nm: Floats, step_s: float
     ) -> None:
         """Set the velocities of joints whose motors are off, so that one step turns them towards the pose.
+
+        The pose is that of the file, which is read again when it has changed. Once the joints have reached it, the hand
+        releases them.
 
         Args:
             angle_rad: Angles of the joints, (n_joints,).
@@ -52,11 +55,15 @@ class BendingHand:
             self._poll_file()
         if self._target_rad is None:
             return
+        # A motor without torque is off: the hand can turn its joint. All arrays are (n_joints,).
         is_free = np.abs(torque_nm) < MAX_PASSIVE_TORQUE_NM
         remaining_rad = np.where(is_free, self._target_rad - angle_rad, 0.0)
-        turn_rad = np.clip(remaining_rad, -HAND_SPEED_RAD_S * step_s, HAND_SPEED_RAD_S * step_s)
+        # The hand turns each joint at most this far in one step.
+        max_turn_rad = HAND_SPEED_RAD_S * step_s
+        turn_rad = np.clip(remaining_rad, -max_turn_rad, max_turn_rad)
         velocity_rad_s[is_free] = turn_rad[is_free] / step_s
-        if not turn_rad.any():
+        has_reached_pose = not turn_rad.any()
+        if has_reached_pose:
             self._target_rad = None
 
     def _poll_file(self) -> None:
@@ -72,7 +79,7 @@ class BendingHand:
         try:
             target_rad = np.array([float(word) for word in text.split()])
         except ValueError:
-            target_rad = np.full(1, np.nan)
+            target_rad = np.full(1, np.nan)  # rejected below
         if len(target_rad) != self._joint_count or not np.isfinite(target_rad).all():
             raise BackendError(
                 f"{self._path}: write {self._joint_count} angles in rad, separated by spaces; it has {text[:80]!r}",

@@ -24,9 +24,9 @@ MAX_REALTIME_BUSY_S = 0.2
 
 def serve_until_stopped(
     ready_text: str,
-    emulator: Callable[[], object],
+    run_cycle: Callable[[], object],
     wait: Callable[[float], object],
-    control: Callable[[], object] = lambda: None,
+    run_control: Callable[[], object] = lambda: None,
 ) -> None:
     """Run emulated drives until this process gets a stop signal.
 
@@ -35,19 +35,20 @@ def serve_until_stopped(
 
     Args:
         ready_text: Line that is printed when the drives are ready.
-        emulator: Function that handles what has arrived, and simulates up to the current time.
+        run_cycle: Function that handles what has arrived, and simulates up to the current time.
         wait: Function that waits until frames or bytes arrive; its argument is the maximum wait in s.
-        control: Function that is called in each cycle, for typed faults and a log.
+        run_control: Function that is called in each cycle, for typed faults and a log.
     """
-    run_flag = [True]  # emptied by the signal handler
-    call_on_stop_signals(run_flag.clear)
+    # A list, because a signal handler may change it at any instruction without a lock.
+    is_running = [True]
+    call_on_stop_signals(is_running.clear)
     tune_garbage_collector()
     if set_realtime_priority(SERVICE_PRIORITY) is None:
         drop_priority_after(MAX_REALTIME_BUSY_S)
     print_line(ready_text)
-    while run_flag:
-        emulator()
-        control()
+    while is_running:
+        run_cycle()
+        run_control()
         wait(MAX_WAIT_S)
 
 

@@ -70,7 +70,7 @@ class EmulatorControl:
     def __init__(
         self,
         arguments: argparse.Namespace,
-        inject: Callable[[FaultInjection, bool], object],
+        inject_fault: Callable[[FaultInjection, bool], object],
         read_state: Callable[[], TrueState],
         exit_stack: ExitStack,
     ) -> None:
@@ -78,14 +78,16 @@ class EmulatorControl:
 
         Args:
             arguments: Parsed command line, with the options of `add_control_arguments`.
-            inject: Function that starts (True) or ends (False) a fault of a joint or of a bus.
-            read_state: Function that returns the true state of the drives.
+            inject_fault: Function that starts or ends a fault of a joint or of a bus. Its second argument is True for
+                the start, and False for the end.
+            read_state: Function that returns the true state of the drives. The log has a JSON line for each change of
+                it.
             exit_stack: Closes the log.
 
         Raises:
             ConfigError: The log cannot be written.
         """
-        self._inject = inject
+        self._inject_fault = inject_fault
         self._read_state = read_state
         self._is_interactive: bool = arguments.interactive
         self._log: DriveLog | None = None
@@ -114,7 +116,7 @@ class EmulatorControl:
     def _inject_typed_fault(self, line: str) -> None:
         try:
             fault, begins = parse_typed_fault(line)
-            self._inject(fault, begins)
+            self._inject_fault(fault, begins)
         except ConfigError as error:
             print_line(str(error))
 

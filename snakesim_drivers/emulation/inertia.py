@@ -94,8 +94,12 @@ class InertiaModel(PhysicsModel):
         self._angle_rad: Floats = np.array(compute_start_pose(config).angles_rad, dtype=np.float64)
         self._velocity_rad_s = np.zeros(count)
         self._torque_nm = np.zeros(count)
-        # Of intermediate results, so that a step allocates no memory.
-        self._buffer = np.zeros(count)
+        # Intermediate results of a step, so that it allocates no memory.
+        self._velocity_change_rad_s = np.zeros(count)
+        self._friction_change_rad_s = np.zeros(count)
+        self._angle_change_rad = np.zeros(count)
+        self._correction_rad = np.zeros(count)
+        # The hand of a person who bends joints whose motors are off; None if there is none.
         self._hand: BendingHand | None = None
         if settings.hand_file:
             self._hand = BendingHand(Path(settings.hand_file), count)
@@ -108,34 +112,43 @@ class InertiaModel(PhysicsModel):
 
         Args:
             torque_nm: (n_joints,) torques of the motors during the step.
+
+        Raises:
+            BackendError: An angle is not finite, or the file of the bending hand is invalid.
         """
         angle_rad = self._angle_rad
         velocity_rad_s = self._velocity_rad_s
-        buffer = self._buffer
         self._torque_nm[:] = torque_nm
 
-        # Velocity.
-        np.multiply(torque_nm, self._velocity_step_per_nm, out=buffer)
-        velocity_rad_s += buffer
+        # The motors' torques accelerate the joints.
+        velocity_change_rad_s = self._velocity_change_rad_s
+        np.multiply(torque_nm, self._velocity_step_per_nm, out=velocity_change_rad_s)
+        velocity_rad_s += velocity_change_rad_s
+
+        # Viscous friction slows them in proportion to their velocity.
         velocity_rad_s *= self._viscous_damping_factor
-        np.clip(
-            velocity_rad_s,
-            -self._dry_friction_step_rad_s,
-            self._dry_friction_step_rad_s,
-            out=buffer,
-        )
-        velocity_rad_s -= buffer
 
+        # Dry friction removes a fixed part of each velocity, or all of it if that is less.
+        friction_change_rad_s = self._friction_change_rad_s
+        max_change_rad_s = self._dry_friction_step_rad_s
+        np.clip(velocity_rad_s, -max_change_rad_s, max_change_rad_s, out=friction_change_rad_s)
+        velocity_rad_s -= friction_change_rad_s
+
+        # A hand replaces the velocities of joints whose motors are off.
         if self._hand is not None:
-            self._hand.bend(angle_rad, velocity_rad_s, torque_nm, self.step_s)
+            self._hand.bend_passive_joints(angle_rad, velocity_rad_s, torque_nm, self.step_s)
 
-        # Angle.
-        np.multiply(velocity_rad_s, self.step_s, out=buffer)
-        angle_rad += buffer
-        np.clip(angle_rad, self._lower_rad, self._upper_rad, out=buffer)
-        buffer -= angle_rad
-        if buffer.any():  # a joint is beyond an end stop, or its angle is NaN
-            self._stop_at_limits(buffer)
+        # The joints rotate at their new velocities.
+        angle_change_rad = self._angle_change_rad
+        np.multiply(velocity_rad_s, self.step_s, out=angle_change_rad)
+        angle_rad += angle_change_rad
+
+        # The angle from each joint back to the nearest end stop; 0 within its travel.
+        correction_rad = self._correction_rad
+        np.clip(angle_rad, self._lower_rad, self._upper_rad, out=correction_rad)
+        correction_rad -= angle_rad
+        if correction_rad.any():  # a joint is beyond an end stop, or its angle is NaN
+            self._stop_at_limits(correction_rad)
 
     @property
     def angle_rad(self) -> Floats:

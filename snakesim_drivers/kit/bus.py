@@ -114,7 +114,7 @@ class InlineBus:
         """Receive what has arrived."""
         self.drives.poll()
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return what is wrong with the drives and the bus.
 
         Raises:
@@ -144,7 +144,7 @@ class InlineBus:
 
         The states have to be read before anything is sent: the next command that switches a drive off or clears its
         errors would also clear a stop that the drive has latched during the pause. What is found is stored, and
-        returned by the next call of `findings`.
+        returned by the next call of `list_findings`.
 
         Returns:
             True if there was a pause and the drives were read; False if nothing was done.
@@ -191,9 +191,9 @@ class InlineBus:
 
     def _collect_findings(self) -> list[FaultFinding]:
         """Return what is wrong with the drives and the bus, and keep the concerned drives off until a reset."""
-        findings = [*self._findings_after_pause, *self.drives.findings()]
+        findings = [*self._findings_after_pause, *self.drives.list_findings()]
         if self.drives.start_up is not None:
-            findings += self.drives.start_up.findings()
+            findings += self.drives.start_up.list_findings()
         self._findings_after_pause = []
         self._guard.note_findings(findings)
         return findings

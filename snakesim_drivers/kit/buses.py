@@ -58,8 +58,9 @@ class RobotBuses(Drives):
             for spec in specs:
                 self.buses.append(_open_bus(config, spec, clock_ns))
         except BaseException:
-            self.close()
+            self.close()  # only needs `buses`, with those that were opened
             raise
+        # Whether all drives are emulated, so that no real motor moves.
         self.emulated = all(bus.drives.emulated for bus in self.buses)
 
     def bring_up(self) -> None:
@@ -125,11 +126,11 @@ class RobotBuses(Drives):
             if joints_on_bus:
                 bus.reset_faults(joints_on_bus)
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return what is wrong on all buses, with joints numbered as in the robot."""
         findings: list[FaultFinding] = []
         for bus in self.buses:
-            for finding in bus.findings():
+            for finding in bus.list_findings():
                 if finding.joint is None:
                     findings.append(finding)
                 else:

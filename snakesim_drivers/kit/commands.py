@@ -26,21 +26,23 @@ DRIVE_NOUNS: Commands = (
 )
 
 
-def add_channel(parser: argparse.ArgumentParser, help_text: str) -> None:
-    """Add the option `--channel`, the bus of emulated drives; `about` is its help text."""
+def add_channel_argument(parser: argparse.ArgumentParser, help_text: str) -> None:
+    """Add the option `--channel`, the bus of emulated drives; `help_text` is its help."""
     parser.add_argument(
         "--channel", action="append", metavar="CHANNEL", help=f"{help_text} (may be repeated)"
     )
 
 
-def add_channels(parser: argparse.ArgumentParser, help_text: str) -> None:
-    """Add the arguments of a scan: the buses, with `about` as their help text, and `--json`."""
+def add_channels_arguments(parser: argparse.ArgumentParser, help_text: str) -> None:
+    """Add the arguments of a scan: the buses, with `help_text` as their help, and `--json`."""
     parser.add_argument("channel", nargs="+", metavar="CHANNEL", help=help_text)
     add_json_argument(parser)
 
 
-def add_pose(parser: argparse.ArgumentParser, help_text: str, default: str | None = None) -> None:
-    """Add the option `--pose`, the receiver of emulated motion capture; `about` is added to its help text."""
+def add_pose_argument(
+    parser: argparse.ArgumentParser, help_text: str, default: str | None = None
+) -> None:
+    """Add the option `--pose`, the receiver of emulated motion capture; `help_text` is added to its help."""
     parser.add_argument(
         "--pose", default=default, metavar="HOST:PORT", help=f"where to send poses ({help_text})"
     )
@@ -61,11 +63,11 @@ def add_control_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_emulation(parser: argparse.ArgumentParser, channel_help: str) -> None:
+def add_emulation_arguments(parser: argparse.ArgumentParser, channel_help: str) -> None:
     """Add all arguments of a command that emulates drives; `channel_help` is the help text of `--channel`."""
     add_scenario_name_argument(parser)
-    add_channel(parser, channel_help)
+    add_channel_argument(parser, channel_help)
     add_set_argument(parser)
-    add_pose(parser, "default: nowhere")
+    add_pose_argument(parser, "default: nowhere")
     add_control_arguments(parser)
     add_parent_argument(parser)

@@ -345,7 +345,7 @@ class DriveBackend(Backend):
 
     def _collect_relevant_findings(self) -> list[FaultFinding]:
         """Return what is wrong now, without isolated joints and without errors that may be from before a reset."""
-        findings = [*self._drives.findings(), *self._find_silent_drives()]
+        findings = [*self._drives.list_findings(), *self._find_silent_drives()]
         relevant: list[FaultFinding] = []
         for finding in findings:
             is_known = finding.affects_only_joint and finding.joint in self._isolated_joints

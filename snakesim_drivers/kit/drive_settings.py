@@ -1,5 +1,6 @@
 """Settings that every driver type has in the scenario, and checks of them before a start."""
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any
 
@@ -187,7 +188,7 @@ def compute_response_timeout_s(config: RunConfig, decimation: int = 1) -> float:
     return RESPONSE_TIMEOUT_PERIODS * decimation * config.period_ns * 1e-9
 
 
-def assign_ports(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:
+def assign_port_indices(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:
     """Return the index of the port of every joint.
 
     Joints that name no `port` are distributed evenly, from the tail on. Without any ports all joints get index 0.
@@ -197,7 +198,7 @@ def assign_ports(joints: Sequence[Joint], ports: Collection[str]) -> list[int]:
         ports: Names of the ports.
     """
     index_by_port = {port: i for i, port in enumerate(ports)}
-    joints_per_port = -(-len(joints) // max(len(ports), 1))  # rounded up
+    joints_per_port = math.ceil(len(joints) / max(len(ports), 1))
     return [
         index_by_port.get(joint.drive.port, i // joints_per_port) for i, joint in enumerate(joints)
     ]

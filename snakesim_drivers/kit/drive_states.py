@@ -113,28 +113,34 @@ class DriveStates:
             self.drives[i].errors = ""
             self.drives[i].is_emergency_stopped = False
 
-    def findings(self) -> list[FaultFinding]:
-        """Return a finding for each drive that reports errors, or that is off although it should be on."""
+    def list_findings(self) -> list[FaultFinding]:
+        """List at most one finding for each drive, for the first of these that is true.
+
+        Its safe-torque-off input keeps the motor off; it reports errors; it is off although it should be on, and had
+        time to switch on.
+        """
         findings: list[FaultFinding] = []
         for i, drive in enumerate(self.drives):
             if drive.safe_torque_off:
                 cause = f"{drive.label}: its safe-torque-off input is active; release it, then reset and arm"
-                findings.append(FaultFinding("safe_torque_off", cause, i))
+                findings.append(FaultFinding("safe_torque_off", cause, joint=i))
             elif drive.errors:
                 findings.append(
                     FaultFinding(
                         "drive_fault",
                         f"{drive.label} reports {drive.errors}",
-                        i,
+                        joint=i,
                         affects_only_joint=True,
                     )
                 )
-            elif drive.should_be_enabled and self._should_have_enabled(drive) and not drive.enabled:
+            elif drive.should_be_enabled and self._had_time_to_enable(drive) and not drive.enabled:
                 cause = (
                     f"{drive.label} does not follow: it is {drive.state or 'in an unknown state'}"
                 )
                 findings.append(
-                    FaultFinding("drive_not_armed", cause, i, affects_only_joint=drive.was_enabled)
+                    FaultFinding(
+                        "drive_not_armed", cause, joint=i, affects_only_joint=drive.was_enabled
+                    )
                 )
         return findings
 
@@ -144,7 +150,7 @@ class DriveStates:
         A drive that was on, or has had time to switch on, is not enabled a second time: it has stopped by itself, and
         that is a finding.
         """
-        if drive.should_be_enabled and self._should_have_enabled(drive):
+        if drive.should_be_enabled and self._had_time_to_enable(drive):
             return False
         return self._has_reported_since_command(drive) and drive.enabled not in (
             None,
@@ -155,7 +161,7 @@ class DriveStates:
         """Return whether the last report is so late that it shows the effect of the last command."""
         return drive.last_report_ns - drive.command_changed_ns > self._min_response_delay_ns
 
-    def _should_have_enabled(self, drive: DriveState) -> bool:
+    def _had_time_to_enable(self, drive: DriveState) -> bool:
         """Return whether a drive was on since the last command, or has had enough time to switch on."""
         return (
             drive.was_enabled

@@ -16,7 +16,7 @@ from snakesim_drivers.kit.buses import RobotBuses
 from snakesim_drivers.kit.drive_backend import DriveBackend, DriveBackendParts, DriverClock
 from snakesim_drivers.kit.drive_settings import (
     DriveSettings,
-    assign_ports,
+    assign_port_indices,
     make_emulated_body,
     make_joint_label,
     validate_body_settings,
@@ -271,7 +271,7 @@ def make_bus_specs_by_port(
     Returns:
         The buses in the order of `ports`, without the ports to which no joint is assigned.
     """
-    port_indices = assign_ports(list(joints.values()), ports)
+    port_indices = assign_port_indices(list(joints.values()), ports)
     specs: list[BusSpec] = []
     for port_index, port in enumerate(ports):
         joints_on_port = tuple(

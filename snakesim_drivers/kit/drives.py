@@ -4,9 +4,9 @@
 their units, when it is called, by which thread, and how long it may take.
 
 Call order
-    `bring_up` once. Then in every control cycle `read`, `send_setpoints`, `poll` and `findings`. In the end `close`,
-    which may also follow a failed `bring_up`. `reset_faults` comes before the `send_setpoints` of the same cycle, and
-    `inject` at any time.
+    `bring_up` once. Then in every control cycle `read`, `send_setpoints`, `poll` and `list_findings`. In the end
+    `close`, which may also follow a failed `bring_up`. `reset_faults` comes before the `send_setpoints` of the same
+    cycle, and `inject` at any time.
 
 Threads
     The host's thread creates the object and calls `bring_up` and `inject`. In real time each bus has a thread of its
@@ -119,7 +119,7 @@ class Drives(ABC):
             BackendError: The bus cannot be closed.
         """
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return what is wrong now with the drives and their bus. The caller reports each finding once.
 
         Drives that do not answer need not be included: the caller counts the requests that they left unanswered.

@@ -41,7 +41,7 @@ class LimitSwitches:
         """Forget the findings of these drives, after the operator's reset; closed switches still restrict motion."""
         self._unacknowledged -= drives
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return a finding for each drive whose switch has closed since the last reset."""
         findings: list[FaultFinding] = []
         for i in sorted(self._unacknowledged):

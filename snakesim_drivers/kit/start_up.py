@@ -138,7 +138,7 @@ class StartUp:
                 self._progress[i] = _StartUpProgress()
         self._publish_not_ready_reasons()
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return a finding for each drive whose start-up has failed or was invalidated."""
         findings: list[FaultFinding] = []
         for i, progress in enumerate(self._progress):

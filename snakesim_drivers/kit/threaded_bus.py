@@ -136,7 +136,7 @@ class ThreadedBus(InlineBus):
     def poll(self) -> None:
         """Do nothing, because the bus thread receives by itself."""
 
-    def findings(self) -> list[FaultFinding]:
+    def list_findings(self) -> list[FaultFinding]:
         """Return what was found wrong since the last call, each time that setpoints were sent."""
         with self._condition:
             self._raise_bus_error()

@@ -219,8 +219,8 @@ class MinimalDrives(Drives):
     def poll(self) -> None:
         self.emulator()
 
-    def findings(self) -> list[FaultFinding]:
-        findings = self.states.findings()
+    def list_findings(self) -> list[FaultFinding]:
+        findings = self.states.list_findings()
         if self.emulator.is_cut:
             findings.append(
                 FaultFinding("interface_down", "the bus is cut; check the adapter and its cable")

@@ -46,6 +46,7 @@ WIDER: Mapping[tuple[int, int], str] = {
     (0, 0): WIDER_BEFORE_2_3,
 }
 CPUINFO = Path("/proc/cpuinfo")
+MAX_MATRIX_SIZE = 30  # rows and columns of the largest matrix that `measure_arithmetic` uses
 
 
 @cache
@@ -127,7 +128,7 @@ def measure_arithmetic() -> dict[str, str]:
     from threadpoolctl import threadpool_limits
 
     generator = random.Random(22)
-    numbers = [generator.uniform(-3.0, 3.0) for _ in range(2000)]
+    numbers = [generator.uniform(-3.0, 3.0) for _ in range(2000)]  # the same on every computer
     with threadpool_limits(1):
         return {
             "BLAS": _compute_digest(_compute_linear_algebra(numbers)),
@@ -137,14 +138,24 @@ def measure_arithmetic() -> dict[str, str]:
 
 
 def _compute_linear_algebra(numbers: list[float]) -> Iterable[Any]:
-    """Yield results of BLAS and LAPACK, in the sizes of a robot."""
+    """Yield results of BLAS and LAPACK, whose hash tells which processor code rounds the sums of linear algebra.
+
+    The matrices have the sizes of a robot's. Their numbers mean nothing.
+
+    Args:
+        numbers: Pseudo-random numbers, at least MAX_MATRIX_SIZE squared.
+
+    Yields:
+        Arrays and numbers. Their order is part of the hash.
+    """
     import numpy as np
 
-    for size in (2, 3, 4, 8, 13, 30):
+    for size in (2, 3, 4, 8, 13, MAX_MATRIX_SIZE):
         a = np.array(numbers[: size * size]).reshape(size, size)
         b = np.array(numbers[-size * 3 :]).reshape(size, 3)
-        tall = np.vstack([a, b.T])
-        square = a @ a.T + size * np.eye(size)
+        tall = np.vstack([a, b.T])  # more rows than columns, for least squares
+        right_side = tall[:, 0] ** 2
+        square = a @ a.T + size * np.eye(size)  # positive definite, for Cholesky
         # Products.
         yield from (
             a @ b,
@@ -155,7 +166,7 @@ def _compute_linear_algebra(numbers: list[float]) -> Iterable[Any]:
             b[:, 0] @ b[:, 1],
             np.linalg.norm(b),
         )
-        # Factorizations.
+        # Factorizations, and the product that was factorized.
         yield from (
             np.linalg.solve(square, b),
             np.linalg.inv(square),
@@ -164,7 +175,7 @@ def _compute_linear_algebra(numbers: list[float]) -> Iterable[Any]:
         )
         yield from (
             np.linalg.eigvalsh(square),
-            np.linalg.lstsq(tall, tall[:, 0] ** 2, rcond=None)[0],
+            np.linalg.lstsq(tall, right_side, rcond=None)[0],
         )
         yield from (np.linalg.pinv(tall), np.linalg.cond(a))
 

@@ -3,7 +3,7 @@
 The file is in the folder of the latched emergency stop. With each angle it has the drive, sign and zero of the joint,
 and when its cable was last declared unwound. If one of these has changed, the angle counts as unknown.
 
-Threads: the host's thread makes every call; a `Sender` thread writes, so that no joint waits for a disk.
+Threads: the host's thread makes every call; a `SerialWorker` thread writes, so that no joint waits for a disk.
 """
 
 import time
@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -45,6 +46,20 @@ class StoredCable(msgspec.Struct, frozen=True, kw_only=True):
     unwound: str  # `cable_unwound` since which it is counted
 
 
+class _FileContent(NamedTuple):
+    """What the file of a robot has, or why it has nothing."""
+
+    cables: Mapping[str, StoredCable]  # by the name of the joint
+    missing_reason: str  # why there is no entry for a joint that is not in `cables`
+
+
+class _LastAngle(NamedTuple):
+    """The last known angle of a joint."""
+
+    angle_rad: float | None  # None: not known
+    unknown_reason: str = ""  # why it is not known
+
+
 class CableFile:
     """The file of one robot. `cables` counts the angles."""
 
@@ -65,7 +80,7 @@ class CableFile:
         cable_joints: list[CableJoint] = []
         last_angles_rad: dict[str, float] = {}
         unknown_reasons: dict[str, str] = {}
-        stored_cables = self._read()
+        file_content = self._read()
         for i, joint in enumerate(joints):
             cable_turns = joint.limits.cable_turns
             if cable_turns is None:
@@ -83,14 +98,13 @@ class CableFile:
             )
             drive = f"{described.serial} {joint.drive.sign:+d} {joint.drive.zero_rad:.6g}".strip()
             self._drive_by_joint[joint.name] = (drive, joint.limits.cable_unwound)
-            angle_rad = _find_counted_angle(stored_cables, joint, drive, now_s)
-            if isinstance(angle_rad, str):
-                reason = angle_rad
+            last_angle = _find_last_known_angle(file_content, joint, drive, now_s)
+            if last_angle.angle_rad is None:
                 unknown_reasons[joint.name] = (
-                    f"how far its cable is wound is not known: {reason}; {WAY_OUT}"
+                    f"how far its cable is wound is not known: {last_angle.unknown_reason}; {WAY_OUT}"
                 )
             else:
-                last_angles_rad[joint.name] = angle_rad
+                last_angles_rad[joint.name] = last_angle.angle_rad
         self.tracker = CableTracker(cable_joints, last_angles_rad, unknown_reasons)
         self._writer = SerialWorker("cables")
 
@@ -109,7 +123,7 @@ class CableFile:
             self._writer.submit(partial(self._write, angles_rad))
 
     def _write(self, angles_rad: dict[str, float]) -> None:
-        """Write the file, in the `Sender` thread."""
+        """Write the file, in the thread of `SerialWorker`."""
         content: dict[str, StoredCable] = {}
         for name, (drive, unwound) in self._drive_by_joint.items():
             angle_rad = angles_rad.get(name)
@@ -126,14 +140,15 @@ class CableFile:
                 f"{self._path}: {error.strerror}: the turns of its joints would be lost"
             )
 
-    def _read(self) -> Mapping[str, StoredCable] | str:
-        """Return the stored joints by name, or the reason why there are none."""
+    def _read(self) -> "_FileContent":
+        """Read the file, if there is one."""
         try:
-            return msgspec.json.decode(self._path.read_bytes(), type=dict[str, StoredCable])
+            cables = msgspec.json.decode(self._path.read_bytes(), type=dict[str, StoredCable])
         except FileNotFoundError:
-            return f"no host before this one has stored it in {self._path}"
+            return _FileContent({}, f"no host before this one has stored it in {self._path}")
         except (OSError, *UNDECODABLE):
-            return f"{self._path} cannot be read"
+            return _FileContent({}, f"{self._path} cannot be read")
+        return _FileContent(cables, "no host has stored it")
 
 
 def open_cable_file(
@@ -152,16 +167,16 @@ def _lacks_end_stop_room(joint: Joint) -> bool:
     return joint.limits.upper_rad - joint.limits.lower_rad > REVOLUTION_RAD - MIN_END_STOP_RAD
 
 
-def _find_counted_angle(
-    stored_cables: Mapping[str, StoredCable] | str, joint: Joint, drive: str, now_s: float
-) -> float | str:
-    """Return the last known angle of a joint, counted over restarts of the host.
+def _find_last_known_angle(
+    file_content: _FileContent, joint: Joint, drive: str, now_s: float
+) -> _LastAngle:
+    """Find the angle from which the turns of a joint are counted on: the last one that is known to be right.
 
-    It is the stored angle if that belongs to the same drive. Otherwise it is 0 if a person has declared within the last
-    hour, in the robot file, that the cable is unwound.
+    It is the stored angle if that belongs to the same drive, and to the same declaration that the cable is unwound.
+    Otherwise it is 0 if a person has declared within the last hour, in the robot file, that the cable is unwound.
 
     Args:
-        stored_cables: Stored state of each joint by name, or the reason why the file could not be read.
+        file_content: Content of the cable file.
         joint: Joint in the robot file.
         drive: Serial number, sign and zero of the joint's drive now.
         now_s: Wall time in s since the epoch.
@@ -169,25 +184,26 @@ def _find_counted_angle(
     Returns:
         The angle in rad, or the reason why it is not known.
     """
-    declaration_time = joint.limits.cable_unwound
-    if isinstance(stored_cables, str):
-        reason = stored_cables
+    declaration_time = joint.limits.cable_unwound  # ISO 8601; empty if nobody has declared it
+    stored = file_content.cables.get(joint.name)
+    if stored is None:
+        reason = file_content.missing_reason
+    elif stored.drive == drive and stored.unwound == declaration_time:
+        return _LastAngle(stored.angle_rad)
     else:
-        stored = stored_cables.get(joint.name)
-        if stored is None:
-            reason = "no host has stored it"
-        elif stored.drive == drive and stored.unwound == declaration_time:
-            return stored.angle_rad
-        else:
-            reason = (
-                f"the stored angle is of another drive, sign or zero ({stored.drive}, now {drive})"
-            )
+        reason = f"the stored angle is of another drive, sign or zero ({stored.drive}, now {drive})"
     if not declaration_time:
-        return reason
+        return _LastAngle(None, reason)
     try:
         age_s = now_s - datetime.fromisoformat(declaration_time).timestamp()
     except ValueError:
-        return f"{reason}, and `cable_unwound` = {declaration_time!r} is no time such as 2026-11-25T02:40:12+00:00"
+        return _LastAngle(
+            None,
+            f"{reason}, and `cable_unwound` = {declaration_time!r} is no time such as 2026-11-25T02:40:12+00:00",
+        )
     if -MAX_CLOCK_SKEW_S <= age_s <= MAX_DECLARATION_AGE_S:
-        return 0.0
-    return f"{reason}, and it was declared unwound at {declaration_time}, {age_s / 3600:.1f} h ago"
+        return _LastAngle(0.0)
+    return _LastAngle(
+        None,
+        f"{reason}, and it was declared unwound at {declaration_time}, {age_s / 3600:.1f} h ago",
+    )

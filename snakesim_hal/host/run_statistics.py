@@ -58,8 +58,8 @@ class DurationHistogram:
             return None
         first_bin = bisect_left(cumulative, 1)  # the first bin that is not empty
         end_bin = bisect_left(cumulative, count) + 1  # the bin after the last one that is not empty
-        # Bins per published bin, rounded up.
-        merged_count = -(-(end_bin - first_bin) // MAX_PUBLISHED_BINS)
+        # Number of bins that are merged into a published one.
+        merged_count = math.ceil((end_bin - first_bin) / MAX_PUBLISHED_BINS)
         merged_bins = [
             sum(bins[i : i + merged_count]) for i in range(first_bin, end_bin, merged_count)
         ]

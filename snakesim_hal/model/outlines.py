@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,13 +70,16 @@ class ObstacleOutlines:
             to_w: Second end of every segment, (m, 2), m.
             rounding_m: Half of the thickness of every segment.
         """
-        segments_w = to_w - from_w
-        length = np.hypot(*segments_w.T)
-        direction = segments_w / np.maximum(length, MIN_SEGMENT_M)[:, None]
-        half_m = np.column_stack([0.5 * length, np.zeros_like(length)])
+        segments_w = to_w - from_w  # (m, 2)
+        length_m = np.hypot(*segments_w.T)
+        # A segment whose ends coincide has no direction; any one does.
+        direction = segments_w / np.maximum(length_m, MIN_SEGMENT_M)[:, None]
+        direction = np.where(length_m[:, None] > 0, direction, [1.0, 0.0])
+        # A segment is a rectangle without width.
+        half_m = np.column_stack([0.5 * length_m, np.zeros_like(length_m)])
         return cls(
             center_w=0.5 * (from_w + to_w),
-            direction=np.where(length[:, None] > 0, direction, [1.0, 0.0]),
+            direction=direction,
             half_m=half_m,
             rounding_m=np.full(len(segments_w), rounding_m),
         )
@@ -119,24 +122,28 @@ class ObstacleOutlines:
         return self.center_w[:, None, :] + rotated
 
     def compute_distances_m(self, points_w: Floats) -> Floats:
-        """Return the distances from points (..., 2) to every outline, (..., m); negative inside.
+        """Compute the distances in m from points (..., 2) to every outline, (..., m); negative inside.
 
         With q = |p| - h, where p is the point in the rectangle's frame and h its half size, the distance is
         |max(q, 0)| + min(max(q_x, q_y), 0) - rounding.
         """
         local_x, local_y = self._transform_to_local_frames(points_w)
+        # How far a point is beyond the edges of the rectangle in x and in y; negative within them.
         over_x = np.abs(local_x) - self.half_m[:, 0]
         over_y = np.abs(local_y) - self.half_m[:, 1]
-        outside = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
-        return outside + np.minimum(np.maximum(over_x, over_y), 0.0) - self.rounding_m
+        # One of these two is 0: the distance outside of the rectangle, and minus the depth inside of it.
+        outside_m = np.hypot(np.maximum(over_x, 0.0), np.maximum(over_y, 0.0))
+        inside_m = np.minimum(np.maximum(over_x, over_y), 0.0)
+        return outside_m + inside_m - self.rounding_m
 
     def compute_distances_and_normals(
         self, points_w: Floats, outline_indices: NDArray[np.intp]
     ) -> tuple[Floats, Floats]:
-        """Compute the distance of each point from one outline, and the outward normal there.
+        """Compute the distance of each point from an outline of its own, and the outward normal there.
 
+        An outline is a rectangle, made larger on all sides by `rounding_m`; see `compute_distances_m` for the equation.
         Outside of the rectangle, the normal points away from the nearest point of the rectangle. Inside, it points out
-        of the nearest edge.
+        of the nearest edge. The rounding does not change it.
 
         Args:
             points_w: Points in the world, (..., 2), m.
@@ -145,6 +152,8 @@ class ObstacleOutlines:
         Returns:
             Distances in m, (...), negative inside, and unit normals in the world, (..., 2).
         """
+        # All arrays below are (...), one number for each point.
+        # The point in the frame of its rectangle.
         cosine = self.direction[outline_indices, 0]
         sine = self.direction[outline_indices, 1]
         dx = points_w[..., 0] - self.center_w[outline_indices, 0]
@@ -152,6 +161,7 @@ class ObstacleOutlines:
         local_x = cosine * dx + sine * dy
         local_y = cosine * dy - sine * dx
 
+        # How far the point is beyond the edges of the rectangle in x and in y, in m; negative within them.
         over_x = np.abs(local_x) - self.half_m[outline_indices, 0]
         over_y = np.abs(local_y) - self.half_m[outline_indices, 1]
         outside_x = np.maximum(over_x, 0.0)
@@ -163,12 +173,17 @@ class ObstacleOutlines:
             - self.rounding_m[outline_indices]
         )
 
+        # The normal in the quadrant of the rectangle's frame in which x and y are positive.
         is_outside = outside_distance > 0
-        length = np.where(is_outside, outside_distance, 1.0)
-        sign_x = np.where(local_x < 0, -1.0, 1.0)
-        sign_y = np.where(local_y < 0, -1.0, 1.0)
-        normal_x = np.where(is_outside, outside_x / length, over_x >= over_y) * sign_x
-        normal_y = np.where(is_outside, outside_y / length, over_x < over_y) * sign_y
+        divisor = np.where(is_outside, outside_distance, 1.0)  # no division by zero inside
+        inside_normal_x = np.where(over_x >= over_y, 1.0, 0.0)
+        inside_normal_y = np.where(over_x < over_y, 1.0, 0.0)
+        normal_x = np.where(is_outside, outside_x / divisor, inside_normal_x)
+        normal_y = np.where(is_outside, outside_y / divisor, inside_normal_y)
+
+        # The normal in the quadrant of the point, and then in the world.
+        normal_x = normal_x * np.where(local_x < 0, -1.0, 1.0)
+        normal_y = normal_y * np.where(local_y < 0, -1.0, 1.0)
         normal_w = np.stack(
             [cosine * normal_x - sine * normal_y, sine * normal_x + cosine * normal_y], axis=-1
         )
@@ -193,7 +208,7 @@ def compute_gaps_m(single: ObstacleOutlines, others: ObstacleOutlines) -> Floats
 
 
 def has_gap_below(single: ObstacleOutlines, others: ObstacleOutlines, limit_m: float) -> bool:
-    """Return whether the gap between a single outline and any of the others is below a limit, as `gaps_m` computes it.
+    """Return whether any gap that `compute_gaps_m` would return is below a limit.
 
     Most of the others are so far away that the circles around both show it, which is faster.
     """
@@ -206,24 +221,31 @@ def has_gap_below(single: ObstacleOutlines, others: ObstacleOutlines, limit_m: f
     return bool(compute_gaps_m(single, others.select(near)).min() < limit_m)
 
 
-def find_nearest_points_on_chain(
-    nodes_w: Floats, outlines: ObstacleOutlines
-) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Return the point of a chain that is nearest to each outline, among `LINK_FRACTIONS` of every link.
+class NearestChainPoints(NamedTuple):
+    """The point of a chain that is nearest to each of m outlines."""
+
+    index: NDArray[np.intp]  # (m,), among all `LINK_FRACTIONS` of all links, tail to head
+    point_w: Floats  # (m, 2), m
+    distance_m: Floats  # (m,), negative inside the outline
+
+
+def find_nearest_points_on_chain(nodes_w: Floats, outlines: ObstacleOutlines) -> NearestChainPoints:
+    """Find the point of a chain that is nearest to each outline, among `LINK_FRACTIONS` of every link.
 
     Args:
         nodes_w: Tail end, joints and head end of the chain, (n, 2), m.
         outlines: Outlines of m obstacles.
-
-    Returns:
-        Index of the point among all `LINK_FRACTIONS` of all links (m,), the point itself (m, 2), and its distance (m,).
     """
-    rear = nodes_w[:-1, None]
-    run = np.diff(nodes_w, axis=0)[:, None]
-    points = (rear + LINK_FRACTIONS[:, None] * run).reshape(-1, 2)
-    distances = outlines.compute_distances_m(points)
-    nearest = distances.argmin(axis=0)
-    return nearest, points[nearest], distances[nearest, np.arange(len(outlines))]
+    # Points on all links, (n - 1, fractions, 2) and then in one row, (points, 2).
+    rear_ends_w = nodes_w[:-1, None]
+    links_w = np.diff(nodes_w, axis=0)[:, None]
+    points_on_links_w = rear_ends_w + LINK_FRACTIONS[:, None] * links_w
+    points_w = points_on_links_w.reshape(-1, 2)
+
+    distances_m = outlines.compute_distances_m(points_w)  # (points, m)
+    nearest = distances_m.argmin(axis=0)
+    nearest_distances_m = distances_m[nearest, np.arange(len(outlines))]
+    return NearestChainPoints(nearest, points_w[nearest], nearest_distances_m)
 
 
 class CapsuleOutline(FileStruct, frozen=True, kw_only=True):

@@ -210,11 +210,10 @@ def _place_pegs_along_route(
         tangent = route.tangent_w(s_m)
         left_w = np.array([-tangent[1], tangent[0]])
         is_forward = left_w @ forward_w > 0
-        # Of the force from the peg on the body.
+        # Direction of the force from the peg on the body: to the side of the route that is forward.
         push_direction_w = left_w if is_forward else -left_w
-        center_w = route.compute_positions_w(s_m) - push_direction_w * (
-            row.corridor_m + row.radius_m
-        )
+        distance_m = row.corridor_m + row.radius_m  # from the route to the center of the peg
+        center_w = route.compute_positions_w(s_m) - push_direction_w * distance_m
         center_m = (float(center_w[0]), float(center_w[1]))
         obstacle = make_peg(f"peg_{index}_{inflection}", center_m, row.radius_m, row.height_m)
         pegs.append(_add_material(obstacle, row))
@@ -242,7 +241,7 @@ def _place_random_field(
 def validate_start_clearance(
     scene: SceneFile, placed: list[PlacedObstacle], snake: list[CapsuleOutline]
 ) -> None:
-    """Raise ConfigError if an obstacle overlaps the snake at its start.
+    """Check that no obstacle overlaps the snake at its start, and that the snake fits into the pipes there.
 
     Args:
         scene: Scene file, whose name is in the error.
@@ -250,23 +249,27 @@ def validate_start_clearance(
         snake: Outlines of the snake's links.
 
     Raises:
-        ConfigError: An obstacle overlaps a link. The error names both, and how far they overlap.
+        ConfigError: An obstacle or the wall of a pipe overlaps a link. The error is about the first such obstacle in
+            the order of the scene, and names it, the link, and how far they overlap.
     """
     validate_pipes(scene, snake)
     height_m = max(link.radius_m for link in snake)
     obstacles = [_move_to_height(item, height_m) for item in placed if not item.walkable]
-    overlaps_m = _compute_overlaps_m(snake, obstacles)
-    # Transposed, so that the error is about the first obstacle in the order of the scene.
-    # (k, 2) indices of obstacle and link.
-    overlapping_pairs = np.argwhere(overlaps_m.T > OVERLAP_TOLERANCE_M)
-    for obstacle_index, link_index in overlapping_pairs[:1]:
-        overlap_mm = overlaps_m[link_index, obstacle_index] * 1000
-        raise ConfigError(
-            f"scene {scene.name!r}: obstacle {obstacles[obstacle_index].name!r} overlaps {snake[link_index].name} of "
-            f"the snake at its start by {overlap_mm:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or "
-            f"change [start] in the scenario",
-            code="scene/overlap",
-        )
+    overlaps_m = _compute_overlaps_m(snake, obstacles)  # (links, obstacles)
+    is_overlapping = overlaps_m > OVERLAP_TOLERANCE_M
+    if not is_overlapping.any():
+        return
+    overlapping_obstacles = np.flatnonzero(is_overlapping.any(axis=0))
+    obstacle_index = overlapping_obstacles[0]
+    overlapping_links = np.flatnonzero(is_overlapping[:, obstacle_index])
+    link_index = overlapping_links[0]
+    overlap_mm = overlaps_m[link_index, obstacle_index] * 1000
+    raise ConfigError(
+        f"scene {scene.name!r}: obstacle {obstacles[obstacle_index].name!r} overlaps {snake[link_index].name} of "
+        f"the snake at its start by {overlap_mm:.1f} mm; move the obstacle, give the pegs more `corridor_m`, or "
+        f"change [start] in the scenario",
+        code="scene/overlap",
+    )
 
 
 def _compute_overlaps_m(snake: list[CapsuleOutline], obstacles: list[KnownObstacle]) -> Floats:
@@ -276,19 +279,22 @@ def _compute_overlaps_m(snake: list[CapsuleOutline], obstacles: list[KnownObstac
     distances from `SAMPLES_PER_LINK` points along the axis are taken, too, and the smallest one counts.
     """
     outlines = ObstacleOutlines.from_obstacles(obstacles)
-    rear_w = np.array([link.rear_m for link in snake])
+    rear_w = np.array([link.rear_m for link in snake])  # (links, 2)
     front_w = np.array([link.front_m for link in snake])
     radius_m = np.array([link.radius_m for link in snake])
+
+    # Distance of each obstacle from points along the axis of each link, which are (links, SAMPLES_PER_LINK, 2).
     fractions = np.linspace(0.0, 1.0, SAMPLES_PER_LINK)[:, None]
-    # (links, SAMPLES_PER_LINK, 2).
     points_w = rear_w[:, None] + fractions * (front_w - rear_w)[:, None]
-    from_points_m = outlines.compute_distances_m(points_w).min(axis=1)
-    from_axes_m = (
-        ObstacleOutlines.from_segments(rear_w, front_w).compute_distances_m(outlines.center_w).T
-        - outlines.rounding_m
-    )
-    gaps_m = np.minimum(from_points_m, from_axes_m)
-    return radius_m[:, None] - gaps_m
+    from_points_m = outlines.compute_distances_m(points_w).min(axis=1)  # (links, obstacles)
+
+    # Distance of each obstacle's center from the whole axis of each link, without the obstacle's rounding.
+    axes = ObstacleOutlines.from_segments(rear_w, front_w)
+    center_distances_m = axes.compute_distances_m(outlines.center_w).T  # (links, obstacles)
+    from_axes_m = center_distances_m - outlines.rounding_m
+
+    distances_m = np.minimum(from_points_m, from_axes_m)  # of the axes, which are without thickness
+    return radius_m[:, None] - distances_m
 
 
 def _move_to_height(item: PlacedObstacle, height_m: float) -> KnownObstacle:

@@ -19,7 +19,7 @@ import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten, suggest_word
 from snakesim_hal.model.files import ConfigTable, decode_table, expand_home
-from snakesim_hal.model.sibling_modules import find_siblings_of
+from snakesim_hal.model.sibling_modules import enable_sibling_imports
 from snakesim_hal.model.textfiles import read_bytes
 
 BaseT = TypeVar("BaseT")
@@ -225,11 +225,17 @@ def _iterate_defined_names(tree: ast.Module) -> Iterator[str]:
 
 
 def _load_from_file(name: str, kind: str) -> Any:
-    """Run a Python file, and return the class that a plugin name asks for.
+    """Run a Python file, and return the class (or other object) that a plugin name asks for.
+
+    The module stays in `sys.modules`, also if its code fails. From now on the file's imports also find modules in its
+    own folder.
 
     Args:
         name: `./file.py:Class`.
         kind: What the plugin is called in errors, such as `controller`.
+
+    Returns:
+        The object of this name in the file, usually a class.
 
     Raises:
         ConfigError: The file cannot be run, or has no such class.
@@ -241,8 +247,9 @@ def _load_from_file(name: str, kind: str) -> Any:
             f"{kind} {name!r}: {path} cannot be loaded as Python", code="plugin/not-loadable"
         )
     module = importlib.util.module_from_spec(spec)
+    # A dataclass looks for its module here while the file runs, and so does `pickle` later.
     sys.modules[spec.name] = module
-    find_siblings_of(path)
+    enable_sibling_imports(path)
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:

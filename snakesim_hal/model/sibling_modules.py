@@ -23,7 +23,7 @@ class SiblingFinder(MetaPathFinder):
 
     def allow_imports_of(self, file: Path) -> None:
         """From now on, also look up the modules that this file imports."""
-        self._imported_names.update(_imported_names(file))
+        self._imported_names.update(_list_imported_modules(file))
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -33,13 +33,16 @@ class SiblingFinder(MetaPathFinder):
             return None
         spec = PathFinder.find_spec(fullname, [str(self.folder)], target)
         if spec is not None:
-            for file in _source_files(spec):
+            for file in _list_source_files(spec):
                 self.allow_imports_of(file)
         return spec
 
 
-def find_siblings_of(file: Path) -> None:
-    """Let the imports of a plugin's file find the modules beside it, until this process ends."""
+def enable_sibling_imports(file: Path) -> None:
+    """Let the imports of a plugin's file find the modules beside it, until this process ends.
+
+    It adds a finder for the folder of the file to `sys.meta_path`, or extends the one that is there.
+    """
     folder = file.parent
     for finder in sys.meta_path:
         if isinstance(finder, SiblingFinder) and finder.folder == folder:
@@ -50,7 +53,7 @@ def find_siblings_of(file: Path) -> None:
     sys.meta_path.append(finder)
 
 
-def _source_files(spec: ModuleSpec) -> Iterator[Path]:
+def _list_source_files(spec: ModuleSpec) -> Iterator[Path]:
     """Yield the file of a module, or all files of a package."""
     if spec.submodule_search_locations is not None:
         for location in spec.submodule_search_locations:
@@ -59,7 +62,7 @@ def _source_files(spec: ModuleSpec) -> Iterator[Path]:
         yield Path(spec.origin)
 
 
-def _imported_names(file: Path) -> Iterator[str]:
+def _list_imported_modules(file: Path) -> Iterator[str]:
     """Yield the top-level modules that a file imports, anywhere in it; nothing for a file that is not Python."""
     try:
         tree = ast.parse(file.read_bytes())

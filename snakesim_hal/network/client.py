@@ -79,23 +79,29 @@ class HostClient:
         self.session = session
         self._decimation = decimation
         self._clock_mode = clock_mode
-        # The clock. Zenoh's thread writes the first four.
-        self._clocks: Mailbox[Clock] = Mailbox()
-        self._last_clock_s = time.monotonic()
-        self.newest_clock: Clock | None = None  # due or not
-        self._has_host_left = False
+        # Written by Zenoh's threads.
+        # Clocks of ticks that this service has to process, and clocks of a paused simulator.
+        self._due_clocks: Mailbox[Clock] = Mailbox()
+        self.newest_clock: Clock | None = None  # the last clock that arrived, due or not
+        self._last_clock_s = time.monotonic()  # monotonic time in s at which it arrived
+        self._has_host_left = False  # whether the liveliness token of the host has vanished
         self._clock_decoder = MessageDecoder(Clock)
-        self._clock: Clock | None = None  # of the current tick
-        # Popped from the queue, but of a later tick than the one returned.
-        self._next_clock: Clock | None = None
+
+        # Written by the thread of the service.
+        self._current_clock: Clock | None = None  # clock of the tick that the service processes
+        # Clock that was popped from `_due_clocks` too early: the next call of `_pop_next_clock` returns it.
+        self._postponed_clock: Clock | None = None
         # Whether robot time has restarted since the last `fetch_changed_description`.
         self._has_restarted = False
-        # Inputs and outputs.
+
+        # Inputs and outputs, written by the thread of the service.
         self._feeds: dict[str, SampleFeed[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._filter = RobotFilter(session.rejected)
-        self.commanded_tick = NO_COMMANDED_TICK
+        self.commanded_tick = NO_COMMANDED_TICK  # last tick that a command of this service answered
         self.missing_keys: set[str] = set()  # keys that were read in this tick, and had no sample
+
+        # From here on, Zenoh's threads call these two.
         session.on_urgent_arrival(keys.CLOCK, self._store_clock)
         session.on_token_change(self._on_host_token, keys.HOST_ALL)
 
@@ -128,8 +134,11 @@ class HostClient:
         Returns:
             The new description, or None if the host is the same.
         """
+        # An armed robot still has its host, whose token has only been lost on the network.
         is_host_replaced = (
-            self._has_host_left and self._clock is not None and self._clock.lifecycle != "armed"
+            self._has_host_left
+            and self._current_clock is not None
+            and self._current_clock.lifecycle != "armed"
         )
         if not self._has_restarted and not is_host_replaced:
             return None
@@ -199,11 +208,11 @@ class HostClient:
 
     def _start_tick(self, clock: Clock) -> None:
         """Make a clock the current one, and store the samples that have arrived. Drop old samples after a restart."""
-        if self._clock is not None and clock.tick < self._clock.tick:
+        if self._current_clock is not None and clock.tick < self._current_clock.tick:
             self._has_restarted = True
             for feed in self._feeds.values():
                 feed.clear()
-        self._clock = clock
+        self._current_clock = clock
         self.commanded_tick = NO_COMMANDED_TICK
         self.missing_keys.clear()
         newest_only = clock.clock_mode != "lockstep"
@@ -219,15 +228,15 @@ class HostClient:
         Raises:
             Empty: No clock arrived in time.
         """
-        clock = self._next_clock or self._clocks.get(timeout=timeout_s)
-        self._next_clock = None
-        while not self._clocks.empty():
-            later_clock = self._clocks.get()
+        clock = self._postponed_clock or self._due_clocks.get(timeout=timeout_s)
+        self._postponed_clock = None
+        while not self._due_clocks.empty():
+            later_clock = self._due_clocks.get()
             is_next_lockstep_tick = (
                 clock.clock_mode == "lockstep" and later_clock.tick != clock.tick
             )
             if is_next_lockstep_tick or later_clock.paused != clock.paused:
-                self._next_clock = later_clock  # the next call returns it
+                self._postponed_clock = later_clock  # the next call returns it
                 break
             clock = later_clock
         return clock
@@ -252,7 +261,7 @@ class HostClient:
             return
         self.newest_clock = clock
         if clock.paused or clock.tick % self._decimation == 0:
-            self._clocks.put(clock)
+            self._due_clocks.put(clock)
 
     # --- inputs ----------------------------------------------------------------------------------------------
 
@@ -293,7 +302,7 @@ class HostClient:
         Raises:
             StalledError: A named sample does not arrive in time.
         """
-        clock = self._clock
+        clock = self._current_clock
         if clock is None:
             return None
         if clock.clock_mode != "lockstep":
@@ -364,7 +373,9 @@ class HostClient:
         """Return the publisher of a key, which is declared at its first message."""
         publisher = self._publishers.get(key)
         if publisher is None:
-            lossless = self._clock is not None and self._clock.clock_mode == "lockstep"
+            lossless = (
+                self._current_clock is not None and self._current_clock.clock_mode == "lockstep"
+            )
             publisher = self.session.declare_publisher(key, message, lossless=lossless)
             self._publishers[key] = publisher
         return publisher
@@ -402,7 +413,7 @@ class Commander:
         """Request the command lease if this service does not hold it.
 
         A request waits for the host's answer, at most two seconds. No request is sent while the robot is armed, or
-        within LEASE_RETRY_S of the last request. If the host refuses, `refusal` has the reason.
+        within LEASE_RETRY_S of the last request. If the host refuses, `lease_refusal` has the reason.
 
         Args:
             clock: Clock of the current tick, which names the lease that the host considers valid.

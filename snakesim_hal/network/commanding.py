@@ -27,9 +27,9 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 
-SILENCE_S = 2.0  # without a clock: the host has stalled
+CLOCK_TIMEOUT_S = 2.0  # without a clock: the host has stalled
 # Longer than a host waits for another service by default: `stall_limit_s` is 10 s.
-LOCKSTEP_SILENCE_S = 15.0
+LOCKSTEP_CLOCK_TIMEOUT_S = 15.0
 LEASE_TIMEOUT_S = 20.0  # to get the lease, after at most one wait of the host for another service
 READABLE_KEYS = {keys.JOINTS: JointState, keys.POSE: Pose, keys.CONTACTS: Contacts}
 
@@ -49,7 +49,9 @@ class CommandingClient:
             RefusedError: The robot has a controller already, or the lease is not granted.
             StalledError: The robot publishes no clock.
         """
-        self._silence_s = LOCKSTEP_SILENCE_S if clock_mode == "lockstep" else SILENCE_S
+        self._clock_timeout_s = (
+            LOCKSTEP_CLOCK_TIMEOUT_S if clock_mode == "lockstep" else CLOCK_TIMEOUT_S
+        )
         if session.list_tokens(keys.alive_key(CONTROL)):
             raise RefusedError(
                 f"{robot.robot} has a controller already; to command it from here start it without one: "
@@ -61,7 +63,7 @@ class CommandingClient:
         for key, message in READABLE_KEYS.items():
             self._feeds[key] = self._client.subscribe(key, message)
         self._client.wait_for_description()
-        self._ticks = self._client.iterate_ticks(self._silence_s)
+        self._ticks = self._client.iterate_ticks(self._clock_timeout_s)
         self._commander = Commander(self._client, robot)
         self._last_setpoints: RequestedSetpoints | None = None
         self.clock: Clock | None = None  # of the current tick
@@ -79,17 +81,19 @@ class CommandingClient:
     def wait_for_tick(self) -> Clock:
         """Wait for the next tick, and return its clock.
 
-        If the last tick was not commanded, this reports it as done, because a lockstep host waits for its output.
+        First it reports the last tick as done, because a lockstep host waits for an output in each tick. If a command
+        has answered that tick, nothing is sent, as a command implies it. At the end it requests the command lease if
+        this process does not hold it; see `holds_lease`.
 
         Raises:
-            StalledError: No clock arrived within SILENCE_S, or in lockstep LOCKSTEP_SILENCE_S.
+            StalledError: No clock arrived within CLOCK_TIMEOUT_S, or in lockstep LOCKSTEP_CLOCK_TIMEOUT_S.
         """
         if self.clock is not None:
-            self._client.report_done(self.clock.tick)
+            self._client.report_done(self.clock.tick)  # sends nothing for a commanded tick
         clock = next(self._ticks)
         if clock is None:
             raise StalledError(
-                f"no tick of the robot for {self._silence_s:g} s; is its HAL host running?"
+                f"no tick of the robot for {self._clock_timeout_s:g} s; is its HAL host running?"
             )
         self.clock = clock
         self._holds_lease = self._commander.ensure_lease(clock)
@@ -108,11 +112,11 @@ class CommandingClient:
         """Return whether this process holds the lease at this tick."""
         return self._holds_lease
 
-    def send_setpoints(self, points: RequestedSetpoints) -> None:
+    def send_setpoints(self, setpoints: RequestedSetpoints) -> None:
         """Send setpoints in this tick. Nothing is sent while no joint state has arrived.
 
         Args:
-            points: One mode, target and torque limit for each joint.
+            setpoints: One mode, target and torque limit for each joint.
 
         Raises:
             RefusedError: This process does not hold the lease.
@@ -125,8 +129,8 @@ class CommandingClient:
                 f"the right to command is lost: {self._commander.lease_refusal or 'no command came in time'}",
                 code="robot/lease-lost",
             )
-        self._commander.send_command(self.clock, joints, points)
-        self._last_setpoints = points
+        self._commander.send_command(self.clock, joints, setpoints)
+        self._last_setpoints = setpoints
 
     def command_tick(self) -> None:
         """Wait for the next tick, and send the last setpoints. While the robot is not armed, hold the measured pose."""

@@ -89,14 +89,14 @@ class ConnectionSettings:
 def open_zenoh(
     connection: ConnectionSettings,
     connect_timeout_s: float,
-    change: Callable[[zenoh.Config], None] | None = None,
+    edit_config: Callable[[zenoh.Config], None] | None = None,
 ) -> zenoh.Session:
     """Open a session of Zenoh with the settings that SnakeSIM needs.
 
     Args:
         connection: Endpoint, and whether to connect to it or listen on it.
         connect_timeout_s: Time in s within which a client must be connected.
-        change: Function that edits the settings of this session just before it is opened. None to keep them.
+        edit_config: Function that edits the settings of this session just before it is opened. None to keep them.
 
     Raises:
         NotConnectedError: The endpoint does not answer, or cannot be listened on.
@@ -106,8 +106,8 @@ def open_zenoh(
         require_loopback_up(connection.endpoint)
     zenoh.init_log_from_env_or("off")
     config = _build_config(connection, connect_timeout_s)
-    if change is not None:
-        change(config)
+    if edit_config is not None:
+        edit_config(config)
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

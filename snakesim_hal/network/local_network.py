@@ -313,7 +313,7 @@ class LocalSession(Session):
             handler(IncomingQuery(key, encode(request), format_encoding(type(request)), query))
         return query
 
-    def _answers(
+    def _iterate_answers(
         self, pattern: str, request: Message, timeout_s: float
     ) -> Iterator[tuple[str, Answer | WireError]]:
         decoder = MessageDecoder(Answer)

@@ -279,7 +279,7 @@ class Session:
             NotConnectedError: No answer arrives in time, or it cannot be decoded.
         """
         decoding_error: WireError | None = None
-        for _, answer in self._answers(key, request, timeout_s):
+        for _, answer in self._iterate_answers(key, request, timeout_s):
             if isinstance(answer, WireError):
                 decoding_error = answer
             elif host is None or answer.host == host:
@@ -298,10 +298,10 @@ class Session:
         Yields:
             The key and the answer of each host as it arrives, until all have answered or the time is up.
         """
-        answers = self._answers(pattern, request, timeout_s)
+        answers = self._iterate_answers(pattern, request, timeout_s)
         return ((key, answer) for key, answer in answers if isinstance(answer, Answer))
 
-    def _answers(
+    def _iterate_answers(
         self, pattern: str, request: Message, timeout_s: float
     ) -> Iterator[tuple[str, Answer | WireError]]:
         """Send a request to all hosts whose keys match a pattern, and yield their answers as they arrive.

@@ -65,10 +65,15 @@ class PowerStages:
         self._derated_limit = self.full_torque_nm.copy()
         self._limit = self._setpoint_limit.copy()
 
-        # Buffers, so that a step allocates nothing. `find_derated` reads the demand of the last step.
-        self._demand = np.zeros(count)
-        self._max_torque_buffer = np.zeros(count)
-        self._scratch_buffer = np.zeros(count)
+        # Intermediate results of a step, so that it allocates no memory, (n_joints,). `find_derated` reads the demand.
+        self._demand = np.zeros(count)  # N·m
+        self._damping_torque = np.zeros(count)  # N·m, kd (velocity - speed)
+        self._torque_lost_by_speed = np.zeros(count)  # N·m, slope * speed
+        self._max_demand = np.zeros(count)  # N·m, at this speed
+        self._min_demand = np.zeros(count)  # N·m, at this speed
+        self._max_torque = np.zeros(count)  # N·m
+        self._min_torque = np.zeros(count)  # N·m
+        self._torque_squared = np.zeros(count)  # N²·m²
 
     def _compute_roll_off_slopes(self, robot: RobotFile, step_s: float) -> Floats:
         """Return how much torque each motor loses per rad/s near its speed limit, (n_joints,), N·m·s/rad."""
@@ -144,45 +149,55 @@ class PowerStages:
         The result is always the same array, and no step allocates one.
 
         Args:
-            angle_rad: joint angles, (n_joints,).
-            speed_rad_s: joint velocities, (n_joints,).
+            angle_rad: Joint angles, (n_joints,).
+            speed_rad_s: Joint velocities, (n_joints,).
         """
         demand = self._demand
-        max_torque = self._max_torque_buffer
-        scratch = self._scratch_buffer
         torque = self.torque_nm
 
         # demand = kp (position - angle) + kd (velocity - speed) + feedforward
         np.subtract(self._position, angle_rad, out=demand)
         demand *= self._kp
-        np.subtract(self._velocity, speed_rad_s, out=scratch)
-        scratch *= self._kd
-        demand += scratch
+        damping_torque = self._damping_torque
+        np.subtract(self._velocity, speed_rad_s, out=damping_torque)
+        damping_torque *= self._kd
+        demand += damping_torque
         demand += self._feedforward
 
-        # -(stall torque + slope * speed) <= demand <= stall torque - slope * speed
-        np.multiply(self._slope, speed_rad_s, out=scratch)
-        np.subtract(self._stall_torque, scratch, out=max_torque)
-        np.minimum(demand, max_torque, out=demand)
-        scratch += self._stall_torque
-        np.negative(scratch, out=scratch)
-        np.maximum(demand, scratch, out=demand)
+        # demand <= stall torque - slope * speed
+        torque_lost_by_speed = self._torque_lost_by_speed
+        np.multiply(self._slope, speed_rad_s, out=torque_lost_by_speed)
+        max_demand = self._max_demand
+        np.subtract(self._stall_torque, torque_lost_by_speed, out=max_demand)
+        np.minimum(demand, max_demand, out=demand)
 
-        # A lowered limit takes effect no faster than the motor can follow.
+        # demand >= -(stall torque + slope * speed)
+        min_demand = self._min_demand
+        np.add(torque_lost_by_speed, self._stall_torque, out=min_demand)
+        np.negative(min_demand, out=min_demand)
+        np.maximum(demand, min_demand, out=demand)
+
+        # A lowered limit takes effect no faster than the motor can follow: max torque >= decay * |torque|
+        max_torque = self._max_torque
         np.abs(torque, out=max_torque)
         max_torque *= self._lag_decay
         np.maximum(max_torque, self._limit, out=max_torque)
 
-        # torque = demand + decay * (torque - demand), within the limit
+        # torque = demand + decay * (torque - demand)
         torque -= demand
         torque *= self._lag_decay
         torque += demand
-        np.minimum(torque, max_torque, out=torque)
-        np.negative(max_torque, out=max_torque)
-        np.maximum(torque, max_torque, out=torque)
 
-        np.multiply(torque, torque, out=scratch)
-        self.torque_squared_sum += scratch
+        # -max torque <= torque <= max torque
+        np.minimum(torque, max_torque, out=torque)
+        min_torque = self._min_torque
+        np.negative(max_torque, out=min_torque)
+        np.maximum(torque, min_torque, out=torque)
+
+        # For the heat of the windings.
+        torque_squared = self._torque_squared
+        np.multiply(torque, torque, out=torque_squared)
+        self.torque_squared_sum += torque_squared
         self._step_count += 1
         return torque
 

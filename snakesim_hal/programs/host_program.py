@@ -125,7 +125,9 @@ def _run_until_end(
         )
         call_on_stop_signals(host.request_stop)
         tune_garbage_collector()
-        memory_fd = arguments.memory and os.open(arguments.memory, os.O_WRONLY)
+        memory_fd: int | None = None
+        if arguments.memory:
+            memory_fd = os.open(arguments.memory, os.O_WRONLY)
         with HostRecordWriter(
             host.black_box,
             host.description,
@@ -186,11 +188,12 @@ def _create_host(
         )
     folder = get_robot_state_folder(description.robot, description.backend, description.hardware)
     backend_with_faults, faults = create_host_faults(config, backend, session)
+    max_ticks: int | None = None
+    if arguments.end_after_duration:
+        max_ticks = round(config.duration_s * config.rate_hz)
     options = HostOptions(
         # The end of the run.
-        max_ticks=round(config.duration_s * config.rate_hz)
-        if arguments.end_after_duration
-        else None,
+        max_ticks=max_ticks,
         end_after_fault_s=arguments.end_after_fault,
         stays_after_run=arguments.end_after_fault is None,
         # What connects the host with its surroundings.

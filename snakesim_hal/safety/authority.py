@@ -170,7 +170,7 @@ class CommandAuthority:
     @property
     def derated_joints(self) -> dict[str, float]:
         """Fraction of the torque limit that derating leaves, by the name of each derated joint."""
-        return self._health_monitor.derated_joints()
+        return self._health_monitor.find_derated_joints()
 
     @property
     def faults(self) -> list[Fault]:

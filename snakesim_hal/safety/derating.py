@@ -22,7 +22,8 @@ UNDERVOLTAGE_DELAY_NS = 50_000_000  # shorter dips, as when motors start, stop n
 # Values of an older report are unknown; modules report about twice a second.
 REPORT_TIMEOUT_NS = 3_000_000_000
 MAX_CAUSE_LENGTH = 400  # characters; a fault's cause has at most 500
-MIN_VOLTAGE_FIELD = "`min_voltage_v` under [limits] in the robot file"
+# Ends messages about a low supply.
+WHERE_TO_SET_MIN_VOLTAGE = "`min_voltage_v` under [limits] in the robot file"
 
 
 class HealthMonitor:
@@ -108,14 +109,14 @@ class HealthMonitor:
         problems: list[str] = []
         low: list[_LastReport] = []
         for health in self._module_healths:
-            if health.is_known(now_ns) and health.undervoltage_since_ns is not None:
+            if health.has_recent_report(now_ns) and health.undervoltage_since_ns is not None:
                 low.append(health)
         if low:
             weakest = min(low, key=lambda health: health.voltage_v)
             problems.append(
                 f"the supply is at {weakest.voltage_v:.1f} V at {weakest.joint.name}, which needs "
                 f"{weakest.joint.min_voltage_v:g} V{_format_others(len(low) - 1)}: check the supply, or set "
-                f"{MIN_VOLTAGE_FIELD} of {self._robot!r}"
+                f"{WHERE_TO_SET_MIN_VOLTAGE} of {self._robot!r}"
             )
         if self._awaits_reports and self._has_power_sensor:
             missing = self._find_unreported_joints()
@@ -125,7 +126,7 @@ class HealthMonitor:
                 )
         return problems
 
-    def derated_joints(self) -> dict[str, float]:
+    def find_derated_joints(self) -> dict[str, float]:
         """Return the fraction of the torque limit that derating leaves, by the name of each derated joint."""
         fractions = zip(self._module_healths, self.torque_fraction.tolist(), strict=True)
         return {health.joint.name: fraction for health, fraction in fractions if fraction < 1.0}
@@ -197,7 +198,7 @@ class _LastReport:
         elif self.undervoltage_since_ns is None:
             self.undervoltage_since_ns = now_ns
 
-    def is_known(self, now_ns: int) -> bool:
+    def has_recent_report(self, now_ns: int) -> bool:
         """Return whether the last report is recent."""
         return self.last_report_ns is not None and now_ns - self.last_report_ns <= REPORT_TIMEOUT_NS
 
@@ -223,7 +224,7 @@ class _LastReport:
 
     def compute_torque_fraction(self, now_ns: int) -> float:
         """Return the fraction of the torque limit that is left after derating, from 0 to 1."""
-        if not self.is_known(now_ns):
+        if not self.has_recent_report(now_ns):
             return 1.0
         return HeatLimits(
             self.joint.derate_from_c, self.joint.stop_at_c
@@ -241,27 +242,33 @@ class _LastReport:
         joint = self.joint
         faults: list[Fault] = []
         if self.is_overheated:
-            limits = f"the limit is {joint.stop_at_c:g} °C, and it must cool below {joint.derate_from_c:g} °C"
             cause = (
-                f"the winding of {joint.name} is at {self.winding_temperature_c:.1f} °C; {limits}"
+                f"the winding of {joint.name} is at {self.winding_temperature_c:.1f} °C; "
+                f"the limit is {joint.stop_at_c:g} °C, and it must cool below {joint.derate_from_c:g} °C"
             )
             faults.append(
                 Fault(tick=tick, what="overheated", cause=cause, joint=joint.name, scope="joint")
             )
-        if not self.is_known(now_ns):
+        if not self.has_recent_report(now_ns):
             return faults
         if self.has_leak:
             cause = f"{joint.name} reports water inside"
             faults.append(
                 Fault(tick=tick, what="leak", cause=cause, joint=joint.name, scope="robot")
             )
-        if (
-            self.undervoltage_since_ns is not None
-            and now_ns - self.undervoltage_since_ns >= UNDERVOLTAGE_DELAY_NS
-        ):
-            requirement = f"it needs {joint.min_voltage_v:g} V: {MIN_VOLTAGE_FIELD}"
-            cause = f"the supply of {joint.name} is at {self.voltage_v:.1f} V, {requirement}"
+        if self._is_undervoltage_confirmed(now_ns):
+            cause = (
+                f"the supply of {joint.name} is at {self.voltage_v:.1f} V, "
+                f"it needs {joint.min_voltage_v:g} V: {WHERE_TO_SET_MIN_VOLTAGE}"
+            )
             faults.append(
                 Fault(tick=tick, what="undervoltage", cause=cause, joint=joint.name, scope="robot")
             )
         return faults
+
+    def _is_undervoltage_confirmed(self, now_ns: int) -> bool:
+        """Return whether the voltage has been too low for at least UNDERVOLTAGE_DELAY_NS."""
+        return (
+            self.undervoltage_since_ns is not None
+            and now_ns - self.undervoltage_since_ns >= UNDERVOLTAGE_DELAY_NS
+        )

@@ -69,9 +69,10 @@ def _bring_up_with_extended_timeouts(
         )
     for servo in servos:
         _write_registers(servo)
+    # Try a fast sync read, which older firmware does not support. Use it from now on if every servo has answered.
     ids = [servo.id for servo in servos]
-    # Older firmware is not.
-    port.fast = len(port.read_all(ids, registers.PRESENT, registers.present_form.size)) == len(ids)
+    statuses_by_id = port.read_all(ids, registers.PRESENT, registers.present_form.size)
+    port.fast = len(statuses_by_id) == len(ids)
     return [
         (
             _read_measurements(servo),

@@ -402,6 +402,7 @@ class EmulatedDynamixel(ServoEmulator):
             i: Index of the servo.
         """
         servo = self.servos[i]
+        # The goal current is the setpoint in current mode, and the torque limit in current-based position mode.
         current = servo.read_register("h", registers.GOALS)
         limit_nm = abs(current) * servo.torque_unit_nm
         joint = self.body.joints[i]

@@ -248,7 +248,13 @@ class EmulatedFeetech(ServoEmulator):
         self._drive_motor(i)
 
     def _drive_motor(self, i: int) -> None:
-        """Drive the body to the goal, as the registers specify."""
+        """Apply goal, limits and gains in the control table of a servo to its motor.
+
+        The motor is passive unless the torque is on in position mode.
+
+        Args:
+            i: Index of the servo.
+        """
         servo = self.servos[i]
         joint = self.body.joints[i]
         speed_rad_s = joint.limits.speed_rad_s * joint.drive.gear  # without a load
@@ -258,17 +264,16 @@ class EmulatedFeetech(ServoEmulator):
         ):
             self.body.drive_motor(i, JointMode.PASSIVE, 0.0, 0.0, 0.0, 0.0, speed_rad_s)
             return
+        # The goal, limited to the servo's own travel, in counts after the homing offset.
         offset = decode_sign_magnitude(servo.read_word(registers.HOMING_OFFSET), OFFSET_SIGN_BIT)
-        goal = decode_sign_magnitude(servo.read_word(registers.GOALS), SIGN_BIT)
-        goal = min(
-            max(goal, servo.read_word(registers.MIN_POSITION)),
-            servo.read_word(registers.MAX_POSITION),
-        )
-        limit_nm = (
-            min(servo.read_word(registers.TORQUE_LIMIT), registers.PER_MILLE)
-            / registers.PER_MILLE
-            * servo.stall_torque_nm
-        )
+        requested_goal = decode_sign_magnitude(servo.read_word(registers.GOALS), SIGN_BIT)
+        min_position = servo.read_word(registers.MIN_POSITION)
+        max_position = servo.read_word(registers.MAX_POSITION)
+        goal = min(max(requested_goal, min_position), max_position)
+        # The torque limit, in thousandths of the stall torque.
+        limit_per_mille = min(servo.read_word(registers.TORQUE_LIMIT), registers.PER_MILLE)
+        limit_nm = limit_per_mille / registers.PER_MILLE * servo.stall_torque_nm
+        # The gains of the joint, at the shaft of the servo.
         stiffness = joint.motor.stiffness_nm_per_rad / joint.drive.gear**2
         damping = joint.motor.damping_nm_s_per_rad / joint.drive.gear**2
         goal_rad = registers.to_angle_rad(goal + offset)

@@ -146,12 +146,12 @@ class BatchedSimulations(SimulationBatch):
         assert self._batch is not None, "no robot has been loaded"
         return self._batch
 
-    def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
+    def step(self, rows: Sequence[int], tick_by_row: Sequence[int]) -> dict[int, str]:
         """Step the physics of some robots through one control period, and restore the states that diverge.
 
         Args:
-            robots: Rows of the robots.
-            ticks: For every row, number of the control cycle that ends with this step, for messages.
+            rows: Rows of the robots to step. The other rows are left alone.
+            tick_by_row: Number of the control cycle that ends with this step, of every row of the batch, for messages.
 
         Returns:
             The reason of the divergence by row, for each simulation that has diverged. The state of such a simulation
@@ -159,22 +159,26 @@ class BatchedSimulations(SimulationBatch):
         """
         batch = self._require_batch()
         divergence_reasons: dict[int, str] = {}
-        row_ids = None if len(robots) == self._count else np.array(robots)  # None means all rows
-        rows = slice(None) if row_ids is None else row_ids
+        if len(rows) == self._count:
+            batch_rows = None  # all rows, in the batch's own notation
+            stepped_rows = slice(None)  # the same, as an index of an array
+        else:
+            batch_rows = np.array(rows)
+            stepped_rows = batch_rows
         try:
-            batch.step(row_ids, nstep=self._steps)
+            batch.step(batch_rows, nstep=self._steps)
         except SimulationError as error:
-            for robot in error.ids.tolist():
-                divergence_reasons[robot] = (
-                    f"MuJoCo cannot go on at tick {ticks[robot]}: {batch.error(robot)}"
+            for row in error.ids.tolist():
+                divergence_reasons[row] = (
+                    f"MuJoCo cannot go on at tick {tick_by_row[row]}: {batch.error(row)}"
                 )
-        self.torque_nm[rows] = self._all_torques_nm[rows, : self._joints]
-        self._is_at_start[rows] = False
-        is_good = self._find_good_states()
+        self.torque_nm[stepped_rows] = self._all_torques_nm[stepped_rows, : self._joints]
+        self._is_at_start[stepped_rows] = False
+        is_good = self._find_good_states()  # (robots,)
         if not is_good.all():
-            for robot in robots:
-                if not is_good[robot] and robot not in divergence_reasons:
-                    divergence_reasons[robot] = self._restore_diverged_state(robot, ticks[robot])
+            for row in rows:
+                if not is_good[row] and row not in divergence_reasons:
+                    divergence_reasons[row] = self._restore_diverged_state(row, tick_by_row[row])
         self._store_states()
         return divergence_reasons
 

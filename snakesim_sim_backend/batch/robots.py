@@ -98,11 +98,12 @@ class SimulatedRobots:
         self._read_motor_range(robot_index)
         self._torque_limit_nm[robot_index] = [joint.limits.torque_nm for joint in joint_table]
         self._last_limit_nm = None
-        only_this_robot = np.zeros(len(self._supplies), dtype=np.bool_)
-        only_this_robot[robot_index] = True
-        ticks = np.zeros(len(self._supplies), dtype=np.int64)
+        robot_count = len(self._supplies)
+        is_loaded_robot = np.zeros(robot_count, dtype=np.bool_)
+        is_loaded_robot[robot_index] = True
+        ticks = np.zeros(robot_count, dtype=np.int64)  # an episode starts at tick 0
         self.sensors.sample(
-            ticks, only_this_robot, self._simulations, self._heat.winding_c, is_reset=True
+            ticks, is_loaded_robot, self._simulations, self._heat.winding_c, is_reset=True
         )
         return True
 
@@ -116,7 +117,7 @@ class SimulatedRobots:
             robots: (robots,) mask of the robots that get new targets.
         """
         inputs = self._simulations.motor_inputs[:, INPUT_INDEX_BY_MODE[mode] :: INPUTS_PER_MOTOR]
-        if robots is self.all_robots:
+        if robots is self.all_robots:  # the usual case, which is faster without a mask
             inputs[:] = target
         else:
             np.copyto(inputs, target, where=robots[:, None])

@@ -98,7 +98,7 @@ class DelayedValues:
                 return
             values, due = self._delay_queue.popleft()
         self.is_new = due
-        if due is self._all_robots:
+        if due is self._all_robots:  # the usual case, which is faster without a mask
             self.is_known = due
             self.values = values
         else:

@@ -84,12 +84,12 @@ class SimulationBatch(ABC):
         """
 
     @abstractmethod
-    def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
+    def step(self, rows: Sequence[int], tick_by_row: Sequence[int]) -> dict[int, str]:
         """Step simulations through one control period.
 
         Args:
-            robots: Rows of the robots.
-            ticks: For every row, number of the control cycle, for messages.
+            rows: Rows of the robots to step. The other rows are left alone.
+            tick_by_row: Number of the control cycle of every row of the batch, for messages.
 
         Returns:
             The reason of the divergence by row, for each simulation that has diverged.
@@ -120,9 +120,15 @@ class LoopedSimulations(SimulationBatch):
     """
 
     def __init__(self, robot_count: int, joint_count: int) -> None:
-        self._joints = joint_count
-        self._placed: list[PlacedRobot | None] = [None] * robot_count
-        self._watches: list[DivergenceWatch | None] = [None] * robot_count
+        """Allocate the arrays. `load` has to be called for a row before it is stepped.
+
+        Args:
+            robot_count: Number of robots, which is the number of rows.
+            joint_count: Number of joints of each robot.
+        """
+        self._joint_count = joint_count
+        self._placed_robots: list[PlacedRobot | None] = [None] * robot_count
+        self._divergence_watches: list[DivergenceWatch | None] = [None] * robot_count
         self.motors = [NO_MOTORS] * robot_count
         self.base_pose = np.zeros((robot_count, FREE_QPOS))
         self.base_velocity = np.zeros((robot_count, FREE_DOFS))
@@ -135,15 +141,17 @@ class LoopedSimulations(SimulationBatch):
     def load(self, robot_index: int, placed: PlacedRobot) -> bool:
         data = placed.data
         if self.motor_state.shape[1] != len(data.act):
-            if any(other is not None for i, other in enumerate(self._placed) if i != robot_index):
+            if any(
+                other is not None for i, other in enumerate(self._placed_robots) if i != robot_index
+            ):
                 return False
-            self.motor_state = np.zeros((len(self._placed), len(data.act)))
-        self._placed[robot_index] = placed
+            self.motor_state = np.zeros((len(self._placed_robots), len(data.act)))
+        self._placed_robots[robot_index] = placed
         self.motors[robot_index] = placed.motors
-        self._watches[robot_index] = DivergenceWatch(
+        self._divergence_watches[robot_index] = DivergenceWatch(
             placed.sim.model, data, placed.physics, placed.sim.steps_per_tick
         )
-        if len(self._placed) == 1:
+        if len(self._placed_robots) == 1:
             self._bind_views(data)
             return True
         placed.motors.bind_state(MotorArrays(self, robot_index, data.history))
@@ -151,38 +159,38 @@ class LoopedSimulations(SimulationBatch):
         self._copy_state(data, robot_index)
         return True
 
-    def step(self, robots: Sequence[int], ticks: Sequence[int]) -> dict[int, str]:
+    def step(self, rows: Sequence[int], tick_by_row: Sequence[int]) -> dict[int, str]:
         """Step the physics of some robots through one control period, one after the other.
 
         Args:
-            robots: Rows of the robots.
-            ticks: For every row, number of the control cycle that ends with this step, for messages.
+            rows: Rows of the robots to step. The other rows are left alone.
+            tick_by_row: Number of the control cycle that ends with this step, of every row of the batch, for messages.
 
         Returns:
             The reason of the divergence by row, for each simulation that has diverged. The state of such a simulation
             is its last good one.
         """
         divergence_reasons: dict[int, str] = {}
-        # The arrays of a single robot are views of MuJoCo's: nothing is copied.
-        is_view = len(self._placed) == 1
-        for robot in robots:
-            tick = ticks[robot]
-            placed = self._placed[robot]
-            watch = self._watches[robot]
+        # The arrays of a single robot are views of MuJoCo's, so that nothing has to be copied to or from its state.
+        must_copy = len(self._placed_robots) > 1
+        for row in rows:
+            tick = tick_by_row[row]
+            placed = self._placed_robots[row]
+            watch = self._divergence_watches[row]
             assert placed is not None and watch is not None
-            if not is_view:
-                placed.data.ctrl[: INPUTS_PER_MOTOR * self._joints] = self.motor_inputs[robot]
-                placed.data.act[:] = self.motor_state[robot]
+            if must_copy:
+                placed.data.ctrl[: INPUTS_PER_MOTOR * self._joint_count] = self.motor_inputs[row]
+                placed.data.act[:] = self.motor_state[row]
             try:
                 placed.physics.step(placed.sim.steps_per_tick)
                 watch.check(tick)
             except mujoco.FatalError as error:
-                divergence_reasons[robot] = f"MuJoCo cannot go on at tick {tick}: {error}"
+                divergence_reasons[row] = f"MuJoCo cannot go on at tick {tick}: {error}"
             except BackendError as error:
-                divergence_reasons[robot] = str(error)
-            if not is_view:
-                self.motor_state[robot] = placed.data.act
-                self._copy_state(placed.data, robot)
+                divergence_reasons[row] = str(error)
+            if must_copy:
+                self.motor_state[row] = placed.data.act
+                self._copy_state(placed.data, row)
         return divergence_reasons
 
     def find_obstacle_contacts(self, robots: Mask) -> ContactArrays:
@@ -190,7 +198,7 @@ class LoopedSimulations(SimulationBatch):
         links: list[int] = []
         forces_w: list[list[float]] = []
         rotations: list[Floats] = []
-        for robot, placed in enumerate(self._placed):
+        for robot, placed in enumerate(self._placed_robots):
             if placed is None or not robots[robot]:
                 continue
             for number, *force_w in placed.read_obstacle_contacts():
@@ -207,7 +215,7 @@ class LoopedSimulations(SimulationBatch):
 
     def _copy_state(self, data: mujoco.MjData, robot_index: int) -> None:
         """Copy what a step has changed into the row of a robot."""
-        joints = self._joints
+        joints = self._joint_count
         self.base_pose[robot_index] = data.qpos[:FREE_QPOS]
         self.base_velocity[robot_index] = data.qvel[:FREE_DOFS]
         self.angle_rad[robot_index] = data.qpos[FREE_QPOS : FREE_QPOS + joints]
@@ -216,7 +224,7 @@ class LoopedSimulations(SimulationBatch):
 
     def _bind_views(self, data: mujoco.MjData) -> None:
         """Make the arrays of a single robot views of MuJoCo's."""
-        joints = self._joints
+        joints = self._joint_count
         self.base_pose = data.qpos[None, :FREE_QPOS]
         self.base_velocity = data.qvel[None, :FREE_DOFS]
         self.angle_rad = data.qpos[None, FREE_QPOS : FREE_QPOS + joints]

@@ -259,9 +259,10 @@ class ContactFriction:
             )
             if is_pressed and (has_friction or self.min_friction > 0.0):
                 friction_contacts.append(_FrictionContact(i, link_geom, other_geom, sign))
-        capacity = (len(self._memory) - 1) // VALUES_PER_CONTACT
-        del friction_contacts[capacity:]
-        return friction_contacts
+        capacity = (
+            len(self._memory) - 1
+        ) // VALUES_PER_CONTACT  # the first value is the number of contacts
+        return friction_contacts[:capacity]
 
     def _write_contacts(self, friction_contacts: list[_FrictionContact]) -> None:
         """Write contacts into `userdata`. A contact that existed in the last step keeps the stretch of its spring.

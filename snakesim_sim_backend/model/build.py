@@ -153,6 +153,7 @@ def assemble_model_blueprint(
         motors: Whether the joints have motors.
         laws: Version of the laws that computes ground and friction.
         keeps_touches: Whether the laws write the forces between links and obstacles into MuJoCo's state.
+        measures_force: Whether the simulation has a contact sensor, which `PhysicsStepper` reads.
 
     Returns:
         The model before it is compiled, with the number of physics steps in a control period and the obstacles that
@@ -161,8 +162,11 @@ def assemble_model_blueprint(
     Raises:
         ConfigError: The settings do not match the robot or the scene.
     """
-    steps_per_tick = int(np.ceil(config.period_ns * 1e-9 / settings.timestep_s - 1e-9))
-    step_s = config.period_ns * 1e-9 / steps_per_tick
+    # The longest step that is at most `timestep_s`, and of which a control period is a multiple. A quotient of floats
+    # may exceed its whole number by less than 1e-9.
+    period_s = config.period_ns * 1e-9
+    steps_per_tick = int(np.ceil(period_s / settings.timestep_s - 1e-9))
+    step_s = period_s / steps_per_tick
     _check_contact_time(settings, step_s)
     placed = place_obstacles(config)
     yielding = [item for item in placed if item.can_move]

@@ -136,6 +136,10 @@ def _make_obstacle_shape(
         geom_type = mujoco.mjtGeom.mjGEOM_CYLINDER
         size = [obstacle.radius_m]
 
+    # MuJoCo has three sizes of every geom: those across the axis, half the height, and unused ones.
+    size.append((top - bottom) / 2)
+    size += [0.0] * (3 - len(size))
+
     # A leaning obstacle is tilted about the point of its axis at height 0.
     lean_rad = placed.lean_rad
     direction_rad = placed.lean_towards_rad
@@ -143,7 +147,7 @@ def _make_obstacle_shape(
     shift = middle * math.sin(lean_rad)
     return GeomArguments(
         type=geom_type,
-        size=[*size, (top - bottom) / 2, 0.0][:3],  # MuJoCo has three sizes of every geom
+        size=size,
         pos=[
             x + shift * math.cos(direction_rad),
             y + shift * math.sin(direction_rad),

@@ -169,16 +169,16 @@ class EnablesRestartedDrives(AnswersForSilentDrives):
         for i in command.enabled_drives:
             self.emulator.handle_message(i, "enable")
 
-    def findings(self) -> list[FaultFinding]:
-        return [finding for finding in super().findings() if finding.what != "drive_not_armed"]
+    def list_findings(self) -> list[FaultFinding]:
+        return [finding for finding in super().list_findings() if finding.what != "drive_not_armed"]
 
 
 @register_driver_mutant(DUPLICATE)
 class TakesTheLastAnswer(MinimalDrives):
     """A second drive with one id goes unnoticed."""
 
-    def findings(self) -> list[FaultFinding]:
-        return [finding for finding in super().findings() if finding.what != "duplicate_node"]
+    def list_findings(self) -> list[FaultFinding]:
+        return [finding for finding in super().list_findings() if finding.what != "duplicate_node"]
 
 
 @register_driver_mutant(DUPLICATE)
@@ -191,8 +191,8 @@ class ForgetsTheSecondDrive(MinimalDrives):
         super().reset_faults(joints)
         self.is_forgotten = True
 
-    def findings(self) -> list[FaultFinding]:
-        findings = super().findings()
+    def list_findings(self) -> list[FaultFinding]:
+        findings = super().list_findings()
         return [
             finding
             for finding in findings

@@ -45,7 +45,7 @@ class HomingSettings(DriveSettings, frozen=True, kw_only=True):
 class HomingInputs(NamedTuple):
     """Inputs of a drive, which it reports besides its motion."""
 
-    homed: bool
+    is_homed: bool
     homing_failed: bool
     safe_torque_off: bool
     at_lower: bool
@@ -56,18 +56,23 @@ class HomingInputs(NamedTuple):
 class HomingState:
     """State of a drive that a minimal drive does not have: homing and holding brake."""
 
-    homed: bool = False
+    is_homed: bool = False
     homing_until_us: float | None = None  # None: it does not home
-    brake_open: bool = False
+    is_brake_open: bool = False
     brake_closed_us: float = -1e9  # time of the last command to close
 
 
 class HomingEmulator(MinimalEmulator):
-    """The emulated drives. `dropped` has the drives whose torque went off while their brake did not hold yet."""
+    """The emulated drives.
+
+    Attributes:
+        homing_states: Homing and brake of each drive, tail to head.
+        dropped_drives: Indices of the drives whose torque went off while their brake did not hold yet.
+    """
 
     def __init__(self, *parts: Any) -> None:
-        self.extras: list[HomingState] = []
-        self.dropped: list[int] = []
+        self.homing_states: list[HomingState] = []
+        self.dropped_drives: list[int] = []
         self.homing_us = 0.0  # set by the driver type
         # Set by tests.
         self.without_index: set[int] = set()
@@ -75,15 +80,15 @@ class HomingEmulator(MinimalEmulator):
         self.at_lower: set[int] = set()
         self.at_upper: set[int] = set()
         super().__init__(*parts)
-        self.extras = [HomingState() for _ in self.drives]
+        self.homing_states = [HomingState() for _ in self.drives]
 
     def request_inputs(self, i: int) -> HomingInputs | None:
         """Return the inputs of a drive; None if it is silent."""
         if self.is_cut or self.body.is_silent(i):
             return None
-        failed = i in self.without_index and self.extras[i].homing_until_us is None
+        failed = i in self.without_index and self.homing_states[i].homing_until_us is None
         return HomingInputs(
-            self.extras[i].homed,
+            self.homing_states[i].is_homed,
             failed,
             i in self.torque_off,
             i in self.at_lower,
@@ -92,11 +97,11 @@ class HomingEmulator(MinimalEmulator):
 
     def request_reports(self, i: int) -> list[Report]:
         reports = super().request_reports(i)
-        if self.extras[i].homed:
+        if self.homing_states[i].is_homed:
             return reports
         return [report._replace(angle_rad=0.0) for report in reports]
 
-    def handle_extra(
+    def handle_extra_message(
         self, i: int, message: Literal["home", "stop_homing", "open_brake", "close_brake"]
     ) -> None:
         """Carry out a message about homing or the brake, which a minimal drive does not have.
@@ -107,7 +112,7 @@ class HomingEmulator(MinimalEmulator):
         """
         if self.is_cut or self.body.is_booting(i):
             return
-        extras = self.extras[i]
+        extras = self.homing_states[i]
         match message:
             case "home":
                 extras.homing_until_us = self.body.now_us + self.homing_us
@@ -116,31 +121,31 @@ class HomingEmulator(MinimalEmulator):
                 extras.homing_until_us = None
                 self._drive_motor(i)
             case "open_brake":
-                extras.brake_open = True
+                extras.is_brake_open = True
             case "close_brake":
-                if extras.brake_open:
+                if extras.is_brake_open:
                     extras.brake_closed_us = self.body.now_us
-                extras.brake_open = False
+                extras.is_brake_open = False
 
     def on_step(self, now_us: float) -> None:
         """End the homing of drives that have reached their index, and keep drives off by their input."""
         super().on_step(now_us)
-        for i, extras in enumerate(self.extras):
+        for i, extras in enumerate(self.homing_states):
             if extras.homing_until_us is not None and now_us > extras.homing_until_us:
                 extras.homing_until_us = None
-                extras.homed = i not in self.without_index
+                extras.is_homed = i not in self.without_index
                 self._drive_motor(i)
             if i in self.torque_off and self.drives[i].enabled:
                 self._latch_error(i, "")
 
     def restart(self, i: int) -> None:
         super().restart(i)
-        self.extras[i] = HomingState()
+        self.homing_states[i] = HomingState()
 
     def _drive_motor(self, i: int) -> None:
         if not self.drives[i].enabled:
             self._note_drop(i)
-        if self.extras and self.extras[i].homing_until_us is not None:
+        if self.homing_states and self.homing_states[i].homing_until_us is not None:
             joint = self.body.joints[i]
             damping = joint.motor.velocity_gain_nm_s_per_rad / joint.drive.gear**2
             limit_nm = joint.limits.torque_nm / joint.drive.gear
@@ -151,12 +156,12 @@ class HomingEmulator(MinimalEmulator):
         super()._drive_motor(i)
 
     def _note_drop(self, i: int) -> None:
-        if not self.extras:
+        if not self.homing_states:
             return
-        extras = self.extras[i]
+        extras = self.homing_states[i]
         is_closing = self.body.now_us - extras.brake_closed_us < ENGAGE_S * 1e6
-        if extras.brake_open or is_closing:
-            self.dropped.append(i)
+        if extras.is_brake_open or is_closing:
+            self.dropped_drives.append(i)
 
 
 class HomingDrives(MinimalDrives):
@@ -174,33 +179,45 @@ class HomingDrives(MinimalDrives):
         *,
         settings: HomingSettings,
     ) -> None:
+        """Create the driver of the drives on one bus. Nothing is sent yet.
+
+        Args:
+            emulator: The emulated drives, which stand in for a bus.
+            joints: Joints of the drives, tail to head.
+            readings: Object that stores the values that the drives report.
+            clock_ns: Function that returns the driver's time in ns.
+            period_ns: Control period in ns.
+            settings: Settings of the driver type: whether and how long the drives home.
+        """
         super().__init__(emulator, joints, readings, clock_ns, period_ns)
+        # The inputs that each drive reported last, tail to head; None for a drive that is silent.
         self.inputs: list[HomingInputs | None] = [None] * len(joints)
         self.switches = LimitSwitches(self.labels)
         self.brakes = HoldingBrakes(
             len(joints), release_s=RELEASE_S, engage_s=ENGAGE_S, clock_ns=clock_ns
         )
-        homing = StartUpStep(
+        homing_step = StartUpStep(
             "homing",
             timeout_s=settings.homing_s + HOMING_MARGIN_S,
-            start=lambda i: emulator.handle_extra(i, "home"),
+            start=lambda i: emulator.handle_extra_message(i, "home"),
             is_done=self.is_homed,
-            abort=lambda i: emulator.handle_extra(i, "stop_homing"),
+            abort=lambda i: emulator.handle_extra_message(i, "stop_homing"),
             moves_joint=True,
         )
         self.homing = StartUp(
-            self.labels, readings, clock_ns, steps=[homing], may_move=settings.home_at_start
+            self.labels, readings, clock_ns, steps=[homing_step], may_move=settings.home_at_start
         )
+        # The driver kit runs what `start_up` names. Its type allows None, unlike that of `homing`.
         self.start_up: StartUp | None = self.homing
 
     def is_homed(self, i: int) -> bool:
-        """Return whether a drive knows its position."""
+        """Return whether a drive knows its position. Raises StepFailedError if it has found no index."""
         inputs = self.inputs[i]
         if inputs is None:
             return False
         if inputs.homing_failed:
             raise StepFailedError("no index found")
-        return inputs.homed
+        return inputs.is_homed
 
     def read(self) -> None:
         super().read()
@@ -211,7 +228,7 @@ class HomingDrives(MinimalDrives):
                 continue
             self.switches.record_switches(i, lower=inputs.at_lower, upper=inputs.at_upper)
             self.states.drives[i].safe_torque_off = inputs.safe_torque_off
-            if self.homing.is_ready(i) and not inputs.homed:
+            if self.homing.is_ready(i) and not inputs.is_homed:
                 self.homing.invalidate(i, "position unknown: the drive has restarted")
 
     def send_setpoints(self, command: BusCommand) -> None:
@@ -219,11 +236,13 @@ class HomingDrives(MinimalDrives):
         restricted = self.switches.restrict_command(command, self.readings.angle_rad)
         plan = self.brakes.update_brakes(restricted, enabled, self.readings.angle_rad)
         for i in self.all_drives:
-            self.emulator.handle_extra(i, "open_brake" if i in plan.released else "close_brake")
+            self.emulator.handle_extra_message(
+                i, "open_brake" if i in plan.released else "close_brake"
+            )
         super().send_setpoints(plan.command)
 
-    def findings(self) -> list[FaultFinding]:
-        return [*super().findings(), *self.switches.findings()]
+    def list_findings(self) -> list[FaultFinding]:
+        return [*super().list_findings(), *self.switches.list_findings()]
 
     def reset_faults(self, joints: frozenset[int]) -> None:
         super().reset_faults(joints)

@@ -167,7 +167,7 @@ class EmulatedReplay:
         """Deliver a frame as `ModuleChain` does, if it is for this module."""
         opcode = parse_opcode(frame.id)
         node = parse_node(frame.id)
-        is_for_one = node == self.module.node
+        is_for_one = node == self.module.node_id
         if frame.id > LAST_ID:
             return
         match opcode:

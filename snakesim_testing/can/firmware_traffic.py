@@ -197,23 +197,43 @@ class Traffic:
         self._send(make_sync(self._sync_count, self._now_us))
 
     def _set_sensors(self, broken: str = "", speed_mrad_s: int | None = None) -> None:
+        """Append an event that sets all measurements to random values, in the order of the event `sensors`.
+
+        Args:
+            broken: What is wrong: "sensor", "voltage", "leak", a case of `_choose_winding_tenths_c`, or "several" for
+                any of them. Empty: nothing.
+            speed_mrad_s: Speed of the joint in mrad/s; None for a slow random speed.
+        """
         choose = self._random.choice
+        # The order of the random choices is that of the values, so that a seed gives the same events.
         is_several = broken == "several"
+        has_failed_sensor = broken == "sensor" or (is_several and choose((True, False)))
+        angle = self._random.randrange(-40_000, 40_000)
+        if speed_mrad_s is None:
+            speed_mrad_s = self._random.randrange(-200, 200)
+        torque = self._random.randrange(-40_000, 40_000)
+        is_derated = choose((0, 1))
+        has_low_voltage = broken == "voltage" or is_several
+        voltages_mv = (0, 17_999, 18_000) if has_low_voltage else (18_000, 24_017, 70_000)
+        voltage_mv = choose(voltages_mv)
+        current_ma = self._random.randrange(-40_000, 40_000)
+        winding_tenths_c = self._choose_winding_tenths_c(broken)
+        board_tenths_c = choose((-500, 213, 2152))
+        has_leak = broken == "leak" or (is_several and choose((True, False)))
         values = [
-            int(not (broken == "sensor" or (is_several and choose((True, False))))),
-            self._random.randrange(-40_000, 40_000),  # angle
-            self._random.randrange(-200, 200) if speed_mrad_s is None else speed_mrad_s,
-            self._random.randrange(-40_000, 40_000),  # torque
-            choose((0, 1)),  # derated
-            choose((0, 17_999, 18_000))
-            if broken == "voltage" or is_several
-            else choose((18_000, 24_017, 70_000)),
-            self._random.randrange(-40_000, 40_000),  # current
-            self._choose_winding_tenths_c(broken),
-            choose((-500, 213, 2152)),  # board
-            int(broken == "leak" or (is_several and choose((True, False)))),
+            int(not has_failed_sensor),
+            angle,
+            speed_mrad_s,
+            torque,
+            is_derated,
+            voltage_mv,
+            current_ma,
+            winding_tenths_c,
+            board_tenths_c,
+            int(has_leak),
+            100 * int(has_leak),  # water, in percent
         ]
-        values.append(100 * values[9])  # water, in percent
+        # Contacts of the link and of the tail.
         values += [*self._make_contact(), *self._make_contact()]
         # IMU.
         values += [choose((0, 1)), *(self._random.randrange(-40_000, 40_000) for _ in range(6))]

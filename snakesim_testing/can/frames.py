@@ -54,7 +54,7 @@ def corrupted(frame: CanFrame) -> CanFrame:
 
 def begin(reading: ModuleReports, *, contacts: bool = False, tail: bool = False) -> int:
     """The next Sync goes out; its number."""
-    reading.start_sync(reading.sync + 1, contacts=contacts, tail=tail)
+    reading.start_sync(reading.sync + 1, has_contacts=contacts, has_tail_contact=tail)
     return reading.sync
 
 

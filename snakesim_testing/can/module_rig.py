@@ -100,14 +100,14 @@ def armed(**flash: float) -> ModuleFirmware:
     return module
 
 
-def chain(run: RunConfig | None = None, *, stepped: bool = True, **given: Any) -> ModuleChain:
+def chain(run: RunConfig | None = None, *, is_stepped: bool = True, **given: Any) -> ModuleChain:
     """On the inertia physics model, with the robot's gains in every flash."""
     run = run or config()
     physics_model = given.pop("physics_model", None) or InertiaModel(run, InertiaSettings())
     settings = CanSettings(
         **{k: given.pop(k) for k in list(given) if k in CanSettings.__struct_fields__}
     )
-    made = ModuleChain(run, settings, physics_model, stepped=stepped, **given)
+    made = ModuleChain(run, settings, physics_model, is_stepped=is_stepped, **given)
     motor = run.robot.motor
     for slot in made.slots:
         slot.module.parameters.values |= {
@@ -164,7 +164,7 @@ def measure_bus_traffic(
         The lateness of each joint state in periods, the traffic counts before and after the run, and the maximum
         number of frames that waited for the bus.
     """
-    emulators = chain(config(joint_count, rate_hz=rate_hz), stepped=False)
+    emulators = chain(config(joint_count, rate_hz=rate_hz), is_stepped=False)
     emulators.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
     for slot in emulators.slots:
         slot.module.parameters.values |= {
@@ -173,7 +173,7 @@ def measure_bus_traffic(
         }
     emulators.advance_to(ARMED_AT_US)
     emulators.receive(0, make_command(CommandAction.ARM))
-    traffic_before = emulators.traffic()[0]
+    traffic_before = emulators.read_traffic()[0]
     period_us = 1e6 / rate_hz
     lateness_periods: list[int] = []
     max_waiting_frames = 0
@@ -190,4 +190,4 @@ def measure_bus_traffic(
             map(len, emulators.buses[0]._waiting_frame_by_mailbox_by_sender.values())
         )
         max_waiting_frames = max(max_waiting_frames, waiting_frames)
-    return lateness_periods, traffic_before, emulators.traffic()[0], max_waiting_frames
+    return lateness_periods, traffic_before, emulators.read_traffic()[0], max_waiting_frames

@@ -43,7 +43,7 @@ class MonitorRig:
             speak(self.reading)
         unsent_on = [unsent] if unsent else []
         return self.watch.find_faults(
-            self.reading, self.lifecycle, errors or (), unsent_on, isolated=self.isolated
+            self.reading, self.lifecycle, errors or (), unsent_on, isolated_joints=self.isolated
         )
 
     def ticks(self, count: int, speak: Speak | None = None) -> list[FaultFinding]:

@@ -101,7 +101,7 @@ def open_shared_bus(channel: str) -> Iterator[SharedBus]:
     server = EmulatorServer(
         [module_wire],
         ModuleChain(
-            run_config, settings, make_physics_model(run_config, settings, "can"), stepped=False
+            run_config, settings, make_physics_model(run_config, settings, "can"), is_stepped=False
         ),
     )
     with pytest.MonkeyPatch.context() as patch:

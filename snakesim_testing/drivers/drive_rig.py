@@ -18,14 +18,35 @@ class DriveRig:
     """While armed, every joint has the same setpoint; otherwise all are passive, unless they damp in a fault."""
 
     def __init__(self, config: RunConfig, backend: DriveBackend) -> None:
-        self.config, self.backend = config, backend
-        self.tick, self.isolated = 0, frozenset[int]()
-        self.mode, self.target, self.limit_nm = JointMode.POSITION, 0.1, 1.0
-        self.damps = False  # in a fault
-        self.joints: JointState | None = None
+        """Start at tick 0, with a position setpoint of 0.1 rad for every joint.
+
+        Args:
+            config: Configuration of the run.
+            backend: The driver, which is open.
+        """
+        self.config = config
+        self.backend = backend
+        self.tick = 0
+        self.isolated = frozenset[int]()  # indices of joints
+
+        # Setpoint of every joint.
+        self.mode = JointMode.POSITION
+        self.target = 0.1
+        self.limit_nm = 1.0
+        self.damps = False  # whether the joints damp in a fault
+
+        self.joints: JointState | None = None  # newest joint state
 
     def run(self, ticks: int, lifecycle: LifecycleState) -> list[Fault]:
-        """So many periods; a fault latches, as in the host."""
+        """Sample, command and advance for some control periods.
+
+        Args:
+            ticks: Number of control periods.
+            lifecycle: Lifecycle state of the robot. From the first fault on it is "fault" instead, as in the host.
+
+        Returns:
+            The faults that the driver reported.
+        """
         found: list[Fault] = []
         for _ in range(ticks):
             self.joints = self.backend.sample(self.tick, self.tick * self.config.period_ns).joints

@@ -16,6 +16,9 @@ Ground = Callable[[Floats, Floats], Floats]
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx_px=90.0, fy_px=90.0, cx_px=79.5, cy_px=59.5)
 DEPTH_RANGE_M = (0.05, 3.0)
 DEPTH_UNIT_M = 0.001
+MAX_RAY_MULTIPLE = 50.0  # a ray that is longer meets nothing
+GROUND_ITERATIONS = 8  # towards the point at which a ray meets hilly ground
+MAX_DESCENDING_SLOPE = -1e-3  # vertical component of a ray; a flatter ray never meets the ground
 
 
 def make_cylinder(
@@ -81,51 +84,82 @@ class SensorErrors:
 def compute_ray_distances(
     origin: Floats, rays: Floats, obstacles: Sequence[KnownObstacle], ground: Ground = flat_ground
 ) -> Floats:
-    """Return the multiple of each ray at which the ray meets an obstacle or the ground first; infinite if nowhere.
+    """Compute how far each ray goes before it meets an obstacle or the ground.
 
     Args:
         origin: (3,) start of all rays, m.
-        rays: (n, 3) directions.
+        rays: (n, 3) directions, of any length.
         obstacles: Upright cylinders and boxes.
         ground: Height of the ground as a function of x and y.
+
+    Returns:
+        (n,) distances as multiples of the length of each ray; infinite for a ray that meets nothing.
     """
+    slopes = rays[:, 2]
     nearest = np.full(len(rays), np.inf)
+    # Rays that are parallel to a surface divide by zero. The result is infinite, or not a number, and is sorted out.
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(rays[:, 2] < 0, -origin[2] / rays[:, 2], np.inf)
-        t = np.minimum(t, 50.0)
-        for _ in range(8):  # towards the hills
-            at = origin + t[:, None] * rays
-            t = np.where(
-                rays[:, 2] < -1e-3, t - (at[:, 2] - ground(at[:, 0], at[:, 1])) / rays[:, 2], np.inf
-            )
-            t = np.clip(t, 0.0, 50.0)
-        nearest = np.where(t < 50.0, t, nearest)
-        for o in obstacles:
-            t = _on_upright(origin, rays, o)
+        # Where descending rays meet flat ground.
+        t = np.where(slopes < 0, -origin[2] / slopes, np.inf)
+        t = np.minimum(t, MAX_RAY_MULTIPLE)
+        # From there, go along each ray by its height above the ground until it lies on the hilly ground.
+        for _ in range(GROUND_ITERATIONS):
+            points = origin + t[:, None] * rays
+            heights_m = points[:, 2] - ground(points[:, 0], points[:, 1])
+            t = np.where(slopes < MAX_DESCENDING_SLOPE, t - heights_m / slopes, np.inf)
+            t = np.clip(t, 0.0, MAX_RAY_MULTIPLE)
+        nearest = np.where(t < MAX_RAY_MULTIPLE, t, nearest)
+        # Obstacles in front of the ground. Those behind the origin have a negative multiple.
+        for obstacle in obstacles:
+            t = _intersect_upright_obstacle(origin, rays, obstacle)
             nearest = np.minimum(nearest, np.where(t > 0, t, np.inf))
     return nearest
 
 
-def _on_upright(origin: Floats, rays: Floats, o: KnownObstacle) -> Floats:
-    to = origin[:2] - np.array(o.position_w[:2])
-    if o.shape == "cylinder":
-        flat_rays = rays[:, :2]
-        a, b, c = (flat_rays**2).sum(1), flat_rays @ to, to @ to - o.radius_m**2
-        root = b * b - a * c
-        t = np.where(root >= 0, (-b - np.sqrt(root)) / a, np.inf)
+def _intersect_upright_obstacle(origin: Floats, rays: Floats, obstacle: KnownObstacle) -> Floats:
+    """Return the multiple of each ray at which it enters the side of a cylinder or box, (n,); infinite if nowhere.
+
+    Top and bottom of the obstacle are open: a ray that enters there meets nothing.
+
+    Args:
+        origin: (3,) start of all rays, m.
+        rays: (n, 3) directions.
+        obstacle: Upright cylinder or box.
+    """
+    from_center = origin[:2] - np.array(obstacle.position_w[:2])
+    if obstacle.shape == "cylinder":
+        t = _intersect_circle(from_center, rays[:, :2], obstacle.radius_m)
     else:
-        cos, sin = math.cos(o.yaw_rad), math.sin(o.yaw_rad)
-        turn = np.array([[cos, sin], [-sin, cos]])
-        local, along = turn @ to, rays[:, :2] @ turn.T
-        one, two = (
-            (-np.array(o.half_size_m[:2]) - local) / along,
-            (np.array(o.half_size_m[:2]) - local) / along,
-        )
-        enter, leave = np.minimum(one, two).max(1), np.maximum(one, two).min(1)
-        t = np.where(enter <= leave, enter, np.inf)
-    height = origin[2] + t * rays[:, 2]
-    middle, half = o.position_w[2], o.height_m / 2
-    return np.where((height >= middle - half) & (height <= middle + half), t, np.inf)
+        t = _intersect_rectangle(from_center, rays[:, :2], obstacle)
+    height_m = origin[2] + t * rays[:, 2]
+    middle_m = obstacle.position_w[2]
+    half_height_m = obstacle.height_m / 2
+    meets_side = (height_m >= middle_m - half_height_m) & (height_m <= middle_m + half_height_m)
+    return np.where(meets_side, t, np.inf)
+
+
+def _intersect_circle(from_center: Floats, flat_rays: Floats, radius_m: float) -> Floats:
+    """Return where rays in the plane enter a circle: the smaller root of a t² + 2 b t + c = 0."""
+    a = (flat_rays**2).sum(1)
+    b = flat_rays @ from_center
+    c = from_center @ from_center - radius_m**2
+    discriminant = b * b - a * c
+    return np.where(discriminant >= 0, (-b - np.sqrt(discriminant)) / a, np.inf)
+
+
+def _intersect_rectangle(from_center: Floats, flat_rays: Floats, box: KnownObstacle) -> Floats:
+    """Return where rays in the plane enter the rectangle of a box: where they are between both pairs of edges."""
+    cosine = math.cos(box.yaw_rad)
+    sine = math.sin(box.yaw_rad)
+    local_from_world = np.array([[cosine, sine], [-sine, cosine]])
+    start = local_from_world @ from_center  # (2,)
+    directions = flat_rays @ local_from_world.T  # (n, 2)
+    half_size_m = np.array(box.half_size_m[:2])
+    at_lower_edges = (-half_size_m - start) / directions  # (n, 2)
+    at_upper_edges = (half_size_m - start) / directions
+    enter = np.minimum(at_lower_edges, at_upper_edges).max(1)
+    leave = np.maximum(at_lower_edges, at_upper_edges).min(1)
+    return np.where(enter <= leave, enter, np.inf)
 
 
 def render_depth_image(

@@ -35,10 +35,11 @@ from snakesim_testing.gnc.rendered import (
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_robot
 from snakesim_testing.hal.small_robots import make_joint_state, make_pose
 
-STEP_NS = 20_000_000  # guidance's turn
-IMAGE_EVERY = 3  # turns
-DELAY_TURNS = 2
+STEP_NS = 20_000_000  # duration of a guidance cycle
+IMAGE_EVERY = 3  # cycles
+DELAY_CYCLES = 2
 POSE_NOISE = PoseNoise(0.0005, 0.001)
+YAW_NOISE_RAD = 0.001  # standard deviation
 NOISE = RangeNoise(0.002, 0.003)
 # Random obstacles.
 MAX_TRIES_PER_OBSTACLE = 100
@@ -47,7 +48,7 @@ MIN_CORNER_M = (1.6, -1.0)  # of the area with obstacles, x and y
 MAX_CORNER_M = (6.0, 1.0)
 BOX_SIZE_RANGE_M = (0.06, 0.18)  # length and width
 RADIUS_RANGE_M = (0.03, 0.06)
-MAX_YAW_RAD = 3.0  # nearly half a turn, after which a box looks the same
+MAX_YAW_RAD = 3.0  # nearly half a revolution, after which a box looks the same
 MIN_GAP_M = 0.12  # between obstacles
 WAVE_HALF_WIDTH_M = 0.1  # strip along the x axis that stays free
 ROUTE = Route(sample_sine_curve(0.045, 0.6, 12.0))
@@ -76,7 +77,7 @@ class SlidingSnake:
         default_factory=lambda: SensorErrors(NOISE.floor_m, NOISE.per_m2, 0.01)
     )
     seed: int = 0
-    turn: int = 0
+    cycle: int = 0
 
     def __post_init__(self) -> None:
         """Create the robot, and a guidance that knows only the start pose."""
@@ -88,11 +89,11 @@ class SlidingSnake:
         self.world = PerceivedWorld(self.robot, start, POSE_NOISE)
         self.delayed_images: list[tuple[int, DepthImage]] = []
 
-    def compute_pose(self, turn: int) -> SnakePose:
+    def compute_pose(self, cycle: int) -> SnakePose:
         """Return the true pose of the snake in a guidance cycle."""
         lay = place_chain_on_route(
             ROUTE,
-            0.02 + self.speed_m_s * turn * STEP_NS * 1e-9,
+            0.02 + self.speed_m_s * cycle * STEP_NS * 1e-9,
             compute_yaw_segments_m(self.axes, self.lengths),
         )
         rotation = rotation_from_quaternion(quaternion_from_yaw(lay.heading_rad))
@@ -119,10 +120,11 @@ class SlidingSnake:
             images: Whether guidance gets depth images.
             imu: Whether guidance gets IMU samples.
         """
-        for turn in range(self.turn, self.turn + count):
-            self.turn = turn
-            here, before = self.compute_pose(self.turn), self.compute_pose(self.turn - 1)
-            timestamp_ns = self.turn * STEP_NS
+        for cycle in range(self.cycle, self.cycle + count):
+            self.cycle = cycle
+            here = self.compute_pose(self.cycle)
+            before = self.compute_pose(self.cycle - 1)
+            timestamp_ns = self.cycle * STEP_NS
             self.world.add_joints(
                 self.make_joint_state(here, before),
                 None,
@@ -130,15 +132,19 @@ class SlidingSnake:
             )
             if pose:
                 self.world.add_pose(self.make_pose(here))
-            if images and self.turn % IMAGE_EVERY == 0:
+            if images and self.cycle % IMAGE_EVERY == 0:
                 self.delayed_images.append(
-                    (self.turn + DELAY_TURNS, self.make_depth_image(here, timestamp_ns))
+                    (self.cycle + DELAY_CYCLES, self.make_depth_image(here, timestamp_ns))
                 )
-            while self.delayed_images and self.delayed_images[0][0] <= self.turn:
-                self.world.add_ranging_sample(self.delayed_images.pop(0)[1], NOISE)
-            self.world.make_world(self.turn, timestamp_ns)
+            while self.delayed_images:
+                arrival_cycle, image = self.delayed_images[0]
+                if arrival_cycle > self.cycle:
+                    break
+                self.delayed_images.pop(0)
+                self.world.add_ranging_sample(image, NOISE)
+            self.world.make_world(self.cycle, timestamp_ns)
             yield here
-        self.turn += 1
+        self.cycle += 1
 
     def make_joint_state(self, here: SnakePose, before: SnakePose) -> JointState:
         """Return the joint state with the noise of encoders."""
@@ -148,8 +154,8 @@ class SlidingSnake:
             self.robot,
             angles.tolist(),
             speeds.tolist(),
-            tick=self.turn,
-            timestamp_ns=self.turn * STEP_NS,
+            tick=self.cycle,
+            timestamp_ns=self.cycle * STEP_NS,
         )
 
     def make_imu(self, here: SnakePose, before: SnakePose) -> Imu:
@@ -157,8 +163,8 @@ class SlidingSnake:
         rates = (here.headings_rad - before.headings_rad) / (STEP_NS * 1e-9)
         rates = rates + 0.005 * self.random.standard_normal(len(rates))
         return Imu(
-            tick=self.turn,
-            timestamp_ns=self.turn * STEP_NS,
+            tick=self.cycle,
+            timestamp_ns=self.cycle * STEP_NS,
             link=list(range(len(rates))),
             angular_velocity_rad_s=[(0.0, 0.0, float(rate)) for rate in rates],
             acceleration_m_s2=[(0.0, 0.0, 9.81)] * len(rates),
@@ -171,40 +177,37 @@ class SlidingSnake:
             here: True pose of the snake.
             off_m: Error along x that is added, as of a jump of the measurement.
         """
-        x, y, turn = self.random.standard_normal(3) * [
-            POSE_NOISE.position_m,
-            POSE_NOISE.position_m,
-            0.001,
-        ]
+        standard_deviations = [POSE_NOISE.position_m, POSE_NOISE.position_m, YAW_NOISE_RAD]
+        x_error_m, y_error_m, yaw_error_rad = self.random.standard_normal(3) * standard_deviations
         return make_pose(
-            self.turn,
-            self.turn * STEP_NS,
+            self.cycle,
+            self.cycle * STEP_NS,
             position_w=(
-                here.base_w[0] + float(x) + off_m,
-                here.base_w[1] + float(y),
+                here.base_w[0] + float(x_error_m) + off_m,
+                here.base_w[1] + float(y_error_m),
                 BODY_RADIUS_M,
             ),
-            orientation_wxyz=quaternion_from_yaw(here.base_w[2] + float(turn)),
+            orientation_wxyz=quaternion_from_yaw(here.base_w[2] + float(yaw_error_rad)),
         )
 
     def make_depth_image(self, here: SnakePose, timestamp_ns: int) -> DepthImage:
         """Return the image of a depth camera at the front end of the head."""
-        mount, link = (self.lengths[-1], 0.0, 0.0), len(self.lengths) - 1
-        ahead = here.rotations[-1][:2, 0]
-        in_view = [
-            o
-            for o in self.obstacles
-            if -0.2 < (np.array(o.position_w[:2]) - here.head_w[:2]) @ ahead < 2.5
-        ]
+        forward_w = here.rotations[-1][:2, 0]
+        # Obstacles that are too far behind or ahead cannot be seen. Without them rendering is faster.
+        visible_obstacles: list[KnownObstacle] = []
+        for obstacle in self.obstacles:
+            distance_ahead_m = (np.array(obstacle.position_w[:2]) - here.head_w[:2]) @ forward_w
+            if -0.2 < distance_ahead_m < 2.5:
+                visible_obstacles.append(obstacle)
         return render_depth_image(
-            in_view,
+            visible_obstacles,
             here.head_w,
             here.rotations[-1],
             ground=self.ground,
             sensor_errors=self.eye,
             timestamp_ns=timestamp_ns,
-            link_index=link,
-            position_l=mount,
+            link_index=len(self.lengths) - 1,
+            position_l=(self.lengths[-1], 0.0, 0.0),
         )
 
 

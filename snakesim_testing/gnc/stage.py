@@ -46,7 +46,13 @@ def require_value(value: T | None) -> T:
 def make_robot(
     module_count: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0
 ) -> RobotDescription:
-    """A chain of modules of 0.11 m."""
+    """Return the description of a chain of equal modules with a length of 0.11 m.
+
+    Args:
+        module_count: Number of modules, which is the number of joints.
+        axes: Axes of the joints, repeated from tail to head.
+        torque_nm: Torque limit of each joint.
+    """
     limits = {
         "speed_rad_s": 7.5,
         "acceleration_rad_s2": 400,
@@ -101,18 +107,17 @@ def make_route(amplitude_m: float = AMPLITUDE_M, wavelength_m: float = WAVELENGT
 
 
 def make_pegs(route: Route) -> list[KnownObstacle]:
-    """Pegs at the inflections, on the side from which they push forward."""
+    """Return a peg at each inflection of a route along x, on the side from which it pushes the body forward."""
+    distance_m = BODY_RADIUS_M + CLEARANCE_M + PEG_RADIUS_M  # from the route to the center of a peg
     pegs: list[KnownObstacle] = []
-    for k, s in enumerate(route.find_inflections_s_m()):
-        tangent = route.tangent_w(s)
+    for index, s_m in enumerate(route.find_inflections_s_m()):
+        tangent = route.tangent_w(s_m)
         left = np.array([-tangent[1], tangent[0]])
-        push = left if left[0] > 0 else -left
-        x, y = (
-            route.compute_positions_w(s) - push * (BODY_RADIUS_M + CLEARANCE_M + PEG_RADIUS_M)
-        ).tolist()
+        push_direction = left if left[0] > 0 else -left  # of the force from the peg on the body
+        x, y = (route.compute_positions_w(s_m) - push_direction * distance_m).tolist()
         pegs.append(
             KnownObstacle(
-                name=f"peg_{k}",
+                name=f"peg_{index}",
                 shape="cylinder",
                 position_w=(x, y, 0.1),
                 radius_m=PEG_RADIUS_M,

@@ -280,23 +280,42 @@ class AuthorityModel(RuleBasedStateMachine):
         return len(strays) >= 5 and self.state != "armed"
 
     def is_frozen(self, i: int, state_: Any, taken_s: float) -> bool:
+        """Return whether a joint reports the same state for longer than a lease while its target moves away.
+
+        Only an armed joint in position mode can be frozen, and none whose torque is at its limit: it may be blocked.
+
+        Args:
+            i: Index of the joint.
+            state_: Its newest angle, velocity and torque.
+            taken_s: Time of the measurement in s.
+        """
         if self.state != "armed" or self.mode_before(i) is not JointMode.POSITION:
             self.unchanged_states[i] = []
             return False
         if self.unchanged_states[i] and self.unchanged_states[i][-1][0] != state_:
             self.unchanged_states[i] = []
         self.unchanged_states[i].append((state_, taken_s, self.target_before(i)))
-        limit = (
-            self.last_output.setpoints.torque_limit_nm[i] if self.last_output else TORQUE_LIMIT_NM
-        )
+        limit_nm = TORQUE_LIMIT_NM
+        if self.last_output:
+            limit_nm = self.last_output.setpoints.torque_limit_nm[i]
+        # Range of the targets from the first unchanged state to each of the others.
         targets = [target for _, _, target in self.unchanged_states[i]]
-        ways = [max(targets[: k + 1]) - min(targets[: k + 1]) for k in range(len(targets))]
-        far = [
-            taken
-            for (_, taken, _), way in zip(self.unchanged_states[i], ways, strict=True)
-            if way > MAX_STEP_RAD / 4
+        target_ranges_rad = [
+            max(targets[: k + 1]) - min(targets[: k + 1]) for k in range(len(targets))
         ]
-        return bool(far) and taken_s - min(far) > LEASE_NS * 1e-9 and abs(state_[2]) < 0.95 * limit
+        # Times at which a working joint would have moved.
+        expected_motion_times_s = [
+            state_time_s
+            for (_, state_time_s, _), range_rad in zip(
+                self.unchanged_states[i], target_ranges_rad, strict=True
+            )
+            if range_rad > MAX_STEP_RAD / 4
+        ]
+        if not expected_motion_times_s:
+            return False
+        is_overdue = taken_s - min(expected_motion_times_s) > LEASE_NS * 1e-9
+        is_blocked = not abs(state_[2]) < 0.95 * limit_nm
+        return is_overdue and not is_blocked
 
     def drop_lease(self) -> None:
         self.holder = self.newest_command = None
@@ -357,6 +376,11 @@ class AuthorityModel(RuleBasedStateMachine):
         )
 
     def check_safe(self, decision: TickOutput) -> None:
+        """Check the setpoints of a tick without an active command: they are those of the stop mode, or passive.
+
+        Args:
+            decision: Output of the authority in this tick.
+        """
         assert decision.command_sequence is None
         assert not decision.limit_by_joint
         action = (

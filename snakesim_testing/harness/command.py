@@ -29,7 +29,7 @@ class CompletedRun:
     code: int
     out: str
     err: str
-    took_s: float = 0.0
+    duration_s: float = 0.0
 
     @property
     def printed(self) -> str:
@@ -46,34 +46,48 @@ def make_environment(home: Path, **more: str) -> dict[str, str]:
 def snakesim(
     *arguments: str,
     cwd: Path,
-    limit_s: float = TIMEOUT_S,
+    timeout_s: float = TIMEOUT_S,
     extra_env: Mapping[str, str] | None = None,
     command_prefix: Sequence[str] = (),
 ) -> CompletedRun:
-    """Run a command to its end. more: of the environment. inside: a prefix that runs it somewhere else."""
-    return run_to_end(
+    """Run a command of `snakesim` until it ends, without input.
+
+    Args:
+        *arguments: Arguments of the command.
+        cwd: Folder in which it runs.
+        timeout_s: Time in s after which it is killed; its exit code is then TIMED_OUT.
+        extra_env: Variables that are added to its environment.
+        command_prefix: Command line that runs it elsewhere, such as in a network namespace.
+
+    Returns:
+        Its exit code and output.
+    """
+    return run_program(
         [*command_prefix, *SNAKESIM_COMMAND, *arguments],
         cwd,
         make_environment(cwd, **(extra_env or {})),
-        limit_s,
+        timeout_s,
     )
 
 
-def run_to_end(
+def run_program(
     command_line: Sequence[object],
     cwd: Path,
     env: Mapping[str, str] | None = None,
-    limit_s: float = TIMEOUT_S,
-    child_setup: Callable[[], None] | None = None,
+    timeout_s: float = TIMEOUT_S,
+    preexec_fn: Callable[[], None] | None = None,
 ) -> CompletedRun:
-    """Run a program to its end, without input.
+    """Run a program until it ends, without input.
 
     Args:
         command_line: The program and its arguments.
         cwd: Folder in which it runs.
-        env: All of its environment; None: `environment(cwd)`.
-        limit_s: Time after which it is killed; its exit code is then TOO_LONG.
-        child_setup: Called in the child process before the program begins.
+        env: All variables of its environment; None for those of `make_environment(cwd)`.
+        timeout_s: Time in s after which it is killed; its exit code is then TIMED_OUT.
+        preexec_fn: Function that is called in the child process before the program begins.
+
+    Returns:
+        Its exit code and output.
     """
     start_s = time.monotonic()
     try:
@@ -83,9 +97,9 @@ def run_to_end(
             env=make_environment(cwd) if env is None else env,
             stdin=subprocess.DEVNULL,
             capture_output=True,
-            timeout=limit_s,
+            timeout=timeout_s,
             check=False,
-            preexec_fn=child_setup,
+            preexec_fn=preexec_fn,
         )
         code = completed.returncode
         out = completed.stdout
@@ -93,12 +107,12 @@ def run_to_end(
     except subprocess.TimeoutExpired as timeout:
         code = TIMED_OUT
         out = timeout.stdout or b""
-        err = (timeout.stderr or b"") + b"\n[did not end within %g s]" % limit_s
+        err = (timeout.stderr or b"") + b"\n[did not end within %g s]" % timeout_s
     return CompletedRun(
         code,
         out.decode(errors="replace"),
         err.decode(errors="replace"),
-        took_s=time.monotonic() - start_s,
+        duration_s=time.monotonic() - start_s,
     )
 
 
@@ -109,8 +123,8 @@ class RunningCommand:
     process: subprocess.Popen[bytes]
     out: Path
     asked_endpoint: str | None
-    more: Mapping[str, str] | None
-    inside: Sequence[str]
+    extra_env: Mapping[str, str] | None
+    command_prefix: Sequence[str]
 
     @property
     def home(self) -> Path:
@@ -143,20 +157,24 @@ class RunningCommand:
         """Return everything that the run has printed."""
         return self.out.with_suffix(".printed").read_text(encoding="utf-8", errors="replace")
 
-    def wait_for(self, text: str, limit_s: float = TIMEOUT_S) -> None:
+    def wait_for(self, text: str, timeout_s: float = TIMEOUT_S) -> None:
         """Wait until the run has printed a text. Fails if the run ends without it."""
         wait_until(
             lambda: text in self.printed() or self.process.poll() is not None,
             f"{text!r} from the run",
-            limit_s,
+            timeout_s,
         )
         assert text in self.printed(), self.describe_ending()
 
-    def run_tool(self, *arguments: str, limit_s: float = TIMEOUT_S) -> CompletedRun:
+    def run_tool(self, *arguments: str, timeout_s: float = TIMEOUT_S) -> CompletedRun:
         """Run a tool on the same machine with the endpoint of this run."""
         where = (*arguments, "--endpoint", self.endpoint)
         return snakesim(
-            *where, cwd=self.home, limit_s=limit_s, extra_env=self.more, command_prefix=self.inside
+            *where,
+            cwd=self.home,
+            timeout_s=timeout_s,
+            extra_env=self.extra_env,
+            command_prefix=self.command_prefix,
         )
 
     def part(self, name: str) -> int:
@@ -168,14 +186,14 @@ class RunningCommand:
         own = ("host", "guidance", "navigation", "control")
         return {name: pid for name, pid in find_run_processes(self.out).items() if name in own}
 
-    def end(self, limit_s: float = TIMEOUT_S) -> int:
+    def end(self, timeout_s: float = TIMEOUT_S) -> int:
         """Wait until the run has ended, and return its exit code."""
-        return self.process.wait(limit_s)
+        return self.process.wait(timeout_s)
 
-    def interrupt(self, limit_s: float = TIMEOUT_S) -> int:
+    def interrupt(self, timeout_s: float = TIMEOUT_S) -> int:
         """Send SIGINT to the run, as Ctrl-C does, wait until it has ended, and return its exit code."""
         self.process.send_signal(signal.SIGINT)
-        return self.end(limit_s)
+        return self.end(timeout_s)
 
 
 @contextmanager

@@ -35,9 +35,15 @@ class ViewerPage:
     """One viewer. A context manager."""
 
     def __init__(self, address: str, origin: str | None = None, *, draws: bool = True) -> None:
-        """address: http://...; origin: of the page. Raises InvalidStatus when it is refused.
+        """Connect to the page server of a console, as a browser does.
 
-        draws: whether it has a scene; one without WebGL does not say where its camera is.
+        Args:
+            address: Address of the console, http://...
+            origin: Origin that the browser names; None for a program that is not a browser.
+            draws: Whether the page draws the scene. A page without WebGL does not send where its camera is.
+
+        Raises:
+            InvalidStatus: The server refuses the connection.
         """
         self._socket = connect(
             address.replace("http", "ws"),

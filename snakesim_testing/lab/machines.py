@@ -47,20 +47,30 @@ class NamespaceMachine:
         cwd: Path | None = None,
         env: Mapping[str, str] | None = None,
     ) -> str:
-        """Run a command in it to its end, and return its output."""
-        output, env = subprocess.PIPE, {**os.environ, **(env or {})}
-        inside = self.wrap_command(*command)
-        done = subprocess.run(
-            inside,
-            stdout=output,
+        """Run a command in the namespace until it ends.
+
+        Args:
+            command: The program and its arguments.
+            check: Whether to fail if its exit code is not 0.
+            cwd: Folder in which it runs; None for the present one.
+            env: Variables that are added to the environment.
+
+        Returns:
+            Its output, with its exit code at the end.
+        """
+        completed = subprocess.run(
+            self.wrap_command(*command),
+            stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             check=False,
             cwd=cwd,
-            env=env,
+            env={**os.environ, **(env or {})},
         )
-        assert done.returncode == 0 or not check, f"{self.name}: {' '.join(command)}: {done.stdout}"
-        return f"{done.stdout}(exit code {done.returncode})"
+        output = completed.stdout
+        has_failed = completed.returncode != 0
+        assert not (check and has_failed), f"{self.name}: {' '.join(command)}: {output}"
+        return f"{output}(exit code {completed.returncode})"
 
     def start(
         self,
@@ -152,14 +162,16 @@ def connect_machines(names: Sequence[str], stack: ExitStack) -> dict[str, Namesp
     middle = machines[names[0]]
     middle.set_address("lo", f"{NET}.1/32")
     for number, name in enumerate(names[1:], 2):
-        machine, port, own = machines[name], f"port{number}", f"{NET}.{number}"
+        machine = machines[name]
+        port = f"port{number}"  # end of the cable at the first machine; the other end is `lab0`
+        own_address = f"{NET}.{number}"
         middle.run(
             "ip", "link", "add", port, "type", "veth", "peer", "name", "lab0", "netns", machine.pid
         )
         middle.run("ip", "link", "set", port, "up")
-        middle.run("ip", "route", "add", own, "dev", port, "src", f"{NET}.1")
-        machine.set_address("lab0", f"{own}/32")
-        machine.run("ip", "route", "add", f"{NET}.1", "dev", "lab0", "src", own)
+        middle.run("ip", "route", "add", own_address, "dev", port, "src", f"{NET}.1")
+        machine.set_address("lab0", f"{own_address}/32")
+        machine.run("ip", "route", "add", f"{NET}.1", "dev", "lab0", "src", own_address)
     return machines
 
 

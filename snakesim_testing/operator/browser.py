@@ -22,6 +22,7 @@ CHROMIUM = next(
     ),
     None,
 )
+MAX_ERROR_CHARACTERS = 500  # of the text of one error
 MISSING = "needs a browser: install the Debian package chromium"
 FLAGS = (
     "--headless=new",
@@ -64,23 +65,21 @@ class BrowserTab:
             self._note(answer)
 
     def _note(self, event: dict[str, Any]) -> None:
-        kind, reported = event.get("method"), event.get("params", {})
-        if kind == "Runtime.exceptionThrown":
-            self.errors.append(
-                str(reported["exceptionDetails"].get("exception", reported["exceptionDetails"]))[
-                    :500
-                ]
-            )
-        elif kind == "Log.entryAdded" and reported["entry"]["level"] == "error":
-            self.errors.append(
-                f"{reported['entry']['text']} {reported['entry'].get('url', '')}"[:500]
-            )
-        elif kind == "Runtime.consoleAPICalled" and reported["type"] == "error":
-            self.errors.append(
-                " ".join(
-                    str(part.get("value", part.get("description"))) for part in reported["args"]
-                )[:500]
-            )
+        """Store the text of an event of the browser if it reports an error of the page."""
+        method = event.get("method")
+        params = event.get("params", {})
+        if method == "Runtime.exceptionThrown":
+            details = params["exceptionDetails"]
+            error_text = str(details.get("exception", details))
+        elif method == "Log.entryAdded" and params["entry"]["level"] == "error":
+            entry = params["entry"]
+            error_text = f"{entry['text']} {entry.get('url', '')}"
+        elif method == "Runtime.consoleAPICalled" and params["type"] == "error":
+            values = [part.get("value", part.get("description")) for part in params["args"]]
+            error_text = " ".join(str(value) for value in values)
+        else:
+            return
+        self.errors.append(error_text[:MAX_ERROR_CHARACTERS])
 
     def value(self, script: str) -> Any:
         """The value of a JavaScript expression."""

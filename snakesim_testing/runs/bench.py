@@ -26,7 +26,15 @@ def lab_folder(folder: Path, joint_count: int, scenario: str, files: Mapping[str
 
 @contextmanager
 def host(home: Path, backend: str) -> Iterator[str]:
-    """A host, disarmed; its endpoint."""
+    """Run a HAL host of the scenario bench.toml, disarmed, until the end of the context.
+
+    Args:
+        home: Folder with the scenario, in which the host runs.
+        backend: Name of its backend.
+
+    Yields:
+        The endpoint of its network, once it answers.
+    """
     endpoint = find_free_endpoint()
     program = [
         *SNAKESIM_COMMAND,

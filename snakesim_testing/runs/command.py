@@ -15,7 +15,7 @@ from snakesim_testing.harness.command import (
     CompletedRun,
     RunningCommand,
     make_environment,
-    run_to_end,
+    run_program,
     running_snakesim,
     snakesim,
 )
@@ -32,7 +32,7 @@ __all__ = [
     "make_environment",
     "read_summary",
     "run_in_background",
-    "run_to_end",
+    "run_program",
     "run_to_summary",
     "running_armed_snakesim",
     "running_snakesim",

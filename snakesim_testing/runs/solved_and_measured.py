@@ -210,22 +210,35 @@ def tabulate_forces(
     Returns:
         Desired and measured forces in N, (n_states, n_obstacles) each. Measured forces are means over FORCE_WINDOW_S.
     """
-    names = sorted(
-        {*forces, *(p.obstacle for s in states for p in s.push_points if p.obstacle is not None)}
-    )
-    window = round(FORCE_WINDOW_S / STEP_S)
-    desired_n, measured_n = np.zeros((len(states), len(names))), np.zeros((len(states), len(names)))
-    for j, name in enumerate(names):
-        sums = np.concatenate(([0.0], np.cumsum(forces.get(name, np.zeros(1)))))
-        for i, state in enumerate(states):
-            begin = round((1e-9 * state.timestamp_ns + shift_s) / STEP_S) - window // 2
-            first, last = (min(max(k, 0), len(sums) - 1) for k in (begin, begin + window))
-            measured_n[i, j] = (sums[last] - sums[first]) / window
-    column = {name: j for j, name in enumerate(names)}
-    for i, state in enumerate(states):
+    pushed_obstacles = {
+        point.obstacle
+        for state in states
+        for point in state.push_points
+        if point.obstacle is not None
+    }
+    names = sorted({*forces, *pushed_obstacles})
+    shape = (len(states), len(names))
+
+    # Measured: the mean over a window around the time of each state, as a difference of cumulative sums.
+    measured_n = np.zeros(shape)
+    window_steps = round(FORCE_WINDOW_S / STEP_S)
+    for column, name in enumerate(names):
+        force_per_step_n = forces.get(name, np.zeros(1))
+        sums_n = np.concatenate(([0.0], np.cumsum(force_per_step_n)))
+        for row, state in enumerate(states):
+            middle_step = round((1e-9 * state.timestamp_ns + shift_s) / STEP_S)
+            begin_step = middle_step - window_steps // 2
+            first = min(max(begin_step, 0), len(sums_n) - 1)
+            last = min(max(begin_step + window_steps, 0), len(sums_n) - 1)
+            measured_n[row, column] = (sums_n[last] - sums_n[first]) / window_steps
+
+    # Desired: the sum over the push-points on each obstacle.
+    desired_n = np.zeros(shape)
+    column_by_name = {name: column for column, name in enumerate(names)}
+    for row, state in enumerate(states):
         for point, force_n in zip(state.push_points, state.desired_force_n, strict=True):
             if point.obstacle is not None:
-                desired_n[i, column[point.obstacle]] += force_n
+                desired_n[row, column_by_name[point.obstacle]] += force_n
     return desired_n, measured_n
 
 

@@ -216,7 +216,19 @@ def swim_wave(
 def swim_without_mujoco(
     wave: JointWave, fluid: dict[str, Any], step_s: float = BALANCE_STEP_S
 ) -> BodyTrack:
-    """Compute the same by a momentum balance of links in the plane, with prescribed joint angles."""
+    """Compute the motion of `swim_wave` without MuJoCo, by a momentum balance of links in the plane.
+
+    Points and vectors in the plane are complex numbers x + iy. The joint angles are prescribed by the wave. They and
+    the momenta of the body determine its motion; the forces of the fluid change the momenta.
+
+    Args:
+        wave: Joint angles as a function of time.
+        fluid: Section `[fluid]` of the scene.
+        step_s: Step of the explicit Euler method.
+
+    Returns:
+        The motion of the body over PERIODS periods of the wave.
+    """
     config = make_config(scene={"fluid": fluid})
     assert config.scene.fluid is not None
     robot = config.robot
@@ -232,11 +244,16 @@ def swim_without_mujoco(
     zeros = np.zeros_like(lengths_m)
     count = len(lengths_m) - 1
     step_count = int(PERIODS * wave.period_s / step_s) + 1
-    center_m, axis_m = np.empty((step_count, 2)), np.empty((step_count, 2))
-    tail, heading_rad = 0j, 0.0
-    momentum, spin = 0j, 0.0
+    center_m = np.empty((step_count, 2))
+    axis_m = np.empty((step_count, 2))
+    # Pose of the tail link, linear momentum in kg·m/s, and angular momentum about the center of mass in kg·m²/s.
+    tail = 0j
+    heading_rad = 0.0
+    momentum = 0j
+    spin = 0.0
     for k in range(step_count):
         time_s = k * step_s
+        # The pose of every link, and the body's center of mass.
         headings = heading_rad + np.append(0.0, np.cumsum(wave.at(time_s, count)))
         relative_rates = np.append(0.0, np.cumsum(wave.rates_at(time_s, count)))
         tangents = np.exp(1j * headings)
@@ -252,12 +269,13 @@ def swim_without_mujoco(
             masses_kg @ (np.conj(arms) * middle_rates).imag + inertias_kg_m2 @ relative_rates
         )
         inertia_kg_m2 = masses_kg @ np.abs(arms) ** 2 + inertias_kg_m2.sum()
-        yaw_rate = float((spin - joint_spin) / inertia_kg_m2)
+        yaw_rate = float((spin - joint_spin) / inertia_kg_m2)  # of the tail link
         center_velocity = (momentum - masses_kg @ middle_rates) / masses_kg.sum()
         tail_velocity = center_velocity - 1j * yaw_rate * (center - tail)
         velocities = tail_velocity + 1j * yaw_rate * (middles - tail) + middle_rates
         rates = yaw_rate + relative_rates
 
+        # The forces of the fluid, from the velocities in the frames of the links, change the momenta.
         local = velocities * np.conj(tangents)
         forces, torques = ellipsoids.compute_forces(
             np.column_stack([local.real, local.imag, zeros]), np.column_stack([zeros, zeros, rates])
@@ -265,6 +283,8 @@ def swim_without_mujoco(
         forces_w = (forces[:, 0] + 1j * forces[:, 1]) * tangents
         momentum += step_s * complex(forces_w.sum())
         spin += step_s * float((np.conj(arms) * forces_w).imag.sum() + torques[:, 2].sum())
+
+        # Record this pose, and advance it by the step.
         center_m[k] = center.real, center.imag
         axis = ends[-1] - ends[0]
         axis_m[k] = axis.real, axis.imag

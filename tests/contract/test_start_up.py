@@ -35,7 +35,7 @@ def unmet(rig: BackendRig) -> str:
 
 
 def test_drives_home_at_the_start_and_are_armed_then(rig: BackendRig) -> None:
-    assert all(extras.homed for extras in emulator_of(rig).extras)
+    assert all(extras.is_homed for extras in emulator_of(rig).homing_states)
     assert rig.faults == []
     rig.arm_and_move_joint()
 
@@ -46,7 +46,7 @@ def test_drive_that_may_not_move_at_the_start_blocks_arming() -> None:
     assert "joint_1 (drive 1): homing moves the joint" in unmet(rig)
     with pytest.raises(AssertionError, match=r"cannot be armed: .*homing moves the joint"):
         rig.arm()
-    assert not any(extras.homed for extras in emulator_of(rig).extras)
+    assert not any(extras.is_homed for extras in emulator_of(rig).homing_states)
     bench.close()
 
 
@@ -57,7 +57,7 @@ def test_restarted_drive_does_not_know_its_position_and_homes_after_reset(rig: B
     assert rig.authority.state == "fault"
     assert "position unknown" in unmet(rig)
     rig.wait_periods(SECOND)
-    assert not emulator_of(rig).extras[0].homed, "it homes without the operator"
+    assert not emulator_of(rig).homing_states[0].is_homed, "it homes without the operator"
     rig.reset()
     rig.wait_periods(5)
     assert "joint_1 (drive 1): homing, 0.1 of 2 s" in unmet(rig)
@@ -83,10 +83,10 @@ def test_emergency_stop_ends_homing(rig: BackendRig) -> None:
     rig.wait_periods(SECOND)
     rig.reset()
     rig.wait_periods(5)
-    assert emulator_of(rig).extras[0].homing_until_us is not None
+    assert emulator_of(rig).homing_states[0].homing_until_us is not None
     rig.trigger_estop()
     rig.wait_periods(3)
-    assert emulator_of(rig).extras[0].homing_until_us is None
+    assert emulator_of(rig).homing_states[0].homing_until_us is None
     assert "homing was aborted: emergency stop" in unmet(rig)
     rig.reset()
     rig.wait_periods(2 * SECOND)
@@ -96,13 +96,13 @@ def test_emergency_stop_ends_homing(rig: BackendRig) -> None:
 def test_brakes_close_before_torque_is_off(rig: BackendRig) -> None:
     emulator = emulator_of(rig)
     rig.arm_and_move_joint()
-    assert all(extras.brake_open for extras in emulator.extras)
-    emulator.dropped.clear()
+    assert all(extras.is_brake_open for extras in emulator.homing_states)
+    emulator.dropped_drives.clear()
     rig.disarm()
     rig.wait_periods(SECOND // 2)
-    assert not any(extras.brake_open for extras in emulator.extras)
+    assert not any(extras.is_brake_open for extras in emulator.homing_states)
     assert not any(KitDrives(rig.backend).list_enabled())
-    assert emulator.dropped == []
+    assert emulator.dropped_drives == []
 
 
 def test_safe_torque_off_needs_its_release_and_a_reset(rig: BackendRig) -> None:

@@ -27,7 +27,7 @@ def snakesim(
 ) -> CompletedRun:
     """Run a command to its end. inside: a prefix that runs it somewhere else."""
     return command.snakesim(
-        *arguments, cwd=home, limit_s=limit_s, extra_env=_machine(home), command_prefix=inside
+        *arguments, cwd=home, timeout_s=limit_s, extra_env=_machine(home), command_prefix=inside
     )
 
 

@@ -17,7 +17,7 @@ from snakesim_testing.runs.command import (
     SNAKESIM_COMMAND,
     CompletedRun,
     make_environment,
-    run_to_end,
+    run_program,
 )
 from verification.golden import GOLDEN, SECONDS
 
@@ -86,7 +86,7 @@ def run(folder: Path, *arguments: str, computer: Mapping[str, str] | None = None
         "--out",
         "run",
     ]
-    return run_to_end(typed, folder, on(computer or {}, folder))
+    return run_program(typed, folder, on(computer or {}, folder))
 
 
 def digest_in(ended: CompletedRun) -> str:
@@ -143,7 +143,7 @@ def test_and_that_of_five_processes(tmp_path: Path, computer: str) -> None:
 def test_and_that_of_a_program_that_imported_numpy_first(tmp_path: Path, computer: str) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
     typed = [sys.executable, "program.py", "peg_row", str(SECONDS)]
-    ended = run_to_end(typed, tmp_path, on(COMPUTERS[computer], tmp_path))
+    ended = run_program(typed, tmp_path, on(COMPUTERS[computer], tmp_path))
     digest, ticks = ended.out.split() or pytest.fail(ended.err)
     assert digest.startswith(GOLDEN["peg_row"]) and int(ticks) == 100 * SECONDS
 
@@ -155,7 +155,7 @@ def test_what_such_a_program_did_wrong_is_raised_there(tmp_path: Path) -> None:
         '[parse_set_option("clock_mode=realtime")]',
     )
     (tmp_path / "program.py").write_text(wrong)
-    ended = run_to_end(
+    ended = run_program(
         [sys.executable, "program.py", "triplet"], tmp_path, on(COMPUTERS["Nehalem"], tmp_path)
     )
     assert (
@@ -177,15 +177,15 @@ def test_other_c_library_marks_digest_as_local(tmp_path: Path) -> None:
         "--out",
         "run",
     ]
-    ended = run_to_end(typed, tmp_path, on(other, tmp_path))
+    ended = run_program(typed, tmp_path, on(other, tmp_path))
     own = (
         "its own: NumPy and C library round otherwise than on most computers with NumPy 2.2 to 2.4"
     )
     assert ended.code == 0 and digest_in(ended).endswith(f", {own}"), ended.out + ended.err
-    told = run_to_end([*SNAKESIM_COMMAND, "recording", "info", "run"], tmp_path, on({}, tmp_path))
+    told = run_program([*SNAKESIM_COMMAND, "recording", "info", "run"], tmp_path, on({}, tmp_path))
     assert own in told.out
-    assert run_to_end([*typed[:-1], "usual"], tmp_path, on({}, tmp_path)).code == 0
-    compared = run_to_end(
+    assert run_program([*typed[:-1], "usual"], tmp_path, on({}, tmp_path)).code == 0
+    compared = run_program(
         [*SNAKESIM_COMMAND, "study", "compare", "run", "usual"], tmp_path, on({}, tmp_path)
     )
     assert "description.arithmetic.C library" in compared.out, compared.out + compared.err

@@ -130,7 +130,7 @@ def _modules(config: RunConfig, settings: Any, pose: str, opened: ExitStack) -> 
     ]
     send_pose = opened.enter_context(closing(PoseSender(pose)))
     physics_model = make_physics_model(config, settings, config.backend)
-    chain = ModuleChain(config, settings, physics_model, stepped=False, send_pose=send_pose)
+    chain = ModuleChain(config, settings, physics_model, is_stepped=False, send_pose=send_pose)
     server = EmulatorServer(wires, chain)
     return DriveProcesses(
         lambda: server.run_due(time.monotonic_ns()),

@@ -23,7 +23,7 @@ from snakesim_operator.base.extras import PACKAGES_BY_EXTRA
 from snakesim_testing.benches.workbench import read_example_from_docs
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.command import CompletedRun, make_environment, run_to_end
+from snakesim_testing.runs.command import CompletedRun, make_environment, run_program
 from snakesim_testing.runs.documents import REPOSITORY, UV, leave_out, needs_uv
 from verification.installation.distributions import required
 
@@ -47,7 +47,7 @@ def run(*command: object, cwd: Path, **more: str) -> str:
 
 
 def ended(*command: object, cwd: Path, **more: str) -> CompletedRun:
-    return run_to_end(command, cwd, {**make_environment(cwd), "UV_OFFLINE": "1", **more}, 100.0)
+    return run_program(command, cwd, {**make_environment(cwd), "UV_OFFLINE": "1", **more}, 100.0)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.programs.commands import Command, Commands
-from snakesim_testing.runs.command import CompletedRun, make_environment, run_to_end
+from snakesim_testing.runs.command import CompletedRun, make_environment, run_program
 from snakesim_testing.runs.documents import REPOSITORY
 
 pytestmark = pytest.mark.e2e
@@ -64,7 +64,7 @@ def test_all_else_works_without(rooms: list[str], tmp_path: Path) -> None:
     work.mkdir()
 
     def run(*words: str) -> CompletedRun:
-        return run_to_end(
+        return run_program(
             [sys.executable, *words],
             work,
             {**make_environment(work), "PYTHONPATH": str(library)},

@@ -37,7 +37,7 @@ def test_triplet_over_socketcan_equals_virtual_bus_to_the_bit(tmp_path: Path, ch
         arguments += [
             argument for value in ("stall_limit_s=300", *sets) for argument in ("--set", value)
         ]
-        ended = snakesim("run", *arguments, "--out", name, cwd=tmp_path, limit_s=LIMIT_S)
+        ended = snakesim("run", *arguments, "--out", name, cwd=tmp_path, timeout_s=LIMIT_S)
         took_s[name] = time.monotonic() - began
         assert ended.code == 0, ended.out + ended.err
         records[name] = RunRecord.load(tmp_path / name)

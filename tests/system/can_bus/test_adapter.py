@@ -15,7 +15,7 @@ from snakesim_can_backend.bus.adapter import (
     validate_channel,
     validate_channels,
 )
-from snakesim_can_backend.bus.load import ReportSchedule, busiest_period_s, compute_bus_load
+from snakesim_can_backend.bus.load import ReportSchedule, compute_bus_load, compute_busiest_period_s
 from snakesim_can_backend.emulator.bus_time import BusTime
 from snakesim_can_backend.protocol.definitions import CanFrame, Opcode, frame_id
 from snakesim_hal.base.errors import BackendError, ConfigError, SnakesimError
@@ -115,8 +115,8 @@ def test_half_the_bit_rate_takes_twice_as_long() -> None:
     assert compute_bus_load(5, slow) == pytest.approx(
         2 * compute_bus_load(5, ReportSchedule(100.0))
     )
-    assert busiest_period_s(5, slow) == pytest.approx(
-        2 * busiest_period_s(5, ReportSchedule(100.0))
+    assert compute_busiest_period_s(5, slow) == pytest.approx(
+        2 * compute_busiest_period_s(5, ReportSchedule(100.0))
     )
     bus, slow_bus = BusTime(), BusTime(500_000)
     for one in (bus, slow_bus):

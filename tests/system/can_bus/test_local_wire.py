@@ -285,7 +285,7 @@ def test_a_bus_without_a_program_is_refused_with_a_way_out(folder: Path, tmp_pat
     with raises_error(ConfigError, code="bus/invalid-channel", field="local"):
         validate_channel("locale:x")
     with join(folder, 1):
-        validate_channels([channel], fd=True)
+        validate_channels([channel], needs_fd=True)
     blocked = tmp_path / "file"
     blocked.touch()
     with pytest.raises(BackendError, match="cannot be opened"):

@@ -104,7 +104,7 @@ def test_a_child_is_told_everything_and_ends_when_asked(
         physics_model="inertia",
         faults=["mute:joint_1@2"],
     )
-    emulators = EmulatorProcess(RUN, settings, "127.0.0.1:5000", stepped=True)
+    emulators = EmulatorProcess(RUN, settings, "127.0.0.1:5000", is_stepped=True)
     noted = child.noted()
     arguments = noted["arguments"]
     assert arguments[:3] == ["-P", "-m", "snakesim_can_backend.emulator.command"]
@@ -128,7 +128,7 @@ def test_a_child_is_told_everything_and_ends_when_asked(
 def test_a_child_that_will_not_end_is_killed(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(emulator_child, "STOP_TIMEOUT_S", 0.2)
     child.does("signal.signal(signal.SIGTERM, signal.SIG_IGN)", READY, SERVE)
-    emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
+    emulators = EmulatorProcess(RUN, ON_VCAN, None, is_stepped=False)
     began = time.monotonic()
     emulators.stop()
     assert time.monotonic() - began < 5.0
@@ -142,7 +142,7 @@ def test_emulator_process_that_never_becomes_ready_is_reported_and_removed(
     monkeypatch.setattr(emulator_child, "SERVICE_START_LIMIT_S", 5.0)
     child.does("print('no such physics_model', flush=True)", ending)
     with raises_error(BackendError, code="emulator/not-started"):
-        EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
+        EmulatorProcess(RUN, ON_VCAN, None, is_stepped=False)
     child.must_be_gone()
     assert "no such physics_model" in capsys.readouterr().err
 
@@ -153,14 +153,14 @@ def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixtu
             RUN,
             CanSettings(channels=["vcan77"], emulators="process", physics_model="inertia"),
             None,
-            stepped=False,
+            is_stepped=False,
         )
     assert "vcan77" in capsys.readouterr().err
 
 
 def test_emulator_process_exit_is_noticed_without_its_log(child: Child) -> None:
     child.does(READY, "time.sleep(0.3)", "sys.exit(3)")
-    emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
+    emulators = EmulatorProcess(RUN, ON_VCAN, None, is_stepped=False)
     assert emulators.describe_exit() is None
     emulators._child.output_path.unlink()
     wait_until(emulators.describe_exit, "the end of the child")
@@ -173,7 +173,7 @@ def test_emulator_process_error_is_reported_as_in_a_terminal(child: Child, tmp_p
     child.does(
         READY, "for line in sys.stdin:", f"    pathlib.Path({str(heard)!r}).open('a').write(line)"
     )
-    emulators = EmulatorProcess(RUN, ON_VCAN, None, stepped=False)
+    emulators = EmulatorProcess(RUN, ON_VCAN, None, is_stepped=False)
     arguments = child.noted()["arguments"]
     assert "--interactive" in arguments
     assert "--stepped" not in arguments
@@ -195,4 +195,4 @@ def test_emulator_process_that_cannot_start_is_a_backend_error(
 ) -> None:
     monkeypatch.setattr(sys, "executable", str(tmp_path / "no python"))
     with raises_error(BackendError, code="emulator/not-started"):
-        EmulatorProcess(RUN, ON_VCAN, None, stepped=True)
+        EmulatorProcess(RUN, ON_VCAN, None, is_stepped=True)

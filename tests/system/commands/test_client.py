@@ -20,7 +20,7 @@ from snakesim_testing.runs.command import (
     CompletedRun,
     RunningCommand,
     make_environment,
-    run_to_end,
+    run_program,
     running_armed_snakesim,
     running_snakesim,
 )
@@ -97,10 +97,10 @@ def test_a_client_leases_arms_moves_and_disarms(waiting: RunningCommand) -> None
             lambda: status(session).waiting_for == ["control"], "a run that waits for control alone"
         )
         joints = session.declare_reader(keys.JOINTS, JointState, depth=DEPTH)
-        ended = run_to_end(
+        ended = run_program(
             [sys.executable, CLIENT, waiting.endpoint, "planar13"],
             waiting.home,
-            child_setup=urgently,
+            preexec_fn=urgently,
         )
         assert ended.code == 0, ended.out + ended.err
         angles = [state.angle_rad for state in joints.drain()]
@@ -120,7 +120,7 @@ def test_a_client_leases_arms_moves_and_disarms(waiting: RunningCommand) -> None
 
 def test_a_stop_by_udp_stops_the_robot(waiting: RunningCommand) -> None:
     host, _, port = waiting.endpoint.removeprefix("tcp/").partition(":")
-    ended = run_to_end([sys.executable, STOP, host, port], waiting.home)
+    ended = run_program([sys.executable, STOP, host, port], waiting.home)
     assert ended.code == 0 and ended.out.startswith("planar13\n") and "anna" in ended.out, (
         ended.out + ended.err
     )
@@ -134,7 +134,7 @@ def script(text: str, run: RunningCommand, folder: Path) -> CompletedRun:
     settled(run)
     (folder / "script.py").write_text(textwrap.dedent(text))
     env = make_environment(folder, PYTHONPATH=str(REPOSITORY))
-    return run_to_end([sys.executable, "script.py", run.endpoint], folder, env, 60.0, urgently)
+    return run_program([sys.executable, "script.py", run.endpoint], folder, env, 60.0, urgently)
 
 
 def settled(run: RunningCommand) -> None:

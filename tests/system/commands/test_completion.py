@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_hal.model.files import list_shipped_names
 from snakesim_hal.model.plugins import CONTROLLERS, list_installed_plugins
-from snakesim_testing.harness.command import run_to_end
+from snakesim_testing.harness.command import run_program
 from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e
@@ -64,7 +64,7 @@ def test_what_can_follow(script: tuple[str, Path], typed: str) -> None:
     shell, path = script
     words, wanted = TYPED[typed]
     plain = ["--norc", "--noprofile"] if shell == "bash" else ["-f"]
-    done = run_to_end(
+    done = run_program(
         [shell, *plain, "-c", ASK[shell], shell, path, "snakesim", *words], path.parent
     )
     assert done.code == 0, done.printed

@@ -21,7 +21,7 @@ from snakesim_testing.runs.command import (
     SNAKESIM_COMMAND,
     RunningCommand,
     make_environment,
-    run_to_end,
+    run_program,
     running_armed_snakesim,
     snakesim,
 )
@@ -54,7 +54,7 @@ def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith("snakesim: ")
     assert done.stderr.count("\n") == 1
-    seen = run_to_end(
+    seen = run_program(
         ["sh", "-c", f"{' '.join(SNAKESIM_COMMAND)} config triplet | head -1"], tmp_path
     )
     assert seen.err == ""
@@ -65,7 +65,7 @@ def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 def test_a_run_goes_on_when_nobody_reads_what_it_prints(tmp_path: Path) -> None:
     run = f"{' '.join(SNAKESIM_COMMAND)} run triplet --in-process --duration 1 --no-record --out"
     for number, unread in enumerate(("| head -0", ">&-", "> /dev/full 2>&1")):
-        ended = run_to_end(["bash", "-c", f"set -o pipefail; {run} {number} {unread}"], tmp_path)
+        ended = run_program(["bash", "-c", f"set -o pipefail; {run} {number} {unread}"], tmp_path)
         assert (ended.code, ended.err) == (0, ""), f"{unread}: {ended.err}"
         assert (tmp_path / str(number) / "summary.json").exists(), unread
 
@@ -199,7 +199,7 @@ def test_a_run_that_accepts_the_risk_listens_on_every_address(tmp_path: Path) ->
     )
     for flags, code in (("", 2), (" --insecure", 0), (" --insecure --with-router", 0)):
         typed = ["unshare", "--net", "sh", "-c", f"{run} --endpoint tcp/0.0.0.0:7461{flags}"]
-        ended = run_to_end(typed, tmp_path, limit_s=120.0)
+        ended = run_program(typed, tmp_path, timeout_s=120.0)
         assert ended.code == code, ended.printed
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_testing.harness.command import run_to_end, snakesim
+from snakesim_testing.harness.command import run_program, snakesim
 
 SUITE_LIMIT_S = 300.0
 
@@ -15,10 +15,10 @@ SUITE_LIMIT_S = 300.0
 def test_new_driver_passes_the_contract_suite_as_generated(tmp_path: Path) -> None:
     written = snakesim("drive", "new", "acme_servo", cwd=tmp_path)
     assert written.code == 0, written.printed
-    ended = run_to_end(
+    ended = run_program(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"],
         tmp_path / "acme_servo",
-        limit_s=SUITE_LIMIT_S,
+        timeout_s=SUITE_LIMIT_S,
     )
     assert ended.code == 0, ended.printed
     passed = re.search(r"(\d+) passed", ended.out)

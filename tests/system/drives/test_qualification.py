@@ -61,7 +61,7 @@ def test_whole_qualification_completes_on_an_emulated_drive(driver_type: str, tm
     ran = snakesim(
         *("drive", "qualify", driver_type, "--yes", "--json", "--out", "out", "--key", "key.pem"),
         cwd=tmp_path,
-        limit_s=250,
+        timeout_s=250,
     )
     result = json.loads(ran.out.splitlines()[-1])
     assert (folder / RECORD).exists(), ran.printed

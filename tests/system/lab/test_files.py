@@ -12,7 +12,7 @@ import zenoh
 
 from snakesim_operator.cli import main
 from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH
-from snakesim_testing.harness.command import run_to_end
+from snakesim_testing.harness.command import run_program
 
 ROBOTS = {
     "emulator": 'can = ["vcan0"]',
@@ -59,11 +59,11 @@ def test_zenoh_parses_every_file(rendered: Path) -> None:
 def test_systemd_accepts_every_unit_and_finds_it_closed(rendered: Path) -> None:
     units = sorted(rendered.rglob("*.service"))
     assert len(units) == 7 + len(ROBOTS) + 6  # of programs, robots, and CAN interfaces
-    done = run_to_end(["systemd-analyze", "verify", "--man=no", *units], rendered)
+    done = run_program(["systemd-analyze", "verify", "--man=no", *units], rendered)
     assert done.code == 0
     assert done.err == ""
     for unit in units:
-        rated = run_to_end(
+        rated = run_program(
             ["systemd-analyze", "security", "--offline=true", "--no-pager", unit], rendered
         )
         score = re.search(r"exposure level for \S+: ([\d.]+)", rated.out)

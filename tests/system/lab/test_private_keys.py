@@ -11,7 +11,7 @@ from snakesim_operator.cli import main
 from snakesim_operator.features.lab.check import CheckResults, _check_certificate
 from snakesim_operator.features.lab.identities import iterate_identities
 from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH, load_lab
-from snakesim_testing.harness.command import SNAKESIM_COMMAND, make_environment, run_to_end
+from snakesim_testing.harness.command import SNAKESIM_COMMAND, make_environment, run_program
 
 
 def mode(path: Path) -> int:
@@ -95,7 +95,7 @@ def test_a_check_of_the_lab_marks_such_a_key(tmp_path: Path) -> None:
 def test_too_little_memory_is_one_line(tmp_path: Path, max_mb: int) -> None:
     typed = [*SNAKESIM_COMMAND, "lab", "certs", str(EXAMPLE_PATH), "--out", str(tmp_path / "lab")]
     limited = ["sh", "-c", f'ulimit -v {max_mb * 1024}; exec "$@"', "sh", *typed]
-    ended = run_to_end(
+    ended = run_program(
         limited, tmp_path, make_environment(tmp_path, PYTHONDONTWRITEBYTECODE="1"), 60.0
     )
     assert ended.code in (0, 1) and "Traceback" not in ended.err, ended.err

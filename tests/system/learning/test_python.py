@@ -20,7 +20,7 @@ from snakesim.environments import SnakeEnv
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_operator.results.signals import UNITS
 from snakesim_operator.run.in_process import simulate
-from snakesim_testing.harness.command import run_to_end
+from snakesim_testing.harness.command import run_program
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY, parse_sections
@@ -209,7 +209,7 @@ def test_python_controller_failure_in_child_process_is_a_cause(tmp_path: Path) -
     """As when NumPy was imported first."""
     (tmp_path / "failing.py").write_text(FAILING)
     code = "import numpy, snakesim\nsnakesim.run('triplet', controller='./failing.py:Failing', duration=0.1)"
-    done = run_to_end(
+    done = run_program(
         [sys.executable, "-c", code], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""}
     )
     assert "raised LinAlgError: Singular matrix (failing.py line 7)" in done.err.splitlines()[-1]
@@ -388,7 +388,7 @@ def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
         "study.py"
     ]
     (tmp_path / "study.py").write_text(study)
-    done = run_to_end(
+    done = run_program(
         [sys.executable, "study.py"], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""}
     )
     assert done.code == 0, done.err

@@ -21,7 +21,7 @@ def shown(sessions: tuple[Session, Session], clocks: list[Clock]) -> Iterator[Cl
     wait_until(publisher.has_subscriber, "the service listens", 5.0)
     for each in clocks:
         publisher.put(each)
-    wait_until(lambda: client._clocks.qsize() == len(clocks), "all clocks there", 5.0)
+    wait_until(lambda: client._due_clocks.qsize() == len(clocks), "all clocks there", 5.0)
     return client.iterate_ticks(0.05)
 
 

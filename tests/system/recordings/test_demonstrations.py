@@ -12,7 +12,7 @@ from snakesim_testing.runs.command import (
     SNAKESIM_COMMAND,
     RunningCommand,
     make_environment,
-    run_to_end,
+    run_program,
     running_armed_snakesim,
 )
 from snakesim_testing.runs.documents import REPOSITORY, UV, needs_uv
@@ -191,7 +191,7 @@ def test_lerobot_itself_loads_the_dataset(demos: Path, tmp_path: Path) -> None:
     )
     assert "2 episodes" in snakesim(*given, cwd=tmp_path).out
     offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "PATH": "/usr/bin:/bin"}
-    loaded = run_to_end([python, "-c", LOADED], tmp_path, offline, 600.0)
+    loaded = run_program([python, "-c", LOADED], tmp_path, offline, 600.0)
     assert loaded.code == 0, loaded.err[-3000:]
     seen = json.loads(loaded.out.splitlines()[-1])
     assert seen["episodes"] == 2

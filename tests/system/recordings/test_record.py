@@ -24,7 +24,7 @@ from snakesim_testing.runs.command import (
     TIMEOUT_S,
     CompletedRun,
     read_summary,
-    run_to_end,
+    run_program,
     run_to_summary,
     running_armed_snakesim,
     running_snakesim,
@@ -160,7 +160,7 @@ def in_a_file_system(
     network = [] if "--in-process" in arguments else ["--endpoint", find_free_endpoint()]
     typed = [*SNAKESIM_COMMAND, "run", *arguments, "--out", str(disk / "run"), *network]
     apart = ["unshare", "-rm", "sh", "-c", script, "sh", disk, left, options, prepare]
-    done = run_to_end([*apart, *typed], tmp_path, limit_s=120.0)
+    done = run_program([*apart, *typed], tmp_path, timeout_s=120.0)
     assert_no_process_left(disk / "run")
     assert done.code != 99, done.err
     return done, left / "run"

@@ -19,7 +19,7 @@ from snakesim_testing.runs import in_process_command as in_process
 from snakesim_testing.runs.command import (
     CompletedRun,
     make_environment,
-    run_to_end,
+    run_program,
     running_snakesim,
 )
 from snakesim_testing.runs.command import snakesim as command
@@ -124,7 +124,7 @@ SAID = {
 def suite(folder: Path, robot: str, clause: str) -> CompletedRun:
     """The contract suite, as docs/hardware/contract-suite.md has it, on the simulator with the whiskers."""
     typed = [sys.executable, "-m", "pytest", "-q", *PYTEST, "--snakesim-set", robot, "-k", clause]
-    return run_to_end(typed, folder, make_environment(folder, PYTHONPATH=str(REPOSITORY)), 120.0)
+    return run_program(typed, folder, make_environment(folder, PYTHONPATH=str(REPOSITORY)), 120.0)
 
 
 @pytest.mark.slow

@@ -45,9 +45,9 @@ class NoProcess:
     ended: str | None = None
 
     def __init__(
-        self, run: RunConfig, settings: CanSettings, pose: str | None, *, stepped: bool
+        self, run: RunConfig, settings: CanSettings, pose: str | None, *, is_stepped: bool
     ) -> None:
-        self.started.append((settings.channels, pose, stepped))
+        self.started.append((settings.channels, pose, is_stepped))
 
     def describe_exit(self) -> str | None:
         return self.ended
@@ -63,7 +63,7 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     real = CanSettings(
         channels=channels, joints_per_channel=[3, 1], emulators="process", physics_model="inertia"
     )
-    chain = ModuleChain(run, real, InertiaModel(run, InertiaSettings()), stepped=True)
+    chain = ModuleChain(run, real, InertiaModel(run, InertiaSettings()), is_stepped=True)
     end = InProcessEmulators(
         EmulatorServer([VirtualWire(name) for name in channels], chain), None, time.monotonic_ns
     )

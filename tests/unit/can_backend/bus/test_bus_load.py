@@ -13,14 +13,14 @@ from snakesim_can_backend.bus.load import (
     MAX_LOAD,
     MAX_SYNCS_PER_REPORT,
     ReportSchedule,
-    busiest_period_s,
     compute_bus_load,
+    compute_busiest_period_s,
     compute_max_frame_bits,
+    compute_syncs_per_report,
     count_joints_per_bus,
+    find_max_rate_hz,
     list_streams,
-    max_rate_hz,
     plan_reports,
-    syncs_per_report,
     validate_bus_load,
 )
 from snakesim_can_backend.protocol.definitions import LAST_NODE, Opcode
@@ -115,10 +115,10 @@ def test_bus_load_of_absent_reports_is_zero() -> None:
 def test_the_busiest_period_is_one_with_forces() -> None:
     expected_us = 105 + 13 * (115 + 135 + 135) + 135
     for contact_every in (1, 2, 7):
-        assert busiest_period_s(13, ReportSchedule(100.0, contact_every)) == pytest.approx(
+        assert compute_busiest_period_s(13, ReportSchedule(100.0, contact_every)) == pytest.approx(
             expected_us * 1e-6
         )
-    assert busiest_period_s(13, ReportSchedule(100.0, 0)) == pytest.approx(
+    assert compute_busiest_period_s(13, ReportSchedule(100.0, 0)) == pytest.approx(
         (105 + 13 * (115 + 135)) * 1e-6
     )
 
@@ -127,11 +127,11 @@ def test_the_busiest_period_is_one_with_forces() -> None:
 def test_reports_come_as_nearly_as_wanted_as_whole_syncs_allow(
     rate_hz: float, wanted_hz: float
 ) -> None:
-    apart = syncs_per_report(rate_hz, wanted_hz)
+    apart = compute_syncs_per_report(rate_hz, wanted_hz)
     assert 1 <= apart <= MAX_SYNCS_PER_REPORT
     if 1 < apart < MAX_SYNCS_PER_REPORT:
         assert abs(rate_hz / wanted_hz - apart) <= 0.5
-    assert syncs_per_report(rate_hz, 0.0) == 0
+    assert compute_syncs_per_report(rate_hz, 0.0) == 0
 
 
 def test_reports_are_those_of_the_robot_and_of_the_settings() -> None:
@@ -270,11 +270,11 @@ def test_bus_load_suggestions_all_fit(
 
 def test_the_rate_that_is_suggested_is_the_highest_whole_one() -> None:
     config, settings = run_of(18, 200.0), CanSettings()
-    best = max_rate_hz(18, config, settings)
+    best = find_max_rate_hz(18, config, settings)
     assert best is not None
     for rate in range(best + 1, 201):
         assert refusal(run_of(18, float(rate)), settings) is not None
-    assert max_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), CanSettings(imu_rate_hz=5.0)) in (
+    assert find_max_rate_hz(LAST_NODE, run_of(LAST_NODE, 21.0), CanSettings(imu_rate_hz=5.0)) in (
         None,
         20,
     )

@@ -103,15 +103,15 @@ def actions(frames: list[CanFrame]) -> list[float]:
 
 def test_bring_up_finds_every_module_with_identity_requests_only(modules: Modules) -> None:
     found = find_modules([modules.bus], 5.0)
-    assert [i.node for i in found] == [1, 2, 3, 4]
+    assert [i.node_id for i in found] == [1, 2, 3, 4]
     assert {i.channel for i in found} == {modules.channel}
     assert [i.serial for i in found] == [slot.module.serial for slot in modules.chain.slots]
-    assert {(i.firmware, i.protocol, i.emulated, i.stepped) for i in found} == {
+    assert {(i.firmware, i.protocol, i.is_emulated, i.is_stepped) for i in found} == {
         ("1.0", 1, True, True)
     }
     assert set(actions(modules.heard)) == {CommandAction.IDENTIFY}
     assert {parse_opcode(frame.id) for frame in modules.heard} == {Opcode.COMMAND}
-    assert find_discovery_errors([modules.bus], found, NAMES, lockstep=True) == []
+    assert find_discovery_errors([modules.bus], found, NAMES, is_lockstep=True) == []
 
 
 def test_bring_up_duplicate_module_id_is_detected_after_first_answer(modules: Modules) -> None:
@@ -128,7 +128,7 @@ def test_bring_up_duplicate_module_id_is_detected_after_first_answer(modules: Mo
 
     modules.to_host, modules.beside = watch_the_last, later
     found = find_modules([modules.bus], 5.0)
-    assert 0xBAD in [i.serial for i in found if i.node == 2]
+    assert 0xBAD in [i.serial for i in found if i.node_id == 2]
     assert len(found) == 5
 
 
@@ -147,7 +147,7 @@ def test_bring_up_lost_identity_answer_is_requested_again(modules: Modules) -> N
     modules.to_host = losing(
         1, lambda frame: parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 3
     )
-    assert [i.node for i in find_modules([modules.bus], 5.0)] == [1, 2, 3, 4]
+    assert [i.node_id for i in find_modules([modules.bus], 5.0)] == [1, 2, 3, 4]
     assert len(actions(modules.heard)) > 1, "asked again"
 
 
@@ -157,7 +157,7 @@ def test_bring_up_foreign_frames_are_forwarded_and_truncated_ones_ignored(module
     for frame in (beat, cut):
         modules.far.send(frame)
     handed_on: list[CanFrame] = []
-    assert [i.node for i in find_modules([modules.bus], 5.0, handed_on.append)] == [1, 2, 3, 4]
+    assert [i.node_id for i in find_modules([modules.bus], 5.0, handed_on.append)] == [1, 2, 3, 4]
     assert [frame for frame in handed_on if parse_opcode(frame.id) != Opcode.HEARTBEAT] == [cut]
     assert beat in handed_on
 
@@ -183,7 +183,7 @@ def two_buses() -> list[ModuleBus]:
 
 
 def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[str]:
-    return find_discovery_errors(two_buses(), found, NAMES, lockstep=lockstep)
+    return find_discovery_errors(two_buses(), found, NAMES, is_lockstep=lockstep)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[s
             "joint_2 (node 2 on can_a) answers 2 times, serials 00001002 and 0000BEEF: give each module its own",
         ),
         (
-            [*GOOD, replace(GOOD[0], node=9)],
+            [*GOOD, replace(GOOD[0], node_id=9)],
             "node 9 with serial 00001001 on can_a is not a joint of this robot",
         ),
         (
@@ -211,7 +211,7 @@ def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[s
             "joint_1 (node 1 on can_a) has protocol version 2, this driver 1",
         ),
         (
-            [replace(GOOD[0], stepped=True), *GOOD[1:]],
+            [replace(GOOD[0], is_stepped=True), *GOOD[1:]],
             "joint_1 (node 1 on can_a) is an emulator whose time is paused",
         ),
     ],
@@ -222,7 +222,7 @@ def test_bring_up_error_names_joint_node_and_bus(found: list[ModuleIdentity], wo
 
 
 def test_modules_that_cannot_wait_are_no_good_for_lockstep() -> None:
-    reported = wrong_with([replace(i, stepped=i.node > 1) for i in GOOD], lockstep=True)
+    reported = wrong_with([replace(i, is_stepped=i.node_id > 1) for i in GOOD], lockstep=True)
     assert reported == [
         "joint_1 (node 1 on can_a) does not support lockstep: use --clock-mode realtime"
     ]
@@ -233,8 +233,8 @@ def test_bring_up_lists_all_problems_in_one_error() -> None:
         replace(GOOD[0], protocol=3),
         replace(GOOD[0], protocol=3, serial=5),
         replace(GOOD[2], channel=A),
-        replace(GOOD[3], stepped=True),
-        replace(GOOD[3], node=62),
+        replace(GOOD[3], is_stepped=True),
+        replace(GOOD[3], node_id=62),
     ]
     reported = wrong_with(found)
     assert len(reported) == 7

@@ -110,11 +110,11 @@ def test_a_heartbeat_tells_state_faults_and_reason() -> None:
     module = made.modules[1]
     assert module.state == ModuleState.FAULT
     assert module.last_stop == LastStop.LEAK
-    assert module.fault_names() == ["leak", "voltage"]
+    assert module.list_fault_names() == ["leak", "voltage"]
     assert module.is_clear_required
     assert module.heartbeat_sync == made.sync
     made.process_frame(heartbeat(2, 1.1))
-    assert module.fault_names() == []
+    assert module.list_fault_names() == []
     assert not module.is_clear_required
 
 
@@ -141,7 +141,7 @@ def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
         assert made.malformed == 2 * (i + 1)
     before[1].frame_count = made.modules[1].frame_count
     assert made.modules == before
-    assert made.health() == [None] * JOINTS
+    assert made.list_health_reports() == [None] * JOINTS
 
 
 def test_strangers_are_counted_by_node() -> None:
@@ -186,7 +186,7 @@ def test_reader_of_arbitrary_frames_never_raises_or_moves_a_joint(
         assert made.is_complete in (True, False)
         assert made.list_contacts() is not None
         assert made.pop_imu_reports() is not None
-        assert len(made.health()) == JOINTS
+        assert len(made.list_health_reports()) == JOINTS
 
 
 @given(st.integers(1, JOINTS), st.integers(0, 63))

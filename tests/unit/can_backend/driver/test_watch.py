@@ -159,14 +159,17 @@ def test_watch_restart_is_reported_once_with_joint_and_lost_settings() -> None:
 
 def test_watch_missing_parameters_at_arming_are_reported_once() -> None:
     bench = MonitorRig()
-    assert bench.watch.find_faults(bench.reading, "disarmed", unconfigured={1}) == []
-    assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}, isolated={1}) == [], (
-        "set aside"
-    )
-    (found,) = bench.watch.find_faults(bench.reading, "armed", unconfigured={1})
+    assert bench.watch.find_faults(bench.reading, "disarmed", unconfigured_joints={1}) == []
+    assert (
+        bench.watch.find_faults(
+            bench.reading, "armed", unconfigured_joints={1}, isolated_joints={1}
+        )
+        == []
+    ), "set aside"
+    (found,) = bench.watch.find_faults(bench.reading, "armed", unconfigured_joints={1})
     assert list_findings([found]) == [("module_not_configured", 1)]
     assert not found.affects_only_joint
-    assert bench.watch.find_faults(bench.reading, "armed", unconfigured={1}) == []
+    assert bench.watch.find_faults(bench.reading, "armed", unconfigured_joints={1}) == []
 
 
 def test_two_modules_with_one_id_are_not_called_a_restart() -> None:

@@ -196,7 +196,7 @@ def test_the_watchdog_ends_within_the_step_in_stepped_time_too():
 
 def test_chain_in_real_time_catches_up_only_short_pauses():
     physics_model = Pushed(4)
-    made = chain(physics_model=physics_model, stepped=False)
+    made = chain(physics_model=physics_model, is_stepped=False)
     made.advance_to(150_000.0)
     assert physics_model.steps == 150
     made.advance_to(1_150_000.0)

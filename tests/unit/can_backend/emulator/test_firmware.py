@@ -198,7 +198,7 @@ def test_firmware_uptime_saturates_at_end_of_range() -> None:
     module = booted()
     module._boot_start_us = -(2**32 - 50) * MS
     beats = [
-        load_layouts()[Opcode.HEARTBEAT].decode(module.heartbeat(at_us).data)
+        load_layouts()[Opcode.HEARTBEAT].decode(module.make_heartbeat(at_us).data)
         for at_us in (0.0, 100 * MS, 500 * MS)
     ]
     assert [beat["uptime"] for beat in beats] == pytest.approx(

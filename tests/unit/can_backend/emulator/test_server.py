@@ -54,7 +54,7 @@ def send_tick(near: VirtualWire, tick: int) -> None:
 
 
 def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():
-    made = chain(stepped=False)
+    made = chain(is_stepped=False)
     with served(made) as (near, _, until):
         assert until(0.09) == []
         assert len(only(until(0.11), Opcode.HEARTBEAT)) == JOINTS
@@ -73,7 +73,7 @@ def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():
 
 
 def test_server_pause_does_not_look_like_a_host_pause():
-    made = chain(stepped=False)
+    made = chain(is_stepped=False)
     with served(made) as (near, server, until):
         until(0.11)
         near.send(make_command(CommandAction.ARM))

@@ -31,7 +31,7 @@ def test_dead_reckoning_knows_how_wrong_it_is():
     assert off[-1] < 3 * sd  # of 1 m that it has gone
     assert drive.world.localizer.position_sd_m > 0.02
     assert (
-        abs(drive.world.localizer.base.planar_w[2] - drive.compute_pose(drive.turn - 1).base_w[2])
+        abs(drive.world.localizer.base.planar_w[2] - drive.compute_pose(drive.cycle - 1).base_w[2])
         < 0.02
     )
 
@@ -76,7 +76,7 @@ def test_a_late_pose_corrects_what_has_happened_since():
             drive.world.add_pose(late.pop(0))
     assert (
         math.dist(
-            drive.world.localizer.base.planar_w[:2], drive.compute_pose(drive.turn - 1).base_w[:2]
+            drive.world.localizer.base.planar_w[:2], drive.compute_pose(drive.cycle - 1).base_w[:2]
         )
         < 0.012
     )

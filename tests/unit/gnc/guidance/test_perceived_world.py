@@ -14,7 +14,7 @@ from snakesim_testing.hal.small_robots import make_link_contact
 
 
 def reported(drive: SlidingSnake) -> WorldModel:
-    world = drive.world.make_world(drive.turn, drive.turn * STEP_NS)
+    world = drive.world.make_world(drive.cycle, drive.cycle * STEP_NS)
     assert world is not None
     return world
 
@@ -23,7 +23,7 @@ def scored(drive: SlidingSnake, turns: int, *, pose: bool = True) -> MapScore:
     """The map every half second, against the truth; without a pose sensor as the robot sees it."""
     total = MapScore()
     for here in drive.run_cycles(turns, pose=pose):
-        if drive.turn % 25 == 0 and drive.turn > 25:
+        if drive.cycle % 25 == 0 and drive.cycle > 25:
             obstacles = reported(drive).obstacles
             if not pose:
                 obstacles = align_map(
@@ -120,7 +120,7 @@ def test_perceived_contact_has_the_name_used_in_the_map():
     drive = SlidingSnake([])
     for _ in drive.run_cycles(10, images=False):
         drive.world.add_contacts(
-            Contacts(tick=drive.turn, timestamp_ns=drive.turn * STEP_NS, contacts=[touch])
+            Contacts(tick=drive.cycle, timestamp_ns=drive.cycle * STEP_NS, contacts=[touch])
         )
     world = drive.world.make_world(9, 9 * STEP_NS)
     assert world is not None
@@ -138,7 +138,7 @@ def test_a_lidar_maps_as_a_camera_does():
             drive.obstacles,
             here.origins_w[-1],
             here.rotations[-1],
-            timestamp_ns=drive.turn * STEP_NS,
+            timestamp_ns=drive.cycle * STEP_NS,
         )
         drive.world.add_ranging_sample(
             msgspec.structs.replace(beams, link=len(here.origins_w) - 1), NOISE

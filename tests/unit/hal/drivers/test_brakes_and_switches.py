@@ -102,22 +102,22 @@ def test_closed_switch_allows_motion_away_from_it_alone(
 def test_switch_is_a_fault_once_and_a_reset_allows_to_leave_it() -> None:
     switches = LimitSwitches(["joint_1"])
     switches.record_switches(0, lower=True, upper=False)
-    [finding] = switches.findings()
+    [finding] = switches.list_findings()
     assert (finding.what, finding.joint, finding.affects_only_joint) == ("limit_switch", 0, True)
     assert "lower limit switch" in finding.cause
     switches.reset(frozenset({0}))
     switches.record_switches(0, lower=True, upper=False)
-    assert switches.findings() == []
+    assert switches.list_findings() == []
     switches.record_switches(0, lower=False, upper=False)
     switches.record_switches(0, lower=True, upper=False)
-    assert len(switches.findings()) == 1, "it has closed again"
+    assert len(switches.list_findings()) == 1, "it has closed again"
 
 
 def test_safe_torque_off_has_a_fault_of_its_own_that_stops_the_robot() -> None:
     states = DriveStates(["joint_1"], PERIOD_NS, lambda: 0)
     states.drives[0].safe_torque_off = True
     states.drives[0].errors = "something else, which is its consequence"
-    [finding] = states.findings()
+    [finding] = states.list_findings()
     assert (finding.what, finding.joint, finding.affects_only_joint) == (
         "safe_torque_off",
         0,

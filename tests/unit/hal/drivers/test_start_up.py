@@ -70,7 +70,7 @@ def test_steps_run_in_order_and_report_step_and_time() -> None:
     bench.run(0.1)
     assert [bench.start_up.is_ready(i) for i in (0, 1)] == [True, False]
     assert bench.readings.not_ready_reasons[0] == ""
-    assert bench.start_up.findings() == []
+    assert bench.start_up.list_findings() == []
 
 
 def test_step_that_takes_too_long_is_aborted_and_begins_again_after_reset() -> None:
@@ -79,13 +79,13 @@ def test_step_that_takes_too_long_is_aborted_and_begins_again_after_reset() -> N
     bench.run(10.2)
     assert bench.sent[-2:] == [("stop", 0), ("stop", 1)]
     assert "homing did not end within 10 s" in bench.readings.not_ready_reasons[0]
-    assert {(finding.what, finding.joint) for finding in bench.start_up.findings()} == {
+    assert {(finding.what, finding.joint) for finding in bench.start_up.list_findings()} == {
         ("drive_not_ready", 0),
         ("drive_not_ready", 1),
     }
     assert not bench.start_up.can_continue()
     bench.start_up.reset(frozenset({1}))
-    assert [finding.joint for finding in bench.start_up.findings()] == [0]
+    assert [finding.joint for finding in bench.start_up.list_findings()] == [0]
     bench.run(0.2)
     assert bench.sent[-2:] == [("configure", 1), ("home", 1)]
 
@@ -108,7 +108,7 @@ def test_emergency_stop_aborts_the_steps_under_way_without_a_fault_of_the_drive(
     assert bench.sent[-1] == ("stop", 1)
     assert bench.start_up.is_ready(0)
     assert "homing was aborted: emergency stop" in bench.readings.not_ready_reasons[1]
-    assert bench.start_up.findings() == []
+    assert bench.start_up.list_findings() == []
 
 
 def test_lost_position_is_a_fault_and_needs_the_whole_start_up_again() -> None:
@@ -117,7 +117,7 @@ def test_lost_position_is_a_fault_and_needs_the_whole_start_up_again() -> None:
     bench.done |= {("homed", 0), ("homed", 1)}
     bench.run(0.1)
     bench.start_up.invalidate(1, "position unknown after a restart")
-    [finding] = bench.start_up.findings()
+    [finding] = bench.start_up.list_findings()
     assert (finding.what, finding.joint, finding.affects_only_joint) == ("drive_not_ready", 1, True)
     assert "position unknown" in finding.cause
     bench.run(5.0)

@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_hal.safety.authority import RECENT_COMMAND_COUNT, CommandAuthority, TickOutput
 from snakesim_hal.safety.cables import CableTracker
-from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD
+from snakesim_hal.safety.derating import WHERE_TO_SET_MIN_VOLTAGE
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, JointMode, LeaseRequest, SensorDescription
 from snakesim_testing.hal.authority_rig import (
@@ -431,7 +431,7 @@ def test_weak_supply_blocks_arming_with_one_explanation() -> None:
     answer = rig.arm()
     assert answer.refusal == "not_ready"
     assert answer.reason.count("12.0 V") == 1
-    assert MIN_VOLTAGE_FIELD in answer.reason
+    assert WHERE_TO_SET_MIN_VOLTAGE in answer.reason
 
 
 def test_joint_angle_after_a_host_pause_may_be_far() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.safety.derating import MIN_VOLTAGE_FIELD, REPORT_TIMEOUT_NS, HealthMonitor
+from snakesim_hal.safety.derating import REPORT_TIMEOUT_NS, WHERE_TO_SET_MIN_VOLTAGE, HealthMonitor
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, SensorDescription
 from snakesim_testing.hal.limiter_rig import JOINTS
@@ -57,7 +57,7 @@ def test_nothing_is_derated_before_anything_is_known() -> None:
     assert bench.derating.current_faults == []
     assert bench.look(0) == []
     assert bench.shares == [1.0] * JOINTS
-    assert bench.derating.derated_joints() == {}
+    assert bench.derating.find_derated_joints() == {}
 
 
 def test_derating_joint_without_heat_or_voltage_sensor_never_stops() -> None:
@@ -82,7 +82,7 @@ def test_torque_fades_linearly(celsius: float, share: float) -> None:
     bench = Bench()
     bench.receive([20.0, celsius, 20.0])
     assert bench.shares == pytest.approx([1.0, share, 1.0])
-    assert bench.derating.derated_joints() == (
+    assert bench.derating.find_derated_joints() == (
         {} if share == 1.0 else {"joint_2": pytest.approx(share)}
     )
 
@@ -152,7 +152,10 @@ def test_a_weak_supply_stops_the_robot_after_50_ms() -> None:
     (fault,) = bench.look(1)
     assert fault.what == "undervoltage"
     assert fault.joint == "joint_2"
-    assert fault.cause == f"the supply of joint_2 is at 17.9 V, it needs 18 V: {MIN_VOLTAGE_FIELD}"
+    assert (
+        fault.cause
+        == f"the supply of joint_2 is at 17.9 V, it needs 18 V: {WHERE_TO_SET_MIN_VOLTAGE}"
+    )
     assert bench.look(1) == []
     assert len(bench.derating.current_faults) == 1
     assert bench.receive() == []
