@@ -29,7 +29,7 @@ from snakesim_operator.results.signals import (
 from snakesim_operator.results.summary import RunSummary, get_distance_m
 
 PLAYBACK_HEIGHT_PX = 580
-WHOLE_RUN_SPAN_S = (0.0, math.inf)
+WHOLE_RUN_SPAN_S = (0.0, math.inf)  # start and end of a span that contains every run
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -180,15 +180,15 @@ class Result:
         speed: float = 1.0,
         span_s: tuple[float, float] = WHOLE_RUN_SPAN_S,
     ) -> Path:
-        """Render the run as a film, and write it to a file.
+        """Render a video of the run, and write it to a file.
 
         Args:
             path: The file to write, with the suffix .mp4 or .gif.
-            width: Width of the film in pixels.
-            height: Height of the film in pixels.
-            fps: Number of pictures in a second of the film.
-            speed: Seconds of robot time in a second of the film.
-            span_s: Start and end of the part of the run to film, in s.
+            width: Width of the video in pixels.
+            height: Height of the video in pixels.
+            fps: Frames per second of the video.
+            speed: Seconds of robot time in a second of the video.
+            span_s: Start and end of the part of the run to render, in s of robot time; the whole run if not given.
 
         Returns:
             The path of the file.

@@ -30,6 +30,7 @@ from snakesim_operator.run import arguments as run
 from snakesim_operator.this_computer import setup
 
 OK, FAILED, BAD_INPUT = 0, 1, 2
+NO_NOUN = ""  # noun of a command of one word, such as `snakesim run`
 # In the order of the help.
 HEADINGS = "daily work", "robot", "runs and studies", "files and computers"
 
@@ -177,11 +178,12 @@ class MainParser(CommandParser):
             epilog="`snakesim COMMAND --help` explains a command. Begin with: snakesim run triplet --console",
         )
         self.add_argument("--version", action=_PrintVersion, nargs=0, help="print the version")
+        # `Any`, because the class of subparsers is private in argparse.
         self.subparsers: Any = self.add_subparsers(
             required=True, metavar="COMMAND", parser_class=CommandParser
         )
-        # The commands below each noun.
-        self._subparsers_by_noun: dict[str, Any] = {"": self.subparsers}
+        # The commands below each noun, such as "robot" of `snakesim robot arm`. Those of one word have the noun "".
+        self._subparsers_by_noun: dict[str, Any] = {NO_NOUN: self.subparsers}
         self._actions_by_heading: dict[str, list[argparse.Action]] = {
             heading: [] for heading in HEADINGS
         }
@@ -242,7 +244,7 @@ class MainParser(CommandParser):
 
     def has_command(self, words: Sequence[str]) -> bool:
         """Return whether the words begin with a command that has been added, not only with a noun."""
-        noun = ""
+        noun = NO_NOUN
         for word in words:
             path = f"{noun} {word}".strip()
             if path not in self._subparsers_by_noun:

@@ -22,21 +22,25 @@ MODE_AND_UNIT_BY_KIND = {
 class ActionTargets:
     """What an action of an environment commands, joint by joint, tail to head."""
 
-    kind: str
+    kind: str  # "position", "velocity", "torque", or "residual:CONTROLLER"
     mode: JointMode
     unit: str
     names: Sequence[str]  # of the joints
-    low: Sequence[float]
-    high: Sequence[float]
+    low: Sequence[float]  # lower bound for each joint, in the unit of the action
+    high: Sequence[float]  # upper bound for each joint
 
     @staticmethod
     def for_robot(robot: RobotDescription, kind: str, residual_rad: float) -> "ActionTargets":
-        """Return what actions of a kind command on a robot, with the bounds of every joint.
+        """Return the targets of the actions of a robot: their mode and unit, and the bounds for each joint.
 
         Args:
             robot: Description of the robot, with the limits of the joints.
-            kind: Kind of action: "position", "velocity", "torque", or "residual:CONTROLLER".
+            kind: Kind of action: "position", "velocity", "torque", or "residual:CONTROLLER", as
+                `parse_corrected_controller` accepts it.
             residual_rad: Largest correction of a joint, for "residual:CONTROLLER". Ignored for other kinds.
+
+        Raises:
+            KeyError: There is no such kind of action.
         """
         joints = robot.joints
         names = [joint.name for joint in joints]
@@ -53,7 +57,7 @@ class ActionTargets:
             case JointMode.VELOCITY:
                 high = [joint.speed_limit_rad_s for joint in joints]
                 low = [-value for value in high]
-            case _:
+            case _:  # JointMode.TORQUE, the last mode in MODE_AND_UNIT_BY_KIND
                 high = [joint.torque_limit_nm for joint in joints]
                 low = [-value for value in high]
         return ActionTargets(kind, mode, unit, names, low, high)
@@ -106,6 +110,7 @@ class ActionTargets:
             )
 
     def _describe_expected(self) -> str:
+        """Return the shape and the meaning of a valid action, for an error message."""
         count = len(self.names)
         what = "a correction" if self.kind.startswith(RESIDUAL_PREFIX) else f"a {self.kind}"
         return (

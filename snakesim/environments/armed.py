@@ -270,38 +270,54 @@ class ArmedRobots:
     def _limit_vectorized(self, mode: JointMode, robots: Mask) -> None:
         """Limit the commands of some robots with the array limiter, and store their setpoints.
 
-        The setpoints of all other robots stay as they are.
+        The rows of all other robots keep the setpoints of the last tick. `_limit_individually`, which is called next,
+        replaces those of the robots that have a limiter of their own. The modes of the robots here do not change: a
+        robot moves to the array limiter only when all its joints follow this mode already.
+
+        Sets `_previous_setpoints`, `_target`, `_torque_limit_nm`, `is_limited` and `_last_decision`.
 
         Args:
             mode: Control mode of all joints.
             robots: Which robots to limit, (robots,).
         """
         self._previous_setpoints = (self._modes, self._target, self._torque_limit_nm)
-        joints = self._joint_count
-        measured = MeasuredArrays(self.joints[:, :joints], self.joints[:, joints : 2 * joints])
+        joint_count = self._joint_count
+        angles_rad = self.joints[:, :joint_count]
+        velocities_rad_s = self.joints[:, joint_count : 2 * joint_count]
+        measured = MeasuredArrays(angles_rad, velocities_rad_s)
+
+        # For all robots at once, (robots, joints); the rows of robots that are not in the mask are not used.
         if self._safe:
             requested = self._select_due_commands()
-            torque_limit_nm = self._limit_torque_limits()
+            torque_limit_nm = self._compute_torque_limits_nm()
             target = limit_targets(
                 mode, requested, self._target, torque_limit_nm, measured, self._limits
             )
             is_limited = target != requested
             if self._is_derated:
+                # A motor that is derated counts as limited, also if its target is not changed.
                 full_nm = self._limits.torque_nm
-                is_limited = is_limited | (full_nm > full_nm * self._torque_fraction)
+                derated_nm = full_nm * self._torque_fraction
+                is_limited = is_limited | (derated_nm < full_nm)
         else:
-            requested = self._commands[-1]
+            requested = self._commands[-1]  # the newest, without latency
             torque_limit_nm = self._limits.torque_nm
             target = requested.copy()
             is_limited = np.zeros_like(self.is_limited)
-        if robots is not self._all_robots:
-            target = np.where(robots[:, None], target, self._target)
-            torque_limit_nm = np.where(robots[:, None], torque_limit_nm, self._torque_limit_nm)
-            is_limited = is_limited & robots[:, None]
+
+        # In the usual case the mask is the object `_all_robots`, and no row has to be restored.
+        has_other_robots = robots is not self._all_robots
+        if has_other_robots:
+            is_in_mask = robots[:, None]
+            target = np.where(is_in_mask, target, self._target)
+            torque_limit_nm = np.where(is_in_mask, torque_limit_nm, self._torque_limit_nm)
+            is_limited = is_limited & is_in_mask
+            # `_limit_individually` changes rows of this array, and `_previous_setpoints` must keep the old ones.
             self._modes = self._modes.copy()
         self._target = target
         self._torque_limit_nm = torque_limit_nm
         self.is_limited = is_limited
+        # Which limit was active is computed from this only when it is needed, by `_update_active_limits`.
         self._last_decision = _LimiterDecision(
             robots, mode, requested, target, torque_limit_nm, self._torque_fraction, measured
         )
@@ -309,19 +325,28 @@ class ArmedRobots:
     def _select_due_commands(self) -> Floats:
         """Return the commands that take effect in this tick, after the latency of control, (robots, joints)."""
         schedule = self._schedule
+        # A controller that runs in every tick: the command of the same age for all robots.
         if schedule.decimation == 1:
             age_ticks = max(schedule.latency_ticks, 1)
-            return self._commands[-min(age_ticks, len(self._commands))]
-        # As `ServiceSchedule.used_output_tick` for the next tick, of every robot.
-        due_ticks = np.maximum(self.ticks + 1 - schedule.latency_ticks, 0)
-        ages = self.ticks - (due_ticks - due_ticks % schedule.decimation)
-        newest_first = np.stack(list(self._commands)[::-1])
-        # Outside of the bounds only for robots with their own limiter.
-        ages = np.clip(ages, 0, len(newest_first) - 1)
-        return newest_first[ages, np.arange(len(ages))]
+            position_from_end = min(age_ticks, len(self._commands))
+            return self._commands[-position_from_end]
 
-    def _limit_torque_limits(self) -> Floats:
-        """Return the torque limits of this tick, (robots, joints)."""
+        # Otherwise the age depends on the tick of the robot, as in `ServiceSchedule.used_output_tick` for the next
+        # tick: the newest tick that is due and in which the controller ran.
+        due_ticks = np.maximum(self.ticks + 1 - schedule.latency_ticks, 0)
+        command_ticks = due_ticks - due_ticks % schedule.decimation
+        ages_ticks = self.ticks - command_ticks
+        newest_first = np.stack(list(self._commands)[::-1])  # (commands, robots, joints)
+        # Outside of the bounds only for robots with their own limiter.
+        ages_ticks = np.clip(ages_ticks, 0, len(newest_first) - 1)
+        robot_indices = np.arange(len(ages_ticks))
+        return newest_first[ages_ticks, robot_indices]
+
+    def _compute_torque_limits_nm(self) -> Floats:
+        """Return the torque limits of this tick, (robots, joints): derated, and changed by a limited rate.
+
+        As long as no robot is derated, they are the full limits, and nothing has to be computed.
+        """
         full_nm = self._limits.torque_nm
         if self._has_full_torque and not self._is_derated:
             return full_nm

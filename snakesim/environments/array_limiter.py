@@ -197,17 +197,27 @@ def _compute_velocity_bounds(
 
 
 def _compute_torque_bounds(measured: MeasuredArrays, limits: LimitArrays) -> tuple[Floats, Floats]:
-    """Return the minimum and maximum torques that keep joints between their ends."""
-    to_lower_end, to_upper_end = _compute_stoppable_speeds(measured, limits)
+    """Return the minimum and maximum torques that keep joints between their ends, in N·m, (robots, joints) each.
+
+    The bounds brake a joint to the speed from which it can stop before the end that it approaches.
+    """
+    lower_end_speed_rad_s, upper_end_speed_rad_s = _compute_stoppable_speeds(measured, limits)
     gain = limits.velocity_gain
-    low = -gain * (to_lower_end + measured.velocity_rad_s)
-    high = gain * (to_upper_end - measured.velocity_rad_s)
-    low = np.where((to_lower_end == 0.0) & (low < 0.0), 0.0, low)
-    high = np.where((to_upper_end == 0.0) & (high > 0.0), 0.0, high)
-    at_upper_end = to_upper_end == 0.0
+    low_nm = -gain * (lower_end_speed_rad_s + measured.velocity_rad_s)
+    high_nm = gain * (upper_end_speed_rad_s - measured.velocity_rad_s)
+
+    # At an end, or beyond it, no torque may push further outward.
+    is_at_lower_end = lower_end_speed_rad_s == 0.0
+    is_at_upper_end = upper_end_speed_rad_s == 0.0
+    low_nm = np.where(is_at_lower_end & (low_nm < 0.0), 0.0, low_nm)
+    high_nm = np.where(is_at_upper_end & (high_nm > 0.0), 0.0, high_nm)
+
+    # Bounds that cross, as between two near ends, become equal: at the upper end to the upper one, otherwise to the
+    # lower one.
+    is_crossed = high_nm < low_nm
     return (
-        np.where(at_upper_end & (high < low), high, low),
-        np.where(at_upper_end | (high > low), high, low),
+        np.where(is_at_upper_end & is_crossed, high_nm, low_nm),
+        np.where(is_at_upper_end | (high_nm > low_nm), high_nm, low_nm),
     )
 
 

@@ -45,6 +45,15 @@ class BatchStepResult:
     endings: dict[int, str]  # how episodes ended in this step, by environment
 
 
+@dataclass(frozen=True)
+class _StepTicks:
+    """The ticks that a step has run."""
+
+    count: int  # of the ticks in which at least one robot took part
+    count_by_environment: NDArray[np.int64]  # (environments,)
+    is_everyone_active: bool  # whether all environments took part in all ticks
+
+
 class EpisodeBatch:
     """The current episodes of a number of environments.
 
@@ -141,32 +150,14 @@ class EpisodeBatch:
         # Until the step is complete: after an interrupt the environments need a reset, because ticks are not counted.
         self.is_over = self.is_over | environments
         start_advance_m = self.advance_m
-        step_ticks = np.zeros(self._count, dtype=np.int64)
-        tick_count = 0
-        is_everyone_active = True
-        min_remaining_ticks = int(self._remaining_ticks[environments].min(initial=setup.frame_skip))
-        active = environments
-        is_armed: Mask | None = None  # as of the last computation of `active`
-        for tick in range(setup.frame_skip):
-            # Which robots are active can change only when one was stopped (a new array), or when the time may be over.
-            if is_armed is not self.robots.is_armed or tick >= min_remaining_ticks:
-                is_armed = self.robots.is_armed
-                active = environments & is_armed & (step_ticks < self._remaining_ticks)
-                is_everyone_active = is_everyone_active and bool(active.all())
-                if not np.count_nonzero(active):
-                    break
-            self.robots.step(setup.commands.mode, actions, active)
-            self._active_by_tick[tick] = active
-            self._joints_by_tick[tick] = self.robots.joints
-            self._is_limited_by_tick[tick] = self.robots.is_limited
-            step_ticks = step_ticks + active
-            tick_count += 1
-        self._elapsed_ticks = self._elapsed_ticks + step_ticks
-        self._remaining_ticks = self._remaining_ticks - step_ticks
+        ticks = self._run_ticks(actions, environments)
+        self._elapsed_ticks = self._elapsed_ticks + ticks.count_by_environment
+        self._remaining_ticks = self._remaining_ticks - ticks.count_by_environment
 
+        # The terms of the rewards. `observe` also updates the advance and whether the goal is reached.
         observations = self.observe(environments)
         energy_j, limited_count = self._sum_energy_and_limited_joints(
-            tick_count, is_everyone_active
+            ticks.count, ticks.is_everyone_active
         )
         is_goal_reached = np.array(
             [progress.is_goal_reached for progress in self._observer.progress]
@@ -175,11 +166,14 @@ class EpisodeBatch:
         term_values = {
             "advance": self.advance_m - start_advance_m,
             "energy": energy_j,
-            "limited": limited_count / (np.maximum(step_ticks, 1) * actions.shape[1]),
+            "limited": limited_count
+            / (np.maximum(ticks.count_by_environment, 1) * actions.shape[1]),
             "goal": is_goal_reached.astype(np.float64),
             "stopped": is_stopped.astype(np.float64),
         }
         terms = {name: setup.weights[name] * value for name, value in term_values.items()}
+
+        # The ends of episodes.
         terminated = (is_goal_reached | is_stopped) & environments
         truncated = (self._remaining_ticks == 0) & environments
         self.is_over = np.where(environments, terminated | truncated, self.is_over)
@@ -192,6 +186,39 @@ class EpisodeBatch:
         return BatchStepResult(
             observations, sum_terms(terms), terminated, truncated, energy_j, terms, endings
         )
+
+    def _run_ticks(self, actions: Floats, environments: Mask) -> _StepTicks:
+        """Run the ticks of a step, and store the samples of each tick in the arrays `..._by_tick`.
+
+        A robot takes part until a fault stops it, or its time is over.
+
+        Args:
+            actions: Targets of all joints, (environments, joints).
+            environments: Which environments take the step, (environments,).
+        """
+        frame_skip = self._setup.frame_skip
+        count_by_environment = np.zeros(self._count, dtype=np.int64)
+        tick_count = 0
+        is_everyone_active = True
+        # No robot's time is over before this tick of the step.
+        min_remaining_ticks = int(self._remaining_ticks[environments].min(initial=frame_skip))
+        active = environments
+        is_armed: Mask | None = None  # as of the last computation of `active`
+        for tick in range(frame_skip):
+            # Which robots are active can change only when one was stopped (a new array), or when the time may be over.
+            if is_armed is not self.robots.is_armed or tick >= min_remaining_ticks:
+                is_armed = self.robots.is_armed
+                active = environments & is_armed & (count_by_environment < self._remaining_ticks)
+                is_everyone_active = is_everyone_active and bool(active.all())
+                if not np.count_nonzero(active):
+                    break
+            self.robots.step(self._setup.commands.mode, actions, active)
+            self._active_by_tick[tick] = active
+            self._joints_by_tick[tick] = self.robots.joints
+            self._is_limited_by_tick[tick] = self.robots.is_limited
+            count_by_environment = count_by_environment + active
+            tick_count += 1
+        return _StepTicks(tick_count, count_by_environment, is_everyone_active)
 
     def render(self, environment: int) -> NDArray[np.uint8]:
         """Return a picture of a robot in its scene, (height, width, 3), drawn as by `snakesim recording video`."""

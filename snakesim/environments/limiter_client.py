@@ -26,9 +26,11 @@ LEASE_PRIORITY = 100
 class LimiterClient:
     """Sends commands to the safety core of one robot.
 
+    The safety core turns commands into setpoints. It is either a `CommandAuthority`, which is the safety core of the
+    HAL with its command limiter, or a `NoLimiter`, which passes commands on unchanged.
+
     Attributes:
-        core: Safety core of the robot: the authority of the HAL, or a stand-in without limits. It turns commands into
-            setpoints.
+        core: Safety core of the robot.
     """
 
     def __init__(self, description: RobotDescription, *, safe: bool) -> None:
@@ -42,6 +44,7 @@ class LimiterClient:
         self._description = description
         self._max_torque_nm = [joint.torque_limit_nm for joint in description.joints]
         self._sequence = 0
+        # One of the two is the safety core; the other is None. `core` is the same object.
         self._authority: CommandAuthority | None = None
         self._no_limiter: NoLimiter | None = None
         if safe:
@@ -121,10 +124,11 @@ class LimiterClient:
         commands: Iterable[tuple[int, list[float]]],
         mode: JointMode,
     ) -> None:
-        """Take over a robot that has been armed and limited by the array limiter until now.
+        """Take over the commands of a robot that is already armed, from the array limiter.
 
-        The safety core is replaced by one in the state that it would have if it had limited the robot before. Without a
-        limiter, this does nothing.
+        The array limiter limits many robots at once, see `armed`. This client gets a new safety core, in the state that
+        it would have if it had limited the robot since its start. The robot is not armed again. Without a limiter, this
+        does nothing.
 
         Args:
             joints: Newest joint state that the array limiter has accepted.

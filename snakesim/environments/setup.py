@@ -59,16 +59,16 @@ class EnvironmentSetup:
                 code="python/invalid-argument",
             )
         _validate_step_arguments(frame_skip, render_mode, residual_rad)
-        # Whose targets the actions correct; None: actions are targets.
-        controller = parse_corrected_controller(action)
+        # The controller whose targets the actions correct; None if the actions are targets themselves.
+        corrected_controller = parse_corrected_controller(action)
         overrides = make_overrides(set, duration_s=duration)
-        if controller is not None:
+        if corrected_controller is not None:
             if not safe:
                 raise ConfigError(
                     f"action={action!r}: a controller commands through the limiter; leave safe=False out",
                     code="python/invalid-argument",
                 )
-            overrides.insert(0, KeyOverride("controller", controller, f"action={action}"))
+            overrides.insert(0, KeyOverride("controller", corrected_controller, f"action={action}"))
 
         # The scenario, and what each seed changes in it.
         self._scenario = os.fspath(scenario)
@@ -78,7 +78,7 @@ class EnvironmentSetup:
         self.new_fields = len(self.config.scene.random_field) if new_field else 0
 
         # Steps, rewards and pictures.
-        self.is_assisted = controller is not None
+        self.is_assisted = corrected_controller is not None
         self.is_safe = safe
         self.frame_skip = frame_skip
         self.weights = fill_reward_weights(reward)

@@ -311,7 +311,7 @@ def _expand_seeds(seed: Any, count: int) -> list[int | None]:
     """Expand the argument `seed` of `reset` to a seed for each environment, by the rules of Gymnasium.
 
     Args:
-        seed: None, the seed of the first environment (the merged_infos ones count up), or a sequence of seeds.
+        seed: None, the seed of the first environment (those of the others count up from it), or a sequence of seeds.
         count: Number of environments.
 
     Returns:

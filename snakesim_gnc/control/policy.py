@@ -103,23 +103,35 @@ def _check_joints_of_model(
     metadata: "_ModelMetadata",
     robot: RobotDescription,
     action: str,
-    parts: Mapping[str, ObservationPart],
+    observation_parts: Mapping[str, ObservationPart],
 ) -> None:
-    """Check that the robot has the joints that the model commands and observes. Raises ConfigError."""
+    """Check that the robot has the joints that the model commands and observes.
+
+    Args:
+        metadata: Metadata of the model, with its number of joints.
+        robot: The robot that the model is going to move.
+        action: What the model commands, a key of MODE_BY_ACTION.
+        observation_parts: What the model observes, by name.
+
+    Raises:
+        ConfigError: The number of joints differs, or a joint does not have the mode or the measurement that the model
+            needs.
+    """
     joint_count = len(robot.joints)
-    expected_count = metadata.read_integer(JOINTS_KEY)
-    if expected_count != joint_count:
-        allowed = f"{joint_count}, the number of joints of robot {robot.robot!r}"
-        raise metadata.make_error(JOINTS_KEY, expected_count, allowed)
+    model_joint_count = metadata.read_integer(JOINTS_KEY)
+    if model_joint_count != joint_count:
+        requirement = f"{joint_count}, the number of joints of robot {robot.robot!r}"
+        raise metadata.make_error(JOINTS_KEY, model_joint_count, requirement)
     for joint in robot.joints:
         if not joint.supports_mode(MODE_BY_ACTION[action]):
-            available = [name for name, mode in MODE_BY_ACTION.items() if joint.supports_mode(mode)]
-            raise metadata.make_error(
-                ACTION_KEY, action, f"what {joint.name} can do: {', '.join(available)}"
-            )
-        if "torque_nm" in parts and "torque" not in joint.measures:
-            allowed = f"without torque_nm: {joint.name} measures none"
-            raise metadata.make_error(OBSERVATIONS_KEY, ",".join(parts), allowed)
+            supported_actions = [
+                name for name, mode in MODE_BY_ACTION.items() if joint.supports_mode(mode)
+            ]
+            requirement = f"what {joint.name} can do: {', '.join(supported_actions)}"
+            raise metadata.make_error(ACTION_KEY, action, requirement)
+        if "torque_nm" in observation_parts and "torque" not in joint.measures:
+            requirement = f"without torque_nm: {joint.name} measures none"
+            raise metadata.make_error(OBSERVATIONS_KEY, ",".join(observation_parts), requirement)
 
 
 class PolicyParameters(FileStruct, frozen=True, kw_only=True):
@@ -224,13 +236,13 @@ class _ModelMetadata:
     def read_parts(self, robot: RobotDescription) -> dict[str, ObservationPart]:
         """Return the parts of the observation, in the order in which the model expects them. Raises ConfigError."""
         available = make_observation_parts(robot)
-        allowed = f"names out of {', '.join(available)}, each once, with commas between"
-        text = self._read_text(OBSERVATIONS_KEY, allowed)
+        requirement = f"names out of {', '.join(available)}, each once, with commas between"
+        text = self._read_text(OBSERVATIONS_KEY, requirement)
         names = [name.strip() for name in text.split(",")]
         has_unknown_names = not set(names) <= set(available)
         has_repeated_names = len(set(names)) < len(names)
         if has_unknown_names or has_repeated_names:
-            raise self.make_error(OBSERVATIONS_KEY, text, allowed)
+            raise self.make_error(OBSERVATIONS_KEY, text, requirement)
         try:
             return select_observation_parts(robot, names)
         except ConfigError as error:
@@ -239,55 +251,71 @@ class _ModelMetadata:
                 code="policy/invalid",
             ) from None
 
-    def read_choice(self, field: str, choices: Mapping[str, Any]) -> str:
+    def read_choice(self, property_name: str, choices: Mapping[str, Any]) -> str:
         """Return a metadata property that must be one of the choices. Raises ConfigError."""
-        allowed = f"one of {', '.join(choices)}"
-        text = self._read_text(field, allowed).strip()
+        requirement = f"one of {', '.join(choices)}"
+        text = self._read_text(property_name, requirement).strip()
         if text not in choices:
-            raise self.make_error(field, text, allowed)
+            raise self.make_error(property_name, text, requirement)
         return text
 
-    def read_integer(self, field: str, maximum: int | None = None, unit: str = "") -> int:
+    def read_integer(self, property_name: str, maximum: int | None = None, unit: str = "") -> int:
         """Return a metadata property as an integer from 1 to `maximum`.
 
         Args:
-            field: Name of the metadata property.
+            property_name: Name of the metadata property.
             maximum: Upper bound; None for no upper bound.
             unit: Unit of the number, for the error message; empty for a count.
 
         Raises:
             ConfigError: The property is missing, is not an integer, or is out of range.
         """
-        allowed = "a whole number"
+        requirement = "a whole number"
         if unit:
-            allowed += f" of {unit}"
-        allowed += " from 1"
+            requirement += f" of {unit}"
+        requirement += " from 1"
         if maximum is not None:
-            allowed += f" to {maximum}"
-        text = self._read_text(field, allowed).strip()
+            requirement += f" to {maximum}"
+        text = self._read_text(property_name, requirement).strip()
         is_number = text.isascii() and text.isdigit() and len(text) <= MAX_INTEGER_DIGITS
         if not is_number:
-            raise self.make_error(field, text, allowed)
+            raise self.make_error(property_name, text, requirement)
         value = int(text)
         if value < 1 or (maximum is not None and value > maximum):
-            raise self.make_error(field, text, allowed)
+            raise self.make_error(property_name, text, requirement)
         return value
 
-    def make_error(self, field: str, value: object, allowed: str) -> ConfigError:
-        """Return an error that names the file, the field, its value and what is allowed."""
+    def make_error(self, property_name: str, value: object, requirement: str) -> ConfigError:
+        """Return an error that names the file, a metadata property, its value and what is allowed.
+
+        Args:
+            property_name: Name of the metadata property.
+            value: Its value.
+            requirement: What it must be; the error continues with this text after "must be".
+        """
         return ConfigError(
-            f"{self._file}: metadata `{field}` is {shorten(str(value))!r}, must be {allowed}",
+            f"{self._file}: metadata `{property_name}` is {shorten(str(value))!r}, must be {requirement}",
             code="policy/invalid",
         )
 
-    def _read_text(self, field: str, allowed: str) -> str:
-        if field not in self._properties:
+    def _read_text(self, property_name: str, requirement: str) -> str:
+        """Return a metadata property as it is written in the file.
+
+        Args:
+            property_name: Name of the metadata property.
+            requirement: What it must be; the error continues with this text after "must be".
+
+        Raises:
+            ConfigError: There is no such property.
+        """
+        if property_name not in self._properties:
             available = ", ".join(sorted(self._properties)) or "no metadata"
             raise ConfigError(
-                f"{self._file}: has no metadata `{field}`, which must be {allowed}; there is {shorten(available, 200)}",
+                f"{self._file}: has no metadata `{property_name}`, which must be {requirement}; there is "
+                f"{shorten(available, 200)}",
                 code="policy/invalid",
             )
-        return self._properties[field]
+        return self._properties[property_name]
 
 
 def _find_model_file(name: str) -> Path:

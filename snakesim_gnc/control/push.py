@@ -200,7 +200,8 @@ def solve_push(
     Returns:
         The contact forces lambda and the joint torques tau for 1 N, and the residual |A lambda - b| of the balance.
     """
-    link_rear_ends_w = body_points_w[:, :-1].T  # (n_links, 2)
+    # The links, (n_links, 2) and (n_links,), and the center of the body, about which moments are taken.
+    link_rear_ends_w = body_points_w[:, :-1].T
     link_vectors_w = np.diff(body_points_w, axis=1).T
     lengths_m = np.hypot(*link_vectors_w.T)
     middles_w = link_rear_ends_w + 0.5 * link_vectors_w
@@ -208,6 +209,7 @@ def solve_push(
     length_fraction = lengths_m / lengths_m.sum()  # the drag of each link, for 1 N in sum
     center_w = length_fraction @ middles_w
 
+    # The balance A lambda = b: the contacts push (A, with a column for each) against the drag of 1 N (b).
     drag_force = length_fraction @ tangents
     drag_moment = length_fraction @ cross_2d(middles_w - center_w, tangents)
     b = np.array([*drag_force, drag_moment])  # (3,)
@@ -215,6 +217,7 @@ def solve_push(
     # (3, k).
     a = np.column_stack([contacts.directions_w, cross_2d(arms_m, contacts.directions_w)]).T
 
+    # The joint torques lever lambda + drag_torque. A joint carries the forces and the drag ahead of it.
     joints_w = body_points_w[:, 1:-1].T  # (n_joints, 2), p_i
     is_ahead = contacts.body_s_m[None, :] > np.cumsum(lengths_m)[:-1, None]
     lever = -(

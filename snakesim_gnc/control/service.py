@@ -109,9 +109,7 @@ class ControlService(Service):
         self._sensor_samples.clear()
 
     def outputs(self, clock: Clock) -> KeyedMessages | None:
-        """Command the robot in one tick: by the controller while the robot is armed, otherwise to hold its pose.
-
-        Without the command lease, or with joint states that are too old, nothing is sent to the robot.
+        """Command the robot in one tick, and return the message about the state of control.
 
         Args:
             clock: The current tick, with the lifecycle state of the robot.
@@ -119,36 +117,56 @@ class ControlService(Service):
         Returns:
             The state of control with its key, or an empty list if no message is due; None if there is no joint state
             for this tick.
+
+        Raises:
+            ControllerError: The controller has failed; its last state has been published.
         """
         self._last_clock = clock
-        self._status_reader.drain()  # `silence` considers only a status that is newer than the last clock
+        # Discard the statuses from before this clock: if clocks stop, `silence` must find only newer ones.
+        self._status_reader.drain()
         self._apply_new_parameters(clock)
         joints = self._client.read(self._joint_feed)
         if joints is None:
             return None
+        return _list_state_messages(self._command_robot(clock, joints))
+
+    def _command_robot(self, clock: Clock, joints: JointState) -> ControlState | None:
+        """Command the robot: by the controller while the robot is armed, otherwise to hold its pose.
+
+        The order of the checks matters. Without the command lease nothing is sent, whatever the inputs are. With joint
+        states that are too old nothing is sent either, not even the command to hold the pose.
+
+        Args:
+            clock: The current tick, with the lifecycle state of the robot.
+            joints: The newest joint state.
+
+        Returns:
+            The state of control, or None if no message about it is due.
+
+        Raises:
+            ControllerError: The controller has failed; its last state has been published.
+        """
         is_armed = clock.lifecycle == "armed"
-        holds_lease = self._commander.ensure_lease(clock)
-        if not (is_armed and holds_lease):
+        has_lease = self._commander.ensure_lease(clock)
+        if not (is_armed and has_lease):
             self._controller = None
-        if not holds_lease:
+        if not has_lease:
             lease_reason = (
                 f"no right to command: {self._commander.lease_refusal or 'the lease is not ours'}"
             )
-            return _list_state_messages(
-                self._state_reports.make_state(
-                    clock, is_armed=is_armed, missing_inputs=lease_reason
-                )
+            return self._state_reports.make_state(
+                clock, is_armed=is_armed, missing_inputs=lease_reason
             )
         late_reason = self._age_limits.check_joints(joints, clock.timestamp_ns)
         if late_reason:
             self._log_late_streams(clock, [late_reason], "no commands")
-            return _list_state_messages(
-                self._state_reports.make_state(clock, is_armed=is_armed, missing_inputs=late_reason)
+            return self._state_reports.make_state(
+                clock, is_armed=is_armed, missing_inputs=late_reason
             )
         if not is_armed:
             self._log_late_streams(clock)
             self._commander.send_command(clock, joints, self._commander.make_hold_setpoints(joints))
-            return _list_state_messages(self._state_reports.make_state(clock))
+            return self._state_reports.make_state(clock)
         return self._run_controller(clock, joints)
 
     def pause(self, clock: Clock) -> None:
@@ -182,12 +200,15 @@ class ControlService(Service):
         if self._parameters.answer_requests(clock):
             self._controller = None
 
-    def _run_controller(self, clock: Clock, joints: JointState) -> KeyedMessages:
-        """Call the controller with its fresh inputs, send its setpoints, and return its state if it is due.
+    def _run_controller(self, clock: Clock, joints: JointState) -> ControlState | None:
+        """Call the controller with its fresh inputs, and send its setpoints.
 
         Args:
             clock: The current tick, in which the robot is armed and this service has the command lease.
             joints: The joint state of this tick.
+
+        Returns:
+            The state of control, or None if no message about it is due.
 
         Raises:
             ControllerError: The controller has failed; its last state has been published.
@@ -212,7 +233,7 @@ class ControlService(Service):
             self._commander.send_command(clock, joints, command.setpoints)
             rest_reason = _explain_no_motion(trajectory)
             try:
-                state = self._state_reports.make_state(
+                return self._state_reports.make_state(
                     clock,
                     command.telemetry,
                     is_armed=True,
@@ -226,7 +247,6 @@ class ControlService(Service):
                 keys.CONTROL_STATE, self._state_reports.make_failure_state(clock, str(error))
             )
             raise
-        return _list_state_messages(state)
 
     def _read_fresh_plan(self, clock: Clock) -> tuple[WorldModel | None, Trajectory | None, str]:
         """Read the newest world model and trajectory, and replace those that are too old by None.

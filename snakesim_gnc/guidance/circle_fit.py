@@ -66,6 +66,7 @@ def fit_circles(
         information, gradient = _linearize(
             offset, radii_m, weights, outward_directions, normal_weights
         )
+        # Gauss-Newton step (b, 3) of x, y and radius, shortened so that no component exceeds MAX_STEP_M.
         step = -np.linalg.solve(information, gradient[..., None])[..., 0]
         longest_m = np.maximum(np.abs(step).max(axis=1), 1e-9)
         step *= np.minimum(1.0, MAX_STEP_M / longest_m)[:, None]
@@ -137,6 +138,7 @@ def _linearize(
         1.0, OUTLIER_THRESHOLD_SD / np.maximum(np.abs(errors_m) * np.sqrt(weights), 1e-9)
     )
     robust_weights = weights * huber_factors
+    # Derivatives of the distance error of each point by x, y and radius: (b, p, 3).
     rows = np.stack(
         [
             -offsets_m[..., 0] / distances_m,
@@ -148,7 +150,8 @@ def _linearize(
     information = np.einsum("bp,bpi,bpj->bij", robust_weights, rows, rows)
     gradient = np.einsum("bp,bpi->bi", robust_weights * errors_m, rows)
 
-    # The line through a point along its measured normal leads through the center.
+    # The line through a point along its measured normal leads through the center. The error is the distance of the
+    # center from this line, and `normal_rows` are its derivatives: (b, p, 3).
     normal_rows = np.stack(
         [outward_directions[..., 1], -outward_directions[..., 0], np.zeros_like(distances_m)],
         axis=-1,

@@ -103,6 +103,8 @@ def estimate_pushes(
     joint_count = len(torques_nm)
     is_yaw: NDArray[np.bool_] = np.any(chain.axes_b != 0.0, axis=1)
 
+    # What inertia and joint torques leave unexplained, (n_joints + 3,). Joints that do not bend in the plane have no
+    # equation, which a row of zeros stands for.
     right_side = inertia @ np.append(accelerations, 1.0)
     right_side[:joint_count] -= np.where(is_yaw, torques_nm, 0.0)
     right_side[:joint_count] *= is_yaw

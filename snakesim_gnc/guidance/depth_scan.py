@@ -122,11 +122,14 @@ class DepthScanner:
         Returns:
             The scan, with one range, point and height for each bin of azimuth.
         """
+        # The points that were seen, (m, 3), in the world's axes: x and y from the camera, z from the world's origin.
         pixels_with_depth = np.flatnonzero(depth_m)
         rays = self._rays[pixels_with_depth] @ rotation.T.astype(np.float32)
-        points = rays * depth_m[pixels_with_depth, None]  # from the camera, in the world's axes
+        points = rays * depth_m[pixels_with_depth, None]
         points[:, 2] += position_w[2]
         ranges_m = np.hypot(points[:, 0], points[:, 1])
+
+        # Their heights above the ground, whose plane is fitted to points near the camera.
         near_points = np.flatnonzero(ranges_m < MAX_FIT_RANGE_M)[::GROUND_PIXEL_STRIDE]
         a, b, c = refine_plane(plane, points[near_points].astype(np.float64)).astype(np.float32)
         heights_m = points[:, 2] - (a + b * points[:, 0] + c * points[:, 1])
@@ -140,12 +143,15 @@ class DepthScanner:
         ).astype(np.int32)
         bin_count = math.ceil(fov_rad / self._step_rad)
 
+        # Which of them show ground, and which may show an obstacle.
         is_valid = (ranges_m > MIN_RANGE_M) & (ranges_m < MAX_RANGE_M) & (bins < bin_count)
         ground_tolerance_m = compute_tolerance_m(ranges_m)
         is_ground = is_valid & (np.abs(heights_m) <= ground_tolerance_m)
         lowest_m = np.maximum(ground_tolerance_m, OBSTACLE_BAND_M[0])
         highest_m = max(OBSTACLE_BAND_M[1], a + MIN_BAND_MARGIN_M)
         band_pixels = np.flatnonzero(is_valid & (heights_m > lowest_m) & (heights_m < highest_m))
+
+        # Farthest ground in each bin.
         free_m = np.zeros(bin_count)
         np.maximum.at(free_m, bins[is_ground], ranges_m[is_ground])
         pixels = _DepthPixels(
@@ -222,17 +228,23 @@ class DepthScanner:
         Returns:
             (bin_count,) ranges of the nearest cell with an upright surface in m; NaN for a bin without one.
         """
+        # Each bin is divided into cells of range, whose size grows with the range as the derivative of sinh. All cells
+        # of all bins have consecutive numbers: (m,) the number of the cell of each pixel.
         cell_of_bin = (
             np.arcsinh(pixels.ranges_m / CELL_GROWTH_RANGE_M) * (CELL_GROWTH_RANGE_M / CELL_M)
         ).astype(np.int32)
         cell = pixels.bins * self._cell_count + cell_of_bin
         cell_count = bin_count * self._cell_count
+
+        # A cell is upright if its pixels span enough height.
         pixel_count = np.bincount(cell, minlength=cell_count)
         low_m = np.full(cell_count, np.inf, dtype=np.float32)
         high_m = np.full(cell_count, -np.inf, dtype=np.float32)
         np.minimum.at(low_m, cell, pixels.heights_m)
         np.maximum.at(high_m, cell, pixels.heights_m)
         is_upright = (pixel_count >= MIN_PIXEL_COUNT) & (high_m - low_m >= MIN_RISE_M)
+
+        # The first upright cell of each bin, and the range of its middle.
         is_upright = is_upright.reshape(bin_count, self._cell_count)
         nearest_cells = is_upright.argmax(axis=1)
         range_m = CELL_GROWTH_RANGE_M * np.sinh(

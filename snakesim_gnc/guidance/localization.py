@@ -43,6 +43,7 @@ MAX_AGE_NS = 60_000_000  # contacts and gyroscope readings count for joint state
 # Leveling by the tail link's accelerometer.
 TILT_FILTER_TIME_CONSTANT_S = 0.5  # time over which accelerations are averaged
 IMU_PERIOD_S = 0.02  # between two readings
+MIN_NORM = 1e-6  # of a vector that is normalized; avoids a division by zero
 
 
 @dataclass(frozen=True)
@@ -165,11 +166,14 @@ class PoseLocalizer:
             map_variance_m2: Variance in m² of the position of the obstacles against which the pose was measured. It is
                 added at the end, because no number of measurements lowers it.
         """
+        # P: the covariance without the part that is common with the map.
         mean_variance_m2 = 0.5 * float(np.trace(self.covariance[:2, :2]))
         independent_ratio = max(
             1.0 - map_variance_m2 / max(mean_variance_m2, 1e-12), MIN_INDEPENDENT_RATIO
         )
         independent_covariance = self.covariance * independent_ratio
+
+        # The innovation, (3,), and the update.
         pose_error = measured_w - estimate.planar_w
         pose_error[2] = wrap_angle(pose_error[2])
         kalman_gain = independent_covariance @ np.linalg.inv(
@@ -263,23 +267,22 @@ class PoseLocalizer:
         """
         if 0 not in imu.link:
             return
+        # Low-pass filter of the first order.
         force_b = np.array(imu.acceleration_m_s2[imu.link.index(0)])
-        if self._mean_specific_force_b is None:
-            self._mean_specific_force_b = force_b
-        else:
-            self._mean_specific_force_b = (
-                self._mean_specific_force_b
-                + (force_b - self._mean_specific_force_b)
-                * IMU_PERIOD_S
-                / TILT_FILTER_TIME_CONSTANT_S
+        mean_b = force_b
+        if self._mean_specific_force_b is not None:
+            change_b = force_b - self._mean_specific_force_b
+            mean_b = (
+                self._mean_specific_force_b + change_b * IMU_PERIOD_S / TILT_FILTER_TIME_CONSTANT_S
             )
-        z = self._mean_specific_force_b / max(
-            float(np.linalg.norm(self._mean_specific_force_b)), 1e-6
-        )
+        self._mean_specific_force_b = mean_b
+
+        # Axes of the level frame in the base: z is up, and x is the forward axis of the base without its vertical part.
+        z = mean_b / max(float(np.linalg.norm(mean_b)), MIN_NORM)
         forward = np.array([1.0, 0.0, 0.0]) - z[0] * z
-        x = forward / max(float(np.linalg.norm(forward)), 1e-6)
-        # Rows: axes of the level frame in the base.
-        tilt: Floats = np.array([x, np.cross(z, x), z], dtype=np.float64)
+        x = forward / max(float(np.linalg.norm(forward)), MIN_NORM)
+        y = np.cross(z, x)
+        tilt: Floats = np.array([x, y, z], dtype=np.float64)
         self.base = BasePose(self.base.planar_w, self.base.z_m, tilt)
 
 

@@ -66,6 +66,8 @@ TOUCH_SD_M = 0.003
 NORMAL_SD_RAD = 0.2
 SKIN_SD_M = 0.004
 
+MIN_LENGTH_M = 1e-9  # avoids a division by zero where two points of the body's axis coincide
+
 # Memory.
 MAX_TRACKS = 1024
 FORGET_DISTANCE_M = 4.0  # from the body; obstacles farther away are forgotten
@@ -128,15 +130,18 @@ class ObstacleMap:
         self._merge_duplicates(list(seen_track_by_number.values()), adjacent_pairs)
         self._drop_disproved_tracks()
 
-    def add_touches(self, touches: Sequence[tuple[Floats, Floats]], timestamp_ns: int) -> None:
+    def add_contacts(
+        self, points_and_normals_w: Sequence[tuple[Floats, Floats]], timestamp_ns: int
+    ) -> None:
         """Add contacts of the body to the surfaces of tracks, and start tracks for contacts that belong to none.
 
         Args:
-            touches: For each contact, the position (2,) on the surface and the normal (2,) into the body, in the world.
+            points_and_normals_w: For each contact, the position (2,) on the surface and the unit normal (2,) into the
+                body, in the world.
             timestamp_ns: Time of the contacts.
         """
         touched_track_by_number: dict[int, ObstacleTrack] = {}
-        for position_w, normal_w in touches:
+        for position_w, normal_w in points_and_normals_w:
             track = self.find_track(position_w)
             if track is None:
                 track = self._start_touched_track(position_w, normal_w)
@@ -175,13 +180,15 @@ class ObstacleMap:
         tracks_with_surface = [track for track in self.tracks if len(track.surface)]
         if not tracks_with_surface:
             return
-        gaps_m = make_outlines(tracks_with_surface).compute_distances_m(axis_w)  # (n, tracks)
+        # Distance of each point of the axis from each outline, and the distance below which the body is surely inside.
+        distances_m = make_outlines(tracks_with_surface).compute_distances_m(axis_w)  # (n, tracks)
         min_distance_m = radius_m - MAX_OVERLAP_WITH_BODY_M - 2 * sd_m
-        left_w = np.gradient(axis_w, axis=0) @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # (n, 2)
-        left_w = left_w / np.maximum(np.hypot(left_w[:, 0], left_w[:, 1]), 1e-9)[:, None]
+        # Unit vectors to the left of the body: the direction of the axis, turned by a quarter. (n, 2)
+        left_w = np.gradient(axis_w, axis=0) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+        left_w = left_w / np.maximum(np.hypot(left_w[:, 0], left_w[:, 1]), MIN_LENGTH_M)[:, None]
         changed_tracks: list[ObstacleTrack] = []
-        for index in np.flatnonzero(gaps_m.min(axis=0) < min_distance_m):
-            is_in_body = gaps_m[:, index] < min_distance_m
+        for index in np.flatnonzero(distances_m.min(axis=0) < min_distance_m):
+            is_in_body = distances_m[:, index] < min_distance_m
             _remove_surface_in_body(
                 tracks_with_surface[index], axis_w, left_w, is_in_body, radius_m, min_distance_m
             )
@@ -227,19 +234,22 @@ class ObstacleMap:
         """
         if not nearby_tracks:
             return self._start_track_for_cluster(cluster, scan)
-        # (points, tracks).
+        # Distance of each point from each outline, and the gate: the distance up to which it may belong to the track.
+        # (points, tracks) each.
         distance_m = np.abs(outlines.compute_distances_m(scan.points_w[cluster]))
         track_gate_m = np.minimum(
             BASE_GATE_M + 2 * get_position_sds_m(nearby_tracks) + sd_m, MAX_GATE_M
         )
-        gate_m = track_gate_m + 2 * scan.sd_m[cluster][:, None]  # (points, tracks)
+        gate_m = track_gate_m + 2 * scan.sd_m[cluster][:, None]
+
+        # Owners are the tracks, as indices in `nearby_tracks`, that are nearest to many points within their gate.
         rows = np.arange(len(cluster))
         nearest_tracks = distance_m.argmin(axis=1)
         is_within_gate = distance_m[rows, nearest_tracks] < gate_m[rows, nearest_tracks]
-        counts = Counter(nearest_tracks[is_within_gate].tolist())
+        point_count_by_track = Counter(nearest_tracks[is_within_gate].tolist())
         owners = [
             index
-            for index, count in counts.items()
+            for index, count in point_count_by_track.items()
             if count >= MIN_OWNER_RATIO * len(cluster) or count >= MIN_OWNER_POINTS
         ]
         if not owners:
@@ -260,7 +270,7 @@ class ObstacleMap:
         if np.count_nonzero(is_apart) > MIN_CLUSTER_POINTS:
             claims.append((self._start_seen_track(), cluster[is_apart]))
         claims = [(track, bins) for track, bins in claims if len(bins)]
-        return sorted(claims, key=lambda claim: int(claim[1][0]))
+        return sorted(claims, key=_get_first_bin)
 
     def _start_track_for_cluster(self, cluster: Indices, scan: AzimuthScan) -> list[TrackClaim]:
         """Start a track for a whole cluster.
@@ -294,9 +304,10 @@ class ObstacleMap:
             scan: The scan.
             seen_numbers: Numbers of the tracks that the scan has seen, whose evidence is not lowered.
         """
-        clear_m = scan.compute_clear_distances_m()
+        clear_m = scan.compute_clear_distances_m()  # (bins,)
         for track in nearby_tracks:
             surface = track.surface
+            # A cell of the surface is seen through if its bin of the scan is clear far beyond the cell.
             bins, ranges_m = scan.find_bins(surface.points_w)
             is_in_view = bins >= 0
             margin_m = min(track.position_sd_m, MAX_TRACK_SD_M)
@@ -308,11 +319,10 @@ class ObstacleMap:
                 is_seen_through, surface.seen_through_counts + 1, surface.seen_through_counts
             )
             surface.keep_cells(surface.seen_through_counts < MAX_SEEN_THROUGH_COUNT)
-            visible = max(np.count_nonzero(is_in_view), 1)
-            if (
-                track.number not in seen_numbers
-                and np.count_nonzero(is_seen_through) > SEEN_THROUGH_RATIO * visible
-            ):
+            visible_count = max(np.count_nonzero(is_in_view), 1)
+            seen_through_count = np.count_nonzero(is_seen_through)
+            is_mostly_seen_through = seen_through_count > SEEN_THROUGH_RATIO * visible_count
+            if is_mostly_seen_through and track.number not in seen_numbers:
                 track.add_evidence(MISS_LOG_ODDS)
 
     def _merge_duplicates(
@@ -326,14 +336,16 @@ class ObstacleMap:
             seen_tracks: Tracks that the last scan saw.
             adjacent_pairs: Pairs of tracks side by side in one cluster of the scan.
         """
+        # Pairs of tracks, each with whether the tracks overlap.
         candidates = [(a, b, False) for a, b in adjacent_pairs]
         candidates += [(a, b, True) for a, b in self._find_overlaps(seen_tracks)]
-        merged_numbers: set[int] = set()
-        for a, b, overlaps in candidates:
+        merged_numbers: set[int] = set()  # of tracks that are part of an older track now
+        for a, b, is_overlap in candidates:
             if a is b or a.number in merged_numbers or b.number in merged_numbers:
                 continue
-            older_track, newer_track = (a, b) if a.number < b.number else (b, a)
-            if self._merge_if_plausible(older_track, newer_track, overlaps=overlaps):
+            older_track = min(a, b, key=lambda track: track.number)
+            newer_track = max(a, b, key=lambda track: track.number)
+            if self._merge_if_plausible(older_track, newer_track, overlaps=is_overlap):
                 merged_numbers.add(newer_track.number)
         self.tracks = [track for track in self.tracks if track.number not in merged_numbers]
 
@@ -354,10 +366,11 @@ class ObstacleMap:
         outlines = make_outlines(self.tracks)
         pairs: list[tuple[ObstacleTrack, ObstacleTrack]] = []
         for track in seen_tracks:
+            # Distance from the track's center to the bounding circle of each track; a quick test for those nearby.
             offset = outlines.center_w - track.center_w
-            apart_m = np.hypot(offset[:, 0], offset[:, 1]) - outlines.bounding_radius_m
+            distance_m = np.hypot(offset[:, 0], offset[:, 1]) - outlines.bounding_radius_m
             size_m = max(track.radius_m, float(track.half_size_m.max()))
-            for index in np.flatnonzero(apart_m < size_m + BASE_GATE_M):
+            for index in np.flatnonzero(distance_m < size_m + BASE_GATE_M):
                 other = self.tracks[index]
                 if other is track:
                     continue
@@ -462,12 +475,13 @@ def _remove_surface_in_body(
     """
     surface = track.surface
     cell_count = len(surface)
+    # From each point of the axis to each cell of the surface: (cells, n, 2) and (cells, n).
     offset = surface.points_w[:, None] - axis_w
-    distance_m = np.hypot(offset[..., 0], offset[..., 1])  # (cells, n)
+    distance_m = np.hypot(offset[..., 0], offset[..., 1])
+    # On which side of the body each cell is, (cells,), by the nearest point of the axis.
     nearest_axis_points = distance_m.argmin(axis=1)
-    is_left = (
-        offset[np.arange(cell_count), nearest_axis_points] * left_w[nearest_axis_points]
-    ).sum(axis=1) > 0
+    nearest_offset = offset[np.arange(cell_count), nearest_axis_points]
+    is_left = (nearest_offset * left_w[nearest_axis_points]).sum(axis=1) > 0
     surface.keep_cells(distance_m.min(axis=1) > min_distance_m)
     body_goes_through = (
         MIN_LEFT_RATIO_WHEN_CROSSING < np.mean(is_left) < MAX_LEFT_RATIO_WHEN_CROSSING
@@ -483,7 +497,14 @@ def _remove_surface_in_body(
     surface.add(skin_w, np.full(len(indices_in_body), SKIN_SD_M), -towards_surface)
 
 
+def _get_first_bin(claim: TrackClaim) -> int:
+    """Return the first bin of a claim, which has the lowest azimuth."""
+    _, bins = claim
+    return int(bins[0])
+
+
 def _is_in_range(track: ObstacleTrack, scan: AzimuthScan) -> bool:
+    """Return whether the obstacle of a track may be seen in a scan, by the distance of its center."""
     return math.hypot(*(track.center_w - scan.origin_w)) < MAX_RANGE_M + SCAN_MARGIN_M
 
 

@@ -116,6 +116,7 @@ class ChainOdometry:
                     [equations.standard_deviations, contact_equations.standard_deviations]
                 ),
             )
+        # Three more equations: the base hardly moves forward or to the left, and turns as the gyroscopes measure.
         rotation_rad, rotation_sd_rad = _measure_base_rotation(previous, current, imu, period_s)
         translation_sd_m = (STEP_SD_M_S + STEP_SD_M_PER_RAD * rms_joint_velocity_rad_s) * period_s
         rows = np.vstack([equations.rows, np.eye(3)])
@@ -127,6 +128,7 @@ class ChainOdometry:
             ]
         )
 
+        # Weighted least squares for the motion of the base: forward, left and rotation.
         information = rows.T @ (rows / np.square(standard_deviations)[:, None])
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
         motion: Floats = covariance @ (rows.T @ (values / np.square(standard_deviations)))

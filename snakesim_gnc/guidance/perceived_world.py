@@ -32,7 +32,7 @@ from snakesim_hal.wire.messages import (
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 
 # Contacts are mapped this often: the body slides a few millimeters meanwhile.
-TOUCH_MAPPING_PERIOD_NS = 50_000_000
+CONTACT_MAPPING_PERIOD_NS = 50_000_000
 OWN_BODY_MARGIN_M = 0.01  # beyond the body's radius: nearer points of a scan are on the body itself
 HALF_CONFIDENCE_SD_M = 0.05  # of the position, at which the confidence in it is one half
 # Part of a contact's normal: with more, the body lies on the obstacle.
@@ -76,8 +76,8 @@ class PerceivedWorld:
         self._scanners: dict[tuple[CameraIntrinsics, RangeNoise], DepthScanner] = {}
         self._joints: JointState | None = None
         self._contacts: Contacts | None = None
-        # Timestamp of the newest contacts in the map; 0 before the first ones.
-        self._last_touch_ns = 0
+        # Timestamp of the newest contacts that were added to the map; 0 before the first ones.
+        self._last_mapped_contacts_ns = 0
 
     def add_joints(self, joints: JointState, contacts: Contacts | None, imu: Imu | None) -> None:
         """Move the estimated body to a joint state by dead reckoning. A joint state that is not newer is ignored.
@@ -98,34 +98,40 @@ class PerceivedWorld:
         if self.localizer.jump_distance_m:
             self.map.add_drift(self.localizer.jump_distance_m**2)
 
-    def add_contacts(self, contacts: Contacts) -> None:
-        """Store contacts, and add the points at which the body touches upright surfaces to the map.
+    def add_contacts(self, sample: Contacts) -> None:
+        """Store the newest contacts, and add those with upright surfaces to the map.
 
-        Contacts are mapped at most every TOUCH_MAPPING_PERIOD_NS. Contacts whose time is not covered by the history of
-        the body are counted in `rejected_sample_counts`.
+        Contacts are mapped at most every CONTACT_MAPPING_PERIOD_NS. A sample whose time is not covered by the history
+        of the body is counted in `rejected_sample_counts`. Contacts of links that the robot does not have are ignored.
 
         Args:
-            contacts: Contacts of the links, in the frames of the links.
+            sample: Contacts of the links, with positions and normals in the frames of the links.
         """
-        self._contacts = contacts
-        has_touched = self._last_touch_ns != 0
-        if has_touched and contacts.timestamp_ns - self._last_touch_ns < TOUCH_MAPPING_PERIOD_NS:
+        self._contacts = sample
+        has_mapped_contacts = self._last_mapped_contacts_ns != 0
+        elapsed_ns = sample.timestamp_ns - self._last_mapped_contacts_ns
+        if has_mapped_contacts and elapsed_ns < CONTACT_MAPPING_PERIOD_NS:
             return
-        body = self.localizer.history.interpolate_body(contacts.timestamp_ns)
+        body = self.localizer.history.interpolate_body(sample.timestamp_ns)
         if body is None:
             self.rejected_sample_counts["contacts without a joint state of their time"] += 1
             return
-        self._last_touch_ns = contacts.timestamp_ns
-        touches: list[tuple[Floats, Floats]] = []  # position (2,) and normal (2,) in the world
-        for contact in contacts.contacts:
+        self._last_mapped_contacts_ns = sample.timestamp_ns
+        points_and_normals_w: list[tuple[Floats, Floats]] = []  # (2,) and (2,) in the world
+        for contact in sample.contacts:
             if contact.link >= len(body.origins_w):
                 continue
-            rotation = body.rotations[contact.link]
-            normal_w = rotation @ np.array(contact.normal_l)
-            if abs(normal_w[2]) < MAX_VERTICAL_NORMAL_PART:
-                position_w = body.origins_w[contact.link] + rotation @ np.array(contact.position_l)
-                touches.append((position_w[:2], normal_w[:2] / math.hypot(*normal_w[:2])))
-        self.map.add_touches(touches, contacts.timestamp_ns)
+            world_from_link = body.rotations[contact.link]
+            normal_w = world_from_link @ np.array(contact.normal_l)
+            # The body lies on a surface with a steeper normal, which is no obstacle beside it.
+            if abs(normal_w[2]) >= MAX_VERTICAL_NORMAL_PART:
+                continue
+            position_w = body.origins_w[contact.link] + world_from_link @ np.array(
+                contact.position_l
+            )
+            horizontal_normal_w = normal_w[:2] / math.hypot(*normal_w[:2])
+            points_and_normals_w.append((position_w[:2], horizontal_normal_w))
+        self.map.add_contacts(points_and_normals_w, sample.timestamp_ns)
 
     def add_ranging_sample(self, sample: RangingSample, noise: RangeNoise) -> None:
         """Add a sample of a depth camera, lidar or range finder to the map.

@@ -72,25 +72,33 @@ class ChainDynamics:
     def compute_generalized_forces(
         self, links: NDArray[np.intp], points_b: Floats, forces_b: Floats
     ) -> Floats:
-        """Compute the generalized forces of m forces: their left-hand sides in all equations of motion.
+        """Compute the generalized forces of m forces: what each of them contributes to every equation of motion.
 
-        A force has a moment about each joint behind its link: axis_i . ((r - p_i) x f).
+        The robot has n joints. A force f at the point r has a moment about the axis of each joint behind its link, with
+        the joint at p_i: axis_i . ((r - p_i) x f).
 
         Args:
-            links: (m,) index of the link on which each force acts.
+            links: (m,) index of the link on which each force acts, from 0 at the tail.
             points_b: (m, 3) points at which the forces act, in the frame of the base, m.
             forces_b: (m, 3) forces in the frame of the base, N.
 
         Returns:
-            (n + 3, m): moments about the n joints, moment about the center of mass, force in x and y.
+            (n + 3, m), a column for each force: n moments about the joints and one about the center of mass, in N·m,
+            then the force in x and y, in N.
         """
-        arms = points_b - self.rear_b[1:, None]  # (n, m, 3)
-        moments = np.einsum("ij,imj->im", self.axes_b, np.cross(arms, forces_b))
-        # Joints ahead of the link carry no moment.
-        moments *= np.arange(len(self.axes_b))[:, None] < links
+        # Joint i is at the rear end of link i + 1. From each joint to each force: (n, m, 3).
+        joints_b = self.rear_b[1:]
+        lever_arms_b = points_b[None, :, :] - joints_b[:, None, :]
+        moments_b = np.cross(lever_arms_b, forces_b)
+        joint_moments_nm = np.einsum("ij,imj->im", self.axes_b, moments_b)  # (n, m)
+        # Only the joints behind the link of a force carry its moment: joint i is behind the links from i + 1 on.
+        joint_indices = np.arange(len(self.axes_b))
+        joint_moments_nm *= joint_indices[:, None] < links
+
+        # About the vertical axis through the center of mass: (m,).
         center_b = self.masses_kg @ self.middles_b / self.masses_kg.sum()
-        total_moments = np.cross(points_b - center_b, forces_b)[:, 2]
-        return np.vstack([moments, total_moments, forces_b[:, :2].T])
+        body_moments_nm = np.cross(points_b - center_b, forces_b)[:, 2]
+        return np.vstack([joint_moments_nm, body_moments_nm, forces_b[:, :2].T])
 
 
 def estimate_angular_velocities(
@@ -109,14 +117,17 @@ def estimate_angular_velocities(
     Returns:
         (n + 1,) angular velocities in rad/s.
     """
+    # (n + 1,) of each link relative to the tail link.
     relative_rad_s = np.append(0.0, np.cumsum(chain.axes_b[:, 2] * velocities_rad_s))
     if not imu.link:
         return relative_rad_s
+    # Vertical component of each gyroscope's angular velocity, which it measures in the frame of its link.
     measured_rad_s = [
-        chain.frames[link][2] @ rate
-        for link, rate in zip(imu.link, imu.angular_velocity_rad_s, strict=True)
+        chain.frames[link][2] @ velocity_l
+        for link, velocity_l in zip(imu.link, imu.angular_velocity_rad_s, strict=True)
     ]
-    return relative_rad_s + float(np.mean(np.array(measured_rad_s) - relative_rad_s[imu.link]))
+    tail_link_rad_s = float(np.mean(np.array(measured_rad_s) - relative_rad_s[imu.link]))
+    return relative_rad_s + tail_link_rad_s
 
 
 def estimate_accelerations(
@@ -136,20 +147,22 @@ def estimate_accelerations(
         The accelerations (n + 3,), those of the tail end first, and the lower Cholesky factor (n + 3, n + 3) of their
         covariance.
     """
+    # Measurement = jacobian @ unknowns + bias. For k sensors it has 2 k rows: x of all sensors, then y of all sensors.
+    sensor_count = len(imu.link)
     unknown_count = len(angular_velocities_rad_s) + 2
-    jacobian_and_bias = _make_acceleration_model(chain, angular_velocities_rad_s)[
-        :, imu.link
-    ].reshape(2 * len(imu.link), unknown_count + 1)
+    model = _make_acceleration_model(chain, angular_velocities_rad_s)
+    jacobian_and_bias = model[:, imu.link].reshape(2 * sensor_count, unknown_count + 1)
     jacobian = jacobian_and_bias[:, :-1]
     # Centripetal accelerations of the sensors, without any of the unknown accelerations.
     bias_m_s2 = jacobian_and_bias[:, -1]
-    # Rows are ordered as in the Jacobian: x of all sensors, then y of all sensors.
+
+    # The measurements, rotated from the frames of their links to that of the base, in the same order: (2 k,).
     specific_forces_l = np.reshape(imu.acceleration_m_s2, (-1, 3))
-    planar_specific_forces = np.einsum("kij,kj->ki", chain.frames[imu.link], specific_forces_l)[
-        :, :2
-    ].T.ravel()
-    has_imu = len(imu.link) > 0
-    if has_imu:
+    specific_forces_b = np.einsum("kij,kj->ki", chain.frames[imu.link], specific_forces_l)
+    planar_specific_forces = specific_forces_b[:, :2].T.ravel()
+
+    # The prior: all unknowns are 0, with these standard deviations.
+    if sensor_count > 0:
         tail_sd_m_s2 = TAIL_ACCELERATION_PRIOR_SD_M_S2
         angular_sd_rad_s2 = ANGULAR_ACCELERATION_PRIOR_SD_RAD_S2
     else:
@@ -158,6 +171,8 @@ def estimate_accelerations(
     prior_sd = np.append(
         np.full(2, tail_sd_m_s2), np.full(len(angular_velocities_rad_s), angular_sd_rad_s2)
     )
+
+    # The least-squares solution, weighted by the inverse variances.
     precision = jacobian.T @ jacobian / ACCELERATION_SD_M_S2**2 + np.diag(prior_sd**-2.0)
     covariance = np.linalg.inv(precision)
     accelerations = (
@@ -206,18 +221,25 @@ def compute_inertia_terms(chain: ChainDynamics, angular_velocities_rad_s: Floats
         `_make_acceleration_model`: accelerations of the tail end and the links, and the constant 1.
     """
     link_count = len(angular_velocities_rad_s)
+    joint_count = link_count - 1
     links = np.arange(link_count)
     model = _make_acceleration_model(chain, angular_velocities_rad_s)
     inertia = np.zeros((link_count + 2, link_count + 3))
+
+    # Accelerated masses: each link's mass times the acceleration of its middle, in x and in y.
     for axis in (0, 1):
         forces_b = chain.masses_kg[:, None] * np.eye(3)[axis]
         inertia += chain.compute_generalized_forces(links, chain.middles_b, forces_b) @ model[axis]
-    # Across its axis.
+
+    # Links that turn: the inertia of a cylinder about an axis across it. A joint carries the links ahead of it.
     link_inertias_kg_m2 = chain.masses_kg * (chain.lengths_m**2 / 12 + chain.radii_m**2 / 4)
-    is_ahead = np.arange(link_count - 1)[:, None] < links
+    is_ahead_of_joint = np.arange(joint_count)[:, None] < links  # (n, n + 1)
+    # Rotors turn with their joint, which is the difference between the link ahead and the link behind: (n, n + 1).
     rotor_terms = chain.rotor_inertias_kg_m2[:, None] * np.diff(np.eye(link_count), axis=0)
-    inertia[: link_count - 1, 2:-1] += is_ahead * link_inertias_kg_m2 + rotor_terms
-    inertia[link_count - 1, 2:-1] += link_inertias_kg_m2
+
+    # Columns 2 to n + 2 are the angular accelerations of the links; row n is the moment about the center of mass.
+    inertia[:joint_count, 2:-1] += is_ahead_of_joint * link_inertias_kg_m2 + rotor_terms
+    inertia[joint_count, 2:-1] += link_inertias_kg_m2
     return inertia
 
 
@@ -232,16 +254,19 @@ def compute_unit_friction(
         pose: Velocity of the base; None if the links are assumed to slide forward along themselves.
 
     Returns:
-        The left-hand sides of all equations, (n + 3,); and a root (n + 3, 2 n + 2) of their covariance, because the
-        ground does not carry all links alike.
+        The generalized force, (n + 3,), as `compute_generalized_forces` returns it for one force; and a matrix R of
+        shape (n + 3, 2 n + 2), with which R R' is the covariance of this force. It is uncertain, because the ground
+        does not carry all links alike.
     """
     links = np.arange(len(angular_velocities_rad_s))
     middles_b = chain.middles_b
-    slide_velocities = _compute_slide_directions(chain, angular_velocities_rad_s, pose)
+    slide_directions_b = _compute_slide_directions(chain, angular_velocities_rad_s, pose)
     weights_n = GRAVITY_M_S2 * chain.masses_kg[:, None]
+    # The friction of each link is opposite to its motion. Their sum is the friction of the body.
     friction = chain.compute_generalized_forces(
-        links, middles_b, -weights_n * slide_velocities
+        links, middles_b, -weights_n * slide_directions_b
     ).sum(axis=1)
+    # The error of each link's load is a friction force in x and in y, independent of all others.
     friction_by_axis = [
         chain.compute_generalized_forces(links, middles_b, weights_n * axis)
         for axis in np.eye(3)[:2]
@@ -254,27 +279,34 @@ def _compute_slide_directions(
 ) -> Floats:
     """Compute the direction in which each link slides over the ground.
 
+    The vectors become shorter at low speeds, because static friction is not known: with the slip speed v_0 of
+    FRICTION_SLIP_SPEED_M_S, the direction of a link with the velocity v is v / sqrt(|v|² + v_0²).
+
     Args:
         chain: Lengths and frames of the links.
         angular_velocities_rad_s: (n + 1,) angular velocities of the links about the vertical axis.
         pose: Velocity of the base; None if the links are assumed to slide forward along themselves.
 
     Returns:
-        (n + 1, 3) vectors in the frame of the base, whose length is 1 for a fast link and below 1 for a slow one.
+        (n + 1, 3) vectors in the frame of the base, whose length is nearly 1 for a link that is much faster than the
+        slip speed, and 0 for a link that is stationary.
     """
     if pose is None:
         return chain.frames[:, :, 0].copy()
     angular_velocities = angular_velocities_rad_s[:, None]
-    front_end_velocities = np.cumsum(np.cross(UP, chain.link_vectors_b) * angular_velocities, 0)[
-        :-1
-    ]
-    rear_end_velocities = np.vstack([np.zeros(3), front_end_velocities])
-    slide_velocities = (
-        rear_end_velocities + np.cross(UP, chain.middles_b - chain.rear_b) * angular_velocities
-    )
-    slide_velocities += rotation_from_quaternion(pose.orientation_wxyz).T @ pose.velocity_w
-    slide_velocities[:, 2] = 0.0
-    slide_velocities /= np.hypot(np.linalg.norm(slide_velocities, axis=1), FRICTION_SLIP_SPEED_M_S)[
-        :, None
-    ]
-    return slide_velocities
+
+    # Velocities relative to the tail end, m/s. A link that turns moves its front end relative to its rear end, and the
+    # front end of a link is the rear end of the next one: (n + 1, 3) each.
+    front_relative_to_rear = np.cross(UP, chain.link_vectors_b) * angular_velocities
+    front_end_velocities_b = np.cumsum(front_relative_to_rear, axis=0)
+    rear_end_velocities_b = np.vstack([np.zeros(3), front_end_velocities_b[:-1]])
+    middle_relative_to_rear = np.cross(UP, chain.middles_b - chain.rear_b) * angular_velocities
+    middle_velocities_b = rear_end_velocities_b + middle_relative_to_rear
+
+    # Add the velocity of the tail end, which is the base, and keep what is in the plane of the ground.
+    base_velocity_b = rotation_from_quaternion(pose.orientation_wxyz).T @ pose.velocity_w
+    middle_velocities_b += base_velocity_b
+    middle_velocities_b[:, 2] = 0.0
+
+    speeds_m_s = np.linalg.norm(middle_velocities_b, axis=1)
+    return middle_velocities_b / np.hypot(speeds_m_s, FRICTION_SLIP_SPEED_M_S)[:, None]

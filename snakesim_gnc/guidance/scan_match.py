@@ -118,25 +118,29 @@ def _compute_residuals(
     Returns:
         The nearest outline and the weight of each point, the information (3, 3) and the gradient (3,).
     """
+    # The scan points with the corrected pose, (m, 2): rotated about the base, and moved.
     cosine = np.cos(correction[2])
     sine = np.sin(correction[2])
     rotated = offsets_from_base_w @ np.array([[cosine, sine], [-sine, cosine]])
     points_w = predicted_w[:2] + correction[:2] + rotated
+
+    # Distance e of each point from its nearest outline, (m,).
     rows = np.arange(len(offsets_from_base_w))
     all_distances_m = outlines.compute_distances_m(points_w)  # (m, outlines)
     nearest = np.abs(all_distances_m).argmin(axis=1)
     distance_m = all_distances_m[rows, nearest]
 
-    slopes: list[Floats] = []  # of the distance along x and y
+    # J, (m, 3): derivatives of the distances by a shift along x and y, by differences, and by the heading.
+    slopes: list[Floats] = []
     for axis in np.eye(2):
-        shifted_distance_m = outlines.compute_distances_m(points_w + DERIVATIVE_STEP_M * axis)[
-            rows, nearest
-        ]
+        shifted_points_w = points_w + DERIVATIVE_STEP_M * axis
+        shifted_distance_m = outlines.compute_distances_m(shifted_points_w)[rows, nearest]
         slopes.append((shifted_distance_m - distance_m) / DERIVATIVE_STEP_M)
-    slope = np.stack(slopes, axis=1)
-    slope_by_heading = slope[:, 1] * rotated[:, 0] - slope[:, 0] * rotated[:, 1]
-    jacobian = np.column_stack([slope, slope_by_heading])
+    slope_by_shift = np.stack(slopes, axis=1)
+    slope_by_heading = slope_by_shift[:, 1] * rotated[:, 0] - slope_by_shift[:, 0] * rotated[:, 1]
+    jacobian = np.column_stack([slope_by_shift, slope_by_heading])
 
+    # W, (m,): inverse variances, reduced for large distances, and 0 for points that belong to no landmark.
     distance_sd_m = np.hypot(np.hypot(sd_m, landmark_sd_m[nearest]), MIN_RANGE_SD_M)
     is_inlier = np.abs(distance_m) < MAX_MATCH_DISTANCE_M
     huber_factors = np.minimum(

@@ -447,8 +447,9 @@ class ClutterPlanner:
         trail = self._trail_w
         if trail and np.hypot(*(trail[-1] - tail_w)) <= TRAIL_SPACING_M:
             return
-        goes_back = len(trail) > 1 and float((tail_w - trail[-1]) @ (trail[-1] - trail[-2])) < 0
-        if goes_back:
+        # Against the last step of the trail.
+        is_going_back = len(trail) > 1 and float((tail_w - trail[-1]) @ (trail[-1] - trail[-2])) < 0
+        if is_going_back:
             trail.pop()
         else:
             trail.append(tail_w)

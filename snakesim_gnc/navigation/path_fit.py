@@ -16,6 +16,7 @@ from snakesim_hal.base.arrays import Floats
 Bools = NDArray[np.bool_]
 
 FIXED_WEIGHT = 1e4  # of points that must not move
+MIN_LENGTH_M = 1e-9  # avoids a division by zero where points coincide
 # Part of a contact's normal along the goal: with more it pushes, with less than its negative it brakes.
 MIN_PROPULSION_PART = 0.1
 # Part of a normal across the path: with more the obstacle is beside the path.
@@ -55,6 +56,10 @@ def fit_path(
 ) -> Floats:
     """Move the points of a path sideways until it has the desired gaps to the obstacles beside it.
 
+    A shift changes the directions of the path and which obstacle is nearest to a point, so the shifts are computed
+    again for the shifted path, `parameters.rounds` times. Shifted points are no longer evenly spaced; each round ends
+    with new points, because the smoothing of the next round assumes even spacing.
+
     Args:
         points_w: (n, 2) the path, evenly spaced, m.
         fixed_point_count: Number of points at its beginning that stay where they are.
@@ -63,25 +68,30 @@ def fit_path(
         parameters: Gaps and weights.
 
     Returns:
-        (m, 2) the path, evenly spaced.
+        The path, evenly spaced: an array of shape (count, 2), whose number of points may differ from n.
     """
     path_w = np.asarray(points_w, dtype=np.float64)
     for _ in range(parameters.rounds):
-        chords = np.gradient(path_w, axis=0)
-        tangents = chords / np.maximum(np.hypot(chords[:, 0], chords[:, 1]), 1e-9)[:, None]
+        tangents = _compute_tangents(path_w)
         left_directions = np.stack([-tangents[:, 1], tangents[:, 0]], axis=-1)
-        shifts_m, weights = _find_desired_shifts(
+        # What the obstacles ask of each point. The fixed points are asked to stay, with a weight above all others.
+        desired_shifts_m, weights = _find_desired_shifts(
             path_w, tangents, left_directions, obstacles, goal_w, parameters
         )
-        shifts_m[:fixed_point_count] = 0.0
+        desired_shifts_m[:fixed_point_count] = 0.0
         weights[:fixed_point_count] = FIXED_WEIGHT
-        path_w = (
-            path_w
-            + _solve_shifts_m(path_w, left_directions, shifts_m, weights, parameters)[:, None]
-            * left_directions
-        )
+        # The compromise between these shifts and a smooth path.
+        shifts_m = _solve_shifts_m(path_w, left_directions, desired_shifts_m, weights, parameters)
+        path_w = path_w + shifts_m[:, None] * left_directions
         path_w = _resample_after_fixed_points(path_w, fixed_point_count)
     return path_w
+
+
+def _compute_tangents(path_w: Floats) -> Floats:
+    """Return the unit vectors along a path, (n, 2), by central differences of its points (n, 2)."""
+    differences_m = np.gradient(path_w, axis=0)
+    lengths_m = np.hypot(differences_m[:, 0], differences_m[:, 1])
+    return differences_m / np.maximum(lengths_m, MIN_LENGTH_M)[:, None]
 
 
 def _resample_after_fixed_points(path_w: Floats, fixed_point_count: int) -> Floats:
@@ -118,26 +128,31 @@ def _find_desired_shifts(
     """
     nearest = obstacles.find_nearest(path_w[:, 0], path_w[:, 1])
     is_near = nearest.obstacle_index != NO_OBSTACLE
+    # Components of the obstacle's unit normal, (n,): to the left of the path, and in the direction of travel.
     sideways_part = np.einsum("ij,ij->i", nearest.normal_w, left_directions)
     propulsion_part = nearest.normal_w @ goal_w
+    does_push = propulsion_part > MIN_PROPULSION_PART
+    does_brake = propulsion_part < -MIN_PROPULSION_PART
+
+    # The gap that the body has now, and the gap that it should have, (n,) in m.
     corner_cut_m = _compute_corner_cut_m(tangents, sideways_part, parameters.segment_m)
     gap_m = nearest.distance_m - parameters.radius_m - CORNER_CUT_SCALE * corner_cut_m
-    desired_gap_m = np.where(
-        propulsion_part > MIN_PROPULSION_PART,
-        parameters.push_gap_m,
-        np.where(
-            propulsion_part < -MIN_PROPULSION_PART, parameters.brake_gap_m, parameters.min_gap_m
-        ),
-    )
+    desired_gap_m = np.full(len(path_w), parameters.min_gap_m)
+    desired_gap_m[does_push] = parameters.push_gap_m
+    desired_gap_m[does_brake] = parameters.brake_gap_m
+
+    # The points that must move, (n,).
     is_too_close = is_near & (gap_m < desired_gap_m)
     is_push_point = (
         is_near
         & (np.abs(sideways_part) > MIN_SIDEWAYS_PART)
-        & (propulsion_part > MIN_PROPULSION_PART)
+        & does_push
         & (gap_m < parameters.max_pull_m)
         & _find_points_near_local_minima(nearest.obstacle_index, gap_m)
     )
     is_moved = is_push_point | is_too_close
+
+    # To widen a gap, a point moves along the normal, which is to the left if the obstacle is on the right.
     shifts_m = np.where(is_moved, (desired_gap_m - gap_m) * np.sign(sideways_part), 0.0)
     weights = parameters.gap_weight * np.maximum(np.abs(sideways_part), MIN_SIDEWAYS_WEIGHT)
     return shifts_m, np.where(is_moved, weights, 0.0)
@@ -163,22 +178,28 @@ def _compute_corner_cut_m(tangents: Floats, sideways_part: Floats, segment_m: fl
     return np.where(is_inner_side, cut_m, 0.0)
 
 
-def _find_points_near_local_minima(obstacle: NDArray[np.intp], gap_m: Floats) -> Bools:
+def _find_points_near_local_minima(obstacle_index: NDArray[np.intp], gap_m: Floats) -> Bools:
     """Find the point nearest to each obstacle, together with its two neighbors on the path.
 
     Args:
-        obstacle: (n,) index of the obstacle nearest to each point; a run of equal indices is one pass beside it.
+        obstacle_index: (n,) index of the obstacle nearest to each point. A run of equal indices is one pass beside an
+            obstacle.
         gap_m: (n,) gap between body and obstacle at each point.
 
     Returns:
         (n,) whether each point has the smallest gap of its run, or is next to such a point in the run.
     """
-    is_minimum = np.zeros(len(gap_m), dtype=bool)
-    edges = np.flatnonzero(np.diff(obstacle)) + 1
-    for first_index, end_index in zip([0, *edges], [*edges, len(gap_m)], strict=True):
-        lowest_index = first_index + int(np.argmin(gap_m[first_index:end_index]))
-        is_minimum[max(lowest_index - 1, first_index) : min(lowest_index + 2, end_index)] = True
-    return is_minimum
+    is_near_minimum = np.zeros(len(gap_m), dtype=bool)
+    # A run begins at 0 and wherever the index changes, and ends where the next run begins.
+    change_indices = np.flatnonzero(np.diff(obstacle_index)) + 1
+    run_starts = [0, *change_indices]
+    run_ends = [*change_indices, len(gap_m)]
+    for run_start, run_end in zip(run_starts, run_ends, strict=True):
+        lowest_index = run_start + int(np.argmin(gap_m[run_start:run_end]))
+        first_index = max(lowest_index - 1, run_start)
+        last_index = min(lowest_index + 1, run_end - 1)
+        is_near_minimum[first_index : last_index + 1] = True
+    return is_near_minimum
 
 
 def _solve_shifts_m(
@@ -188,11 +209,13 @@ def _solve_shifts_m(
     weights: Floats,
     parameters: PathFitParameters,
 ) -> Floats:
-    """Return the shifts u to the left, (n,) in m, with which the path is smooth and has the desired gaps.
+    """Return the shifts u to the left, (n,) in m, that are the best compromise of smoothness and desired gaps.
 
     They minimize
 
         sum_i u_i² + w_i (u_i - v_i)² + k |third difference of (p + u l)|²,   k = (smoothing / spacing)^6
+
+    The sum is quadratic in u. Its derivative is zero where A u = b, which is solved here.
 
     Args:
         path_w: (n, 2) points p of the path, m.
@@ -201,24 +224,30 @@ def _solve_shifts_m(
         weights: (n,) weights w.
         parameters: Length over which the path is smoothed.
     """
-    point_count = len(path_w)
-    equation_count = point_count - 3
+    difference_count = len(path_w) - 3
     stiffness = (parameters.smoothing_m / SPACING_M) ** 6
+    # A and b without the third differences.
     matrix = np.diag(1.0 + weights)
     right_side = weights * desired_m
-    rows = np.arange(equation_count)
+    # Third difference d depends on the points d to d + 3, one for each factor.
+    difference_indices = np.arange(difference_count)
     for axis in (0, 1):
-        # Column j of the third difference in this axis, as it depends on the shift of point i + j.
-        columns = [
-            factor * left_directions[j : equation_count + j, axis]
-            for j, factor in enumerate(THIRD_DIFFERENCE)
-        ]
-        third_difference = sum(
-            factor * path_w[j : equation_count + j, axis]
-            for j, factor in enumerate(THIRD_DIFFERENCE)
+        # Of the path as it is, (difference_count,).
+        third_differences = sum(
+            factor * path_w[offset : difference_count + offset, axis]
+            for offset, factor in enumerate(THIRD_DIFFERENCE)
         )
-        for i, row in enumerate(columns):
-            right_side[i : equation_count + i] -= stiffness * row * third_difference
-            for j, column in enumerate(columns):
-                matrix[rows + i, rows + j] += stiffness * row * column
+        # How much each third difference changes with the shift of its first, second, third and fourth point.
+        derivatives = [
+            factor * left_directions[offset : difference_count + offset, axis]
+            for offset, factor in enumerate(THIRD_DIFFERENCE)
+        ]
+        for row_offset, row_derivative in enumerate(derivatives):
+            right_side[row_offset : difference_count + row_offset] -= (
+                stiffness * row_derivative * third_differences
+            )
+            for column_offset, column_derivative in enumerate(derivatives):
+                matrix[difference_indices + row_offset, difference_indices + column_offset] += (
+                    stiffness * row_derivative * column_derivative
+                )
     return np.asarray(np.linalg.solve(matrix, right_side), dtype=np.float64)

@@ -25,55 +25,62 @@ PAGES_BACKLOG = 128  # connections that wait until the page server accepts them
 class ConsolePorts:
     """Sockets and secret of the two processes of one console."""
 
-    browsers: socket.socket  # socket of the front server, on loopback
-    pages: socket.socket  # Unix socket of the page server
-    pages_path: Path
+    browser_socket: socket.socket  # of the front server, on loopback, to which browsers connect
+    page_socket: (
+        socket.socket
+    )  # of the page server, a Unix socket to which the front server connects
+    page_socket_path: Path
     token: str  # first part of the path in the address of each page; secret
 
     @property
     def address(self) -> str:
         """Address of the page of the console, for a browser."""
-        return make_page_address(self.browsers, self.token)
+        return make_page_address(self.browser_socket, self.token)
 
     def close(self) -> None:
         """Close the sockets in this process. Processes that inherited them are not affected."""
-        self.browsers.close()
-        self.pages.close()
+        self.browser_socket.close()
+        self.page_socket.close()
 
 
 @contextlib.contextmanager
 def open_console_ports(port: int | None) -> Iterator[ConsolePorts]:
-    """Open the sockets of the console, for browsers and for its page server, and choose a secret token.
+    """Open the sockets of the two servers of the console, and choose a secret token.
+
+    Browsers connect to the front server, which passes their requests on to the page server, the process that draws the
+    pages.
 
     Args:
-        port: Port for browsers; None for the default port, or any free port if that is in use.
+        port: Port for browsers; None for the default port, or for any free port if the default port is in use.
 
     Yields:
         The open sockets, which are closed when the context ends.
 
     Raises:
-        NotConnectedError: The port is in use.
+        NotConnectedError: A port was given, and it is in use.
     """
     with contextlib.ExitStack() as exit_stack:
-        browsers = exit_stack.enter_context(open_port(port))
+        browser_socket = exit_stack.enter_context(open_port(port))
         folder = Path(
             exit_stack.enter_context(tempfile.TemporaryDirectory(prefix="snakesim-console-"))
         )
-        pages = exit_stack.enter_context(socket.socket(socket.AF_UNIX))
-        pages_path = folder / "pages"
-        pages.bind(str(pages_path))
-        pages.listen(PAGES_BACKLOG)
-        yield ConsolePorts(browsers, pages, pages_path, secrets.token_urlsafe(TOKEN_BYTES))
+        page_socket = exit_stack.enter_context(socket.socket(socket.AF_UNIX))
+        page_socket_path = folder / "pages"
+        page_socket.bind(str(page_socket_path))
+        page_socket.listen(PAGES_BACKLOG)
+        yield ConsolePorts(
+            browser_socket, page_socket, page_socket_path, secrets.token_urlsafe(TOKEN_BYTES)
+        )
 
 
 def open_port(port: int | None) -> socket.socket:
     """Open a listening socket on loopback.
 
     Args:
-        port: Port to listen on; None for DEFAULT_PORT, or any free port if that is in use.
+        port: Port to listen on; None for DEFAULT_PORT, or for any free port if DEFAULT_PORT is in use.
 
     Raises:
-        NotConnectedError: The port is in use.
+        NotConnectedError: A port was given, and it is in use.
     """
     candidates = (DEFAULT_PORT, 0) if port is None else (port,)
     for candidate in candidates:

@@ -45,7 +45,7 @@ FOLDER_PREFIX = "snakesim-workers-"
 
 
 class WorkerDiedError(Exception):
-    """The workers that ran a call died, `MAX_DEATHS` times."""
+    """The workers that ran a call died, MAX_WORKER_DEATHS times."""
 
 
 class CallTookTooLongError(Exception):
@@ -75,8 +75,8 @@ class _PendingCall:
 
     number: int
     arguments: Sequence[Any]
-    deaths: int = 0
-    raises: int = 0
+    worker_death_count: int = 0  # of workers that died while they ran this call
+    exception_count: int = 0  # of exceptions that the function raised
     deadline_s: float = float("inf")  # on the monotonic clock, after the call has begun
 
 
@@ -138,8 +138,8 @@ class WorkerPool:
                     running[worker] = call
                 for worker in self._wait_for_workers(running):
                     call = running.pop(worker)
-                    outcome = self._receive_outcome(worker, call)
-                    if outcome is None:
+                    outcome = self._finish_attempt(worker, call)
+                    if outcome is None:  # it is tried again, before the calls that have not started
                         waiting.appendleft(call)
                     else:
                         yield call.number, outcome
@@ -186,30 +186,35 @@ class WorkerPool:
             if worker.connection in readable or now_s >= call.deadline_s
         ]
 
-    def _receive_outcome(self, worker: "_WorkerProcess", call: _PendingCall) -> Outcome | None:
-        """Receive the outcome of a call; None if the call has to be retried.
+    def _finish_attempt(self, worker: "_WorkerProcess", call: _PendingCall) -> Outcome | None:
+        """Receive the outcome of a call from its worker, and remove a worker that is dead or takes too long.
 
-        A call is retried if its worker died or the function raised, unless this has happened too often.
+        A call that takes too long fails at once. It is tried again if its worker died, in all up to MAX_WORKER_DEATHS
+        times, or if the function raised, in all up to MAX_FAILED_ATTEMPTS times.
 
         Args:
-            worker: Worker of the call. If it has sent nothing yet, the call has timed out, and the worker is killed.
-            call: The call, whose failures are counted here.
+            worker: Worker of the call, from `_wait_for_workers`: it has sent something, has died, or takes too long.
+            call: The call, whose failed attempts are counted here.
+
+        Returns:
+            The outcome, or None if the call has to be tried again.
         """
-        has_outcome = worker.connection.poll()
-        if not has_outcome:
+        # The connection of a worker that has died is readable, too.
+        is_readable = worker.connection.poll()
+        if not is_readable:
             self._kill_and_remove(worker)
             return CallFailure(CallTookTooLongError())
         try:
             outcome = worker.connection.recv()
         except (EOFError, OSError):
             self._kill_and_remove(worker)
-            call.deaths += 1
-            if call.deaths < MAX_WORKER_DEATHS:
+            call.worker_death_count += 1
+            if call.worker_death_count < MAX_WORKER_DEATHS:
                 return None
             return CallFailure(WorkerDiedError())
         if isinstance(outcome, CallFailure):
-            call.raises += 1
-            if call.raises < MAX_FAILED_ATTEMPTS:
+            call.exception_count += 1
+            if call.exception_count < MAX_FAILED_ATTEMPTS:
                 return None
         return outcome
 

@@ -116,7 +116,10 @@ def _resolve_reference(schema: dict[str, Any], part: dict[str, Any]) -> dict[str
 
 
 def _parse_parameter(name: str, schema: dict[str, Any], value: Any) -> RobotParameter:
-    """Return one parameter with its unit and range. Texts are shortened, because they come from the network.
+    """Return one parameter with its unit and range.
+
+    Name, unit and description are shortened, because they come from the network. Choices are complete, because a
+    shortened choice would not be accepted.
 
     Args:
         name: Name of the parameter.
@@ -125,8 +128,8 @@ def _parse_parameter(name: str, schema: dict[str, Any], value: Any) -> RobotPara
     """
     choices = schema.get("enum")
     return RobotParameter(
-        name[:MAX_NAME_CHARACTERS],
-        value,
+        name=name[:MAX_NAME_CHARACTERS],
+        value=value,
         unit=str(schema.get("unit", ""))[:MAX_NAME_CHARACTERS],
         description=str(schema.get("description", ""))[:MAX_DESCRIPTION_CHARACTERS],
         choices=tuple(str(choice) for choice in choices) if isinstance(choices, list) else (),

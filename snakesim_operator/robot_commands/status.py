@@ -32,9 +32,13 @@ MESSAGE_WAIT_S = 1.0  # for the messages of a network
 SINGLE_ATTEMPT_TIMEOUT_S = 0.0
 
 
+# Lifecycle states of a robot without a fault.
+STATES_WITHOUT_FAULT = ("armed", "disarmed")
+
+
 @dataclass(frozen=True)
-class _NewestMessages:
-    """The newest messages of one robot on the network, as `snakesim status` prints them."""
+class _ReachableRobot:
+    """A robot on the network with its newest messages, as `snakesim status` prints them."""
 
     link: ConnectionSettings
     # Newest status of each host with the robot's name; more than one means an impostor.
@@ -66,17 +70,18 @@ def print_status(selection: RobotSelection, *, as_json: bool = False) -> int:
     """
     local_robots = selection.list_local_robots()
     local_endpoints = {robot.endpoint for robot in local_robots}
-    robots: list[_NewestMessages] = []
+    robots: list[_ReachableRobot] = []
     for link in selection.list_networks():
         with contextlib.suppress(NotConnectedError):
             robots += _find_robots(link, _choose_connect_timeout_s(link, local_endpoints))
     reachable_addresses = {(robot.link.endpoint, robot.link.namespace) for robot in robots}
+    # Listed again: a robot whose run has ended in the meantime is not silent.
     silent_robots = [
         robot
         for robot in selection.list_local_robots()
         if (robot.endpoint, robot.namespace) not in reachable_addresses
     ]
-    has_fault = any(robot.status.lifecycle not in ("armed", "disarmed") for robot in robots)
+    has_fault = any(robot.status.lifecycle not in STATES_WITHOUT_FAULT for robot in robots)
     is_all_right = bool(robots) and not has_fault and not silent_robots
     exit_code = 0 if is_all_right else 1
     if as_json:
@@ -107,7 +112,8 @@ def _print_no_robot(selection: RobotSelection) -> None:
     print_line("  next: `snakesim run triplet --console`, or another of `snakesim scenario list`")
 
 
-def _print_robot(robot: _NewestMessages) -> None:
+def _print_robot(robot: _ReachableRobot) -> None:
+    """Print state, processes and next commands of a robot, with a warning if another host uses its name."""
     lines = [*_describe_robot(robot), *describe_processes(robot.processes)]
     if robot.is_impostor:
         lines.append(
@@ -149,7 +155,16 @@ class _NetworkMessages:
                 self._decode_and_store(arrival, live_process_keys)
 
     def _decode_and_store(self, arrival: ReceivedSample, live_process_keys: set[str]) -> None:
-        """Decode a message and keep it. live: keys of the processes that run. Raises WireError."""
+        """Decode a message and store it.
+
+        Args:
+            arrival: The message, with its key.
+            live_process_keys: Keys of the processes that run. The entries of other processes are ignored.
+
+        Raises:
+            WireError: The message is invalid.
+        """
+        # Keys of processes end in the name of the process, so they are recognized by exclusion.
         decoder = self._decoders[keys.PROCESS_ALL]
         for key in (keys.STATUS, keys.DESCRIPTION):
             if arrival.key.endswith(key):
@@ -187,7 +202,7 @@ def _choose_connect_timeout_s(
     return CONNECT_TIMEOUT_S
 
 
-def _find_robots(connection: ConnectionSettings, connect_timeout_s: float) -> list[_NewestMessages]:
+def _find_robots(connection: ConnectionSettings, connect_timeout_s: float) -> list[_ReachableRobot]:
     """Return the robots on a network with their newest messages, sorted by name.
 
     Args:
@@ -200,24 +215,26 @@ def _find_robots(connection: ConnectionSettings, connect_timeout_s: float) -> li
     messages = _NetworkMessages(connection)
     with open_session(connection, connect_timeout_s) as session:
         messages.read(session)
-    robots: list[_NewestMessages] = []
+    robots: list[_ReachableRobot] = []
     for name, status_by_host in sorted(messages.statuses.items()):
         statuses = list(status_by_host.values())
         description = messages.descriptions.get((name, statuses[-1].host))
         processes = messages.processes.get(name, [])
         robots.append(
-            _NewestMessages(replace(connection, namespace=name), statuses, processes, description)
+            _ReachableRobot(replace(connection, namespace=name), statuses, processes, description)
         )
     return robots
 
 
-def _convert_to_json(robot: _NewestMessages) -> dict[str, Any]:
+def _convert_to_json(robot: _ReachableRobot) -> dict[str, Any]:
+    """Return what `snakesim status --json` prints of a robot."""
+    is_emulated = None  # unknown
+    if robot.description is not None:
+        is_emulated = robot.description.emulated
     return {
         "namespace": robot.link.namespace,
         "endpoint": robot.link.endpoint,
-        "emulated": None
-        if robot.description is None
-        else robot.description.emulated,  # null: unknown
+        "emulated": is_emulated,
         "impostor": robot.is_impostor,
         "processes": robot.processes,
         "status": robot.status,
@@ -245,7 +262,7 @@ def describe_processes(processes: Sequence[ProcessInfo]) -> list[str]:
     return lines
 
 
-def _describe_robot(robot: _NewestMessages) -> list[str]:
+def _describe_robot(robot: _ReachableRobot) -> list[str]:
     link = robot.link
     status = robot.status
     return [

@@ -66,7 +66,7 @@ def stop_robots(selection: RobotSelection, print_text: PrintLine = print_line) -
         print_text(
             f"no robot on {', '.join(selection.list_endpoints())}, and none that this user runs on this computer"
         )
-    if selection.namespace is not None and not any(robot.is_stopped for robot in results):
+    if selection.namespace is not None and not any(result.is_stopped for result in results):
         _print_other_robots(selection, print_text)
     return 0 if are_all_stopped(results) else 1
 
@@ -174,24 +174,29 @@ def describe_results(
 ) -> list[str]:
     """Return a line for each robot, and a warning for each robot for which an impostor may answer on the network.
 
+    A robot of this computer may have a result of both ways. Its line shows that of its stop port, which an impostor
+    cannot forge, so a doubtful result of the network is shown as a warning in addition.
+
     Args:
-        results: One result for each robot.
-        local_results: Results of stop ports of this computer, which an impostor cannot forge.
-        network_results: Results of queries over the network.
+        results: One result for each robot, which `combine_results` has made of the results of all ways.
+        local_results: Results of stop ports of this computer.
+        network_results: Results of queries over the network. They are doubtful if more than one host answers in the
+            robot's name.
     """
     lines: list[str] = []
-    for robot in results:
-        state = "stopped" if robot.is_stopped else "NOT STOPPED"
-        lines.append(f"{robot.name}: {state}: {robot.text} ({robot.endpoint})")
-    for robot in network_results:
-        if robot.is_doubtful and any(_is_same_robot(robot, other) for other in local_results):
-            lines.append(f"{robot.name}: WARNING: {robot.text} ({robot.endpoint})")
+    for result in results:
+        state = "stopped" if result.is_stopped else "NOT STOPPED"
+        lines.append(f"{result.name}: {state}: {result.text} ({result.endpoint})")
+    for result in network_results:
+        has_local_result = any(_is_same_robot(result, other) for other in local_results)
+        if result.is_doubtful and has_local_result:
+            lines.append(f"{result.name}: WARNING: {result.text} ({result.endpoint})")
     return lines
 
 
 def are_all_stopped(results: Sequence[StopResult]) -> bool:
     """Return whether there are robots, and every one has confirmed that it is stopped."""
-    return bool(results) and all(robot.is_stopped for robot in results)
+    return bool(results) and all(result.is_stopped for result in results)
 
 
 def _confirm_remote_results(
@@ -220,11 +225,12 @@ def _confirm_remote_results(
             text = (
                 f"its stop port reports it, but nothing on its network confirms it: {result.text}"
             )
-            confirmed_results.append(replace(result, stopped=False, text=text))
+            confirmed_results.append(replace(result, is_stopped=False, text=text))
         elif not is_confirmed:
             confirmed_results.append(result)
     return confirmed_results
 
 
 def _is_same_robot(a: StopResult, b: StopResult) -> bool:
+    """Return whether two results are of the robot with the same name at the same endpoint."""
     return (a.endpoint, a.name) == (b.endpoint, b.name)

@@ -45,7 +45,7 @@ def run_console(
     on_output = partial(files.append, LOG_FILENAME)
     with open_console_ports(port=None) as ports:
         front_process = start_console_front(ports, connection, on_output)
-        pages_fd = ports.pages.fileno()
+        pages_fd = ports.page_socket.fileno()
         arguments = [CONSOLE_MODULE, *common_arguments, "--listening", str(pages_fd)]
         page_server_process = children.start_child(
             "console", arguments, on_output, pass_fds=[pages_fd]

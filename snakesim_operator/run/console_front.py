@@ -19,13 +19,13 @@ def start_console_front(
         connection: Connection to the robot that its stop button stops; None for a recording.
         on_output: Called with each piece of output of the server, in another thread.
     """
-    browsers_fd = ports.browsers.fileno()
+    browsers_fd = ports.browser_socket.fileno()
     arguments = [
         FRONT_MODULE,
         "--browsers",
         str(browsers_fd),
         "--pages",
-        str(ports.pages_path),
+        str(ports.page_socket_path),
         *_make_robot_arguments(connection),
     ]
     token = {TOKEN_VARIABLE: ports.token}

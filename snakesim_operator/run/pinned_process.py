@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -26,6 +27,22 @@ ResultT = TypeVar("ResultT")
 CALL_FILENAME = "call"  # holds the function and its arguments
 RESULT_FILENAME = "result"
 POLL_S = 1.0  # Python code runs again after so long, so that an exception can be raised in the caller's thread
+
+
+@dataclass(frozen=True)
+class _RaisedError:
+    """A SnakesimError that the function raised in the child, in the place of a result."""
+
+    class_name: str
+    lines: tuple[str, ...]
+    code: str
+
+    def make_error(self) -> errors.SnakesimError:
+        """Return an error of the same class, with the same text and code."""
+        error_type = getattr(errors, self.class_name, errors.SnakesimError)
+        error = error_type(*self.lines)
+        error.code = self.code
+        return error
 
 
 def call_in_pinned_process(function: Callable[..., ResultT], **arguments: Any) -> ResultT:
@@ -67,35 +84,33 @@ def call_in_pinned_process(function: Callable[..., ResultT], **arguments: Any) -
             raise errors.SnakesimError(
                 f"the process of the run ended with exit code {process.returncode}; see above"
             )
-        result = pickle.loads(result_path.read_bytes())
-    if isinstance(result, tuple):  # the function raised an error
-        error_name, lines, code = result
-        error_type = getattr(errors, error_name, errors.SnakesimError)
-        error = error_type(*lines)
-        error.code = code
-        raise error
-    return result
+        outcome = pickle.loads(result_path.read_bytes())
+    if isinstance(outcome, _RaisedError):
+        raise outcome.make_error()
+    return outcome
 
 
 def main() -> int:
-    """Run the child process: load the call, call the function, and store the result or the error.
+    """Run the child process: load the call, call the function, and store the result or the error in a file.
 
-    The command line has two arguments: the temporary folder, and the process id of the parent.
+    The command line has two arguments: the temporary folder, and the process id of the parent. Any other exception than
+    a SnakesimError leaves no file: Python prints its traceback, and ends this process with exit code 1.
 
     Returns:
-        The exit code.
+        The exit code, 0.
     """
     folder = Path(sys.argv[1])
     parent_pid = int(sys.argv[2])
-    # Ctrl-C reaches both processes; the parent reports it.
+    # Ctrl-C reaches both processes, and the parent reports it. With the default action the child ends silently, without
+    # the traceback of a KeyboardInterrupt.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     set_parent_death_signal(parent_pid)
     function, arguments = pickle.loads((folder / CALL_FILENAME).read_bytes())
     try:
-        result: Any = function(**arguments)
+        outcome: Any = function(**arguments)
     except errors.SnakesimError as error:
-        result = type(error).__name__, error.lines, error.code
-    (folder / RESULT_FILENAME).write_bytes(pickle.dumps(result))
+        outcome = _RaisedError(type(error).__name__, error.lines, error.code)
+    (folder / RESULT_FILENAME).write_bytes(pickle.dumps(outcome))
     return 0
 
 

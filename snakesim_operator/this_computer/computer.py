@@ -93,16 +93,13 @@ def check_packages() -> Iterator[ComputerFinding]:
     Yields:
         One finding for the packages of the core, and one for those of each extra.
     """
-    # Extra -> packages with their versions; the core's extra is empty.
-    installed_by_extra: dict[str, list[str]] = {}
-    missing_by_extra: dict[str, list[str]] = {}  # extra -> packages
+    # By extra; the packages of the core have the extra "".
+    installed_by_extra: dict[str, list[str]] = {}  # names with versions
+    missing_by_extra: dict[str, list[str]] = {}  # names
     for requirement in importlib.metadata.requires("snakesim") or []:
-        # Such as `numpy>=2; extra == "report"`.
-        package = re.split(r"[\[<>=!~; ]", requirement)[0]
+        package, extra = _parse_requirement(requirement)
         if package == "snakesim":  # an extra that includes another extra
             continue
-        extra_match = re.search(r"""extra == ['"]([^'"]+)""", requirement)
-        extra = extra_match[1] if extra_match else ""
         try:
             package_with_version = f"{package} {importlib.metadata.version(package)}"
         except importlib.metadata.PackageNotFoundError:
@@ -118,6 +115,21 @@ def check_packages() -> Iterator[ComputerFinding]:
                 state="ok",
                 detail=", ".join(installed_by_extra[extra]),
             )
+
+
+def _parse_requirement(requirement: str) -> tuple[str, str]:
+    """Return the package that a requirement names, and the extra that it belongs to; "" for the core.
+
+    The library `packaging`, which parses all requirements, is none of our dependencies. This is enough for ours: apart
+    from extras they have no environment markers.
+
+    Args:
+        requirement: A requirement as package metadata has it, such as `numpy>=2; extra == "report"`.
+    """
+    package = re.split(r"[\[<>=!~; ]", requirement)[0]
+    extra_match = re.search(r"""extra == ['"]([^'"]+)""", requirement)
+    extra = extra_match[1] if extra_match else ""
+    return package, extra
 
 
 def _make_missing_packages_finding(extra: str, names: list[str]) -> ComputerFinding:
@@ -224,22 +236,17 @@ def _find_render_error(renderer: str) -> str | None:
 
 
 def check_can() -> Iterator[ComputerFinding]:
-    """Check that the kernel has SocketCAN, and that its interfaces are up."""
+    """Check that the kernel has SocketCAN, and that its interfaces are up.
+
+    Yields:
+        One finding. It is a warning if the kernel has no CAN, if there is no interface, or if an interface is down.
+    """
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
-        detail = (
-            f"this kernel has none ({error.strerror}); only real joint modules need it, "
-            "`--backend can` emulates them"
-        )
-        run_in_vm = "python3 deploy/vm/with_vcan.py -- .venv/bin/snakesim run triplet --backend can"
-        fix = ["sudo modprobe -a can_raw vcan", run_in_vm]
-        yield ComputerFinding(what="CAN", state="warn", detail=detail, fix=fix)
+        yield _make_no_can_finding(error)
         return
-    interfaces: list[str] = []
-    for type_file in Path("/sys/class/net").glob("*/type"):
-        if type_file.read_text().strip() == ARPHRD_CAN:
-            interfaces.append(type_file.parent.name)
+    interfaces = _list_can_interfaces()
     if not interfaces:
         yield ComputerFinding(
             what="CAN", state="warn", detail="no interface", fix=["sudo deploy/can/up.sh vcan0"]
@@ -247,14 +254,41 @@ def check_can() -> Iterator[ComputerFinding]:
         return
     up_interfaces = [name for name in interfaces if _is_interface_up(name)]
     down_interfaces = [name for name in interfaces if name not in up_interfaces]
-    detail = f"up: {', '.join(up_interfaces) or 'none'}"
-    fix = [f"sudo ip link set {name} up" for name in down_interfaces]
     yield ComputerFinding(
-        what="CAN", state="warn" if down_interfaces else "ok", detail=detail, fix=fix
+        what="CAN",
+        state="warn" if down_interfaces else "ok",
+        detail=f"up: {', '.join(up_interfaces) or 'none'}",
+        fix=[f"sudo ip link set {name} up" for name in down_interfaces],
     )
 
 
+def _make_no_can_finding(error: OSError) -> ComputerFinding:
+    """Make the finding that the kernel has no SocketCAN, from the error of opening a socket."""
+    return ComputerFinding(
+        what="CAN",
+        state="warn",
+        detail=(
+            f"this kernel has none ({error.strerror}); only real joint modules need it, "
+            "`--backend can` emulates them"
+        ),
+        fix=[
+            "sudo modprobe -a can_raw vcan",
+            "python3 deploy/vm/with_vcan.py -- .venv/bin/snakesim run triplet --backend can",
+        ],
+    )
+
+
+def _list_can_interfaces() -> list[str]:
+    """Return the names of the CAN interfaces of this computer."""
+    interfaces: list[str] = []
+    for type_file in Path("/sys/class/net").glob("*/type"):
+        if type_file.read_text().strip() == ARPHRD_CAN:
+            interfaces.append(type_file.parent.name)
+    return interfaces
+
+
 def _is_interface_up(name: str) -> bool:
+    """Return whether a network interface is up; False if it has disappeared."""
     try:
         flags = int(Path(f"/sys/class/net/{name}/flags").read_text(), 16)
     except (OSError, ValueError):

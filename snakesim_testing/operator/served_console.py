@@ -21,7 +21,7 @@ def running_front_server(ports: ConsolePorts, stop: StopPath | None) -> Iterator
         ports: Sockets and token of the console.
         stop: Stops the robot. None for the console of a recording.
     """
-    server = FrontServer(ports.browsers, ports.pages_path, ports.token, stop)
+    server = FrontServer(ports.browser_socket, ports.page_socket_path, ports.token, stop)
     ended = asyncio.Event()
     loops: Queue[asyncio.AbstractEventLoop] = Queue()
 
@@ -55,6 +55,6 @@ def running_console(
     with (
         open_console_ports(None) as ports,
         running_front_server(ports, stop),
-        serve_pages(ports.pages, report, answer_first, has_stop=stop is not None) as server,
+        serve_pages(ports.page_socket, report, answer_first, has_stop=stop is not None) as server,
     ):
         yield server, ports.address

@@ -99,28 +99,30 @@ class ChainFit:
     ) -> None:
         """Do one Gauss-Newton step of a group of joints, and of the base if the group begins at the tail.
 
+        The unknowns are the angles of the k joints of the group and, with the base, its rotation (3) and translation
+        (3). Three kinds of equations are stacked: the n nodes up to the end of the group are on the curve, the middle
+        link has the roll of the curve, and the angles are small.
+
         Args:
             backbone: The curve that the chain is fitted to.
             first_joint_index: Index of the first joint of the group, from the tail.
             end_joint: Index after the last joint of the group.
         """
         origins, rotations = self._compute_link_frames()
-        points = np.vstack([origins, origins[-1] + self._lengths_m[-1] * rotations[-1][:, 0]])[
-            : end_joint + 2
-        ]
+        head_end = origins[-1] + self._lengths_m[-1] * rotations[-1][:, 0]
+        points = np.vstack([origins, head_end])[: end_joint + 2]  # (n, 3) the nodes
         includes_base = first_joint_index == 0
-        pivots = origins[first_joint_index + 1 : end_joint + 1]  # (k, 3) of the joints
-        columns = [0 if axis == "pitch" else 1 for axis in self._axes[first_joint_index:end_joint]]
+        angles = self.angles_rad[first_joint_index:end_joint]
+        pivots = origins[first_joint_index + 1 : end_joint + 1]  # (k, 3) positions of the joints
+        # (k, 3) unit vectors about which the joints turn: the y axis of the link ahead for pitch, its z axis for yaw.
         axes = np.array(
             [
-                rotations[first_joint_index + 1 + k][:, 2 if column else 1]
-                for k, column in enumerate(columns)
+                rotations[joint + 1][:, 1 if self._axes[joint] == "pitch" else 2]
+                for joint in range(first_joint_index, end_joint)
             ]
-        )  # (k, 3) of rotation, unit
+        )
 
-        # Derivatives of the nodes and of the middle link's y axis by rotations about points.
-        angles = self.angles_rad[first_joint_index:end_joint]
-        # (k, n, 3).
+        # The nodes. A joint turns all nodes ahead of it about its axis; those behind it stay. (k, n, 3)
         point_derivatives = np.cross(axes[:, None, :], points[None, :, :] - pivots[:, None, :])
         is_behind_joint = (
             np.arange(len(points))[None, :]
@@ -162,7 +164,7 @@ class ChainFit:
                 np.array([weight_m * rotations[self._middle_link][:, 1] @ backbone.roll_normal])
             )
 
-        # The angles.
+        # The angles, which should be small, so that joints that hardly move a node do not turn without need.
         weight_m = ANGLE_WEIGHT * self._mean_link_length_m
         rows.append(
             np.hstack(
@@ -174,6 +176,7 @@ class ChainFit:
         )
         residuals.append(weight_m * angles)
 
+        # The damped step. It is applied to the angles first, and then to the base.
         jacobian = np.vstack(rows)
         normal_matrix = jacobian.T @ jacobian + DAMPING * self._mean_link_length_m**2 * np.eye(
             unknown_count

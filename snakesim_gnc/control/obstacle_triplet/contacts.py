@@ -40,6 +40,15 @@ class PlannedContact:
 
 
 @dataclass(frozen=True)
+class _NearestPathPoint:
+    """The point of a path that is nearest to a box."""
+
+    path_s_m: float  # arc length on the path
+    distance_m: float  # from the surface of the box
+    direction_from_box_w: Planar  # unit vector
+
+
+@dataclass(frozen=True)
 class PushPoint:
     """A planned contact, and the place along the body that is at it now."""
 
@@ -49,7 +58,12 @@ class PushPoint:
 
 
 def plan_contact(
-    route: Route, obstacle: KnownObstacle, body_radius_m: float, *, near_s_m: float, window_m: float
+    route: Route,
+    obstacle: KnownObstacle,
+    body_radius_m: float,
+    *,
+    search_middle_s_m: float,
+    window_m: float,
 ) -> PlannedContact:
     """Find the point of the route that is nearest to an obstacle, where the body will push off the obstacle.
 
@@ -57,24 +71,26 @@ def plan_contact(
         route: The path.
         obstacle: An obstacle of any shape.
         body_radius_m: Radius of the robot's body.
-        near_s_m: Arc length on the route that is the middle of the searched part.
-        window_m: Length of the searched part on either side of `near_s_m`.
+        search_middle_s_m: Arc length on the route that is the middle of the searched part.
+        window_m: Length of the searched part on either side of `search_middle_s_m`.
 
     Returns:
         The contact, with the normal from the obstacle into the body and the tangent towards the head.
     """
     if obstacle.shape == "box":
-        nearest_s_m, direction_from_obstacle_w, distance_m = _find_nearest_point_to_box(
-            route, obstacle, near_s_m, window_m
-        )
+        nearest_point = _find_nearest_point_to_box(route, obstacle, search_middle_s_m, window_m)
+        nearest_s_m = nearest_point.path_s_m
+        direction_from_obstacle_w = nearest_point.direction_from_box_w
+        distance_m = nearest_point.distance_m
     else:
         center_w = np.array(obstacle.position_w[:2])
-        nearest_s_m = route.project_point(center_w, near_s_m, window_m)
+        nearest_s_m = route.project_point(center_w, search_middle_s_m, window_m)
         x, y = route.compute_point(nearest_s_m)
         direction_from_obstacle_w = (x - float(center_w[0]), y - float(center_w[1]))
         distance_m = math.hypot(*direction_from_obstacle_w) - obstacle.radius_m
     heading_rad = route.compute_heading_rad(nearest_s_m)
     tangent = (math.cos(heading_rad), math.sin(heading_rad))
+    # The cross product of tangent and direction is positive if the path passes on the left of the obstacle.
     is_pushed_left = (
         tangent[0] * direction_from_obstacle_w[1] - tangent[1] * direction_from_obstacle_w[0] >= 0
     )
@@ -91,42 +107,47 @@ def plan_contact(
 
 
 def _find_nearest_point_to_box(
-    route: Route, box: KnownObstacle, near_s_m: float, window_m: float
-) -> tuple[float, Planar, float]:
-    """Find the point of a route that is nearest to a box, by a coarse and a fine search.
+    route: Route, box: KnownObstacle, search_middle_s_m: float, window_m: float
+) -> _NearestPathPoint:
+    """Find the point of a route that is nearest to a box: first in coarse steps, then in fine steps around the best.
 
     Args:
         route: The path.
         box: The obstacle.
-        near_s_m: Arc length on the route that is the middle of the searched part.
-        window_m: Length of the searched part on either side of `near_s_m`.
-
-    Returns:
-        The arc length of the nearest point in m, the unit vector from the box to this point, and its distance from the
-        box in m.
+        search_middle_s_m: Arc length on the route that is the middle of the searched part.
+        window_m: Length of the searched part on either side of `search_middle_s_m`.
     """
-    outline = ObstacleOutlines.from_obstacles([box])
-    low_s_m = near_s_m - window_m
-    high_s_m = near_s_m + window_m
-    nearest_s_m = near_s_m
-    direction_from_obstacle_w = np.zeros(2)
-    distance_m = 0.0
-    for step_m in (COARSE_STEP_M, FINE_STEP_M):
-        candidates_s_m = np.arange(low_s_m, high_s_m, step_m)
-        box_indices = np.zeros(len(candidates_s_m), dtype=np.intp)
-        distances_m, normals_w = outline.compute_distances_and_normals(
-            route.compute_positions_w(candidates_s_m), box_indices
-        )
-        best_index = int(np.argmin(distances_m))
-        nearest_s_m = float(candidates_s_m[best_index])
-        direction_from_obstacle_w = normals_w[best_index]
-        distance_m = float(distances_m[best_index])
-        low_s_m = nearest_s_m - step_m
-        high_s_m = nearest_s_m + step_m
-    return (
-        nearest_s_m,
-        (float(direction_from_obstacle_w[0]), float(direction_from_obstacle_w[1])),
-        distance_m,
+    box_outline = ObstacleOutlines.from_obstacles([box])
+    coarse_candidates_s_m = np.arange(
+        search_middle_s_m - window_m, search_middle_s_m + window_m, COARSE_STEP_M
+    )
+    coarse_s_m = _select_nearest_to_box(route, box_outline, coarse_candidates_s_m).path_s_m
+    fine_candidates_s_m = np.arange(
+        coarse_s_m - COARSE_STEP_M, coarse_s_m + COARSE_STEP_M, FINE_STEP_M
+    )
+    return _select_nearest_to_box(route, box_outline, fine_candidates_s_m)
+
+
+def _select_nearest_to_box(
+    route: Route, box_outline: ObstacleOutlines, candidates_s_m: Floats
+) -> _NearestPathPoint:
+    """Return the candidate that is nearest to a box.
+
+    Args:
+        route: The path.
+        box_outline: Outlines of which the box is the first and only one.
+        candidates_s_m: (n,) arc lengths of the candidates on the route.
+    """
+    outline_indices = np.zeros(len(candidates_s_m), dtype=np.intp)
+    distances_m, normals_w = box_outline.compute_distances_and_normals(
+        route.compute_positions_w(candidates_s_m), outline_indices
+    )
+    nearest = int(np.argmin(distances_m))
+    normal_x, normal_y = normals_w[nearest]
+    return _NearestPathPoint(
+        path_s_m=float(candidates_s_m[nearest]),
+        distance_m=float(distances_m[nearest]),
+        direction_from_box_w=(float(normal_x), float(normal_y)),
     )
 
 

@@ -141,8 +141,9 @@ class ObstacleTriplet(Controller[TripletParameters]):
     def update(self, observation: Observation) -> ControllerCommand:
         """Return the setpoints of the next period: one joint propels by its torque, the others follow the path.
 
-        Push-points and the triplet that propels are chosen again for each new world model. While the position on the
-        path is unknown, all joints hold their reference angles.
+        Push-points are the places where the body can push off an obstacle. They, and the triplet of them that propels,
+        are chosen again for each new world model. While the position on the path is unknown, all joints hold their
+        reference angles.
 
         Args:
             observation: The inputs of this tick.
@@ -150,12 +151,18 @@ class ObstacleTriplet(Controller[TripletParameters]):
         Returns:
             Setpoints of all joints, with telemetry about the triplet and its forces.
         """
+        # 1. Where the body is on its path. A text instead is the reason why this is unknown.
         location = self._progress.update(observation)
-        if isinstance(location, str):  # why the position is unknown
+        if isinstance(location, str):
             return self._hold_reference(observation, location)
         self._measured_contacts.add_world(location.world)
+
+        # 2. The pose that the joints in position mode follow, stored as `_reference_rad`.
         body_pose = self._update_reference_pose(observation, location)
-        last_choice = self._choice
+
+        # 3. Which triplet propels in this tick, stored as `_choice`. The order matters: a new choice uses the new
+        # push-points, and the joint of a new choice may be released at once.
+        choice_of_last_tick = self._choice
         if location.trajectory.speed_m_s <= 0:
             self._choice = None
             self._stall_detector.reset()
@@ -163,10 +170,12 @@ class ObstacleTriplet(Controller[TripletParameters]):
             self._update_push_points(location, body_pose)
             self._update_choice(observation, location, body_pose)
         self._release_swung_out_joint(observation, body_pose)
+
+        # 4. Targets of the joints. The load and the propulsion joint depend on the choice of this tick.
         reference_rad = self._reference_rad + self._compute_load_compensation_rad(
             observation, body_pose
         )
-        self._switch_propulsion_joint(observation, location, reference_rad, last_choice)
+        self._switch_propulsion_joint(observation, location, reference_rad, choice_of_last_tick)
         return self._make_command(observation, location, body_pose, reference_rad)
 
     def _switch_propulsion_joint(
@@ -174,7 +183,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         observation: Observation,
         location: BodyLocation,
         reference_rad: Floats,
-        last_choice: PropulsionChoice | None,
+        choice_of_last_tick: PropulsionChoice | None,
     ) -> None:
         """Switch torque mode to the joint of the chosen triplet, and advance the ramps by time and by travel.
 
@@ -182,7 +191,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
             observation: The inputs of this tick.
             location: Speed of the body on the path.
             reference_rad: (n_joints,) reference angles in rad.
-            last_choice: The chosen triplet of the tick before; None if there was none.
+            choice_of_last_tick: The chosen triplet of the tick before; None if there was none.
         """
         parameters = self.parameters
         choice = self._choice
@@ -191,7 +200,8 @@ class ObstacleTriplet(Controller[TripletParameters]):
         if choice is not None:
             joint = self._body.yaw_joints[choice.joint]
             has_changed_triplet = (
-                last_choice is not None and choice.triplet.names != last_choice.triplet.names
+                choice_of_last_tick is not None
+                and choice.triplet.names != choice_of_last_tick.triplet.names
             )
         self._bumpless_transfer.switch_torque_joint(
             joint, observation.joints, reference_rad, restart_ramp=has_changed_triplet
@@ -256,17 +266,21 @@ class ObstacleTriplet(Controller[TripletParameters]):
             The updated pose; its joint angles are stored as the reference.
         """
         parameters = self.parameters
-        s = location.tail_s_m
+        measured_s_m = location.tail_s_m
         last_pose = self._body_pose
         if last_pose is None or location.may_have_jumped:
-            body_pose = location.body_on_path.compute_pose_at(s)
+            body_pose = location.body_on_path.compute_pose_at(measured_s_m)
         else:
-            last_s = last_pose.tail_s_m
+            # Stay where the pose was, unless the body has moved on by more than the slack in either direction.
+            last_s_m = last_pose.tail_s_m
+            lowest_s_m = measured_s_m - parameters.slack_m
+            highest_s_m = measured_s_m + parameters.slack_m
+            # A body that is too fast is braked by the pose, which does not follow, but not without limit.
             max_speed_m_s = max(location.trajectory.speed_m_s, 0.0) * parameters.overspeed_ratio
-            max_s = last_s + max_speed_m_s * observation.period_s
-            followed_s = min(max(last_s, s - parameters.slack_m), s + parameters.slack_m, max_s)
+            reachable_s_m = last_s_m + max_speed_m_s * observation.period_s
+            followed_s_m = min(max(last_s_m, lowest_s_m), highest_s_m, reachable_s_m)
             body_pose = location.body_on_path.compute_pose_at(
-                max(followed_s, s - parameters.brake_m)
+                max(followed_s_m, measured_s_m - parameters.brake_m)
             )
         pitch_rad = self._platform_climb.compute_pitch_angles_rad(
             location.trajectory.rises, body_pose.tail_s_m
@@ -330,9 +344,11 @@ class ObstacleTriplet(Controller[TripletParameters]):
         limit_nm = self._body.torque_limit_nm[joint]
         torque_per_n = choice.torque_per_n
 
+        # Force by the speed.
         speed_error_ratio = 1.0 - location.speed_m_s / location.trajectory.speed_m_s
         desired_force_n = parameters.propulsion_n * min(max(speed_error_ratio, 0.0), 1.0)
 
+        # Fade the force while the joint swings out, and limit its change from tick to tick.
         swing_out_rad = observation.joints.angle_rad[joint] - float(self._reference_rad[joint])
         if torque_per_n <= 0:
             swing_out_rad = -swing_out_rad  # positive: in the direction of the torque
@@ -345,6 +361,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
         )
         self._unlimited_force_n = unlimited_force_n
 
+        # Torque by the force, with damping, and within the limit of the joint.
         force_n = min(unlimited_force_n, limit_nm / max(abs(torque_per_n), MIN_TORQUE_PER_N))
         torque_nm = (
             force_n * torque_per_n
@@ -409,7 +426,7 @@ class ObstacleTriplet(Controller[TripletParameters]):
             location.body_on_path.route,
             obstacle,
             self._body.radius_m,
-            near_s_m=location.tail_s_m + half_length_m,
+            search_middle_s_m=location.tail_s_m + half_length_m,
             window_m=half_length_m + PLAN_WINDOW_M,
         )
 

@@ -50,17 +50,17 @@ class NativeExpander(PathExpander):
         obstacles: ObstacleGrid,
         parameters: SearchParameters,
         task: SearchTask,
-        start: NodeLayer,
-        step_count: int,
+        start_nodes: NodeLayer,
+        max_arc_count: int,
     ) -> None:
         """Copy a search into the structures of the C library, which then expands it layer by layer.
 
         Args:
             obstacles: The map.
             parameters: Size of the robot's body, and the cost weights.
-            task: Goal of the search, and the body from which it starts.
-            start: Nodes of the first layer.
-            step_count: Maximum number of layers after the first.
+            task: Direction of travel, and how the body lies before the search.
+            start_nodes: Nodes of the first layer.
+            max_arc_count: Maximum number of layers after the first.
 
         Raises:
             PlannerLibraryError: The C library is not installed.
@@ -71,8 +71,8 @@ class NativeExpander(PathExpander):
                 f"there is no C library of the planner: {explain_missing_library()}"
             )
         self._expand_in_c = library.expand
-        self._max_nodes_per_layer = max(parameters.kept_nodes, len(start.x_m))
-        self._max_layers = step_count + 1
+        self._max_nodes_per_layer = max(parameters.kept_nodes, len(start_nodes.x_m))
+        self._max_layers = max_arc_count + 1
         self._memory = NativeMemory()
 
         self._native_search = NativeSearch()
@@ -80,7 +80,7 @@ class NativeExpander(PathExpander):
         self._fill_arc_table(ArcTable(parameters))
         self._fill_parameters(parameters)
         self._fill_task(task, parameters)
-        self._fill_layers(start)
+        self._fill_layers(start_nodes)
         self._allocate_scratch_memory(library.layout, len(parameters.curvatures_per_m))
 
     @property
@@ -196,58 +196,65 @@ class NativeExpander(PathExpander):
         native.kept_per_wide_cell = parameters.kept_per_wide_cell
 
     def _fill_task(self, task: SearchTask, parameters: SearchParameters) -> None:
-        """Copy the goal of the search and the body from which it starts into the structure that C reads.
+        """Copy the direction of travel, the body's initial pose and failed paths into the structure that C reads.
+
+        The structure is new, so that all its fields are 0: what is not set here counts as absent. Its addresses stay
+        valid as long as `self._memory` lives. The texts name the arrays in errors about their shapes.
 
         Args:
             task: The task of the search.
-            parameters: The robot, whose length gives the number of arcs of the body.
+            parameters: Length of the body, which gives its number of arcs.
         """
         native = self._native_search.task
         native.origin_x_m, native.origin_y_m = task.origin_w
         native.goal_rad = task.travel_direction_rad
         native.goal_x, native.goal_y = task.travel_direction_w
-        body_arcs = count_arcs_per_body(parameters)
+
+        # The body as it lies before the search. A search of the whole body may lay it on another path ("relaid").
+        body_arc_count = count_arcs_per_body(parameters)
         native.lying_drag_m = self._memory.get_array_address(
-            "the drag of the lying body", task.initial_drag_m, (body_arcs, 3)
+            "the drag of the lying body", task.initial_drag_m, (body_arc_count, 3)
         )
         native.is_relaid = task.initial_body_w is not None
         if task.initial_body_w is not None:
             native.lying_count = len(task.initial_body_w)
             native.lying_m = self._memory.get_array_address(
-                "the lying body", task.initial_body_w, (body_arcs + 1, 2)
+                "the lying body", task.initial_body_w, (body_arc_count + 1, 2)
             )
         native.max_sideways_m = task.max_sideways_m
+
+        # Points of paths on which the body got stuck.
         if task.failed_w is not None:
             native.failed_count = len(task.failed_w)
             native.failed_m = self._memory.get_array_address(
                 "the failed paths", task.failed_w, (len(task.failed_w), 2)
             )
 
-    def _fill_layers(self, start: NodeLayer) -> None:
+    def _fill_layers(self, start_nodes: NodeLayer) -> None:
         """Allocate the layers of the search for C, and copy the nodes of the first layer into them.
 
         Parents, positions, margins and drag of all layers are kept, so that a path can be traced back. Complete nodes
         are kept for two layers only, which C reads and writes alternately.
 
         Args:
-            start: Nodes of the first layer.
+            start_nodes: Nodes of the first layer.
         """
-        start_node_count = len(start.x_m)
+        start_node_count = len(start_nodes.x_m)
         history_shape = (self._max_layers, self._max_nodes_per_layer)
         self._parent = np.empty(history_shape, dtype=INTEGER_DTYPE)
         self._x_m = np.empty(history_shape)
         self._y_m = np.empty(history_shape)
         self._margin_n = np.empty(history_shape)
         arc_drag_m = np.empty((*history_shape, 3))
-        self._parent[0, :start_node_count] = start.parent
-        self._x_m[0, :start_node_count] = start.x_m
-        self._y_m[0, :start_node_count] = start.y_m
-        self._margin_n[0, :start_node_count] = start.propulsion_margin_n
-        arc_drag_m[0, :start_node_count] = start.arc_drag_m
+        self._parent[0, :start_node_count] = start_nodes.parent_row
+        self._x_m[0, :start_node_count] = start_nodes.x_m
+        self._y_m[0, :start_node_count] = start_nodes.y_m
+        self._margin_n[0, :start_node_count] = start_nodes.propulsion_margin_n
+        arc_drag_m[0, :start_node_count] = start_nodes.arc_drag_m
 
         # Layers with even numbers are in the first array, the others in the second.
         self._alternating_nodes = (
-            _make_node_array(start, self._max_nodes_per_layer),
+            _make_node_array(start_nodes, self._max_nodes_per_layer),
             np.empty(self._max_nodes_per_layer, dtype=NODE_DTYPE),
         )
 
@@ -256,7 +263,7 @@ class NativeExpander(PathExpander):
         layers.layer_room = self._max_layers
         layers.node_room = self._max_nodes_per_layer
         layers.node_count = start_node_count
-        layers.s_m = start.path_length_m
+        layers.s_m = start_nodes.path_length_m
         layers.parents = self._memory.get_array_address(
             "the parents", self._alternating_nodes[0], (self._max_nodes_per_layer,), NODE_DTYPE
         )
@@ -297,18 +304,23 @@ class NativeExpander(PathExpander):
 
 
 def _make_node_array(layer: NodeLayer, capacity: int) -> Array:
-    """Return the nodes of a layer, in an array with room for more."""
-    count = len(layer.x_m)
+    """Return the nodes of a layer as structures of the C library, in an array with room for more.
+
+    Args:
+        layer: Nodes of one depth of the search.
+        capacity: Length of the array; the elements after the nodes are zero.
+    """
     nodes = np.zeros(capacity, dtype=NODE_DTYPE)
-    used = nodes[:count]
-    used["x_m"] = layer.x_m
-    used["y_m"] = layer.y_m
-    used["heading_rad"] = layer.heading_rad
-    used["curvature_per_m"] = layer.curvature_per_m
-    used["cost_m"] = layer.cost_m
-    used["drag_m"] = layer.drag_m
-    used["contacts"]["obstacle"] = layer.contact_obstacle_index
-    used["contacts"]["s_m"] = layer.contact_arc_length_m
-    used["contacts"]["gap_m"] = layer.contact_gap_m
-    used["contacts"]["wrench"] = layer.contact_wrench
+    # A view of the elements that hold a node, so that assignments fill `nodes`.
+    used_nodes = nodes[: len(layer.x_m)]
+    used_nodes["x_m"] = layer.x_m
+    used_nodes["y_m"] = layer.y_m
+    used_nodes["heading_rad"] = layer.heading_rad
+    used_nodes["curvature_per_m"] = layer.curvature_per_m
+    used_nodes["cost_m"] = layer.cost_m
+    used_nodes["drag_m"] = layer.drag_m
+    used_nodes["contacts"]["obstacle"] = layer.contact_obstacle_index
+    used_nodes["contacts"]["s_m"] = layer.contact_arc_length_m
+    used_nodes["contacts"]["gap_m"] = layer.contact_gap_m
+    used_nodes["contacts"]["wrench"] = layer.contact_wrench
     return nodes

@@ -17,17 +17,19 @@ class PathExpander(ABC):
         obstacles: ObstacleGrid,
         parameters: SearchParameters,
         task: SearchTask,
-        start: NodeLayer,
-        step_count: int,
+        start_nodes: NodeLayer,
+        max_arc_count: int,
     ) -> None:
-        """Start with the start nodes as the first layer.
+        """Prepare a search, in which the start nodes are the first and only layer.
+
+        Every implementation has this constructor, so that a search can choose the class.
 
         Args:
             obstacles: The map.
             parameters: Size of the robot's body, and the cost weights.
-            task: Goal of the search, and the body from which it starts.
-            start: The nodes from which the paths grow.
-            step_count: Maximum number of arcs of a path.
+            task: Direction of travel, and how the body lies before the search.
+            start_nodes: The nodes from which the paths grow: places of the head without contacts.
+            max_arc_count: Maximum number of arcs of a path, which is the maximum number of calls of `expand_layer`.
         """
 
     @property

@@ -25,9 +25,9 @@ class SearchArcs:
     middle_y_m: Floats
     middle_heading_rad: Floats
     # Ends of the arcs.
-    x_m: Floats
-    y_m: Floats
-    heading_rad: Floats
+    end_x_m: Floats
+    end_y_m: Floats
+    end_heading_rad: Floats
 
 
 class ArcTable:
@@ -73,9 +73,9 @@ class ArcTable:
             middle_x_m=x_m + cosine * self.middle_m[0] - sine * self.middle_m[1],
             middle_y_m=y_m + sine * self.middle_m[0] + cosine * self.middle_m[1],
             middle_heading_rad=heading_rad - 0.5 * self.curvatures_per_m * STEP_M,
-            x_m=x_m + cosine * self.end_m[0] - sine * self.end_m[1],
-            y_m=y_m + sine * self.end_m[0] + cosine * self.end_m[1],
-            heading_rad=heading_rad,
+            end_x_m=x_m + cosine * self.end_m[0] - sine * self.end_m[1],
+            end_y_m=y_m + sine * self.end_m[0] + cosine * self.end_m[1],
+            end_heading_rad=heading_rad,
         )
 
     def find_clear_poses(

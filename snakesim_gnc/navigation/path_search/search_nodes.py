@@ -16,6 +16,8 @@ from snakesim_hal.base.arrays import Floats
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 
+NO_PARENT = -1  # row of the parent of a start node
+
 
 @dataclass
 class NodeLayer:
@@ -26,7 +28,7 @@ class NodeLayer:
     y_m: Floats  # (n,)
     heading_rad: Floats  # (n,) at the end of the arc, world
     curvature_per_m: Floats  # (n,)
-    parent: Ints  # (n,) row in the layer before
+    parent_row: Ints  # (n,) row in the layer before
     cost_m: Floats  # (n,) of the path from its start, in meters of path
     # Contacts of the body; the newest is last.
     contact_obstacle_index: Ints  # (n, C) index; NO_OBSTACLE in an empty slot
@@ -92,6 +94,8 @@ class NodeLayer:
 def make_start_nodes(points_w: Floats, headings_rad: Floats) -> NodeLayer:
     """Return nodes without contacts and drag, from which a search starts.
 
+    The layer gets copies, so that later changes of its arrays do not change the arguments.
+
     Args:
         points_w: (n, 2) positions in the world, m.
         headings_rad: (n,) directions in which the paths begin.
@@ -100,9 +104,9 @@ def make_start_nodes(points_w: Floats, headings_rad: Floats) -> NodeLayer:
     return NodeLayer(
         x_m=points_w[:, 0].copy(),
         y_m=points_w[:, 1].copy(),
-        heading_rad=headings_rad,
+        heading_rad=headings_rad.copy(),
         curvature_per_m=np.zeros(count),
-        parent=np.full(count, NO_OBSTACLE),
+        parent_row=np.full(count, NO_PARENT),
         cost_m=np.zeros(count),
         contact_obstacle_index=np.full((count, MAX_CONTACTS), NO_OBSTACLE),
         contact_arc_length_m=np.full((count, MAX_CONTACTS), -np.inf),
@@ -133,14 +137,18 @@ def compute_cell_numbers(
     column = np.floor(x_m / cell_size_m).astype(np.int64)
     row = np.floor(y_m / cell_size_m).astype(np.int64)
     sector = np.floor(heading_rad / cell_size_rad).astype(np.int64)
+    # Two primes keep the numbers of cells that are near each other apart.
     return (column * 100_003 + row) * 1009 + sector
 
 
 def count_earlier_in_cell(cells: NDArray[np.int64]) -> Ints:
     """Return for each node, (n,), how many nodes before it have the same cell number."""
+    # Nodes of one cell are next to each other in this order, and a stable sort keeps their order.
     order = np.argsort(cells, kind="stable")
-    is_first = np.concatenate(([True], np.diff(cells[order]) != 0))
-    cell_starts = np.flatnonzero(is_first)
+    is_first_of_cell = np.concatenate(([True], np.diff(cells[order]) != 0))
+    # For each sorted node, the sorted position at which its cell begins.
+    cell_starts = np.flatnonzero(is_first_of_cell)
+    own_cell_start = cell_starts[np.cumsum(is_first_of_cell) - 1]
     earlier_counts = np.empty(len(order), dtype=np.intp)
-    earlier_counts[order] = np.arange(len(order)) - cell_starts[np.cumsum(is_first) - 1]
+    earlier_counts[order] = np.arange(len(order)) - own_cell_start
     return earlier_counts

@@ -50,16 +50,16 @@ class NumpyExpander(PathExpander):
         obstacles: ObstacleGrid,
         parameters: SearchParameters,
         task: SearchTask,
-        start: NodeLayer,
-        step_count: int,
+        start_nodes: NodeLayer,
+        max_arc_count: int,
     ) -> None:
-        del step_count  # memory is allocated layer by layer
+        del max_arc_count  # memory is allocated layer by layer
         self._obstacles = obstacles
         self._parameters = parameters
         self._task = task
         self._arc_table = ArcTable(parameters)
         self._arcs_per_body = count_arcs_per_body(parameters)
-        self._layers = [start]
+        self._layers = [start_nodes]
 
     @property
     def node_count(self) -> int:
@@ -69,11 +69,13 @@ class NumpyExpander(PathExpander):
         """Add a layer with the best children of the newest one; return False if no arc is allowed."""
         parents = self._layers[-1]
         arcs = self._arc_table.make_arcs(parents)
-        sideways_m = self._compute_distance_from_initial_body_m(arcs, parents.path_length_m)
-        is_allowed = self._find_allowed_arcs(arcs, sideways_m)
+        distances_from_initial_body_m = self._compute_distances_from_initial_body_m(
+            arcs, parents.path_length_m
+        )
+        is_allowed = self._find_allowed_arcs(arcs, distances_from_initial_body_m)
         if not is_allowed.any():
             return False
-        cost_m = self._compute_path_costs_m(parents, arcs, sideways_m)
+        cost_m = self._compute_path_costs_m(parents, arcs, distances_from_initial_body_m)
         arc_indices = self._select_candidates(arcs, is_allowed, cost_m)
         nodes = self._make_nodes(parents, arcs, cost_m, arc_indices)
         self._add_contact_terms(nodes, arcs, arc_indices)
@@ -92,10 +94,10 @@ class NumpyExpander(PathExpander):
         for layer in reversed(self._layers):
             points.append((layer.x_m[row], layer.y_m[row]))
             margins.append(layer.propulsion_margin_n[row])
-            row = int(layer.parent[row])
+            row = int(layer.parent_row[row])
         return SearchedPath(np.array(points[::-1]), np.array(margins[::-1]), cost_m)
 
-    def _compute_distance_from_initial_body_m(
+    def _compute_distances_from_initial_body_m(
         self, arcs: SearchArcs, parent_s_m: float
     ) -> Floats | None:
         """Compute the distances of the ends of the arcs from where the body lies at the same arc length.
@@ -115,34 +117,40 @@ class NumpyExpander(PathExpander):
         if arc_end_index >= len(initial_body_w):
             return None
         return np.hypot(
-            arcs.x_m - initial_body_w[arc_end_index, 0], arcs.y_m - initial_body_w[arc_end_index, 1]
+            arcs.end_x_m - initial_body_w[arc_end_index, 0],
+            arcs.end_y_m - initial_body_w[arc_end_index, 1],
         )
 
-    def _find_allowed_arcs(self, arcs: SearchArcs, sideways_m: Floats | None) -> Bools:
+    def _find_allowed_arcs(
+        self, arcs: SearchArcs, distances_from_initial_body_m: Floats | None
+    ) -> Bools:
         """Find the arcs on which the body clears all obstacles and heads roughly towards the goal.
 
         Args:
             arcs: (n, c) arcs, one for each node and curvature.
-            sideways_m: (n, c) distance of the ends from the current body; None if this does not count.
+            distances_from_initial_body_m: (n, c) distances of the ends of the arcs from where the body lies; None if
+                they do not count.
 
         Returns:
             (n, c) whether each arc is allowed.
         """
+        # The body must clear all obstacles at the middle of each arc and at its end.
         is_allowed = self._arc_table.find_clear_poses(
             self._obstacles, arcs.middle_x_m, arcs.middle_y_m, arcs.middle_heading_rad
         )
         is_allowed &= self._arc_table.find_clear_poses(
-            self._obstacles, arcs.x_m, arcs.y_m, arcs.heading_rad
+            self._obstacles, arcs.end_x_m, arcs.end_y_m, arcs.end_heading_rad
         )
-        from_goal_rad = arcs.heading_rad - self._task.travel_direction_rad
+        # Angle between the end of the arc and the direction of travel, 0 to pi.
+        from_goal_rad = arcs.end_heading_rad - self._task.travel_direction_rad
         heading_error_rad = np.abs(np.remainder(from_goal_rad + np.pi, 2 * np.pi) - np.pi)
         is_allowed &= heading_error_rad < MAX_HEADING_ERROR_RAD
-        if sideways_m is not None:
-            is_allowed &= sideways_m < self._task.max_sideways_m
+        if distances_from_initial_body_m is not None:
+            is_allowed &= distances_from_initial_body_m < self._task.max_sideways_m
         return is_allowed
 
     def _compute_path_costs_m(
-        self, parents: NodeLayer, arcs: SearchArcs, sideways_m: Floats | None
+        self, parents: NodeLayer, arcs: SearchArcs, distances_from_initial_body_m: Floats | None
     ) -> Floats:
         """Return the cost of the paths to the ends of the arcs, without the terms of the last contacts.
 
@@ -152,7 +160,8 @@ class NumpyExpander(PathExpander):
         Args:
             parents: (n) nodes at which the arcs begin.
             arcs: (n, c) arcs, one for each node and curvature.
-            sideways_m: (n, c) distance of the ends from the current body; None if this does not count.
+            distances_from_initial_body_m: (n, c) distances of the ends of the arcs from where the body lies; None if
+                they do not count.
 
         Returns:
             (n, c) costs in m.
@@ -162,8 +171,8 @@ class NumpyExpander(PathExpander):
         curvature_change = np.abs(
             self._arc_table.curvatures_per_m - parents.curvature_per_m[:, None]
         )
-        step_x = arcs.x_m - parents.x_m[:, None]
-        step_y = arcs.y_m - parents.y_m[:, None]
+        step_x = arcs.end_x_m - parents.x_m[:, None]
+        step_y = arcs.end_y_m - parents.y_m[:, None]
         progress_m = step_x * task.travel_direction_w[0] + step_y * task.travel_direction_w[1]
         cost_m = (
             parents.cost_m[:, None]
@@ -171,15 +180,20 @@ class NumpyExpander(PathExpander):
             + parameters.curvature_change_cost_m * STEP_M * curvature_change
             - parameters.progress_reward * progress_m
         )
-        if sideways_m is None:
+        if distances_from_initial_body_m is None:
             return cost_m
         if task.failed_w is not None:
-            to_failed_x = arcs.x_m[..., None] - task.failed_w[:, 0]
-            to_failed_y = arcs.y_m[..., None] - task.failed_w[:, 1]
+            to_failed_x = arcs.end_x_m[..., None] - task.failed_w[:, 0]
+            to_failed_y = arcs.end_y_m[..., None] - task.failed_w[:, 1]
             failed_path_distance_m = np.hypot(to_failed_x, to_failed_y).min(axis=-1)
             closeness = np.maximum(1.0 - failed_path_distance_m / FAILED_PATH_M, 0.0)
             cost_m = cost_m + STEP_M * parameters.failed_path_cost * closeness
-        return cost_m + STEP_M * parameters.sideways_cost * (sideways_m / task.max_sideways_m) ** 2
+        return (
+            cost_m
+            + STEP_M
+            * parameters.sideways_cost
+            * (distances_from_initial_body_m / task.max_sideways_m) ** 2
+        )
 
     def _select_candidates(self, arcs: SearchArcs, is_allowed: Bools, cost_m: Floats) -> Ints:
         """Select the cheapest allowed arc in each cell of position and heading, up to a maximum number.
@@ -195,9 +209,9 @@ class NumpyExpander(PathExpander):
         allowed_indices = np.flatnonzero(is_allowed.ravel())
         cheapest_first = allowed_indices[np.argsort(cost_m.ravel()[allowed_indices], kind="stable")]
         cells = compute_cell_numbers(
-            arcs.x_m.ravel()[cheapest_first],
-            arcs.y_m.ravel()[cheapest_first],
-            arcs.heading_rad.ravel()[cheapest_first],
+            arcs.end_x_m.ravel()[cheapest_first],
+            arcs.end_y_m.ravel()[cheapest_first],
+            arcs.end_heading_rad.ravel()[cheapest_first],
             CELL_M,
             CELL_RAD,
         )
@@ -221,10 +235,10 @@ class NumpyExpander(PathExpander):
         curvature_count = len(self._arc_table.curvatures_per_m)
         parent_rows = arc_indices // curvature_count
         nodes = parents.select_rows(parent_rows)
-        nodes.parent = parent_rows
-        nodes.x_m = arcs.x_m.ravel()[arc_indices]
-        nodes.y_m = arcs.y_m.ravel()[arc_indices]
-        nodes.heading_rad = arcs.heading_rad.ravel()[arc_indices]
+        nodes.parent_row = parent_rows
+        nodes.x_m = arcs.end_x_m.ravel()[arc_indices]
+        nodes.y_m = arcs.end_y_m.ravel()[arc_indices]
+        nodes.heading_rad = arcs.end_heading_rad.ravel()[arc_indices]
         nodes.curvature_per_m = self._arc_table.curvatures_per_m[arc_indices % curvature_count]
         nodes.cost_m = cost_m.ravel()[arc_indices]
         nodes.path_length_m = parents.path_length_m + STEP_M
@@ -294,7 +308,7 @@ class NumpyExpander(PathExpander):
             tangents: (n, 2) unit vectors along these arcs.
         """
         nodes.arc_drag_m = STEP_M * compute_wrenches(middles_w - self._task.origin_w, tangents)
-        nodes.drag_m += nodes.arc_drag_m - self._get_drag_at_tail_m(nodes.parent)
+        nodes.drag_m += nodes.arc_drag_m - self._get_drag_at_tail_m(nodes.parent_row)
 
     def _add_margin_cost(self, nodes: NodeLayer) -> None:
         """Add the cost of propulsion margins below the wanted one; it is higher just ahead of the measured head."""
@@ -329,7 +343,7 @@ class NumpyExpander(PathExpander):
             return self._task.initial_drag_m[len(layers) - 1]
         rows = parent_rows
         for layer in reversed(layers[len(layers) - self._arcs_per_body + 1 :]):
-            rows = layer.parent[rows]
+            rows = layer.parent_row[rows]
         return layers[-self._arcs_per_body].arc_drag_m[rows]
 
     def _keep_best_nodes(self, nodes: NodeLayer) -> NodeLayer:

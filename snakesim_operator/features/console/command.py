@@ -61,7 +61,7 @@ def show_live_robot(
     stop_event = _make_stop_event()
     with _run_front_server(port, link, stop_event) as ports:
         run_live_display(
-            link, _find_surroundings(link), ports.pages, stop_event, robot_file=robot_file
+            link, _find_surroundings(link), ports.page_socket, stop_event, robot_file=robot_file
         )
     return 0
 
@@ -87,7 +87,7 @@ def show_recorded_run(folder: Path, at_s: float, port: int | None) -> int:
     run = RunPlayback(folder)
     stop_event = _make_stop_event()
     with _run_front_server(port, None, stop_event) as ports:
-        return run_recording_display(run, at_s, ports.pages, stop_event)
+        return run_recording_display(run, at_s, ports.page_socket, stop_event)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -155,7 +155,7 @@ def _run_front_server(
             ports, connection, lambda output: print_line(output.decode(errors="replace").rstrip())
         )
         print_line(f"console: {ports.address}")
-        ports.browsers.close()  # the front server has its own copy
+        ports.browser_socket.close()  # the front server has its own copy
         start_restarting_thread("console front watch", partial(_set_after_exit, front, stop_event))
         try:
             yield ports

@@ -1,5 +1,8 @@
 """The score card of an evaluation: what each controller did in each row, by what code, and how it compares with others.
 
+A field is a random scene with its number. A row is a setting of the suite: one value of a varied key, with the scenario
+and all other keys. "Crossed" means that a run reached its goal.
+
 Two controllers are compared on the same fields only, by McNemar's exact test. Its p values are corrected for the number
 of comparisons by Holm's method.
 """
@@ -108,24 +111,28 @@ class ControllerComparison(msgspec.Struct, frozen=True):
 def make_card(
     suite: str, cases: Sequence[EvaluationCase], outcome_by_id: Results
 ) -> EvaluationCard:
-    """Make the score card of all cases that have an outcome.
+    """Make the score card of an evaluation, with this code and this computer.
 
     Args:
         suite: Name of the evaluation.
         cases: All cases, in the order of the table.
         outcome_by_id: The outcome of each finished case by its id.
+
+    Returns:
+        The card. Its fields are those of all cases, its scores and goal results those of the finished ones only.
     """
-    crossings: list[GoalResult] = []
+    goal_results: list[GoalResult] = []
     for case in cases:
         if case.id in outcome_by_id:
-            crossed = outcome_by_id[case.id].numbers.get("crossed") is True
-            crossings.append(
+            # None if the case could not run, or had no goal; for a comparison both count as not reached.
+            has_reached_goal = outcome_by_id[case.id].numbers.get("crossed") is True
+            goal_results.append(
                 GoalResult(
-                    case.controller,
-                    case.setting,
-                    case.field,
-                    _hash_without_controller(case),
-                    crossed,
+                    controller=case.controller,
+                    row=case.setting,
+                    field=case.field,
+                    same=_hash_without_controller(case),
+                    crossed=has_reached_goal,
                 )
             )
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
@@ -136,7 +143,7 @@ def make_card(
         machine=machine,
         fields=sorted({case.field for case in cases}),
         scores=[_make_score(row) for row in group_results_by_row(cases, outcome_by_id)],
-        crossings=crossings,
+        crossings=goal_results,
     )
 
 
@@ -269,7 +276,10 @@ def _compute_median(values: Sequence[float]) -> float | None:
 
 
 def _hash_without_controller(case: EvaluationCase) -> str:
-    """Return a hash of a case's configuration without its controller: it names the field and all that it sets."""
+    """Return a hash of a case's configuration without its controller.
+
+    It is equal for two cases that differ in the controller only, whose results may be compared as a pair.
+    """
     config = msgspec.json.decode(case.config, type=RunConfig)
     return compute_config_hash(msgspec.structs.replace(config, controller="any", controllers={}))
 

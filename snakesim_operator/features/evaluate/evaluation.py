@@ -35,6 +35,7 @@ from snakesim_operator.features.evaluate.suite import (
     select_cases_of_rows,
 )
 from snakesim_operator.features.evaluate.table import (
+    ResultRow,
     find_best_controller,
     find_worst_failures,
     format_table,
@@ -252,19 +253,17 @@ def _report_results(
         other_cards: Score cards of other evaluations to compare with.
     """
     rows = group_results_by_row(cases, outcome_by_id)
-    for line in format_table(rows):
-        print_line(line)
-    if any(row.runs == 1 and row.crossed is None for row in rows):
-        print_line("a row of one run has no interval; give --seeds 2 or more (of a suite --fields)")
+    _print_table(rows)
     _print_errors(cases, outcome_by_id)
 
-    best = find_best_controller(rows)
-    cases_of_best = [case for case in cases if case.controller == best]
+    best_controller = find_best_controller(rows)
+    cases_of_best = [case for case in cases if case.controller == best_controller]
     failures = _list_worst_failures(request, cases_of_best, outcome_by_id)
-    _print_failures(best, failures)
+    _print_failures(best_controller, failures)
 
     table_paths = store.write_tables(output_folder, cases, outcome_by_id)
     card = make_card(request.name, cases, outcome_by_id)
+    # The card is printed only if it is used for a comparison: on fresh fields, or with other cards.
     if request.suite.fresh or other_cards:
         for line in format_card(card, compare_cards(card, other_cards)):
             print_line(line)
@@ -275,6 +274,15 @@ def _report_results(
     write_text(page_path, render_evaluation_page(title, request.source, rows, failures))
     for path in (*table_paths, card_path, page_path):
         print_line(f"written: {path}")
+
+
+def _print_table(rows: Sequence[ResultRow]) -> None:
+    """Print the table of results, and how to get intervals if it has rows without any."""
+    for line in format_table(rows):
+        print_line(line)
+    # A row without a goal has no success rate. Its interval is that of the mean over its runs.
+    if any(row.runs == 1 and row.crossed is None for row in rows):
+        print_line("a row of one run has no interval; give --seeds 2 or more (of a suite --fields)")
 
 
 def _print_errors(cases: Sequence[EvaluationCase], outcome_by_id: store.Results) -> None:

@@ -152,7 +152,16 @@ def _make_search_command(
     range_by_key: Mapping[str, ParameterRange],
     cases_at_ends: Sequence[EvaluationCase],
 ) -> SearchCommand:
-    """Collect everything on which the results of trials depend; workers and the number of trials are not included."""
+    """Collect everything on which the results of trials depend; workers and the number of trials are not included.
+
+    Scenario, robot and scene files are part of it by a hash of complete configurations. Those at the two ends of the
+    ranges are enough: the configurations of all other trials differ from them in the varied keys only.
+
+    Args:
+        request: The options of the search.
+        range_by_key: The range of each varied key.
+        cases_at_ends: The cases of two trials, in which all varied keys have their lowest or their highest values.
+    """
     return SearchCommand(
         scenario=request.scenario,
         rows=list(request.rows),
@@ -160,12 +169,14 @@ def _make_search_command(
             key: f"{value_range.low!r}:{value_range.high!r}"
             for key, value_range in range_by_key.items()
         },
-        set=_parse_set_options(request),
-        set_words=list(request.set),
+        set=_parse_set_options(request),  # the values, which are compared
+        set_words=list(
+            request.set
+        ),  # the options as they were typed, for the command that continues the search
         goal=request.goal,
         direction="minimize" if request.minimize else "maximize",
-        seeds=request.seeds,
-        seed=request.seed,
+        seeds=request.seeds,  # number of random scenes for each trial
+        seed=request.seed,  # the first of them
         configurations=hash_configurations(cases_at_ends),
         code=compute_code_digest(),
     )

@@ -96,7 +96,6 @@ class ResultRow:
                 values.append(float(value))
         return values
 
-    @property
     def format_cells(self) -> list[str]:
         """Return the texts of this row of the table of results, one for each heading in HEADINGS; some are UNKNOWN.
 
@@ -173,7 +172,7 @@ def group_results_by_row(
 
 def make_result_table(rows: Sequence[ResultRow]) -> list[list[str]]:
     """Return HEADINGS and the cells of each row, without the columns in which nothing is known."""
-    table = [list(HEADINGS), *(row.format_cells for row in rows)]
+    table = [list(HEADINGS), *(row.format_cells() for row in rows)]
     shown_columns: list[int] = []
     for column in range(len(HEADINGS)):
         has_a_value = any(cells[column].strip(UNKNOWN_TEXT) for cells in table[1:])

@@ -62,22 +62,32 @@ def draw_head_and_tail_paths(
 
 
 def _sample_body_points_w(record: RunRecord, span_s: tuple[float, float]) -> Floats:
-    """Return tail end, joints and head end in the world at evenly chosen ticks, (n, joints + 2, 3)."""
+    """Return tail end, joints and head end in the world at evenly chosen ticks, (n, joints + 2, 3).
+
+    Args:
+        record: The run.
+        span_s: Begin and end of the part of the run, in s on the time axis.
+
+    Raises:
+        ConfigError: The pose is unknown in this part of the run.
+    """
+    start_s, end_s = span_s
     time_s = record.time_s - get_time_origin_s(record)
-    rows = np.flatnonzero(record.has_pose & (time_s >= span_s[0]) & (time_s <= span_s[1]))
-    chosen = rows[
-        np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_PATH_POINTS)).astype(int))
-    ]
-    nodes_w = [
-        nodes for nodes in map(record.find_body_points_w, chosen.tolist()) if nodes is not None
-    ]
-    if not nodes_w:
+    rows = np.flatnonzero(record.has_pose & (time_s >= start_s) & (time_s <= end_s))
+    sample_count = min(len(rows), MAX_PATH_POINTS)
+    sampled_positions = np.unique(np.linspace(0, len(rows) - 1, sample_count).astype(int))
+    samples_w: list[Floats] = []
+    for row in rows[sampled_positions].tolist():
+        body_points_w = record.find_body_points_w(row)
+        if body_points_w is not None:
+            samples_w.append(body_points_w)
+    if not samples_w:
         raise ConfigError(
             f"{record.path}: the pose is unknown in this part of the run, so there is no path; a path needs a robot "
             "with a pose sensor; signals such as angle_rad can be drawn of any run",
             code="recording/missing-data",
         )
-    return np.stack(nodes_w)
+    return np.stack(samples_w)
 
 
 def plot_obstacles(axes: Axes, record: RunRecord) -> None:

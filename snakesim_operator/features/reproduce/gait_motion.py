@@ -65,17 +65,18 @@ def measure_gait(record: RunRecord, period_s: float, skipped_periods: int) -> Ga
         ConfigError: The run is shorter than that.
     """
     rows = _select_whole_periods(record, period_s, skipped_periods)
-    time_s = (len(rows) - 1) / record.config.rate_hz
-    finder = ForwardKinematics(record.description)
-    nodes_w = finder.compute_body_points_w(
+    duration_s = (len(rows) - 1) / record.config.rate_hz
+    # (rows, joints + 2, 2): tail end, joints and head end, seen from above.
+    body_points_w = ForwardKinematics(record.description).compute_body_points_w(
         record.position_w_m[rows], record.orientation_wxyz[rows], record.angle_rad[rows]
     )[..., :2]
-    center_w = compute_center_of_mass_w(record.description, nodes_w)
-    axis_w = (nodes_w[:-1, -1] - nodes_w[:-1, 0]).mean(axis=0)
-    way_w = center_w[-1] - center_w[0]
+    center_w = compute_center_of_mass_w(record.description, body_points_w)
+    # Mean vector from tail to head. The last row is left out, because it begins the next period.
+    axis_w = (body_points_w[:-1, -1] - body_points_w[:-1, 0]).mean(axis=0)
+    displacement_w = center_w[-1] - center_w[0]
     return GaitMotion(
-        speed_m_s=float(way_w @ axis_w / np.linalg.norm(axis_w)) / time_s,
-        ground_power_w=_measure_ground_power_w(record, nodes_w),
+        speed_m_s=float(displacement_w @ axis_w / np.linalg.norm(axis_w)) / duration_s,
+        ground_power_w=_measure_ground_power_w(record, body_points_w),
         angle_harmonics=_find_harmonics(
             record.angle_rad[rows[:-1]], period_s, record.config.rate_hz
         ),
@@ -111,22 +112,28 @@ def _find_harmonics(angles_rad: Floats, period_s: float, rate_hz: float) -> NDAr
     return series
 
 
-def _measure_ground_power_w(record: RunRecord, nodes_w: Floats) -> float:
+def _measure_ground_power_w(record: RunRecord, body_points_w: Floats) -> float:
     """Return the mean power of friction on flat ground.
 
     Friction acts at the joints and ends. Each of these feet has half of the weight of both of its links, and their mean
     direction, as in the simulator.
+
+    Args:
+        record: The run.
+        body_points_w: (rows, feet, 2) positions of the feet in consecutive rows of the run, m.
     """
     friction = GroundFriction.from_config(record.config)
     masses_kg = np.array([link.mass_kg for link in record.description.links])
     loads_n = find_foot_loads_n(masses_kg)
-    places = nodes_w[..., 0] + 1j * nodes_w[..., 1]
-    velocities = np.diff(places, axis=0) * record.config.rate_hz
-    tangents = find_foot_tangents(np.diff(places, axis=1))
-    between = tangents[1:] + tangents[:-1]
-    slips = velocities * np.conj(between / np.abs(between))
-    forces = find_friction_per_load(slips, friction, MIN_SLIP_M_S)
-    powers_w = -(forces * np.conj(slips)).real @ loads_n
+    # Vectors in the plane as complex numbers: (rows, feet), and (rows - 1, feet) between two rows.
+    positions = body_points_w[..., 0] + 1j * body_points_w[..., 1]
+    velocities = np.diff(positions, axis=0) * record.config.rate_hz
+    tangents = find_foot_tangents(np.diff(positions, axis=1))
+    mean_tangents = tangents[1:] + tangents[:-1]
+    # Rotated into the direction of the body: real parts along it, imaginary parts across it.
+    slips = velocities * np.conj(mean_tangents / np.abs(mean_tangents))
+    forces_per_load = find_friction_per_load(slips, friction, MIN_SLIP_M_S)
+    powers_w = -(forces_per_load * np.conj(slips)).real @ loads_n
     return float(powers_w.mean())
 
 
@@ -164,7 +171,7 @@ def find_friction_per_load(
     along = slips.real
     across = slips.imag
     speeds_m_s = np.sqrt(along**2 + across**2 + smooth_m_s**2)
-    of_along = np.where(along > 0, friction.dry.forward, friction.dry.backward)
-    dry = (of_along * along + 1j * friction.dry.sideways * across) / speeds_m_s
+    along_coefficients = np.where(along > 0, friction.dry.forward, friction.dry.backward)
+    dry = (along_coefficients * along + 1j * friction.dry.sideways * across) / speeds_m_s
     viscous = friction.along_s_per_m * along + 1j * friction.across_s_per_m * across
     return -dry - viscous

@@ -118,8 +118,8 @@ class PlanarChain:
             The chain at the start of the step.
         """
         masses_kg = self._masses_kg
+        # The pose: heading and yaw rate relative to the tail link for each link, and its vector from rear to front end.
         headings_rad = self._tail_heading_rad + np.append(0.0, np.cumsum(angles_rad))
-        # Of the links, relative to the tail link.
         relative_rates_rad_s = np.append(0.0, np.cumsum(rates_rad_s))
         links = (self._lengths_m * np.exp(1j * headings_rad)).astype(np.complex128)
         # Both ends of the body, and the joints.
@@ -143,6 +143,7 @@ class PlanarChain:
         center_velocity = (self._momentum - masses_kg @ middle_rates) / self._mass_kg
         tail_velocity = center_velocity - 1j * yaw_rate_rad_s * (center - self._tail_end)
 
+        # Where the body touches the ground, with the velocities there, and the friction in the world.
         if self._has_middle_contacts:
             contacts = middles
             contact_rates = middle_rates
@@ -160,6 +161,7 @@ class PlanarChain:
             * find_friction((velocities * np.conj(tangents)).astype(np.complex128))
         )
 
+        # The explicit step of the state.
         self._momentum += step_s * forces_n.sum()
         self._angular_momentum += step_s * float((np.conj(contacts - center) * forces_n).imag.sum())
         self._tail_end += step_s * tail_velocity

@@ -13,7 +13,7 @@ from rosbags.serde import SerdeError
 
 from snakesim_hal.wire.messages import Clock, JointMode, JointState, RobotDescription
 from snakesim_hal.wire.setpoints import RequestedSetpoints
-from snakesim_operator.features.ros2.message_age import find_age_problem
+from snakesim_operator.features.ros2.message_age import explain_stale_message
 from snakesim_operator.features.ros2.messages import JOINT_STATE, TYPE_STORE
 
 TARGET_LIFETIME_NS = 500_000_000  # of a joint's target in robot time
@@ -176,7 +176,7 @@ def _determine_age_ns(command: _FollowableCommand, age_ns: int, ros_now_ns: int)
     if command.timestamp_ns:
         age_ns = ros_now_ns - command.timestamp_ns
         source = "the stamp of its header"
-    refusal = find_age_problem(age_ns, source)
+    refusal = explain_stale_message(age_ns, source)
     if refusal:
         raise _RefusedMessageError(refusal)
     return age_ns

@@ -90,15 +90,15 @@ def parse_attachment(attachment: bytes) -> tuple[bytes, int] | None:
     return sender, sent_ns
 
 
-def find_age_problem(age_ns: float, source: str) -> str:
-    """Find out whether a message is too old, or too far in the future, to move the robot.
+def explain_stale_message(age_ns: float, source: str) -> str:
+    """Explain why a message is too old, or too far in the future, to move the robot.
 
     Args:
         age_ns: Age of the message; negative for a timestamp in the future.
         source: How the age was measured, as a text for the reason.
 
     Returns:
-        The reason to refuse the message; empty if the message may move the robot.
+        The reason to refuse the message; an empty text if the message may move the robot.
     """
     if age_ns > MAX_AGE_NS:
         return f"is older than {MAX_AGE_NS * 1e-9:g} s by {source}"
@@ -110,8 +110,8 @@ def find_age_problem(age_ns: float, source: str) -> str:
     return ""
 
 
-def find_request_age_problem(attachment: bytes, wall_ns: int) -> str:
-    """Find out whether a service request is too old to let the robot move.
+def explain_stale_request(attachment: bytes, wall_ns: int) -> str:
+    """Explain why a service request is too old, or too far in the future, to let the robot move.
 
     A client sends a single request, so there is no faster message to compare with: its clock must agree with ours to
     within MAX_REQUEST_AGE_NS.
@@ -121,7 +121,7 @@ def find_request_age_problem(attachment: bytes, wall_ns: int) -> str:
         wall_ns: Current time of this computer's wall clock.
 
     Returns:
-        The reason to refuse the request; empty if the request is recent.
+        The reason to refuse the request; an empty text if the request is recent.
     """
     sender_and_time = parse_attachment(attachment)
     if sender_and_time is None:
@@ -130,11 +130,9 @@ def find_request_age_problem(attachment: bytes, wall_ns: int) -> str:
     age_ns = wall_ns - sent_ns
     if abs(age_ns) <= MAX_REQUEST_AGE_NS:
         return ""
-    direction = "in the future"
-    if age_ns > 0:
-        direction = "ago"
+    past_or_future = "ago" if age_ns > 0 else "in the future"
     return (
-        f"the request was sent {abs(age_ns) * 1e-9:.0f} s {direction}, by the clock of its sender; "
-        f"{MAX_REQUEST_AGE_NS * 1e-9:g} s are allowed. Ask "
-        "again; if it is refused again, synchronise the clocks of both computers"
+        f"the request was sent {abs(age_ns) * 1e-9:.0f} s {past_or_future}, by the clock of its sender; "
+        f"{MAX_REQUEST_AGE_NS * 1e-9:g} s are allowed. "
+        "Ask again; if it is refused again, synchronise the clocks of both computers"
     )

@@ -16,7 +16,7 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.features.ros2.graph import RosNode
-from snakesim_operator.features.ros2.message_age import find_request_age_problem
+from snakesim_operator.features.ros2.message_age import explain_stale_request
 from snakesim_operator.features.ros2.server import ServiceServer, run_action
 from snakesim_operator.features.ros2.service_types import TRIGGER
 from snakesim_operator.robot_commands.command import request_from_host
@@ -79,7 +79,7 @@ def _explain_late_arm_request(attachment: bytes) -> str:
 
     A network that stalls may deliver a request long after the client has stopped waiting.
     """
-    return find_request_age_problem(attachment, time.time_ns())
+    return explain_stale_request(attachment, time.time_ns())
 
 
 class _RobotOperator:

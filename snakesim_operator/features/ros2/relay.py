@@ -21,7 +21,7 @@ class ImuMeasurement(NamedTuple):
     """What one IMU has measured."""
 
     sample: Imu
-    entry: int  # of the IMU in the lists of the sample
+    index_in_sample: int  # of the IMU in the lists of the sample
 
 
 def _has_always_subscriber() -> bool:

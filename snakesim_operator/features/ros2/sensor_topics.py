@@ -229,20 +229,34 @@ class SensorTopics:
         return NewestRelay(self._session, key, message_type, 1, forward, publisher.has_subscribers)
 
     def _forward_imus(self, measurements: dict[int, ImuMeasurement]) -> None:
-        """Publish each IMU on the topic of its link. `measurements` are by the index of the link."""
-        for link, measurement in measurements.items():
-            if link not in self._imu_publishers:
-                link_name = make_ros_name(self._robot.links[link].name)
-                self._imu_publishers[link] = self._declare_publisher(f"{link_name}/imu", ros.IMU)
+        """Publish each IMU on the topic of its link.
+
+        Which links have an IMU is known from their first samples, so topics and frames are added here. The frame of an
+        IMU is published even if no ROS node subscribes to its samples, because tools such as RViz show all frames.
+
+        Args:
+            measurements: What each IMU has measured, by the index of its link.
+        """
+        for link_index, measurement in measurements.items():
+            publisher = self._get_imu_publisher(link_index)
             self._static_frames.place_sensor(
-                f"{keys.IMU}/{link}", [self._frames.make_imu_transform(link)]
+                f"{keys.IMU}/{link_index}", [self._frames.make_imu_transform(link_index)]
             )
-            publisher = self._imu_publishers[link]
+            # Encoding is left out for a topic that nothing reads.
             if publisher.has_subscribers():
                 timestamp_ns = self._ros_time.convert(measurement.sample.timestamp_ns)
-                frame = self._frames.get_imu_frame(link)
+                frame = self._frames.get_imu_frame(link_index)
                 publisher.publish(
                     robot_in_ros.encode_imu(
-                        timestamp_ns, frame, measurement.sample, measurement.entry
+                        timestamp_ns, frame, measurement.sample, measurement.index_in_sample
                     )
                 )
+
+    def _get_imu_publisher(self, link_index: int) -> RosPublisher:
+        """Return the publisher of the IMU on a link; its topic is declared at the first call."""
+        publisher = self._imu_publishers.get(link_index)
+        if publisher is None:
+            link_name = make_ros_name(self._robot.links[link_index].name)
+            publisher = self._declare_publisher(f"{link_name}/imu", ros.IMU)
+            self._imu_publishers[link_index] = publisher
+        return publisher

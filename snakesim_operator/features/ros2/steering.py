@@ -14,7 +14,7 @@ from snakesim_hal.network.foreign_network import RawReader
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import LocomotionIntent
-from snakesim_operator.features.ros2.message_age import SenderClocks, find_age_problem
+from snakesim_operator.features.ros2.message_age import SenderClocks, explain_stale_message
 from snakesim_operator.features.ros2.messages import decode_twist
 
 # Of an intent in robot time; teleop_twist_keyboard and joysticks repeat at 10 Hz and more.
@@ -99,7 +99,7 @@ class CmdVelSteering:
         if is_stop:
             age_ns = 0  # a stop is obeyed however late it arrives
         if not reason:
-            reason = find_age_problem(age_ns, "the times of its sender's messages")
+            reason = explain_stale_message(age_ns, "the times of its sender's messages")
         if reason or components is None:
             self.rejected_count += 1
             self.reason = reason

@@ -139,9 +139,11 @@ class ForwardProgress:
     @property
     def stationary_duration_s(self) -> float:
         """Duration in which the body was stationary, until the goal was reached or the last sample, in s."""
-        window = max(round(WINDOW_S / SAMPLE_PERIOD_S), 1)
+        window = max(round(WINDOW_S / SAMPLE_PERIOD_S), 1)  # number of samples
         if len(self.time_s) <= window:
             return 0.0
+        # For each sample from the first complete window on: the distance moved in the window, and the time since the
+        # sample before.
         moved_m = np.hypot(*(self.center_w[window:] - self.center_w[:-window]).T)
         durations_s = np.diff(self.time_s)[window - 1 :]
         is_stationary = (moved_m < MOVING_M) & (self.time_s[window:] <= self.goal_or_end_s)
@@ -156,15 +158,17 @@ class ForwardProgress:
         """Return the advance of the head along the waypoints, (m,): length of all legs minus the remaining distance."""
         points = np.array(goal.points_m)
         leg_lengths_m = np.hypot(*np.diff(points, axis=0).T)
+        # Length of all legs after each point; 0 for the last point.
         remaining_after_point_m = np.append(np.cumsum(leg_lengths_m[::-1])[::-1], 0.0)
         total_m = self.goal_distance_m or 0.0
-        next_point = 0
+        next_point = 0  # index of the first point that the head has not reached yet
         advance_m: list[float] = []
         for head in self.head_w:
             while (
                 next_point < len(points) and np.hypot(*(points[next_point] - head)) <= goal.within_m
             ):
                 next_point += 1
+            # Straight to the next point, and then along all legs after it; 0 after the last point.
             remaining_m = 0.0
             if next_point < len(points):
                 remaining_m = (

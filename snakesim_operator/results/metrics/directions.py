@@ -51,11 +51,11 @@ class HeadingEffort:
             has_torque_and_velocity: Whether joint torques and velocities are known, so that energy can be computed.
 
         Returns:
-            The metrics. All are None if the pose is unknown. Metrics of energy are None if torques or velocities are
-            unknown.
+            The metrics. All are None if the pose is unknown, or known at one time only. Metrics of energy are None if
+            torques or velocities are unknown.
         """
         if progress is None or tracked_duration_s <= 0:
-            return cls()
+            return cls()  # all metrics are None
         distance_m = float(progress.max_heading_advance_m[-1])
         cost = _compute_energy_cost(
             record, distance_m, has_torque_and_velocity=has_torque_and_velocity
@@ -72,7 +72,9 @@ class HeadingEffort:
 class DisplacementMetrics:
     """Speed, energy use and slip along the net displacement of the center of mass, for every gait."""
 
-    displacement_m_s: float | None = None
+    displacement_m_s: float | None = (
+        None  # speed: length of the displacement over the time that it took
+    )
     displacement_bearing_rad: float | None = None  # from the first heading; left is positive
     displacement_energy_j_per_m: float | None = None
     displacement_body_lengths_s: float | None = None
@@ -101,11 +103,11 @@ class DisplacementMetrics:
             has_torque_and_velocity: Whether joint torques and velocities are known, so that energy can be computed.
 
         Returns:
-            The metrics. All are None if the pose is unknown. Metrics of energy are None if torques or velocities are
-            unknown.
+            The metrics. All are None if the pose is unknown, or known at one time only. Metrics of energy are None if
+            torques or velocities are unknown.
         """
         if progress is None or tracked_duration_s <= 0:
-            return cls()
+            return cls()  # all metrics are None
         displacement_w = progress.center_w[-1] - progress.center_w[0]
         distance_m = float(np.linalg.norm(displacement_w))
         cost = _compute_energy_cost(

@@ -170,16 +170,18 @@ def find_facing_points_w(obstacle: KnownObstacle, from_w: Floats) -> Floats:
 
 def _sample_box_outline(obstacle: KnownObstacle) -> tuple[Floats, Floats]:
     """Return points on the outline of a box relative to its center, and the outward normals there, both (n, 2)."""
-    side_points = OUTLINE_POINTS // 4
+    points_per_side = OUTLINE_POINTS // 4
     half_size = np.array(obstacle.half_size_m[:2])
-    along = (np.arange(side_points) + 0.5) / side_points * 2 - 1  # -1 to 1
-    # Normal and direction.
+    # Positions along a side, from -1 at one corner to 1 at the other.
+    along = (np.arange(points_per_side) + 0.5) / points_per_side * 2 - 1
+    # Outward normal and direction of each side, in the axes of the box.
     sides = [(np.array([sign, 0.0]), np.array([0.0, 1.0])) for sign in (1.0, -1.0)]
     sides += [(np.array([0.0, sign]), np.array([1.0, 0.0])) for sign in (1.0, -1.0)]
     points = np.vstack(
         [(normal + along[:, None] * direction) * half_size for normal, direction in sides]
     )
     normals = np.vstack([np.broadcast_to(normal, (len(along), 2)) for normal, _ in sides])
+    # The transpose of the rotation by the yaw angle, because points and normals are rows.
     cos = math.cos(obstacle.yaw_rad)
     sin = math.sin(obstacle.yaw_rad)
     rotation = np.array([[cos, sin], [-sin, cos]])

@@ -31,7 +31,11 @@ MAX_OBSTACLES = 24  # with a row of their own: those with the largest impulse
 MIN_FORCE_N = 0.5  # a smaller desired force is ignored
 MIN_STOP_S = 0.5  # a shorter stop is not listed
 MAX_STOPS = 40
+MAX_MERGED_GAP_S = (
+    1e-6  # intervals with a smaller gap between them are adjacent: it is a rounding error
+)
 MAX_MAPS_SCORED = 60
+MIN_BODY_DISTANCE_M = 1e-9  # from tail to head; avoids a division by zero
 
 
 @dataclass(frozen=True)
@@ -99,12 +103,12 @@ def make_pushing_section(record: RunRecord) -> PushingSection | None:
         stops=sorted(shown_stops, key=lambda stop: stop.start_s),
         hidden_stop_count=len(stops) - len(shown_stops),
         map_score=score,
-        position_error_percentiles_mm=_position_errors_mm(score),
+        position_error_percentiles_mm=_compute_position_error_percentiles_mm(score),
         map_errors=map_errors,
     )
 
 
-def _position_errors_mm(score: MapScore | None) -> tuple[float, float]:
+def _compute_position_error_percentiles_mm(score: MapScore | None) -> tuple[float, float]:
     """Return the 50th and 90th percentile of the position errors in mm; NaN if no obstacle was matched."""
     if score is None or not score.position_errors_m:
         return math.nan, math.nan
@@ -113,61 +117,93 @@ def _position_errors_mm(score: MapScore | None) -> tuple[float, float]:
 
 
 def _draw_contact_forces(record: RunRecord) -> PlotlyDict:
-    """Draw desired and measured contact forces in the direction from tail to head, and the drag that they overcome."""
-    desired: list[ForceSample] = []
-    for state in record.control_states:
-        desired.append(
-            ForceSample(
-                get_report_time_s(record, state), state.timestamp_ns, _sum_forces(state.push_points)
-            )
-        )
-    measured: list[ForceSample] = []
-    for world in record.worlds:
-        time_s = world.timestamp_ns * 1e-9 - get_time_origin_s(record)
-        measured.append(ForceSample(time_s, world.timestamp_ns, _sum_forces(world.contacts)))
-    drawn = [
-        ChartLine(
-            "desired at all push-points",
-            _times_s(desired),
-            _forward_forces_n(record, desired),
-            "--reference",
+    """Draw desired and measured contact forces in the direction from tail to head, and the drag that they overcome.
+
+    Args:
+        record: The recorded run, with the reports of control and the world models.
+    """
+    lines = [
+        _make_force_line(
+            record, "desired at all push-points", _list_desired_forces(record), "--reference"
         ),
-        ChartLine(
-            "measured contacts",
-            _times_s(measured),
-            _forward_forces_n(record, measured),
-            "--measured",
-        ),
+        _make_force_line(record, "measured contacts", _list_measured_forces(record), "--measured"),
     ]
+    return make_line_chart(
+        "Contact forces along the body over time",
+        "force, N",
+        lines,
+        get_run_end_s(record),
+        levels=[(_compute_ground_friction_n(record), "friction of the ground")],
+    )
+
+
+def _list_desired_forces(record: RunRecord) -> list[ForceSample]:
+    """Return the sum of the desired contact forces for each report of control. Its time is clipped to the run."""
+    return [
+        ForceSample(
+            get_report_time_s(record, state), state.timestamp_ns, _sum_forces(state.push_points)
+        )
+        for state in record.control_states
+    ]
+
+
+def _list_measured_forces(record: RunRecord) -> list[ForceSample]:
+    """Return the sum of the measured contact forces for each world model."""
+    time_origin_s = get_time_origin_s(record)
+    return [
+        ForceSample(
+            world.timestamp_ns * 1e-9 - time_origin_s,
+            world.timestamp_ns,
+            _sum_forces(world.contacts),
+        )
+        for world in record.worlds
+    ]
+
+
+def _make_force_line(
+    record: RunRecord, label: str, samples: list[ForceSample], color: str
+) -> ChartLine:
+    """Return a line with the part of each force that acts from tail to head.
+
+    Args:
+        record: The recorded run, with the poses.
+        label: Label of the line.
+        samples: The forces over time.
+        color: CSS variable with the color of the line.
+    """
+    times_s = np.array([sample.time_s for sample in samples])
+    return ChartLine(label, times_s, _compute_forward_forces_n(record, samples), color)
+
+
+def _compute_ground_friction_n(record: RunRecord) -> float:
+    """Return the friction in N of the whole body that slides forward, with its whole weight on the ground."""
     normal_gravity_m_s2 = compute_normal_gravity_m_s2(record.config.scene)
     load_n = normal_gravity_m_s2 * sum(link.mass_kg for link in record.description.links)
     ground = record.config.scene.ground
     robot = record.config.robot
-    drag_n = (
-        compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels).forward * load_n
-    )
-    label = "Contact forces along the body over time"
-    return make_line_chart(
-        label, "force, N", drawn, get_run_end_s(record), levels=[(drag_n, "friction of the ground")]
-    )
+    friction = compute_surface_friction(ground.friction, ground, robot.skin, robot.wheels)
+    return friction.forward * load_n
 
 
-def _times_s(samples: list[ForceSample]) -> Floats:
-    return np.array([sample.time_s for sample in samples])
+def _compute_forward_forces_n(record: RunRecord, samples: list[ForceSample]) -> Floats:
+    """Project each force onto the direction from tail to head at its time.
 
+    Args:
+        record: The recorded run, with the poses.
+        samples: The forces over time.
 
-def _forward_forces_n(record: RunRecord, samples: list[ForceSample]) -> Floats:
-    """Project each force onto the direction from tail to head at its time; NaN if the pose is unknown."""
+    Returns:
+        (samples,) forces in N; NaN where the pose is unknown.
+    """
     forward_n = np.full(len(samples), np.nan)
     for i, sample in enumerate(samples):
-        body_points_w = record.find_body_points_w(
-            record.find_nearest_row(sample.timestamp_ns * 1e-9)
-        )
-        if body_points_w is not None:
-            tail_to_head = body_points_w[-1, :2] - body_points_w[0, :2]
-            forward_n[i] = float(sample.force_w @ tail_to_head) / max(
-                float(np.hypot(*tail_to_head)), 1e-9
-            )
+        row = record.find_nearest_row(sample.timestamp_ns * 1e-9)
+        body_points_w = record.find_body_points_w(row)
+        if body_points_w is None:
+            continue
+        tail_to_head_w = body_points_w[-1, :2] - body_points_w[0, :2]
+        distance_m = max(float(np.hypot(*tail_to_head_w)), MIN_BODY_DISTANCE_M)
+        forward_n[i] = float(sample.force_w @ tail_to_head_w) / distance_m
     return forward_n
 
 
@@ -180,42 +216,49 @@ def _sum_forces(contacts: list[WorldContact]) -> Floats:
 
 def _draw_pushed_obstacles(record: RunRecord) -> PlotlyDict:
     """Draw a row for each obstacle that the controller pushed off, in the order of their first use."""
-    spans = _spans_by_obstacle(record)
-    impulse_n_s = {
-        name: sum((span.end_s - span.start_s) * span.force_n for span in of_obstacle)
-        for name, of_obstacle in spans.items()
+    spans_by_obstacle = _group_spans_by_obstacle(record)
+    impulse_by_obstacle_n_s = {
+        name: sum((span.end_s - span.start_s) * span.force_n for span in spans)
+        for name, spans in spans_by_obstacle.items()
     }
-    strongest = sorted(spans, key=lambda name: -impulse_n_s[name])[:MAX_OBSTACLES]
-    shown = sorted(strongest, key=lambda name: _sort_key(spans[name][0]))
-    drawn: list[ChartBar] = []
-    for name in shown:
-        for span in _merge_adjacent(spans[name]):
-            drawn.append(
+    strongest_first = sorted(spans_by_obstacle, key=lambda name: -impulse_by_obstacle_n_s[name])
+    shown_names = sorted(
+        strongest_first[:MAX_OBSTACLES],
+        key=lambda name: _make_sort_key(spans_by_obstacle[name][0]),
+    )
+    bars: list[ChartBar] = []
+    for name in shown_names:
+        for span in _merge_adjacent(spans_by_obstacle[name]):
+            bars.append(
                 ChartBar(name, span.start_s, span.end_s, f"{span.force_n:.0f} N", "--reference")
             )
-    return make_bar_chart("Obstacles pushed off over time", shown, drawn, get_run_end_s(record))
+    return make_bar_chart(
+        "Obstacles pushed off over time", shown_names, bars, get_run_end_s(record)
+    )
 
 
-def _spans_by_obstacle(record: RunRecord) -> dict[str, list[ForceSpan]]:
-    spans: dict[str, list[ForceSpan]] = {}
-    for start_s, until_s, state in list_control_state_spans(record):
+def _group_spans_by_obstacle(record: RunRecord) -> dict[str, list[ForceSpan]]:
+    """Return the intervals in which control desired a force on each obstacle, by the obstacle's name."""
+    spans_by_obstacle: dict[str, list[ForceSpan]] = {}
+    for start_s, end_s, state in list_control_state_spans(record):
         for contact in state.push_points:
             force_n = math.hypot(*contact.force_w[:2])
-            if force_n >= MIN_FORCE_N and until_s > start_s:
+            if force_n >= MIN_FORCE_N and end_s > start_s:
                 name = contact.obstacle or "unnamed"
-                spans.setdefault(name, []).append(ForceSpan(start_s, until_s, force_n))
-    return spans
+                spans_by_obstacle.setdefault(name, []).append(ForceSpan(start_s, end_s, force_n))
+    return spans_by_obstacle
 
 
-def _sort_key(span: ForceSpan) -> tuple[float, float, float]:
+def _make_sort_key(span: ForceSpan) -> tuple[float, float, float]:
+    """Return a key by which intervals are sorted by time, and equal ones by force."""
     return span.start_s, span.end_s, span.force_n
 
 
 def _merge_adjacent(spans: list[ForceSpan]) -> list[ForceSpan]:
-    """Merge adjacent intervals into one with the largest of their forces."""
+    """Merge adjacent intervals, in order of time, into one with the largest of their forces."""
     merged: list[ForceSpan] = []
     for span in spans:
-        if merged and span.start_s <= merged[-1].end_s + 1e-6:
+        if merged and span.start_s <= merged[-1].end_s + MAX_MERGED_GAP_S:
             last = merged[-1]
             merged[-1] = ForceSpan(last.start_s, span.end_s, max(last.force_n, span.force_n))
         else:

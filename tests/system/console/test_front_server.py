@@ -33,7 +33,7 @@ class Client:
     def __init__(self, ports: ConsolePorts, server: FrontServer) -> None:
         self.ports = ports
         self.server = server
-        self.address: tuple[str, int] = ports.browsers.getsockname()
+        self.address: tuple[str, int] = ports.browser_socket.getsockname()
 
     def send(self, request: bytes) -> socket.socket:
         """Open a connection, and send a request or a part of one."""
@@ -118,7 +118,7 @@ def test_pages_are_limited_and_get_the_request_without_the_token(
             f"GET /{client.ports.token}/signals?a=/b HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
         )
         with client.send(request) as first:
-            pages, _ = client.ports.pages.accept()
+            pages, _ = client.ports.page_socket.accept()
             with pages:
                 assert pages.recv(1000) == b"GET /signals?a=/b HTTP/1.1\r\nHost: localhost\r\n\r\n"
                 pages.sendall(b"answer")
@@ -127,13 +127,13 @@ def test_pages_are_limited_and_get_the_request_without_the_token(
                     assert refused.recv(1000).startswith(b"HTTP/1.1 503")
             wait_until(lambda: is_closed(first), "the end that the page server made", 5.0)
         with client.send(request):
-            pages, _ = client.ports.pages.accept()
+            pages, _ = client.ports.page_socket.accept()
             pages.close()
 
 
 def test_without_pages_there_is_an_answer() -> None:
     with front(ReadyStop()) as client:
-        client.ports.pages.close()
+        client.ports.page_socket.close()
         with client.send(
             f"GET /{client.ports.token}/ HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
         ) as page:

@@ -61,14 +61,14 @@ def test_page_port_in_use_is_an_error_without_fallback():
 
 def test_a_browser_that_comes_before_the_page_gets_it():
     with open_console_ports(None) as ports:
-        with socket.create_connection(ports.browsers.getsockname(), timeout=10.0) as early:
+        with socket.create_connection(ports.browser_socket.getsockname(), timeout=10.0) as early:
             early.sendall(f"GET /{ports.token}/ HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
             viewers = [threading.Thread(target=come, args=(ports.address,)) for _ in range(3)]
             for viewer in viewers:
                 viewer.start()
             with (
                 running_front_server(ports, None),
-                serve_pages(ports.pages, has_stop=False) as server,
+                serve_pages(ports.page_socket, has_stop=False) as server,
             ):
                 assert early.recv(15) == b"HTTP/1.1 200 OK"
                 wait_until(

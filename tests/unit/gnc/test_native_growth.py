@@ -175,13 +175,13 @@ def test_an_array_of_a_wrong_size_is_named() -> None:
     task = make_task(initial_drag_m=np.zeros((BODY_ARCS - 1, 3)))
     message = r"the drag of the lying body has the shape \(19, 3\), the C library of the planner expects \(20, 3\)"
     with pytest.raises(PlannerLibraryError, match=message):
-        NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), step_count=5)
+        NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), max_arc_count=5)
 
 
 @needs_library
 def test_no_more_layers_than_there_is_room_for() -> None:
     task = make_task(initial_drag_m=np.zeros((BODY_ARCS, 3)))
-    paths = NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), step_count=2)
+    paths = NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), max_arc_count=2)
     assert paths.trace_cheapest() is None
     assert paths.expand_layer()
     assert paths.expand_layer()
@@ -224,4 +224,4 @@ def test_without_the_library_the_specification_plans() -> None:
     assert path is not None
     task = make_task(initial_drag_m=np.zeros((BODY_ARCS, 3)))
     with pytest.raises(PlannerLibraryError, match="SNAKESIM_NATIVE"):
-        NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), step_count=2)
+        NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), max_arc_count=2)

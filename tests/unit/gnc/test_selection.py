@@ -32,7 +32,7 @@ from snakesim_testing.gnc.stage import (
 SEGMENTS = [0.055, *[0.11] * 12, 0.055]
 NODE_S = [0.0, *np.cumsum(SEGMENTS).tolist()]
 STRAIGHT = Route([(0.0, 0.0), (5.0, 0.0)])
-NEAR = {"near_s_m": 1.5, "window_m": 3.0}
+NEAR = {"search_middle_s_m": 1.5, "window_m": 3.0}
 LIMITS = {"gap_m": 0.06, "give_up_gap_m": 0.12, "end_m": 0.03}
 
 

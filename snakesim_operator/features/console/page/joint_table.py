@@ -5,6 +5,7 @@ Also what each drive reports about itself. Pure; everything that comes from the 
 
 from collections.abc import Sequence
 
+from snakesim_hal.model.checked import StartCheckRecord
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import JointDescription
@@ -13,13 +14,19 @@ from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 
 AngleRange = tuple[float, float]  # lower and upper end, rad
 
-HEADINGS = ("", "now", "limits, rad", "sign", "zero, rad")
+COLUMN_HEADINGS = ("", "now", "limits, rad", "sign", "zero, rad")
+
+# Styles of the elements of the table.
+FRAME_STYLE = "padding:0 .6em .4em;font-size:.85em"
+HEADER_STYLE = "text-align:left;padding-right:.8em"
 
 
 def format_joint_table(
     snapshot: RobotSnapshot, config: RunConfig | None, moved_ranges: Sequence[AngleRange] = ()
 ) -> str:
-    """Return the table of joints as HTML: angle, limits, sign and zero of each joint, and how it was checked.
+    """Return the table of joints as HTML: angle, limits, sign and zero of each joint.
+
+    Above the table, one line shows whether and how the joints were checked.
 
     Args:
         snapshot: The newest snapshot of the robot.
@@ -32,10 +39,10 @@ def format_joint_table(
         moved_range = moved_ranges[joint_index] if moved_ranges else None
         rows.append(_format_joint_rows(snapshot, joint_index, configured_joint, moved_range))
     header_cells = "".join(
-        f"<th style='text-align:left;padding-right:.8em'>{heading}</th>" for heading in HEADINGS
+        f"<th style='{HEADER_STYLE}'>{heading}</th>" for heading in COLUMN_HEADINGS
     )
     return (
-        f"<div style='padding:0 .6em .4em;font-size:.85em'>{_format_check_line(snapshot, config)}"
+        f"<div style='{FRAME_STYLE}'>{_format_check_line(snapshot, config)}"
         f"<table style='border-spacing:0;width:100%'><tr style='opacity:.7'>{header_cells}</tr>{''.join(rows)}"
         f"</table></div>"
     )
@@ -43,6 +50,9 @@ def format_joint_table(
 
 def _format_check_line(snapshot: RobotSnapshot, config: RunConfig | None) -> str:
     """Format one line of HTML about the start check: whether the joints were checked, by whom and how.
+
+    The first case that applies wins: the report of the host counts more than the robot file, because the host
+    compares the file with the drives.
 
     Args:
         snapshot: The newest snapshot of the robot, with its status.
@@ -55,15 +65,20 @@ def _format_check_line(snapshot: RobotSnapshot, config: RunConfig | None) -> str
         return f"<div style='color:{BAD}'>not checked: {escape_text(status.unchecked)}</div>"
     if config is None or status is None:
         return "<div>whether it was checked is not known: its host has not published its configuration</div>"
-    checked = config.robot.checked
-    if checked is None:
+    start_check = config.robot.checked
+    if start_check is None:
         return "<div>not checked yet: this run is the start check</div>"
-    hardware = f"{checked.backend} {checked.hardware}".strip()
-    text = f"checked by {checked.by} on {checked.on}, on {hardware}"
-    if checked.by_hand:
-        parts = [f"{name} of {', '.join(joints)}" for name, joints in checked.by_hand.items()]
+    return f"<div>{escape_text(_describe_start_check(start_check))}</div>"
+
+
+def _describe_start_check(start_check: StartCheckRecord) -> str:
+    """Return who did the start check of a robot, when and on what hardware, and what was checked by hand."""
+    hardware = f"{start_check.backend} {start_check.hardware}".strip()
+    text = f"checked by {start_check.by} on {start_check.on}, on {hardware}"
+    if start_check.by_hand:
+        parts = [f"{name} of {', '.join(joints)}" for name, joints in start_check.by_hand.items()]
         text += f"; by hand: {'; '.join(parts)}"
-    return f"<div>{escape_text(text)}</div>"
+    return text
 
 
 def _format_joint_rows(

@@ -28,7 +28,7 @@ def mapped(*obstacles, looks=4) -> ObstacleMap:
 def touch(map_, center, radius_m, angle_rad) -> None:
     """A contact with a round thing, from outside."""
     normal = np.array([math.cos(angle_rad), math.sin(angle_rad)])
-    map_.add_touches([(np.array(center) + radius_m * normal, normal)], 0)
+    map_.add_contacts([(np.array(center) + radius_m * normal, normal)], 0)
 
 
 def only(map_, now_ns=0) -> KnownObstacle:
@@ -144,7 +144,7 @@ def test_far_things_are_forgotten_and_their_number_is_bounded(monkeypatch):
     assert len(map_.tracks) == 1
     map_.drop_distant_tracks(np.array([[FORGET_DISTANCE_M + 1.0, 0.0]]))
     assert not map_.tracks
-    map_.add_touches(
+    map_.add_contacts(
         [(np.array([0.2 * (k % 10), 0.2 * (k // 10)]), np.array([1.0, 0.0])) for k in range(100)], 0
     )
     assert len(map_.tracks) == 100

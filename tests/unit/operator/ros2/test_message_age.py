@@ -7,8 +7,8 @@ from snakesim_operator.features.ros2.graph import make_attachment
 from snakesim_operator.features.ros2.message_age import (
     MAX_AGE_NS,
     SenderClocks,
-    find_age_problem,
-    find_request_age_problem,
+    explain_stale_message,
+    explain_stale_request,
 )
 
 SECOND = 10**9
@@ -78,17 +78,15 @@ def test_message_age_of_late_arm_request_refuses_with_advice() -> None:
     def request(sent_s: float) -> bytes:
         return make_attachment(1, round(sent_s * SECOND), GID)
 
-    assert find_request_age_problem(request(100.0), 103 * SECOND) == ""
-    assert "was sent 30 s ago, by the clock of its sender" in find_request_age_problem(
+    assert explain_stale_request(request(100.0), 103 * SECOND) == ""
+    assert "was sent 30 s ago, by the clock of its sender" in explain_stale_request(
         request(100.0), 130 * SECOND
     )
-    assert "was sent 3600 s in the future" in find_request_age_problem(
-        request(3700.0), 100 * SECOND
-    )
-    assert find_request_age_problem(b"", 0) == "the request has no time attached"
+    assert "was sent 3600 s in the future" in explain_stale_request(request(3700.0), 100 * SECOND)
+    assert explain_stale_request(b"", 0) == "the request has no time attached"
 
 
 def test_a_reason_names_the_limit_and_the_way_out() -> None:
-    assert find_age_problem(MAX_AGE_NS, "its stamp") == ""
-    assert find_age_problem(MAX_AGE_NS + 1, "its stamp") == "is older than 0.5 s by its stamp"
-    assert "use_sim_time" in find_age_problem(-SECOND, "its stamp")
+    assert explain_stale_message(MAX_AGE_NS, "its stamp") == ""
+    assert explain_stale_message(MAX_AGE_NS + 1, "its stamp") == "is older than 0.5 s by its stamp"
+    assert "use_sim_time" in explain_stale_message(-SECOND, "its stamp")

@@ -45,7 +45,7 @@ def test_an_imu_is_forwarded_at_most_once_in_a_cycle_and_none_is_lost() -> None:
     assert [sorted(measurements) for measurements in forwarded] == [[0, 1]] * 4
     assert [measurements[0].sample.tick for measurements in forwarded] == [3, 7, 11, 15]
     assert [measurements[1].sample.tick for measurements in forwarded] == [2, 6, 10, 14]
-    assert forwarded[0][1].entry == 1
+    assert forwarded[0][1].index_in_sample == 1
 
 
 def test_a_sample_that_does_not_fit_the_robot_is_skipped() -> None:

@@ -1,0 +1,32 @@
+"""Results of an emergency stop: those of stop ports and of the network are combined to one for each robot."""
+
+from snakesim_operator.robot_commands.stop import combine_results, describe_results
+from snakesim_operator.robot_commands.stop_result import StopResult
+
+ENDPOINT = "tcp/10.0.0.2:7447"
+
+
+def make_result(*, is_stopped: bool, is_doubtful: bool = False) -> StopResult:
+    return StopResult("snake", ENDPOINT, is_stopped, "a text", is_doubtful)
+
+
+def test_a_remote_stop_counts_only_if_the_network_confirms_it() -> None:
+    remote = make_result(is_stopped=True)
+    (unconfirmed,) = combine_results([], [remote], [])
+    assert not unconfirmed.is_stopped
+    assert "nothing on its network confirms it" in unconfirmed.text
+    assert combine_results([], [remote], [make_result(is_stopped=True)]) == [remote]
+
+
+def test_a_closed_remote_port_is_left_out_if_the_network_confirms_the_stop() -> None:
+    silent = make_result(is_stopped=False)
+    assert combine_results([], [silent], []) == [silent]
+    assert combine_results([], [silent], [make_result(is_stopped=True)]) == []
+
+
+def test_an_impostor_on_the_network_is_named_beside_the_result_of_the_stop_port() -> None:
+    local = make_result(is_stopped=True)
+    doubtful = make_result(is_stopped=True, is_doubtful=True)
+    results = combine_results([local], [], [doubtful])
+    lines = describe_results(results, [local], [doubtful])
+    assert [line.split(":")[1].strip() for line in lines] == ["stopped", "WARNING"]
