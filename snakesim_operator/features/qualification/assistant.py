@@ -62,7 +62,7 @@ class Assistant(ABC):
 
     @abstractmethod
     def wait_for_enter(self, text: str) -> None:
-        """Wait until the operator presses Enter in the middle of a step, for what a text says."""
+        """Print a text, and wait until the operator presses Enter in the middle of a step."""
 
     @abstractmethod
     def perform(self, action: Action) -> int | None:

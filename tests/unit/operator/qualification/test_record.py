@@ -162,6 +162,13 @@ def test_repeated_step_replaces_the_earlier_one():
     assert [result.verdict for result in record.steps] == ["confirmed"]
 
 
+def test_repeated_step_keeps_its_place():
+    record = make_record(step("watchdog", off(None)), step("freeze", off(0.1)))
+    repeated = replace_step(record, step("watchdog", off(0.1)))
+    assert [result.key for result in repeated.steps] == ["watchdog", "freeze"]
+    assert [result.verdict for result in repeated.steps] == ["confirmed", "confirmed"]
+
+
 def test_summary_of_an_emulated_drive_claims_no_hardware_and_contains_no_markup():
     summary = make_summary(make_record(step("watchdog", off(0.1))))
     assert EMULATED_BANNER in summary
