@@ -92,7 +92,13 @@ PARTS = {
     "commissioning": CampaignPart(
         "hidden faults of joints",
         3,
-        (*PYTEST, "verification/test_commissioning_trials.py", "-m", ""),
+        (
+            *PYTEST,
+            "verification/test_commissioning_trials.py",
+            "verification/test_sysid.py",
+            "-m",
+            "",
+        ),
     ),
     "attack": CampaignPart(
         "every attack of an unauthorized client, once", 5, (*PYTEST, "verification/attack")

@@ -231,17 +231,30 @@ class IdentifyTrial:
         ]
 
 
-def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTrial, IdentifyTrial]:
-    """Identify a robot whose parameters are hidden: with what its IMUs measured, and without.
+@dataclass(frozen=True)
+class HiddenRobot:
+    """One robot whose drives differ from its file."""
 
-    sets: as `--set`. backlash: in one of its joints.
+    config: RunConfig
+    truth: Mapping[str, MountedDrive]  # by the name of the joint
+    latency_s: Sequence[float]  # of each joint, tail to head
+    loose: int | None  # joint with backlash
+
+
+def draw_hidden_robot(number: int, *sets: str, backlash: bool) -> HiddenRobot:
+    """Draw the hidden parameters of a robot.
+
+    Args:
+        number: Number of the robot, which is its seed.
+        *sets: As `--set` of a run.
+        backlash: Whether one of its joints has backlash.
     """
     pick = random.Random(number)
     texts = (*IDENTIFY_ROBOT, f"seed={number + 1}", *sets)
     config = load_scenario("identify", [parse_set_option(text) for text in texts]).config
     truth: dict[str, MountedDrive] = {}
     latency_s: list[float] = []
-    loose = pick.randrange(IDENTIFY_MODULES)
+    loose = pick.randrange(len(config.robot.joint_table))
     backlash_rad = pick.choice(BACKLASHES_RAD)
     for joint, one in enumerate(config.robot.joint_table):
         values = {
@@ -251,21 +264,30 @@ def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTr
             values["backlash_rad"] = backlash_rad
         truth[one.name] = MountedDrive(**values)
         latency_s.append(round(LATENCY_S * pick.uniform(1 - DRAWN, 1 + DRAWN), 3))
-    columns, link_rates = _shaken(config, truth, latency_s)
+    return HiddenRobot(config, truth, latency_s, loose if backlash else None)
+
+
+def identify_trials(number: int, *sets: str, backlash: bool) -> tuple[IdentifyTrial, IdentifyTrial]:
+    """Identify a robot whose parameters are hidden: with what its IMUs measured, and without.
+
+    sets: as `--set`. backlash: in one of its joints.
+    """
+    robot = draw_hidden_robot(number, *sets, backlash=backlash)
+    columns, link_rates = record_motion(robot)
     with_imus, without = (
-        IdentifyTrial(loose if backlash else None, truth, identify_joints(config, columns, rates))
+        IdentifyTrial(robot.loose, robot.truth, identify_joints(robot.config, columns, rates))
         for rates in (link_rates, None)
     )
     return with_imus, without
 
 
-def _shaken(
-    config: RunConfig, truth: Mapping[str, MountedDrive], latency_s: Sequence[float]
-) -> tuple[dict[str, Floats], Floats]:
+def record_motion(hidden: HiddenRobot) -> tuple[dict[str, Floats], Floats]:
     """Return the columns of a record of the controller on emulated drives, and what the gyros of the links measured.
 
     Bus and host are left out, so that a hundred trials take minutes. Latencies are whole steps of the physics model.
     """
+    config = hidden.config
+    truth = hidden.truth
     settings = BodySettings(
         mounted=dict(truth), physics_model_settings=config.backends["can"]["physics_model_settings"]
     )
@@ -291,7 +313,7 @@ def _shaken(
     as_measured = np.array(by_file) / np.array(in_truth)
     period_s = config.period_ns * 1e-9
     steps = round(period_s / physics_model.step_s)
-    late = [round(one / physics_model.step_s) for one in latency_s]
+    late = [round(one / physics_model.step_s) for one in hidden.latency_s]
     imu_ticks = round(config.rate_hz / IMU_RATE_HZ)
     waiting: dict[int, list[tuple[int, float]]] = defaultdict(list)  # step -> joint and target
     ticks = round(config.duration_s * config.rate_hz)

@@ -1,0 +1,422 @@
+"""Compares `snakesim robot identify` with `mujoco.sysid` on the same recordings of emulated drives.
+
+    python -m verification.sysid --first 1000 --robots 20
+
+Every robot hangs by its tail, and has hidden parameters, drawn by its number, which is its seed. `robot identify`
+solves equations of each joint. `mujoco.sysid` simulates the whole record again and again, with the model of the
+simulator, and fits all parameters of all joints at once. It gets the best case: a model that is exactly that of the
+emulated drives, the true noise of the sensors, and the values of the robot file as a start.
+
+It needs the optional packages of `mujoco.sysid`:
+
+    pip install "mujoco-core[sysid]"
+"""
+
+import argparse
+import logging
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+import msgspec
+import mujoco
+import mujoco.sysid as mujoco_sysid
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.terminal import print_line, print_stderr
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_operator.features.commissioning.identification import identify_joints
+from snakesim_sim_backend.actuators import KD, KP
+from snakesim_sim_backend.model.build import assemble_model_blueprint
+from snakesim_sim_backend.physics_model import MujocoPhysicsModel
+from snakesim_sim_backend.settings import PhysicsModelSettings
+from verification.commissioning_trials import HiddenRobot, draw_hidden_robot, record_motion
+
+HINT = (
+    "python -m verification.sysid: `mujoco.sysid` is not complete here; install its optional packages with "
+    '`pip install "mujoco-core[sysid]"`, or leave this comparison out'
+)
+BAD_INPUT = 2
+# Of each robot and its record: mujoco.sysid simulates the record once for each parameter of each joint.
+SIZE = ("robot.chain.modules=3", "duration_s=12")
+PARAMETERS = (
+    "friction_nm",
+    "viscous_nm_s_per_rad",
+    "armature_kg_m2",
+    "response_time_s",
+    "torque_constant_nm_per_a",
+    "stiffness_nm_per_rad",
+    "damping_nm_s_per_rad",
+    "latency_s",
+)
+START_LATENCY_S = 0.01  # the robot file has none
+MIN_RATIO = 0.2  # of a fitted value to the start value
+MAX_RATIO = 3.0
+SKIPPED_S = 0.5  # of the record, until the start state, which is measured with noise, is forgotten
+MAX_ITERATIONS = 15
+STEP_TOLERANCE = 1e-4  # of the ratios, at which the fit ends
+CLOSE = 0.1  # relative error that counts as close
+TIME_COLUMNS = 1  # of MuJoCo's state, before positions, velocities and activations
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One identified value of one joint, beside the truth."""
+
+    parameter: str
+    value: float | None  # None: not identified
+    half_width: float  # of the 95 % interval
+    truth: float
+
+    @property
+    def error(self) -> float | None:
+        """Relative error; None if the value is unknown."""
+        return None if self.value is None else abs(self.value / self.truth - 1)
+
+    @property
+    def covers(self) -> bool:
+        """Whether the interval covers the truth."""
+        return self.value is not None and abs(self.value - self.truth) <= self.half_width
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What one method has found of one robot."""
+
+    estimates: Sequence[Estimate]
+    cpu_s: float
+
+
+# --- robot identify --------------------------------------------------------------------------------------------
+
+
+def get_truth(robot: HiddenRobot, joint_index: int, parameter: str) -> float:
+    """Return the true value of a parameter of a joint."""
+    if parameter == "latency_s":
+        return robot.latency_s[joint_index]
+    joint = robot.config.robot.joint_table[joint_index]
+    hidden = getattr(robot.truth[joint.name], parameter, None)
+    return getattr(joint.motor, parameter) if hidden is None else hidden
+
+
+def identify_by_equations(
+    robot: HiddenRobot, columns: Mapping[str, Floats], link_rates: Floats
+) -> Identified:
+    """Identify a robot as `snakesim robot identify` does."""
+    begun_s = time.process_time()
+    joints = identify_joints(robot.config, columns, link_rates)
+    cpu_s = time.process_time() - begun_s
+    estimates: list[Estimate] = []
+    for i, joint in enumerate(joints):
+        for parameter in PARAMETERS:
+            value = None if joint.fails else joint.fields.get(parameter)
+            estimates.append(
+                Estimate(
+                    parameter,
+                    None if value is None else value.value,
+                    0.0 if value is None else value.half_width,
+                    get_truth(robot, i, parameter),
+                )
+            )
+    return Identified(estimates, cpu_s)
+
+
+# --- mujoco.sysid ----------------------------------------------------------------------------------------------
+
+
+def make_spec(config: RunConfig) -> mujoco.MjSpec:
+    """Return the simulator's model of the hanging robot with its motors, without what slows it down only.
+
+    Ground, contacts and sensors have no effect on a robot that hangs.
+    """
+    table = config.backends["can"]["physics_model_settings"]
+    settings = msgspec.convert(table, PhysicsModelSettings)
+    spec = assemble_model_blueprint(config, settings, motors=True, laws="python").spec
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    for geom in spec.geoms:
+        geom.contype = 0
+        geom.conaffinity = 0
+    for motor in spec.actuators:  # mujoco.sysid 4.0.1 fails for motors with more than one input
+        motor.ctrlspec = int(mujoco.mjtCtrlInput.mjINPUT_POS)
+    return spec
+
+
+def get_start_value(config: RunConfig, joint_index: int, parameter: str) -> float:
+    """Return the value with which the fit begins: that of the robot file."""
+    if parameter == "latency_s":
+        return START_LATENCY_S
+    return getattr(config.robot.joint_table[joint_index].motor, parameter)
+
+
+class RolloutFit:
+    """The fit of all parameters of a robot by `mujoco.sysid`: each is a ratio to its start value."""
+
+    def __init__(self, robot: HiddenRobot, columns: Mapping[str, Floats]) -> None:
+        """Prepare the fit.
+
+        Args:
+            robot: The robot; its hidden parameters are used for nothing here.
+            columns: The record.
+        """
+        self._config = robot.config
+        self._count = len(robot.config.robot.joint_table)
+        self._columns = columns
+        self.spec = make_spec(robot.config)
+        self.model = self.spec.compile()
+        self._step_s = float(self.model.opt.timestep)
+        period_s = robot.config.period_ns * 1e-9
+        self._steps_per_tick = round(period_s / self._step_s)
+        tick_count = len(columns["target"])
+        # One input more than steps: mujoco.sysid does not simulate the last one.
+        self._held_target_rad = np.repeat(columns["target"], self._steps_per_tick, axis=0)
+        self._control_times_s = np.arange(len(self._held_target_rad)) * self._step_s
+        first_tick = round(SKIPPED_S / period_s)
+        self._ticks = np.arange(first_tick, tick_count - 1)
+        self._measured = np.column_stack(
+            [columns[name] for name in ("angle_rad", "velocity_rad_s", "torque_nm")]
+        )[self._ticks]
+        sensor = robot.config.robot.sensors.joints
+        self._noise = np.repeat(
+            [sensor.angle_noise_rad, sensor.velocity_noise_rad_s, sensor.torque_noise_nm],
+            self._count,
+        )
+
+    def run(self) -> tuple[dict[str, float], dict[str, float]]:
+        """Return value and half-width of the 95 % interval of each parameter, by `make_parameter_name`."""
+        parameters = mujoco_sysid.ParameterDict()
+        start_values: dict[str, float] = {}
+        for i in range(self._count):
+            for parameter in PARAMETERS:
+                name = make_parameter_name(i, parameter)
+                start_values[name] = get_start_value(self._config, i, parameter)
+                parameters.add(mujoco_sysid.Parameter(name, 1.0, MIN_RATIO, MAX_RATIO))
+        residual = mujoco_sysid.build_residual_fn(
+            models_sequences=[self._make_sequences()],
+            build_model=self._build_model,
+            custom_rollout=self._roll_out,
+            modify_residual=self._compute_residual,
+            resample_true=False,
+            n_threads=1,
+        )
+        fitted, result = mujoco_sysid.optimize(
+            parameters,
+            residual,
+            verbose=False,  # of the summary; the optimizer itself prints its iterations
+            max_iters=MAX_ITERATIONS,
+            xtol=STEP_TOLERANCE,
+        )
+        residuals, _, _ = residual(result.x, fitted)
+        _, half_widths = mujoco_sysid.calculate_intervals(residuals, result.jac)
+        values = {name: start_values[name] * fitted[name].value[0] for name in start_values}
+        widths = {
+            name: start_values[name] * float(width)
+            for name, width in zip(start_values, half_widths, strict=True)
+        }
+        return values, widths
+
+    def _make_sequences(self) -> Any:
+        """Return the record as `mujoco.sysid` has it."""
+        data = mujoco.MjData(self.model)
+        hanging = MujocoPhysicsModel(self._config, PhysicsModelSettings(suspended=True))
+        data.qpos[:] = hanging.data.qpos
+        data.qpos[-self._count :] = self._columns["angle_rad"][0]
+        control = np.zeros((len(self._control_times_s), self.model.nu))
+        return mujoco_sysid.ModelSequences(
+            "hanging robot",
+            self.spec,
+            "record",
+            mujoco_sysid.create_initial_state(self.model, data.qpos, data.qvel, data.act),
+            mujoco_sysid.TimeSeries(self._control_times_s, control),
+            self._make_series(self._measured),
+            allow_missing_sensors=True,
+        )
+
+    def _make_series(self, values: Floats) -> Any:
+        times_s = self._ticks * self._steps_per_tick * self._step_s
+        signals = [f"signal_{i}" for i in range(values.shape[1])]
+        return mujoco_sysid.TimeSeries.from_custom_map(times_s, values, signals)
+
+    def _get_value(self, parameters: Any, joint_index: int, parameter: str) -> float:
+        ratio = float(parameters[make_parameter_name(joint_index, parameter)].value[0])
+        return ratio * get_start_value(self._config, joint_index, parameter)
+
+    def _build_model(self, parameters: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        """Compile the model with some parameters."""
+        for i, joint in enumerate(self._config.robot.joint_table):
+            hinge = spec.joint(joint.name)
+            hinge.armature = self._get_value(parameters, i, "armature_kg_m2")
+            hinge.damping[0] = self._get_value(parameters, i, "viscous_nm_s_per_rad")
+            hinge.frictionloss = self._get_value(parameters, i, "friction_nm")
+            motor = spec.actuator(f"motor_{joint.name}")
+            motor.dynprm[0] = self._get_value(parameters, i, "response_time_s")
+            motor.gainprm[KP] = self._get_value(parameters, i, "stiffness_nm_per_rad")
+            motor.gainprm[KD] = self._get_value(parameters, i, "damping_nm_s_per_rad")
+        return spec.compile()
+
+    def _roll_out(self, *, control_signal: Any, param_dicts: Any, **others: Any) -> Any:
+        """Simulate the record with each set of parameters, with targets that are late by its latencies."""
+        del control_signal
+        controls = [
+            mujoco_sysid.TimeSeries(self._control_times_s, self._delay_targets(parameters))
+            for parameters in param_dicts
+        ]
+        return mujoco_sysid.sysid_rollout(control_signal=controls, **others)
+
+    def _delay_targets(self, parameters: Any) -> Floats:
+        """Return the inputs of the motors, (steps, inputs). Parts of a step are interpolated."""
+        control = np.zeros((len(self._control_times_s), self.model.nu))
+        for i in range(self._count):
+            latency_s = self._get_value(parameters, i, "latency_s")
+            whole_steps, part = divmod(latency_s / self._step_s, 1.0)
+            steps = np.arange(len(control)) - int(whole_steps)
+            target_rad = self._held_target_rad[:, i]
+            start_rad = self._columns["angle_rad"][0, i]
+            newer = np.where(steps >= 0, target_rad[np.maximum(steps, 0)], start_rad)
+            older = np.where(steps >= 1, target_rad[np.maximum(steps - 1, 0)], start_rad)
+            control[:, i] = (1 - part) * newer + part * older
+        return control
+
+    def _compute_residual(
+        self,
+        parameters: Any,
+        _predicted: Any,
+        measured: Any,
+        model: mujoco.MjModel,
+        _return_all: bool,
+        *,
+        state: Floats,
+        **_others: Any,
+    ) -> tuple[Floats, Any, Any]:
+        """Return measured minus simulated signals in standard deviations of their noise, (ticks, signals)."""
+        rows = state[self._ticks * self._steps_per_tick - 1]  # after the step that ends at the tick
+        speed_end = TIME_COLUMNS + model.nq + model.nv
+        angle_rad = rows[:, TIME_COLUMNS + model.nq - self._count : TIME_COLUMNS + model.nq]
+        velocity_rad_s = rows[:, speed_end - self._count : speed_end]
+        torque_nm = rows[:, speed_end : speed_end + self._count]
+        # A drive computes its torque from its current, by the constant of the file.
+        constants = [
+            parameters[make_parameter_name(i, "torque_constant_nm_per_a")].value[0]
+            for i in range(self._count)
+        ]
+        predicted = np.column_stack((angle_rad, velocity_rad_s, torque_nm / constants))
+        residual = (measured.data - predicted) / self._noise
+        return residual, self._make_series(predicted), measured
+
+
+def make_parameter_name(joint_index: int, parameter: str) -> str:
+    """Return the name of a parameter of a joint in `mujoco.sysid`."""
+    return f"{parameter} of joint {joint_index + 1}"
+
+
+def identify_by_rollouts(robot: HiddenRobot, columns: Mapping[str, Floats]) -> Identified:
+    """Identify a robot with `mujoco.sysid`."""
+    begun_s = time.process_time()
+    values, widths = RolloutFit(robot, columns).run()
+    cpu_s = time.process_time() - begun_s
+    estimates: list[Estimate] = []
+    for i in range(len(robot.config.robot.joint_table)):
+        for parameter in PARAMETERS:
+            name = make_parameter_name(i, parameter)
+            truth = get_truth(robot, i, parameter)
+            estimates.append(Estimate(parameter, values[name], widths[name], truth))
+    return Identified(estimates, cpu_s)
+
+
+# --- comparison ------------------------------------------------------------------------------------------------
+
+
+def compare_robot(
+    number: int, sets: Sequence[str], *, backlash: bool
+) -> tuple[Identified, Identified]:
+    """Identify one robot with both methods."""
+    logging.getLogger("absl").setLevel(logging.ERROR)
+    robot = draw_hidden_robot(number, *SIZE, *sets, backlash=backlash)
+    columns, link_rates = record_motion(robot)
+    return (
+        identify_by_equations(robot, columns, link_rates),
+        identify_by_rollouts(robot, columns),
+    )
+
+
+def make_table(pairs: Sequence[tuple[Identified, Identified]]) -> Iterator[str]:
+    """Yield the lines of the table: for each parameter the errors of both methods, and what their intervals cover."""
+    yield (
+        "| parameter | joints | robot identify: unknown | median error | worst | covered "
+        "| mujoco.sysid: median error | worst | covered |"
+    )
+    yield "|---|---|---|---|---|---|---|---|---|"
+    for parameter in PARAMETERS:
+        ours, theirs = (
+            [one for found in method for one in found.estimates if one.parameter == parameter]
+            for method in zip(*pairs, strict=True)
+        )
+        unknown = sum(one.value is None for one in ours)
+        yield (
+            f"| `{parameter}` | {len(ours)} | {unknown} | {_describe_errors(ours)} "
+            f"| {_describe_errors(theirs)} |"
+        )
+    for label, method in zip(
+        ("robot identify", "mujoco.sysid"), zip(*pairs, strict=True), strict=True
+    ):
+        close = [
+            one.error < CLOSE
+            for found in method
+            for one in found.estimates
+            if one.error is not None
+        ]
+        cpu_s = median(found.cpu_s for found in method)
+        yield (
+            f"{label}: {len(close)} values, {sum(close) / max(len(close), 1):.1%} within {CLOSE:.0%}, "
+            f"median CPU time of a robot {cpu_s:.1f} s"
+        )
+
+
+def _describe_errors(estimates: Sequence[Estimate]) -> str:
+    """Return median and greatest relative error, and how many intervals cover the truth."""
+    known = [one for one in estimates if one.value is not None]
+    errors = [one.error for one in known if one.error is not None]
+    if not errors:
+        return "- | - | -"
+    covered = sum(one.covers for one in known) / len(known)
+    return f"{median(errors):.2%} | {max(errors):.1%} | {covered:.0%}"
+
+
+def has_mujoco_sysid() -> bool:
+    """Return whether `mujoco.sysid` can be used: it is empty if one of its optional packages is missing."""
+    return hasattr(mujoco_sysid, "optimize")
+
+
+def main() -> int:
+    """Print the comparison; return 2 if `mujoco.sysid` is not installed."""
+    parser = argparse.ArgumentParser(prog="python -m verification.sysid", description=__doc__)
+    parser.add_argument("--first", type=int, default=1000, help="number of the first robot (1000)")
+    parser.add_argument("--robots", type=int, default=20, help="number of robots (20)")
+    parser.add_argument("--backlash", action="store_true", help="one joint has backlash")
+    parser.add_argument("--workers", type=int, default=2, help="processes (2)")
+    parser.add_argument(
+        "--set", action="append", default=[], dest="sets", metavar="PATH=VALUE", help="as of a run"
+    )
+    arguments = parser.parse_args()
+    if not has_mujoco_sysid():
+        print_stderr(HINT)
+        return BAD_INPUT
+    numbers = range(arguments.first, arguments.first + arguments.robots)
+    with ProcessPoolExecutor(arguments.workers) as pool:
+        futures = [
+            pool.submit(compare_robot, number, arguments.sets, backlash=arguments.backlash)
+            for number in numbers
+        ]
+        pairs = [future.result() for future in futures]
+    for line in make_table(pairs):
+        print_line(line)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
