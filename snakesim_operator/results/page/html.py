@@ -13,6 +13,7 @@ from markupsafe import Markup
 from snakesim_hal.base.terminal import escape_invisible
 from snakesim_operator.results.page.charts import LIBRARY, PlotlyDict
 from snakesim_operator.results.page.palette import make_theme_css
+from snakesim_operator.results.page.template_cache import TemplateCache
 
 HERE = Path(__file__).parent
 # Line breaks of a configuration, and the spaces in large numbers.
@@ -93,6 +94,8 @@ def _make_environment(folder: Path) -> jinja2.Environment:
         finalize=_show_control_characters,
         trim_blocks=True,
         lstrip_blocks=True,
+        # The options are those of this file.
+        bytecode_cache=TemplateCache(options=_read_texts(Path(__file__))),
     )
     environment.filters.update(chart=make_chart_markup, data=embed_json, shown=format_number)
     return environment
