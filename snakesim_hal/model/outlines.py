@@ -224,7 +224,7 @@ def has_gap_below(single: ObstacleOutlines, others: ObstacleOutlines, limit_m: f
 class NearestChainPoints(NamedTuple):
     """The point of a chain that is nearest to each of m outlines."""
 
-    index: NDArray[np.intp]  # (m,), among all `LINK_FRACTIONS` of all links, tail to head
+    point_index: NDArray[np.intp]  # (m,), among all `LINK_FRACTIONS` of all links, tail to head
     point_w: Floats  # (m, 2), m
     distance_m: Floats  # (m,), negative inside the outline
 
