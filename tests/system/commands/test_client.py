@@ -74,7 +74,7 @@ def test_a_client_needs_nothing_of_ours(client: Path, known: set[str]) -> None:
 
 
 def test_example_clients_are_as_short_as_documented() -> None:
-    assert len(CLIENT.read_text(encoding="utf-8").splitlines()) <= 60
+    assert len(CLIENT.read_text(encoding="utf-8").splitlines()) < 100
     lines = STOP.read_text(encoding="utf-8").split("import sys\n")[1].split("\n")
     assert len([line for line in lines if line]) == 9
 
