@@ -181,10 +181,10 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None,
         _make_quantity_meta("m", "distance from the start to the mission's goal; null without one"),
     ] = None
-    crossed: Annotated[
+    reached_goal: Annotated[
         bool | None, Meta(description="whether the goal was reached; null without one")
     ] = None
-    crossed_s: Annotated[
+    goal_reached_s: Annotated[
         float | None, _make_quantity_meta("s", "from the first arming until the goal was reached")
     ] = None
     advance_m: Annotated[
@@ -546,13 +546,15 @@ def _compute_advance_metrics(
         Values by name of the field in RunSummary. All are None if the pose is unknown.
     """
     if progress is None:
-        return dict.fromkeys(("goal_m", "crossed", "crossed_s", "advance_m", "advance_m_s"))
+        return dict.fromkeys(
+            ("goal_m", "reached_goal", "goal_reached_s", "advance_m", "advance_m_s")
+        )
     return {
         "goal_m": progress.goal_distance_m,
-        "crossed": progress.goal_reached_s is not None
+        "reached_goal": progress.goal_reached_s is not None
         if progress.goal_distance_m is not None
         else None,
-        "crossed_s": progress.goal_reached_s,
+        "goal_reached_s": progress.goal_reached_s,
         "advance_m": progress.final_advance_m,
         "advance_m_s": progress.final_advance_m / progress.goal_or_end_s
         if progress.goal_or_end_s > 0

@@ -258,8 +258,8 @@ def _make_motion_rows(summary: RunSummary) -> list[tuple[str, str]]:
         ("moved" if summary.path_distance_m is None else "moved along the path", distance_text),
         ("time", f"{summary.duration_s:.2f} s in {summary.wall_s:.2f} s ({speed_text})"),
     ]
-    if summary.crossed_s:
-        rows.append(("goal", f"{summary.goal_m:g} m, reached after {summary.crossed_s:.1f} s"))
+    if summary.goal_reached_s:
+        rows.append(("goal", f"{summary.goal_m:g} m, reached after {summary.goal_reached_s:.1f} s"))
     rows += [
         ("locomoting", _format_time_fraction(summary.locomoting_fraction)),
         ("propulsion joints", _describe_propulsion(summary)),

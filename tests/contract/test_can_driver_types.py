@@ -324,7 +324,7 @@ def test_drive_with_other_id_is_missing_then_a_stranger(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     renamed = robot.driver_type.drives(robot.emulator)[0]
-    setattr(renamed, "node" if hasattr(renamed, "node") else "id", 9)
+    setattr(renamed, "node_id" if hasattr(renamed, "node_id") else "id", 9)
     faults = robot.run(40, "disarmed")
     assert {(fault.what, fault.joint) for fault in faults} == {
         ("drive_silent", "joint_1"),

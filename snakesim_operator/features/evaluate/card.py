@@ -37,15 +37,15 @@ class CardMetric:
 
     label: str
     digits: int
-    only_crossed: bool = False  # of the runs that reached their goal, instead of all runs
+    successful_only: bool = False  # of the runs that reached their goal, instead of all runs
 
 
 METRICS = {
-    "advance_m_s": CardMetric("speed, m/s", 3, only_crossed=True),
-    "body_lengths_s": CardMetric("speed, body lengths/s", 3, only_crossed=True),
-    "energy_j_per_m": CardMetric("energy, J/m", 1, only_crossed=True),
-    "cost_of_transport": CardMetric("cost of transport", 3, only_crossed=True),
-    "propulsive_efficiency": CardMetric("propulsive efficiency", 3, only_crossed=True),
+    "advance_m_s": CardMetric("speed, m/s", 3, successful_only=True),
+    "body_lengths_s": CardMetric("speed, body lengths/s", 3, successful_only=True),
+    "energy_j_per_m": CardMetric("energy, J/m", 1, successful_only=True),
+    "cost_of_transport": CardMetric("cost of transport", 3, successful_only=True),
+    "propulsive_efficiency": CardMetric("propulsive efficiency", 3, successful_only=True),
     "displacement_m_s": CardMetric("net displacement: speed, m/s", 3),
     "displacement_energy_j_per_m": CardMetric("net displacement: energy, J/m", 1),
     "displacement_cost_of_transport": CardMetric("net displacement: cost of transport", 3),
@@ -53,7 +53,7 @@ METRICS = {
     "displacement_slip": CardMetric("slip along the path", 3),
     "lateral_slip": CardMetric("lateral slip", 3),
     "jam_ratio": CardMetric("jam ratio", 3),
-    "impulse_n_s_per_m": CardMetric("contact impulse, N·s/m", 1, only_crossed=True),
+    "impulse_n_s_per_m": CardMetric("contact impulse, N·s/m", 1, successful_only=True),
     "torque_headroom": CardMetric("torque headroom", 2),
     "form_closure": CardMetric("form closure, share of time", 3),
     "planning_fraction": CardMetric("planning, share of turns", 2),
@@ -70,7 +70,7 @@ class GoalResult(msgspec.Struct, frozen=True):
     row: str
     field: int
     same: str  # hash of the configuration without its controller: equal for runs of two controllers that may be paired
-    crossed: bool
+    reached_goal: bool
 
 
 class ControllerScore(msgspec.Struct, frozen=True):
@@ -79,7 +79,7 @@ class ControllerScore(msgspec.Struct, frozen=True):
     controller: str
     row: str
     runs: int
-    crossed: int | None
+    success_count: int | None
     interval: tuple[float, float]  # 95 %, of the success rate
     medians: dict[str, float | None]  # by the metric; null: no run knows it
 
@@ -103,7 +103,7 @@ class ControllerComparison(msgspec.Struct, frozen=True):
     one: str
     other: str
     fields: int
-    only_one: int  # fields that only the first controller crossed
+    only_one: int  # fields that in which only the first controller reached the goal
     only_other: int
     p: float  # corrected for the number of comparisons
 
@@ -125,14 +125,14 @@ def make_card(
     for case in cases:
         if case.id in outcome_by_id:
             # None if the case could not run, or had no goal; for a comparison both count as not reached.
-            has_reached_goal = outcome_by_id[case.id].numbers.get("crossed") is True
+            has_reached_goal = outcome_by_id[case.id].numbers.get("reached_goal") is True
             goal_results.append(
                 GoalResult(
                     controller=case.controller,
                     row=case.setting,
                     field=case.field,
                     same=_hash_without_controller(case),
-                    crossed=has_reached_goal,
+                    reached_goal=has_reached_goal,
                 )
             )
     machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
@@ -220,7 +220,7 @@ def format_card(card: EvaluationCard, comparisons: Sequence[ControllerComparison
     """Return the card for a terminal: the numbers that the table does not have, and the comparisons."""
     lines = [f"score card: {card.suite}, snakesim {card.version}, code {card.code}, {card.machine}"]
     lines.append(
-        f"fields {card.fields[0]} to {card.fields[-1]}; medians, speed and cost of the runs that crossed"
+        f"fields {card.fields[0]} to {card.fields[-1]}; medians, speed and cost of the runs that reached the goal"
     )
     for score in card.scores:
         lines += _format_score(score)
@@ -240,11 +240,11 @@ def format_card(card: EvaluationCard, comparisons: Sequence[ControllerComparison
 
 
 def _format_score(score: ControllerScore) -> list[str]:
-    crossed = "no goal"
-    if score.crossed is not None:
+    success_text = "no goal"
+    if score.success_count is not None:
         low, high = score.interval
-        crossed = f"{score.crossed}/{score.runs} ({100 * low:.0f}-{100 * high:.0f} %)"
-    lines = [f"  {score.row}, {score.controller}: {crossed}"]
+        success_text = f"{score.success_count}/{score.runs} ({100 * low:.0f}-{100 * high:.0f} %)"
+    lines = [f"  {score.row}, {score.controller}: {success_text}"]
     for key, metric in METRICS.items():
         median = score.medians[key]
         shown = "unknown"
@@ -256,15 +256,15 @@ def _format_score(score: ControllerScore) -> list[str]:
 
 def _make_score(row: ResultRow) -> ControllerScore:
     medians = {
-        key: _compute_median(row.list_values(key, of_crossed=metric.only_crossed))
+        key: _compute_median(row.list_values(key, successful_only=metric.successful_only))
         for key, metric in METRICS.items()
     }
     return ControllerScore(
         controller=row.controller,
         row=row.setting,
         runs=row.runs,
-        crossed=row.crossed,
-        interval=compute_wilson_interval(row.crossed or 0, row.runs),
+        success_count=row.success_count,
+        interval=compute_wilson_interval(row.success_count or 0, row.runs),
         medians=medians,
     )
 
@@ -316,13 +316,13 @@ def _compare_controllers(
     has_reached_goal_by_config: dict[str, bool] = {}
     for crossing in other.crossings:
         if crossing.controller == other_controller:
-            has_reached_goal_by_config[crossing.same] = crossing.crossed
+            has_reached_goal_by_config[crossing.same] = crossing.reached_goal
 
     # (first, second) reached the goal, for each shared field.
     pairs_by_row: dict[str, list[tuple[bool, bool]]] = {}
     for crossing in card.crossings:
         if crossing.controller == controller and crossing.same in has_reached_goal_by_config:
-            pair = (crossing.crossed, has_reached_goal_by_config[crossing.same])
+            pair = (crossing.reached_goal, has_reached_goal_by_config[crossing.same])
             pairs_by_row.setdefault(crossing.row, []).append(pair)
 
     comparisons: list[ControllerComparison] = []

@@ -110,7 +110,7 @@ def _simulate_case(config: RunConfig, stall_timeout_s: float, timeout_s: float) 
             config, until_goal=True, stall_timeout_s=stall_timeout_s, turn_limit_s=timeout_s
         )
     numbers = collect_reproducible_metrics(result.summary)
-    numbers[GAVE_UP_FIELD] = result.has_stalled and not result.summary.crossed
+    numbers[GAVE_UP_FIELD] = result.has_stalled and not result.summary.reached_goal
     return CaseOutcome(numbers=numbers)
 
 

@@ -281,7 +281,7 @@ def _print_table(rows: Sequence[ResultRow]) -> None:
     for line in format_table(rows):
         print_line(line)
     # A row without a goal has no success rate. Its interval is that of the mean over its runs.
-    if any(row.runs == 1 and row.crossed is None for row in rows):
+    if any(row.runs == 1 and row.success_count is None for row in rows):
         print_line("a row of one run has no interval; give --seeds 2 or more (of a suite --fields)")
 
 

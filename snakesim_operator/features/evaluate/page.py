@@ -41,18 +41,18 @@ def render_evaluation_page(
         about=source,
         runs=sum(row.runs for row in rows),
         figures=[
-            _draw_figure("Fields crossed, %", rows, controllers, _compute_success_rate_percent),
+            _draw_figure("Success rate, %", rows, controllers, _compute_success_rate_percent),
             _draw_figure(
                 "Speed, m/s",
                 rows,
                 controllers,
-                _make_quartile_function("advance_m_s", of_crossed=True),
+                _make_quartile_function("advance_m_s", successful_only=True),
             ),
             _draw_figure(
                 "Energy, J/m",
                 rows,
                 controllers,
-                _make_quartile_function("energy_j_per_m", of_crossed=True),
+                _make_quartile_function("energy_j_per_m", successful_only=True),
             ),
             _draw_figure("Advance, m", rows, controllers, _make_quartile_function("advance_m")),
             _draw_figure(
@@ -68,7 +68,7 @@ def render_evaluation_page(
                 "Stalled time, s", rows, controllers, _make_quartile_function("stalled_s")
             ),
         ],
-        goals=any(row.crossed is not None for row in rows),
+        goals=any(row.success_count is not None for row in rows),
         head=headings,
         rows=table_rows,
         worst=failures,
@@ -78,17 +78,17 @@ def render_evaluation_page(
 
 def _compute_success_rate_percent(row: ResultRow) -> ValueWithInterval | None:
     """Return the success rate with its 95 % interval, in percent; None without a goal."""
-    if row.crossed is None:
+    if row.success_count is None:
         return None
-    low, high = compute_wilson_interval(row.crossed, row.runs)
-    return 100 * row.crossed / row.runs, 100 * low, 100 * high
+    low, high = compute_wilson_interval(row.success_count, row.runs)
+    return 100 * row.success_count / row.runs, 100 * low, 100 * high
 
 
-def _make_quartile_function(name: str, *, of_crossed: bool = False) -> ComputeValue:
+def _make_quartile_function(name: str, *, successful_only: bool = False) -> ComputeValue:
     """Return a function that computes median and quartiles of a metric in a row; it returns None if none is known."""
 
     def quartiles(row: ResultRow) -> ValueWithInterval | None:
-        values = row.list_values(name, of_crossed=of_crossed)
+        values = row.list_values(name, successful_only=successful_only)
         if not values:
             return None
         middle, lower, upper = np.percentile(values, [50, 25, 75]).tolist()

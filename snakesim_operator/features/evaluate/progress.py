@@ -17,7 +17,7 @@ class CaseProgress(StatusLine):
         self._total = total
         self._done = 0
         self._with_goal = 0
-        self._crossed = 0
+        self._success_count = 0
         self._errors = 0
         # Times, by the monotonic clock.
         self._start_s = time.monotonic()
@@ -25,10 +25,10 @@ class CaseProgress(StatusLine):
 
     def count_outcome(self, outcome: CaseOutcome) -> None:
         """Count one more case, and print the line if it is due."""
-        is_crossed = outcome.numbers.get("crossed")
+        reached_goal = outcome.numbers.get("reached_goal")
         self._done += 1
-        self._with_goal += isinstance(is_crossed, bool)
-        self._crossed += is_crossed is True
+        self._with_goal += isinstance(reached_goal, bool)
+        self._success_count += reached_goal is True
         self._errors += outcome.error is not None
         now_s = time.monotonic()
         if self.is_terminal or now_s >= self._next_line_s or self._done == self._total:
@@ -40,7 +40,7 @@ class CaseProgress(StatusLine):
         remaining_s = elapsed_s / self._done * (self._total - self._done)
         parts = [f"{self._done} of {self._total} cases"]
         if self._with_goal:
-            parts.append(f"{self._crossed} crossed")
+            parts.append(f"{self._success_count} reached the goal")
         if self._errors:
             parts.append(f"{self._errors} could not run")
         parts.append(

@@ -1,4 +1,4 @@
-"""The table of an evaluation: for each setting and controller, how many fields were crossed, and how."""
+"""The table of an evaluation: for each setting and controller, how many runs reached the goal, and how."""
 
 import math
 from collections import Counter
@@ -12,11 +12,11 @@ from snakesim_operator.features.evaluate.store import Results
 from snakesim_operator.results.metrics.intervals import Z95, compute_mean_interval
 
 UNKNOWN_TEXT = "–"
-# Headings of the columns. "crossed": runs that reached their goal. "net": of runs without a goal, whose displacement
-# from start to end counts, in any direction.
+# Headings of the columns. "reached goal": runs that reached their goal. "net": of runs without a goal, whose
+# displacement from start to end counts, in any direction.
 SETTING = "setting"
 CONTROLLER = "controller"
-CROSSED = "crossed"
+REACHED_GOAL = "reached goal"
 CROSSED_INTERVAL = "95 %"
 ADVANCE_M = "m"
 ADVANCE_INTERVAL_M = "95 % of m"
@@ -32,7 +32,7 @@ ERRORS = "errors"
 HEADINGS = (
     SETTING,
     CONTROLLER,
-    CROSSED,
+    REACHED_GOAL,
     CROSSED_INTERVAL,
     ADVANCE_M,
     ADVANCE_INTERVAL_M,
@@ -71,28 +71,30 @@ class ResultRow:
         return sum(outcome.error is not None for outcome in self.outcomes)
 
     @property
-    def crossed(self) -> int | None:
+    def success_count(self) -> int | None:
         """The number of runs that reached their goal; None if they had no goal."""
-        crossings = [
-            outcome.numbers.get("crossed") for outcome in self.outcomes if outcome.error is None
+        goal_results = [
+            outcome.numbers.get("reached_goal")
+            for outcome in self.outcomes
+            if outcome.error is None
         ]
-        had_no_goal = crossings and all(crossed is None for crossed in crossings)
+        had_no_goal = goal_results and all(reached is None for reached in goal_results)
         if had_no_goal:
             return None
-        return sum(crossed is True for crossed in crossings)
+        return sum(reached is True for reached in goal_results)
 
-    def list_values(self, name: str, *, of_crossed: bool = False) -> list[float]:
+    def list_values(self, name: str, *, successful_only: bool = False) -> list[float]:
         """Return the values of one field of the summary in all runs in which it is known.
 
         Args:
             name: Name of a field of the summary.
-            of_crossed: Whether to leave out the runs that had a goal and did not reach it.
+            successful_only: Whether to leave out the runs that had a goal and did not reach it.
         """
         values: list[float] = []
         for outcome in self.outcomes:
-            missed_goal = outcome.numbers.get("crossed") not in (True, None)
+            missed_goal = outcome.numbers.get("reached_goal") not in (True, None)
             value = outcome.numbers.get(name)
-            if isinstance(value, int | float) and not (of_crossed and missed_goal):
+            if isinstance(value, int | float) and not (successful_only and missed_goal):
                 values.append(float(value))
         return values
 
@@ -102,32 +104,34 @@ class ResultRow:
         Distances and stalls are those of all runs. Speed, energy and time are those of the runs that reached their
         goal, or that had none. Each number is a median, but intervals are 95 % confidence intervals of means.
         """
-        duration = "crossed_s" if self.crossed else "duration_s"
+        duration = "goal_reached_s" if self.success_count else "duration_s"
         cells = {
             SETTING: self.setting,
             CONTROLLER: self.controller,
-            CROSSED: self._format_success_count(),
+            REACHED_GOAL: self._format_success_count(),
             CROSSED_INTERVAL: self._format_success_interval(),
             ADVANCE_M: _format_median(self.list_values("advance_m"), 2),
             ADVANCE_INTERVAL_M: self._format_mean_interval("advance_m"),
-            SPEED_M_S: _format_median(self.list_values("advance_m_s", of_crossed=True), 3),
-            ENERGY_J_PER_M: _format_median(self.list_values("energy_j_per_m", of_crossed=True), 1),
+            SPEED_M_S: _format_median(self.list_values("advance_m_s", successful_only=True), 3),
+            ENERGY_J_PER_M: _format_median(
+                self.list_values("energy_j_per_m", successful_only=True), 1
+            ),
             **self._format_net_displacement_cells(),
             STALLED_S: _format_median(self.list_values("stalled_s"), 1),
-            DURATION_S: _format_median(self.list_values(duration, of_crossed=True), 1),
+            DURATION_S: _format_median(self.list_values(duration, successful_only=True), 1),
             ERRORS: str(self.errors or ""),
         }
         return [cells[heading] for heading in HEADINGS]
 
     def _format_success_count(self) -> str:
-        if self.crossed is None:
+        if self.success_count is None:
             return UNKNOWN_TEXT
-        return f"{self.crossed}/{self.runs}"
+        return f"{self.success_count}/{self.runs}"
 
     def _format_success_interval(self) -> str:
-        if self.crossed is None:
+        if self.success_count is None:
             return UNKNOWN_TEXT
-        low, high = compute_wilson_interval(self.crossed, self.runs)
+        low, high = compute_wilson_interval(self.success_count, self.runs)
         return f"{100 * low:.0f}-{100 * high:.0f}"
 
     def _format_net_displacement_cells(self) -> dict[str, str]:
@@ -135,7 +139,7 @@ class ResultRow:
 
         They are UNKNOWN for runs with a goal, for which the advance towards the goal counts instead.
         """
-        if self.crossed is not None:
+        if self.success_count is not None:
             return dict.fromkeys(
                 (NET_M, NET_INTERVAL_M, NET_SPEED_M_S, NET_ENERGY_J_PER_M), UNKNOWN_TEXT
             )
@@ -149,7 +153,7 @@ class ResultRow:
     def _format_mean_interval(self, name: str) -> str:
         """Return the interval of a mean; with a goal, the success rate has an interval instead."""
         values = self.list_values(name)
-        if self.crossed is not None or len(values) < 2:
+        if self.success_count is not None or len(values) < 2:
             return UNKNOWN_TEXT
         low, high = compute_mean_interval(values)
         return f"{low:.2f} to {high:.2f}"
@@ -182,7 +186,10 @@ def make_result_table(rows: Sequence[ResultRow]) -> list[list[str]]:
 
 
 def format_table(rows: Sequence[ResultRow]) -> list[str]:
-    """Return the table for a terminal. Speed, energy and time are medians of the runs that crossed, others of all."""
+    """Return the table for a terminal.
+
+    Speed, energy and time are medians of the runs that reached the goal. Other values are medians of all runs.
+    """
     table = make_result_table(rows)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines: list[str] = []
@@ -196,11 +203,11 @@ def format_table(rows: Sequence[ResultRow]) -> list[str]:
 
 
 def find_best_controller(rows: Sequence[ResultRow]) -> str:
-    """Return the controller that crossed most often; its failures are the most interesting ones."""
-    crossed: Counter[str] = Counter()
+    """Return the controller that reached the goal most often; its failures are the most interesting ones."""
+    success_counts: Counter[str] = Counter()
     for row in rows:
-        crossed[row.controller] += row.crossed or 0
-    return max(crossed, key=lambda name: crossed[name], default="")
+        success_counts[row.controller] += row.success_count or 0
+    return max(success_counts, key=lambda name: success_counts[name], default="")
 
 
 def find_worst_failures(
@@ -246,10 +253,10 @@ def _has_succeeded(outcome: CaseOutcome) -> bool:
     """Return whether a run reached its goal; without a goal, whether it ran to its end."""
     if outcome.error is not None:
         return False
-    crossed = outcome.numbers.get("crossed")
-    if crossed is None:
+    reached_goal = outcome.numbers.get("reached_goal")
+    if reached_goal is None:
         return outcome.numbers.get("ended") == "complete"
-    return crossed is True
+    return reached_goal is True
 
 
 def _compute_advance_fraction(outcome: CaseOutcome) -> float:

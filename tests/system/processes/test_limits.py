@@ -39,7 +39,7 @@ def ran(
 def test_who_comes_no_further_is_given_up() -> None:
     reported = ran("hold", give_up_s=1.0).numbers
     assert reported[GAVE_UP_FIELD] is True
-    assert reported["crossed"] is False
+    assert reported["reached_goal"] is False
     assert isinstance(reported["duration_s"], float)
     assert 1.0 <= reported["duration_s"] < 2.0
 
@@ -48,7 +48,7 @@ def test_who_comes_no_further_is_given_up() -> None:
 def test_who_comes_on_is_not() -> None:
     reported = ran("path_following", give_up_s=1.0).numbers
     assert reported[GAVE_UP_FIELD] is False
-    assert reported["crossed"] is True
+    assert reported["reached_goal"] is True
 
 
 @pytest.mark.slow

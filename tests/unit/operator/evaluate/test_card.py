@@ -35,7 +35,7 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
         cases = make_cases(suite, "here", controllers, 6, first_field=seed)
         done = {
             case.id: CaseOutcome(
-                numbers={**numbers, "crossed": crosses == (case.controller == "hold")}
+                numbers={**numbers, "reached_goal": crosses == (case.controller == "hold")}
             )
             for case in cases
         }
@@ -65,7 +65,7 @@ def test_cards_pair_by_field_whatever_the_controller_and_its_settings() -> None:
 def test_a_card_on_disk_is_the_card(tmp_path: Path) -> None:
     suite = EvaluationSuite(scenario="surveyed_clutter")
     cases = make_cases(suite, "here", ["hold"], 1, first_field=1)
-    card = make_card("mine", cases, {cases[0].id: CaseOutcome(numbers={"crossed": False})})
+    card = make_card("mine", cases, {cases[0].id: CaseOutcome(numbers={"reached_goal": False})})
     (tmp_path / CARD_FILENAME).write_bytes(msgspec.json.encode(card))
     assert read_card(tmp_path) == card
     with raises_error(ConfigError, code="file/not-readable"):

@@ -40,14 +40,14 @@ def center_m(result: InProcessResult, row: int) -> float:
     return float(np.mean(0.5 * (nodes[:-1, 0] + nodes[1:, 0])))
 
 
-def test_a_goal_is_crossed_when_the_whole_body_has_advanced() -> None:
+def test_a_goal_is_reached_when_the_whole_body_has_advanced() -> None:
     result = simulate_run("path_following", goal="heading")
     reported, record = result.summary, result.record
-    assert reported.crossed is True
+    assert reported.reached_goal is True
     assert reported.goal_m == reported.advance_m == 0.3
-    assert reported.crossed_s is not None
-    assert reported.advance_m_s == pytest.approx(0.3 / reported.crossed_s)
-    row = record.find_nearest_row(record.time_s[0] + reported.crossed_s)
+    assert reported.goal_reached_s is not None
+    assert reported.advance_m_s == pytest.approx(0.3 / reported.goal_reached_s)
+    row = record.find_nearest_row(record.time_s[0] + reported.goal_reached_s)
     assert center_m(result, row) - center_m(result, 0) == pytest.approx(0.3, abs=0.01)
     used_j = np.abs(record.torque_nm * record.velocity_rad_s)[: row + 1].sum() * 0.01
     assert reported.energy_j_per_m == pytest.approx(used_j / 0.3, rel=0.02)
@@ -55,10 +55,10 @@ def test_a_goal_is_crossed_when_the_whole_body_has_advanced() -> None:
 
 
 @pytest.mark.slow
-def test_advance_goal_out_of_reach_is_not_crossed() -> None:
+def test_advance_goal_out_of_reach_is_not_reached() -> None:
     reported = simulate_run("path_following", goal="too far").summary
-    assert reported.crossed is False
-    assert reported.crossed_s is None
+    assert reported.reached_goal is False
+    assert reported.goal_reached_s is None
     assert reported.goal_m == 50
     assert reported.advance_m is not None
     assert 0.4 < reported.advance_m < 1
@@ -67,7 +67,7 @@ def test_advance_goal_out_of_reach_is_not_crossed() -> None:
 @pytest.mark.slow
 def test_advance_backward_is_zero() -> None:
     reported = simulate_run("path_following", goal="backward").summary
-    assert reported.crossed is False
+    assert reported.reached_goal is False
     assert reported.advance_m == pytest.approx(0, abs=0.01)
     assert reported.energy_j_per_m is None
 
@@ -79,10 +79,10 @@ def test_points_are_passed_by_the_head() -> None:
     assert nodes is not None
     head = nodes[-1, :2]
     assert reported.goal_m == pytest.approx(np.hypot(1.7 - head[0], head[1]) + 0.2)
-    assert reported.crossed is True
-    assert reported.crossed_s is not None
+    assert reported.reached_goal is True
+    assert reported.goal_reached_s is not None
     last = result.record.find_body_points_w(
-        result.record.find_nearest_row(result.record.time_s[0] + reported.crossed_s)
+        result.record.find_nearest_row(result.record.time_s[0] + reported.goal_reached_s)
     )
     assert last is not None
     assert np.hypot(1.9 - last[-1, 0], last[-1, 1]) < 0.06
@@ -92,12 +92,12 @@ def test_points_are_passed_by_the_head() -> None:
 def test_advance_of_standing_body_is_all_stalled() -> None:
     reported = simulate_run("hold", goal="heading").summary
     assert reported.stalled_s == pytest.approx(2.5 - 1.0, abs=0.2)
-    assert reported.crossed is False
+    assert reported.reached_goal is False
 
 
 def test_advance_without_goal_is_forward_distance() -> None:
     reported = simulate_run("path_following").summary
-    assert reported.goal_m is reported.crossed is None
+    assert reported.goal_m is reported.reached_goal is None
     assert reported.advance_m == pytest.approx(reported.net_displacement_m, rel=0.02)
 
 
@@ -120,7 +120,7 @@ def test_advance_of_run_ending_at_goal_keeps_its_numbers() -> None:
     short = simulate(whole.record.config, until_goal=True)
     assert short.summary.ended == "complete"
     assert len(short.record.time_s) < len(whole.record.time_s)
-    for name in ("crossed_s", "advance_m", "energy_j_per_m", "stalled_s"):
+    for name in ("goal_reached_s", "advance_m", "energy_j_per_m", "stalled_s"):
         assert getattr(short.summary, name) == getattr(whole.summary, name), name
 
 
