@@ -1,6 +1,6 @@
 """Compares `snakesim robot identify` with `mujoco.sysid` on the same recordings of emulated drives.
 
-    python -m verification.sysid --first 1000 --robots 20
+    python -m verification.sysid --first 1000 --robots 6
 
 Every robot hangs by its tail, and has hidden parameters, drawn by its number, which is its seed. `robot identify`
 solves equations of each joint. `mujoco.sysid` simulates the whole record again and again, with the model of the
