@@ -168,6 +168,8 @@ def test_it_sends_to_several_programs_and_one_that_does_not_read_delays_no_other
         contextlib.closing(LocalWire(str(path))) as host,
         contextlib.closing(LocalWire(str(path))) as deaf,
     ):
+        # While they boot, modules answer no request.
+        wait_until(lambda: list_answering_nodes(host) == [1, 2, 3, 4], "answers after the boot")
         for begin in range(0, fillers, BATCH):
             for _ in range(min(BATCH, fillers - begin)):
                 host.send(filler)

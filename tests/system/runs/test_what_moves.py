@@ -115,7 +115,7 @@ def test_one_real_joint_module_makes_a_robot_real(monkeypatch: pytest.MonkeyPatc
 
     def find(*arguments: Any) -> Any:
         first, *others = found_by(*arguments)
-        return [dataclasses.replace(first, emulated=False), *others]
+        return [dataclasses.replace(first, is_emulated=False), *others]
 
     monkeypatch.setattr(modules, "find_modules", find)
     robot = opened(configured("can"))
