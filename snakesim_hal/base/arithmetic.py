@@ -138,7 +138,7 @@ def measure_arithmetic() -> dict[str, str]:
 
 
 def _compute_linear_algebra(numbers: list[float]) -> Iterable[Any]:
-    """Yield results of BLAS and LAPACK, whose hash tells which processor code rounds the sums of linear algebra.
+    """Yield results of BLAS and LAPACK, whose hash shows which processor code rounds the sums of linear algebra.
 
     The matrices have the sizes of a robot's. Their numbers mean nothing.
 
