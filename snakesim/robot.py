@@ -87,7 +87,7 @@ class Robot:
         Raises:
             NotConnectedError: The endpoint does not answer, or the robot publishes no description or status.
         """
-        self._link = connection
+        self._connection = connection
         self._exit_stack = ExitStack()
         self._session: Session = self._exit_stack.enter_context(
             open_session(connection, CONNECT_TIMEOUT_S)
@@ -254,7 +254,7 @@ class Robot:
         if self._is_armed_by_us and clock.lifecycle != "armed":
             self._is_armed_by_us = False
             raise RefusedError(
-                f"{self._link.namespace} is no longer armed, but {clock.lifecycle}: {self.status.reason}",
+                f"{self._connection.namespace} is no longer armed, but {clock.lifecycle}: {self.status.reason}",
                 code="robot/not-armed",
             )
         return clock.timestamp_ns * 1e-9
@@ -336,7 +336,9 @@ class Robot:
         """
         output: list[str] = []
         self._is_armed_by_us = False
-        selection = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
+        selection = RobotSelection(
+            self._connection.endpoint, self._connection.namespace, self._connection.session
+        )
         exit_code = stop_robots(selection, output.append)
         if exit_code:
             raise RefusedError(*output, code="robot/not-confirmed")
@@ -376,7 +378,7 @@ class Robot:
         """
         should_stop = threading.Event()
         has_started = threading.Event()
-        link = replace(self._link, max_bytes=MAX_IMAGE_BYTES)
+        link = replace(self._connection, max_bytes=MAX_IMAGE_BYTES)
         with ThreadPoolExecutor(1) as executor:
             recording = executor.submit(
                 record_to_file,
@@ -420,7 +422,9 @@ class Robot:
 
     def _request_and_wait(self, request: LifecycleRequest, done: str) -> None:
         """Send a lifecycle request and wait until the robot confirms it. The lease is renewed meanwhile."""
-        request_while_commanding(self._session, request, done, self._link, self._tick_or_sleep)
+        request_while_commanding(
+            self._session, request, done, self._connection, self._tick_or_sleep
+        )
 
     def _tick_or_sleep(self) -> None:
         """Run one tick if this connection commands the robot, so that its lease stays valid; otherwise sleep."""
@@ -442,7 +446,9 @@ class Robot:
         clock = self._current_clock
         while clock.tick == previous_tick:
             if time.monotonic() > deadline:
-                raise StalledError(f"no tick of {self._link.namespace} for {TICK_TIMEOUT_S:g} s")
+                raise StalledError(
+                    f"no tick of {self._connection.namespace} for {TICK_TIMEOUT_S:g} s"
+                )
             time.sleep(POLL_INTERVAL_S)
             clock = self._current_clock
         return clock.timestamp_ns * 1e-9
@@ -452,7 +458,7 @@ class Robot:
         newest = self._read_newest(key, message_type, CONNECT_TIMEOUT_S)
         if newest is None:
             raise NotConnectedError(
-                f"{self._link.namespace} publishes nothing on {key}; is its HAL host running?",
+                f"{self._connection.namespace} publishes nothing on {key}; is its HAL host running?",
                 code="network/no-robot",
             )
         return newest

@@ -121,9 +121,8 @@ class MessagesPlugin:
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
         """Begin with the messages of a test."""
-        if (
-            item.get_closest_marker("hypothesis") is not None
-        ):  # it runs many examples, with as many texts
+        # It runs many examples, with as many texts.
+        if item.get_closest_marker("hypothesis") is not None:
             return
         stored = self.read_stored().get(make_key(item.nodeid), [])
         self.current = StoredMessages(item, stored, updating=self._updating)

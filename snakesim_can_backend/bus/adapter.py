@@ -369,9 +369,8 @@ class AdapterWire:
             return False
         if not self._uses_fd and (message.is_extended_id or message.is_fd):
             return False
-        if (
-            self._pending_echo_counts and self._pending_echo_counts[frame] > 0
-        ):  # UDP does not report which end sent a datagram
+        # UDP does not report which end sent a datagram.
+        if self._pending_echo_counts and self._pending_echo_counts[frame] > 0:
             self._pending_echo_counts[frame] -= 1
             return False
         return (

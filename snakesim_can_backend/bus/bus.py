@@ -227,9 +227,8 @@ class SocketCanWire:
         self._is_down = True
 
     def _record_interface_up(self) -> None:
-        if (
-            self._is_unplugged
-        ):  # an adapter that was plugged in again is another interface of the same name
+        # An adapter that was plugged in again is another interface of the same name.
+        if self._is_unplugged:
             try:
                 self._socket.bind((self.channel,))
                 self._set_filters()  # the kernel dropped them with the interface

@@ -84,9 +84,8 @@ class VirtualFaults:
         """Return what becomes of a frame that is sent now."""
         if "cut" in self.active:
             return SendOutcome.REJECTED
-        if (
-            "bus_off" in self.active
-        ):  # its queue is gone with the carrier: the kernel accepts frames and drops them
+        # Its queue is gone with the carrier: the kernel accepts frames and drops them.
+        if "bus_off" in self.active:
             return SendOutcome.LOST
         if "full" in self.active:
             self._errors.append(BusError("queue_full", self._channel, "the transmit queue is full"))

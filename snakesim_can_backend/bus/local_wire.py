@@ -89,13 +89,13 @@ class LocalWire(FaultableWire):
     """One end of a bus between the programs of one user."""
 
     def __init__(
-        self, folder: str, only: Iterable[Opcode] | None = None, *, fd: bool = False
+        self, folder: str, received_opcodes: Iterable[Opcode] | None = None, *, fd: bool = False
     ) -> None:
         """Join a bus, and create it if there is none.
 
         Args:
             folder: Folder of the bus.
-            only: Opcodes of the messages to receive; None for all messages.
+            received_opcodes: Opcodes of the messages to receive; None for all messages.
             fd: Whether the bus is CAN FD. On classic CAN, this end ignores 29-bit ids and more than 8 bytes.
 
         Raises:
@@ -104,7 +104,9 @@ class LocalWire(FaultableWire):
         """
         super().__init__(f"{LOCAL}:{folder}")
         self._folder = Path(folder).absolute()
-        self._received_opcodes = None if only is None else frozenset(int(opcode) for opcode in only)
+        self._received_opcodes = (
+            None if received_opcodes is None else frozenset(map(int, received_opcodes))
+        )
         self._uses_fd = fd
         self._inbox_path = self._folder / f"{os.getpid()}-{uuid.uuid4().hex[:8]}{INBOX_SUFFIX}"
         try:

@@ -199,9 +199,8 @@ class JointModules(Drives):
         self._rejecting_channels = [wire.channel for wire in self.wires if not wire.send(frame)]
         for wire, query in queries:
             wire.send(query)
-        if (
-            module_reports.is_complete
-        ):  # no response is expected; but emulators in this process run only in `wait`
+        # No response is expected; but emulators in this process run only in `wait`.
+        if module_reports.is_complete:
             wait(self.wires, 0.0)
         is_every_bus_queried = len(queries) == len(self.wires)
         deadline_s = time.monotonic() + self._response_timeout_s
@@ -252,9 +251,8 @@ class JointModules(Drives):
             joints: Indices of the joints whose faults the operator has reset.
         """
         self.monitor.reset(self.module_reports.sync)
-        if (
-            not self._was_clear_broadcast
-        ):  # otherwise `send_lifecycle_commands` has sent a Clear to all modules
+        # Otherwise `send_lifecycle_commands` has sent a Clear to all modules.
+        if not self._was_clear_broadcast:
             for joint in sorted(joints):
                 self._send_command(CommandAction.CLEAR, joint)
         if self._unconfigured_joints:

@@ -302,9 +302,8 @@ class ModuleReports:
             frame: Received joint state.
         """
         identifier, data = frame
-        if (
-            crc_hqx(data[:-1], identifier) & 0xFF != data[-1]
-        ):  # `has_valid_checksum`, without the cost of a call
+        # `has_valid_checksum`, without the cost of a call.
+        if crc_hqx(data[:-1], identifier) & 0xFF != data[-1]:
             module.corrupt_state_count += 1
             return
         raw_values = self._read_state(data)

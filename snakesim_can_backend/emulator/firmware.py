@@ -197,9 +197,8 @@ class ModuleFirmware:
         if mode > JointMode.TORQUE:
             self.rejected_frame_count += 1
             return
-        if (
-            self._has_sync_since_setpoint
-        ):  # otherwise a host without Syncs would keep an old demand active for ever
+        # Otherwise a host without Syncs would keep an old demand active for ever.
+        if self._has_sync_since_setpoint:
             self._watchdog_fed_us = now_us
             self._has_sync_since_setpoint = False
         target = target_steps * TARGET_STEPS[mode]  # position, velocity and torque share their bits

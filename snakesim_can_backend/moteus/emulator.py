@@ -135,9 +135,8 @@ class EmulatedMoteus(CanEmulator):
                 watchdog_timeout_us = (
                     controller.command[Register.WATCHDOG] * 1e6 or self.watchdog_us
                 )
-                if (
-                    now_us - controller.watchdog_fed_us > watchdog_timeout_us
-                ):  # never true if the limit is NaN
+                # Never true if the limit is NaN.
+                if now_us - controller.watchdog_fed_us > watchdog_timeout_us:
                     controller.mode = MoteusMode.TIMEOUT
                     self._drive_motor(i)
             if self.body.is_too_hot(i) and controller.mode != MoteusMode.FAULT:

@@ -176,9 +176,8 @@ class OdriveAxes(CanDrives):
         self.readings.mark_checked(i)
         self.axes[i].errors = error_count
         drive = self.states.drives[i]
-        if (
-            drive.is_emergency_stopped
-        ):  # this driver has requested it, so it is no fault of the drive
+        # This driver has requested it, so it is no fault of the drive.
+        if drive.is_emergency_stopped:
             error_count &= ~AxisError.ESTOP_REQUESTED
         drive.errors = describe_errors(error_count)
 
@@ -186,9 +185,8 @@ class OdriveAxes(CanDrives):
         self.firmware[i] = firmware
         self.readings.set_identity(i, firmware=_join_version(firmware))
         self._hardware_versions[i] = _join_version(hardware)
-        if (
-            firmware[:2] == FIRMWARE
-        ):  # firmware 0.5 would take the request for the address as a new node id
+        # Firmware 0.5 would take the request for the address as a new node id.
+        if firmware[:2] == FIRMWARE:
             self._request(i, MessageId.ADDRESS)
             self._request_next_setting(i)
 
@@ -225,9 +223,8 @@ class OdriveAxes(CanDrives):
         firmware = _join_version(self.firmware[i])
         if self.firmware[i][:2] != FIRMWARE:
             return f"has firmware {firmware}; this driver knows {FIRMWARE[0]}.{FIRMWARE[1]}"
-        if (
-            not self._endpoint_files
-        ):  # the limits are unknown: `OdriveAxis.max_current_a` caps the current
+        # The limits are unknown: `OdriveAxis.max_current_a` caps the current.
+        if not self._endpoint_files:
             return ""
         if self._find_endpoints(i) is None:
             files = ", ".join(

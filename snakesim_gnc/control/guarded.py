@@ -143,9 +143,8 @@ def _check_numbers(field: str, values: Any, joint_names: Sequence[str], *, minim
     """Check that a field has one plain number per joint, from `minimum` to MAX_TARGET. Raises ValueError."""
     _check_length(field, values, joint_names)
     for i, value in enumerate(values):
-        if (
-            type(value) in PLAIN_NUMBER_TYPES and minimum <= value <= MAX_TARGET
-        ):  # the comparison is false for NaN
+        # The comparison is false for NaN.
+        if type(value) in PLAIN_NUMBER_TYPES and minimum <= value <= MAX_TARGET:
             continue
         found = f"RequestedSetpoints.{field}[{i}] ({joint_names[i]}) is {_format_value(value)}"
         if type(value) not in PLAIN_NUMBER_TYPES:

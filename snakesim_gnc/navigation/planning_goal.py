@@ -5,7 +5,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 
-# A body that was at its goal goes on only if it is farther away than this.
+# A body that was at its goal continues only if it is farther away than this.
 REACHED_HYSTERESIS_M = 0.01
 
 

@@ -129,9 +129,8 @@ class FaultInjector:
         self._lifecycle = lifecycle
         if arm_session and self._first_armed_s is None:
             self._first_armed_s = now_s
-            if (
-                not self._has_ticked
-            ):  # this part was restarted while the robot was armed: the first arming is unknown
+            # This part was restarted while the robot was armed: the first arming is unknown.
+            if not self._has_ticked:
                 self._plan = InjectionPlan()
         self._has_ticked = True
         self._apply_due_transitions(now_s)

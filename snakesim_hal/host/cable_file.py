@@ -184,7 +184,7 @@ def _find_last_known_angle(
     Returns:
         The angle in rad, or the reason why it is not known.
     """
-    declaration_time = joint.limits.cable_unwound  # ISO 8601; empty if nobody has declared it
+    declaration_time = joint.limits.cable_unwound  # ISO 8601; empty if it was not declared
     stored = file_content.cables.get(joint.name)
     if stored is None:
         reason = file_content.missing_reason

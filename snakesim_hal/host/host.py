@@ -505,9 +505,8 @@ class Host:
             if not late_services:
                 break
             remaining_ns = stall_deadline_ns - time.monotonic_ns()
-            if (
-                self._published_arm_session != self.authority.arm_session
-            ):  # armed in this tick: publish it
+            # Armed in this tick: publish it.
+            if self._published_arm_session != self.authority.arm_session:
                 self._publish_samples(samples)
             if remaining_ns > 0:
                 self._inbox.handle_next_item(min(remaining_ns * 1e-9, MAX_PARTICIPANT_WAIT_S))

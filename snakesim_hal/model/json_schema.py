@@ -22,9 +22,8 @@ def make_schema(struct: type[msgspec.Struct]) -> dict[str, Any]:
     schema = msgspec.json.schema(struct)
     definitions: dict[str, Any] = schema.get("$defs", {})
     for definition in definitions.values():
-        if (
-            "description" in definition
-        ):  # without its indentation, as Python itself removes it from 3.13 on
+        # Without its indentation, as Python itself removes it from 3.13 on.
+        if "description" in definition:
             definition["description"] = cleandoc(definition["description"])
     for part in list_structs(struct):
         full_name = re.sub(r"[^a-zA-Z0-9.\-_]", "_", f"{part.__module__}.{part.__qualname__}")

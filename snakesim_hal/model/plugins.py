@@ -160,9 +160,8 @@ def load_plugin_unless_file(group: str, name: str) -> Any | None:
     kind = _get_kind_name(group)
     _, attribute, tree = _parse_plugin_file(name, kind)
     defined_names = set(_iterate_defined_names(tree))
-    if (
-        attribute not in defined_names and "*" not in defined_names
-    ):  # `from x import *` may define any name
+    # `from x import *` may define any name.
+    if attribute not in defined_names and "*" not in defined_names:
         raise _make_missing_class_error(name, kind, tree)
     return None
 

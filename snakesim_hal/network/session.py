@@ -106,9 +106,8 @@ class Session:
         if lossless:
             congestion_control = zenoh.CongestionControl.BLOCK
         session = self._zenoh
-        if (
-            message in IMAGE_MESSAGE_TYPES and not lossless
-        ):  # in lockstep, images must arrive before the clock of their tick
+        # In lockstep, images must arrive before the clock of their tick.
+        if message in IMAGE_MESSAGE_TYPES and not lossless:
             session = self._open_image_session()
         publisher = session.declare_publisher(
             key,

@@ -197,9 +197,8 @@ class InProcessRun:
         arm_deadline_s = time.monotonic() + arm_timeout_s
         with closing(self.host.iterate_ticks()) as host_turns:
             for turn in itertools.count():
-                with (
-                    self._watchdog
-                ):  # the backend may be third-party code, and turns this into an error of its own
+                # The backend may be third-party code, and turns this into an error of its own.
+                with self._watchdog:
                     if next(host_turns, HOST_ENDED) is HOST_ENDED:
                         return
                 if turn == 0:

@@ -221,9 +221,8 @@ class BlackBox:
             rows = bytes(
                 memoryview(self._buffer)[position * row_bytes : (position + count) * row_bytes]
             )
-            if (
-                self._rows_written - first_row < self._capacity
-            ):  # otherwise the host has overwritten them meanwhile
+            # Otherwise the host has overwritten them meanwhile.
+            if self._rows_written - first_row < self._capacity:
                 return first_row, rows
 
 

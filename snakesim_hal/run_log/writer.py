@@ -125,9 +125,8 @@ class HostRecordWriter:
 
     def _write_statistics(self, folder: Path, failure: str) -> None:
         """Write the statistics, with this failure in them, to a file of the folder. Raises OSError."""
-        if (
-            self._black_box_fd is None
-        ):  # the file in the folder is an earlier host's, and must not be overwritten
+        # The file in the folder is an earlier host's, and must not be overwritten.
+        if self._black_box_fd is None:
             return
         content = msgspec.json.encode(self._collect_statistics(failure))
         write_atomically(folder / HOST_RECORD, msgspec.json.format(content))

@@ -251,9 +251,8 @@ def _decode_content(arrival: ReceivedSample) -> dict[str, Any]:
         decoded = get_decoder(message).decode(arrival.payload, arrival.encoding)
     except WireError as error:
         return {"error": str(error)}
-    if (
-        message is CustomSample
-    ):  # as it was sent, because only its robot describes some of the fields
+    # As it was sent, because only its robot describes some of the fields.
+    if message is CustomSample:
         return {"message": msgspec.msgpack.decode(arrival.payload)}
     return {"message": msgspec.to_builtins(decoded)}
 

@@ -124,7 +124,7 @@ class _DemonstrationRecorder:
     def __init__(
         self, connection: ConnectionSettings, folder: Path, task: str, keyboard: _LineReader
     ) -> None:
-        self._link = connection
+        self._connection = connection
         self._folder = folder
         self._task = task
         self._keyboard = keyboard
@@ -145,7 +145,7 @@ class _DemonstrationRecorder:
         success = None  # as judged by the operator; None: drop the episode
         try:
             recorder = record_to_file(
-                self._link, path, lambda: not self._keyboard.pop_line_if_any()
+                self._connection, path, lambda: not self._keyboard.pop_line_if_any()
             )
             self.failure = recorder.writer.failure
             if not self.failure:

@@ -107,9 +107,8 @@ def inspect_recording(path: Path) -> RecordingInfo:
     )
     duration_s = _measure_duration_s(by_key)
     irregular: list[str] = [*IRREGULAR_KEYS]
-    if (
-        robot is not None and robot.backend == "can"
-    ):  # joint modules on a bus send their IMUs by turns
+    # Joint modules on a bus send their IMUs by turns.
+    if robot is not None and robot.backend == "can":
         irregular.append(keys.IMU)
     host = None
     if robot is not None and status is not None:

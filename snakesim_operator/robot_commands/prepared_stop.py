@@ -96,7 +96,7 @@ class PreparedStop:
             on_result: Called after each stop with its requesters and its result in words, by another thread.
         """
         self._selection = selection
-        self._link = connection
+        self._connection = connection
         self._on_result = on_result
         self._user = get_user_name()  # looked up in a file
         # Threads.
@@ -312,7 +312,7 @@ class PreparedStop:
         if session is None:
             return []
         with closing(session.create_subsession()) as part:
-            return request_stop_over_session(part, self._link, STOP_TIMEOUT_S)
+            return request_stop_over_session(part, self._connection, STOP_TIMEOUT_S)
 
 
 def _wait_for_result(

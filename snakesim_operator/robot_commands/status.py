@@ -128,7 +128,7 @@ class _NetworkMessages:
     """Collects the messages of all robots on one network."""
 
     def __init__(self, connection: ConnectionSettings) -> None:
-        self._link = connection
+        self._connection = connection
         self._decoders = {
             keys.STATUS: MessageDecoder(RobotStatus),
             keys.PROCESS_ALL: MessageDecoder(ProcessInfo),
@@ -141,7 +141,7 @@ class _NetworkMessages:
     def read(self, session: Session) -> None:
         """Subscribe to status, descriptions and processes, and collect these messages for MESSAGE_WAIT_S."""
         arrivals: Mailbox[ReceivedSample] = Mailbox()
-        prefix = "" if self._link.namespace is not None else "**/"
+        prefix = "" if self._connection.namespace is not None else "**/"
         for key in self._decoders:
             session.on_latched_arrival(f"{prefix}{key}", arrivals.put)
         live_process_keys = set(session.list_tokens(f"{prefix}{keys.PROCESS_ALL}"))
@@ -170,7 +170,7 @@ class _NetworkMessages:
             if arrival.key.endswith(key):
                 decoder = self._decoders[key]
         message = decoder.decode(arrival.payload, arrival.encoding)
-        name = self._link.namespace or get_namespace(arrival.key)
+        name = self._connection.namespace or get_namespace(arrival.key)
         match message:
             case RobotStatus():
                 self.statuses.setdefault(name, {})[message.host] = message

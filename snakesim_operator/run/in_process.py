@@ -136,9 +136,8 @@ def simulate(
             f"simulate() takes a RunConfig, not {config!r:.60}; `snakesim.run` takes a scenario's name or path",
             code="python/invalid-argument",
         )
-    if (
-        not is_pinned() and not has_registered_plugins()
-    ):  # a child would not have the plugins that this program offers
+    # A child would not have the plugins that this program offers.
+    if not is_pinned() and not has_registered_plugins():
         return call_in_pinned_process(
             simulate,
             config=config,
@@ -288,9 +287,8 @@ def _run_until_over(
                 if tick_count % TICKS_PER_POLL == 0:
                     if recording is not None:
                         recording.flush_when_due()
-                    if (
-                        progress is not None and host.authority.arm_session
-                    ):  # before the arming nothing changes
+                    # Before the arming nothing changes.
+                    if progress is not None and host.authority.arm_session:
                         progress.update(
                             host.build_status(),
                             control_states.pop_newest(lambda _state: True),

@@ -71,9 +71,8 @@ def collect_keys(scenario: LoadedScenario, include_section_of: str = "") -> dict
 
     key_by_name: dict[str, ScenarioKey] = {}
     for key in _iter_struct_keys(RunConfig, values, ""):
-        if (
-            key.name in key_by_name
-        ):  # several kinds of one table, such as obstacles of several shapes, share a key
+        # Several kinds of one table, such as obstacles of several shapes, share a key.
+        if key.name in key_by_name:
             key_by_name[key.name] = _merge_duplicate_keys(key_by_name[key.name], key)
         else:
             key_by_name[key.name] = key

@@ -65,9 +65,8 @@ class DynamixelServos(SerialServos[DynamixelServo, DynamixelPacket]):
         servo.alert = status.alert
         if not status.alert:
             servo.errors = 0
-        if (
-            not servo.is_torque_requested
-        ):  # it may have restarted, and lost count of its revolutions
+        # It may have restarted, and lost count of its revolutions.
+        if not servo.is_torque_requested:
             turns = registers.find_whole_turns(
                 angle_rad, servo.lower_rad, servo.upper_rad, SLACK_RAD
             )

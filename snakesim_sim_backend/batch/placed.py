@@ -79,9 +79,8 @@ def create_settled_robot(config: RunConfig) -> PlacedRobot:
     # Disable MuJoCo's sensors: the model defines only IMUs, which environments do not read.
     sim.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     contact_plugin_state = None
-    if (
-        sim.laws == "c"
-    ):  # the C version of the laws is a plugin of MuJoCo, which writes the contacts into its state
+    # The C version of the laws is a plugin of MuJoCo, which writes the contacts into its state.
+    if sim.laws == "c":
         contact_plugin_state = data.plugin_state[find_contact_slice(sim.model)]
     return PlacedRobot(
         config=config,

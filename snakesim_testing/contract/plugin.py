@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 
-if (
-    TYPE_CHECKING
-):  # nothing else of SnakeSIM is imported before it is used: every pytest run loads this module
+# Nothing else of SnakeSIM is imported before it is used: every pytest run loads this module.
+if TYPE_CHECKING:
     from snakesim_hal.wire.messages import JointMode
     from snakesim_testing.contract.bench import Bench, EmulatedDrives
     from snakesim_testing.contract.loopback import HostedBackend

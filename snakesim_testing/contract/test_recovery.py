@@ -132,9 +132,8 @@ def assert_recovers_by_reset_alone(rig: BackendRig, drives: EmulatedDrives) -> N
     assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
     rig.reset()
     assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.DRIVE_RESTART_TIME_S))
-    if (
-        rig.authority.state == "fault"
-    ):  # a fault that was detected again while its cause was still there
+    # A fault that was detected again while its cause was still there.
+    if rig.authority.state == "fault":
         rig.reset()
         assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.DRIVE_RESTART_TIME_S))
     rig.arm_and_move_joint()

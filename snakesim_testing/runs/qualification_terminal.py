@@ -212,7 +212,7 @@ Answer = Callable[[QualificationTerminal, str], str]
 
 
 def answer_truly(terminal: QualificationTerminal, question: str) -> str:
-    """Act and answer as a person does who reads the question and looks at the drive."""
+    """Answer each question as a person would who looks at the drive."""
     bench = terminal.bench
     for action, instruction in INSTRUCTIONS.items():
         if instruction in question:

@@ -254,9 +254,8 @@ class NetworkStranger:
     def recover(self, limit_s: float = TIMEOUT_S) -> None:
         """Have the robot armed and following its controller, whatever happened to it."""
         self.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
-        if (
-            self.lifecycle() == "armed" and self.follows()
-        ):  # the next status may take a fifth of a second
+        # The next status may take a fifth of a second.
+        if self.lifecycle() == "armed" and self.follows():
             return
         deadline = time.monotonic() + limit_s
         last: Any = None

@@ -67,9 +67,8 @@ def test_a2_a_second_answer_is_an_impostor(
     )
     with impostor(routed, "hal/estop" if tool == "estop" else "hal/lifecycle", lies):
         ended = routed.run.run_tool(*arguments)
-    if (
-        tool == "estop" and ended.code == 0
-    ):  # confirmed past the network, by the stop port of a run of this user
+    # Confirmed past the network, by the stop port of a run of this user.
+    if tool == "estop" and ended.code == 0:
         assert operator.next("hal/clock")["lifecycle"] == "estop", ended.printed
         return
     assert ended.code == 1, (

@@ -73,9 +73,8 @@ def test_a4_the_command_stops_the_robot_under(
     )
     assert took_s < COMMAND_S, ended.printed
     assert "nobody listens" not in ended.printed, ended.printed
-    if (
-        name not in SHUTS
-    ):  # there the robot is stopped, and the tool may have had no status to confirm it by
+    # There the robot is stopped, and the tool may have had no status to confirm it by.
+    if name not in SHUTS:
         assert ended.code == 0 and "planar13: stopped" in ended.printed, ended.printed
 
 

@@ -125,9 +125,8 @@ def test_and_that_of_five_processes(tmp_path: Path, computer: str) -> None:
     ended = run(
         tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer]
     )
-    if (
-        " is gone: " in ended.out
-    ):  # a computer that stands for seconds loses a process, and the run is no whole one
+    # A computer that stands for seconds loses a process, and the run is no whole one.
+    if " is gone: " in ended.out:
         ended = run(
             tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer]
         )

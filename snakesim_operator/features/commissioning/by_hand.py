@@ -262,9 +262,8 @@ def calibrate_directions(path: Path, selection: RobotSelection, names: Sequence[
             turn = _wait_for_hand_turn(robot, joint, instruction)
             if turn is None:
                 unknown_joints.append(joint.name)
-            elif (
-                turn.angle_rad > 0
-            ):  # the person turned it in the positive direction, so the sign in the file is right
+            elif turn.angle_rad > 0:
+                # The person turned it in the positive direction, so the sign in the file is right.
                 print_line(f"  {turn.angle_rad:+.2f} rad: matches the file")
             else:
                 print_line(f"  {turn.angle_rad:+.2f} rad: mounted the other way round")

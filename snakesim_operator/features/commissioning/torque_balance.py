@@ -97,9 +97,8 @@ def fit_torque_balance(
     is_slow_tick = is_slow(record.velocity_rad_s, SLOW_RAD_S, MAX_SLOW_FRACTION)
     is_used = ~is_slow_tick & record.is_below_torque_limit()[HALF_WINDOW_TICKS:-HALF_WINDOW_TICKS]
     fitted_torque_nm = torque_nm[is_used]
-    if (
-        not fit_scale
-    ):  # the load is the last column; with a known scale it is subtracted from the torque
+    # The load is the last column; with a known scale it is subtracted from the torque.
+    if not fit_scale:
         regressors = regressors[:, :-1]
         instruments = instruments[:, :-1]
         fitted_torque_nm = fitted_torque_nm - load_nm[is_used]

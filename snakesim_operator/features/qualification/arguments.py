@@ -76,9 +76,8 @@ def _qualify(arguments: argparse.Namespace) -> int:
     extras.require_extra("lab", "snakesim drive qualify")
     from snakesim_operator.features.qualification.command import qualify
 
-    with (
-        tolerate_failed_output()
-    ):  # a terminal that is gone must not keep the command from stopping
+    # A terminal that is gone must not keep the command from stopping.
+    with tolerate_failed_output():
         return qualify(arguments)
 
 

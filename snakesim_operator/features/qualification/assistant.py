@@ -172,9 +172,8 @@ class EmulatedBench(Assistant):
 
     def perform(self, action: Action) -> int | None:
         text = TYPED_FAULTS.get(action)
-        if (
-            text is None
-        ):  # "block" is friction of the emulated joint, and "close_relay" is part of the restart
+        # "block" is friction of the emulated joint, and "close_relay" is part of the restart.
+        if text is None:
             return time.monotonic_ns()
         acted_ns = self._drive.type_fault(text)
         if text.startswith("reboot"):

@@ -59,7 +59,7 @@ class CommandThread:
             plan: First motion once the robot is armed.
             center_rad: Angle from which offsets count; None: the first angle that is measured.
         """
-        self._link = connection
+        self._connection = connection
         self._robot = robot
         self._thread = threading.Thread(target=self._run, name="qualification", daemon=True)
         self._stop_event = threading.Event()
@@ -106,7 +106,7 @@ class CommandThread:
 
     def _run(self) -> None:
         try:
-            with open_session(self._link, CONNECT_TIMEOUT_S) as session:
+            with open_session(self._connection, CONNECT_TIMEOUT_S) as session:
                 client = CommandingClient(session, self._robot, "realtime")
                 while not self._stop_event.is_set():
                     self._command(client, client.wait_for_tick())

@@ -71,7 +71,7 @@ class Rig:
         self.typed_firmware = typed_firmware
         self._folder = folder
         self._endpoint = f"tcp/127.0.0.1:{find_free_port()}"
-        self._link = ConnectionSettings(self._endpoint, setup.config.robot.name)
+        self._connection = ConnectionSettings(self._endpoint, setup.config.robot.name)
         self._host: ChildProcess | None = None
         self._is_frozen = False
         self._center_rad: float | None = None  # angle of the joint at the very start
@@ -120,7 +120,7 @@ class Rig:
         self._status_reader = session.declare_latched_reader(keys.STATUS, RobotStatus)
         joint = self._robot.joints[0]
         plan = MotionPlan(joint.torque_limit_nm)
-        self._commands = CommandThread(self._link, self._robot, plan, self._center_rad)
+        self._commands = CommandThread(self._connection, self._robot, plan, self._center_rad)
         self._commands.start()
 
     def _connect(self) -> Session:
@@ -134,7 +134,7 @@ class Rig:
                     ending, *self._host.output.last_lines()[-5:], code="robot/not-running"
                 )
             try:
-                return self._exit_stack.enter_context(open_session(self._link, 0.5))
+                return self._exit_stack.enter_context(open_session(self._connection, 0.5))
             except NotConnectedError:
                 if time.monotonic() > deadline_s:
                     raise

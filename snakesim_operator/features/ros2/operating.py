@@ -87,12 +87,14 @@ class _RobotOperator:
 
     def __init__(self, session: Session, connection: ConnectionSettings) -> None:
         self._session = session
-        self._link = connection
+        self._connection = connection
 
     def stop(self) -> str:
         """Stop the robot by `snakesim estop`. Raises RefusedError if the robot does not confirm it."""
         lines: list[str] = []
-        robot = RobotSelection(self._link.endpoint, self._link.namespace, self._link.session)
+        robot = RobotSelection(
+            self._connection.endpoint, self._connection.namespace, self._connection.session
+        )
         exit_code = stop_robots(robot, lines.append)
         if exit_code != 0:
             raise RefusedError(*lines)
@@ -105,7 +107,7 @@ class _RobotOperator:
         )
         if robot is None:
             raise NotConnectedError(
-                f"{self._link.namespace} publishes no description; is its HAL host running?",
+                f"{self._connection.namespace} publishes no description; is its HAL host running?",
                 code="network/no-robot",
             )
         # If it does not become ready, the host's answer to the request gives the reason.
@@ -128,5 +130,7 @@ class _RobotOperator:
 
     def _send_lifecycle_request(self, request: LifecycleRequest, done: str) -> str:
         lines: list[str] = []
-        request_from_host(self._session, keys.LIFECYCLE, request, done, self._link, lines.append)
+        request_from_host(
+            self._session, keys.LIFECYCLE, request, done, self._connection, lines.append
+        )
         return "; ".join(lines)

@@ -72,9 +72,8 @@ class HeadingEffort:
 class DisplacementMetrics:
     """Speed, energy use and slip along the net displacement of the center of mass, for every gait."""
 
-    displacement_m_s: float | None = (
-        None  # speed: length of the displacement over the time that it took
-    )
+    # Speed: length of the displacement over the time that it took.
+    displacement_m_s: float | None = None
     displacement_bearing_rad: float | None = None  # from the first heading; left is positive
     displacement_energy_j_per_m: float | None = None
     displacement_body_lengths_s: float | None = None

@@ -155,9 +155,8 @@ def _describe_motion(
         return reported
     is_stationary = stop_intervals.is_stationary_at(time_s)
     measured = STATIONARY_LABEL if is_stationary else MOVING_LABEL
-    if (
-        state is None or state.reason == STANDING_STILL
-    ):  # measured by control over a preceding window
+    # Measured by control over a preceding window.
+    if state is None or state.reason == STANDING_STILL:
         return measured
     reports_stationary = state.state != "Locomoting"
     if is_stationary == reports_stationary:

@@ -31,9 +31,8 @@ MAX_OBSTACLES = 24  # with a row of their own: those with the largest impulse
 MIN_FORCE_N = 0.5  # a smaller desired force is ignored
 MIN_STOP_S = 0.5  # a shorter stop is not listed
 MAX_STOPS = 40
-MAX_MERGED_GAP_S = (
-    1e-6  # intervals with a smaller gap between them are adjacent: it is a rounding error
-)
+# Intervals with a smaller gap between them are adjacent: it is a rounding error.
+MAX_MERGED_GAP_S = 1e-6
 MAX_MAPS_SCORED = 60
 MIN_BODY_DISTANCE_M = 1e-9  # from tail to head; avoids a division by zero
 

@@ -98,7 +98,7 @@ class TeleopLoop:
             stick: The joystick. None if there is none.
         """
         # The operator.
-        self._link = connection
+        self._connection = connection
         self._keyboard = keyboard
         self._stick = stick
         self._user = f"{get_user_name()[:40]}, teleop {os.getpid()}"  # with the process id: one user may run two
@@ -160,7 +160,7 @@ class TeleopLoop:
         self._stop_robot_at_end()
         with contextlib.suppress(OSError):  # the terminal may be gone
             print_line(
-                f"teleop ended: {self._end_reason}; {self._link.namespace} gets no more requests"
+                f"teleop ended: {self._end_reason}; {self._connection.namespace} gets no more requests"
             )
         return 1 if self._is_input_lost() else 0
 
@@ -311,11 +311,9 @@ class TeleopLoop:
     def _describe_status(self) -> str:
         status = self._status
         if status is None:
-            return f"{self._link.namespace}: no status yet"
+            return f"{self._connection.namespace}: no status yet"
         age = _describe_age_if_old(self._status_arrival_s)
-        return (
-            f"{self._link.namespace} ({status.backend}): {status.lifecycle}{age}: {status.reason}"
-        )
+        return f"{self._connection.namespace} ({status.backend}): {status.lifecycle}{age}: {status.reason}"
 
     def _describe_control(self) -> str:
         control = self._control_state

@@ -104,9 +104,8 @@ def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
         "--set",
         "rate_hz=50",
     ]
-    if (
-        clock_mode == "free"
-    ):  # the host waits for nothing, so a recorder that joins late misses ticks
+    # The host waits for nothing, so a recorder that joins late misses ticks.
+    if clock_mode == "free":
         arguments.append("--no-record")
     ended, summary = run_to_summary(tmp_path / "run", *arguments)
     assert summary.clock_mode == clock_mode

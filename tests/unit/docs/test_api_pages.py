@@ -35,9 +35,8 @@ def test_internal_names_exist() -> None:
 )
 def test_the_example_is_valid_python(page: Page) -> None:
     compile(page.example, page.file, "exec")
-    if (
-        "snakesim.run" not in page.example and "gymnasium" not in page.example
-    ):  # tests of runs are elsewhere
+    # Tests of runs are elsewhere.
+    if "snakesim.run" not in page.example and "gymnasium" not in page.example:
         exec(page.example, {"__name__": "example"})
 
 

@@ -37,9 +37,8 @@ def test_blind_controller_without_push_holds_and_continues_without_jump(plugin, 
     angles = np.array(stage.make_observation(0, TAIL_S_M).joints.angle_rad)
     assert np.abs(np.diff(targets, axis=0)).max() < STEP_RAD
     assert np.abs(targets[-1] - targets[-100]).max() < 2e-3  # it stays
-    if (
-        pushing
-    ):  # what the joint pushed with has faded, and is not kept up by a position target far away
+    # What the joint pushed with has faded, and is not kept up by a position target far away.
+    if pushing:
         turn = before.setpoints.mode.index(JointMode.TORQUE)
         stiffness = stage.robot.joints[turn].stiffness_nm_per_rad
         assert abs(targets[0, turn] - angles[turn]) * stiffness == pytest.approx(TORQUE_NM, rel=0.2)

@@ -56,9 +56,8 @@ def test_terminal_streams_are_never_written_directly() -> None:
     for package in REPOSITORY.glob("snakesim*"):
         for path in package.rglob("*.py"):
             text = path.read_text(encoding="utf-8")
-            if (
-                ".stdout.write" not in text and ".stderr.write" not in text
-            ):  # parsing all files takes seconds
+            # Parsing all files takes seconds.
+            if ".stdout.write" not in text and ".stderr.write" not in text:
                 continue
             for node in ast.walk(ast.parse(text)):
                 if isinstance(node, ast.Attribute) and node.attr in ("write", "writelines"):

@@ -167,9 +167,8 @@ class FrontServer:
             return False
         if request.path == STOP_PATH:
             return await self._answer_stop_request(request.method, writer)
-        if (
-            not request.path and not request.is_websocket
-        ):  # relative addresses in the page need the slash
+        # Relative addresses in the page need the slash.
+        if not request.path and not request.is_websocket:
             _write_response(writer, 308, "", f"Location: /{self._token}/\r\n")
             return False
         await self._relay_request(request, reader, writer)

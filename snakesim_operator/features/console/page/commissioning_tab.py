@@ -107,9 +107,8 @@ class CommissioningTab:
                 "jog moves one joint: give its number", code="commissioning/not-possible"
             )
         joint_names: list[str] = []
-        if (
-            joint_name is not None and step_name != "zero"
-        ):  # the zeros of all joints are calibrated together
+        # The zeros of all joints are calibrated together.
+        if joint_name is not None and step_name != "zero":
             joint_names.append(joint_name)
         with self._lock:
             if self._step is not None and self._step.is_running:

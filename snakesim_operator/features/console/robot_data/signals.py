@@ -105,9 +105,8 @@ class LiveSignals:
         numbers = collect_signal_values(snapshot)
         values = np.fromiter(numbers.values.values(), dtype=float, count=len(numbers.values))
         with self._lock:
-            if (
-                self._samples and time_s < self._samples[-1].time_s
-            ):  # the robot was reset, or is another one
+            # The robot was reset, or is another one.
+            if self._samples and time_s < self._samples[-1].time_s:
                 self._samples.clear()
                 self._units.clear()
             self._units |= numbers.units
