@@ -88,7 +88,7 @@ def ours(
     p50, p99 = (record.state_to_command_us[name] for name in ("p50", "p99"))
     if record.ended != "complete" or p50 is None or p99 is None:
         raise RuntimeError(
-            f"stopped after {record.armed_ticks * PERIOD_S:.1f} s: {record.ended_why}"
+            f"stopped after {record.armed_ticks * PERIOD_S:.1f} s: {record.ending_reason}"
         )
     return p50, p99
 

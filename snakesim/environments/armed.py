@@ -219,7 +219,7 @@ class ArmedRobots:
                 not change afterwards.
             active: Which robots take part, (robots,). They must be armed. The array must not change afterwards, either.
         """
-        # The masks are cached: all arrays are replaced, not changed, so that their identity tells whether they are new.
+        # The masks are cached: all arrays are replaced, not changed, so that their identity shows whether they are new.
         if (
             active is not self._active_at_last_call
             or self._is_vectorized is not self._vectorized_at_last_call

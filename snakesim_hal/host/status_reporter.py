@@ -84,10 +84,10 @@ class StatusReporter:
             state.backend_time.describe_slowness() if clock.clock_mode == "realtime" else []
         )
 
-        why = authority.reason
+        reason = authority.reason
         if authority.state == "disarmed" and (refusals or missing or differing):
             waits = self._readiness.describe_missing(missing)
-            why = "; ".join([why, *slow_backend, *differing, *waits, *refusals])[:500]
+            reason = "; ".join([reason, *slow_backend, *differing, *waits, *refusals])[:500]
 
         return RobotStatus(
             # The robot and its time.
@@ -103,7 +103,7 @@ class StatusReporter:
             real_time_factor=simulated.real_time_factor,
             # The lifecycle.
             lifecycle=authority.state,
-            reason=why,
+            reason=reason,
             ready_to_arm=not refusals and not missing and not differing,
             unchecked=authority.unchecked_reason[:500],
             derated=authority.derated_joints,

@@ -186,9 +186,9 @@ def _parse_plugin_file(name: str, kind: str) -> tuple[Path, str, ast.Module]:
         path = expand_home(path_text).absolute()
         tree = ast.parse(read_bytes(path), str(path))
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        why = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
+        reason = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
         raise ConfigError(
-            f"{kind} {shorten(name)!r} cannot be loaded: {why}", code="plugin/not-loadable"
+            f"{kind} {shorten(name)!r} cannot be loaded: {reason}", code="plugin/not-loadable"
         ) from None
     if not attribute:
         raise _make_missing_class_error(name, kind, tree)

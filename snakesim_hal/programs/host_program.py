@@ -264,7 +264,7 @@ def create_host_record(host: Host, *, lost_ticks: int = 0, failure: str = "") ->
         lifecycle=authority.state,
         reason=authority.reason,
         ended=host.ending_status,
-        ended_why=host.ending_reason,
+        ending_reason=host.ending_reason,
         lost_ticks=lost_ticks,
         failure=failure,
         injected=list(host.faults.notes),

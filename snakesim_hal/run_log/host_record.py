@@ -31,7 +31,7 @@ class HostRecord(msgspec.Struct, frozen=True, kw_only=True):
     lifecycle: str
     reason: str
     ended: Ending = "complete"
-    ended_why: str = ""  # unless complete
+    ending_reason: str = ""  # unless complete
     lost_ticks: int = 0  # missing from the black box on disk
     failure: str = ""  # which files could not be written, and why
     faults_left_out: int = 0  # of `faults`, in the middle

@@ -171,7 +171,7 @@ def _record_robot_or_demonstrations(arguments: argparse.Namespace) -> int:
         foxglove_origins=arguments.foxglove_origin,
         raw_only=arguments.raw_only,
         stamps=arguments.stamps
-        or "robot",  # no default in argparse: None tells that --stamps was not given
+        or "robot",  # no default in argparse: None means that --stamps was not given
     )
 
 

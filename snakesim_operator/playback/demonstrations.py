@@ -36,7 +36,7 @@ class EpisodeLabel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     file: str  # name of the recording in the same folder
     task: str
     success: bool
-    who: str
+    recorded_by: str
     began: str  # UTC
 
 
@@ -161,7 +161,7 @@ class _DemonstrationRecorder:
                 file=path.name,
                 task=self._task,
                 success=success,
-                who=get_user_name(),
+                recorded_by=get_user_name(),
                 began=start_time_utc,
             )
             self._append_label(label)

@@ -386,7 +386,7 @@ class RecordingContents:
             lifecycle=status.lifecycle,
             reason=status.reason,
             ended="finished",
-            ended_why="as far as it was recorded",
+            ending_reason="as far as it was recorded",
             isolated=status.isolated,
         )
 

@@ -12,17 +12,18 @@ UNKNOWN_PREFIX = "unknown: "  # prefix of a sentence that explains why the endin
 def describe_early_end(host: HostRecord, config: RunConfig) -> str:
     """Describe by the statistics of the host why a run was not complete. Returns an empty text if it was complete."""
     progress = f"after {host.armed_ticks / config.rate_hz:.1f} of {config.duration_s:g} s"
+    reached_goal = host.ending_reason.endswith(GOAL_REQUESTER)
     match host.ended:
         case "complete":
             return ""
         case "running":
-            return f"the record ends {progress}, and may lack the last second"
-        case "finished" if config.mission.until_goal and host.ended_why.endswith(GOAL_REQUESTER):
+            return f"the record ends {progress}, and the last second may be missing"
+        case "finished" if config.mission.until_goal and reached_goal:
             return ""
         case "stopped" | "finished":
-            return f"the host was {host.ended} {host.ended_why} {progress}"
+            return f"the host was {host.ended} {host.ending_reason} {progress}"
         case _:
-            return f"the run ended {progress}: {host.ended_why}"
+            return f"the run ended {progress}: {host.ending_reason}"
 
 
 def describe_recorded_end(

@@ -104,7 +104,7 @@ def make_servo(joint: Joint, port: DynamixelPort, settings: DynamixelSettings) -
 def get_torque_constant(joint: Joint, model: EmulatedModel) -> float:
     """Return a joint's torque constant in N·m/A.
 
-    Without one, which only emulated servos may lack, it is such that half of the possible current gives full torque.
+    Without one, which only emulated servos allow, it is such that half of the possible current gives full torque.
     """
     max_a = MAX_CURRENT * model.current_a / 2
     return joint.motor.torque_constant_nm_per_a or joint.limits.torque_nm / joint.drive.gear / max_a

@@ -94,7 +94,7 @@ def make_servo(joint: Joint, port: FeetechPort, settings: FeetechSettings) -> Fe
 
 
 def get_stall_torque_nm(joint: Joint, settings: FeetechSettings) -> float:
-    """Return the stall torque of a joint's servo. Without a setting, which only emulated servos may lack, the joint's.
+    """Return the stall torque of a joint's servo. Without a setting, which only emulated servos allow, the joint's.
 
     It is a little more than the joint demands, because the torque limit is rounded down.
     """

@@ -117,10 +117,10 @@ def measure_case(scenario: str, label: str, controller: Any, **options: Any) -> 
         options: Changes of the scenario, by key.
     """
     result, forces = run_and_measure_forces(scenario, controller, **options)
-    metres, joules = result.summary.advance_m or 0.0, result.summary.energy_j_per_m
+    distance_m, joules = result.summary.advance_m or 0.0, result.summary.energy_j_per_m
     impulse_ns = STEP_S * sum(float(force.sum()) for force in forces.values())
-    per_m = f"{joules:.1f} | {impulse_ns / metres:.0f}" if joules is not None else "- | -"
-    return metres, f"| `{scenario}` | {label} | {metres:.2f} | {per_m} |"
+    per_m = f"{joules:.1f} | {impulse_ns / distance_m:.0f}" if joules is not None else "- | -"
+    return distance_m, f"| `{scenario}` | {label} | {distance_m:.2f} | {per_m} |"
 
 
 def iter_cases(scenario: str) -> Iterator[str]:

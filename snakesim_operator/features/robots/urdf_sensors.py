@@ -22,8 +22,8 @@ from snakesim_operator.features.robots.xml_tree import XmlElement
 SECTION_BY_SENSOR_TYPE = {"imu": "imu", "contact": "contacts"}
 DEPTH_SENSOR_TYPES = ("depth", "depth_camera", "rgbd_camera")
 RANGE_SENSOR_TYPES = ("ray", "gpu_ray", "lidar", "gpu_lidar")
-DEFAULT_BEAMS = "one beam"  # of a lidar without <horizontal>, as the report of the import says it
-# Of a lidar without <range>, as the report of the import says it.
+DEFAULT_BEAMS = "one beam"  # of a lidar without <horizontal>, as the report of the import names it
+# Of a lidar without <range>, as the report of the import names it.
 DEFAULT_LIDAR_RANGE = "0.02 to 5 m"
 MAX_ROLL_RAD = 0.01  # about the viewing direction; more is reported
 POSE_DIGITS = 9  # decimals, which removes the noise of multiplying transforms

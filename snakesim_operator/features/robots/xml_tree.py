@@ -128,13 +128,13 @@ class XmlElement:
             )
         return numbers
 
-    def make_error(self, why: str) -> ConfigError:
-        """Make an error about this element. `why` is the rest of a sentence that begins with the element's tag."""
+    def make_error(self, reason: str) -> ConfigError:
+        """Make an error about this element. `reason` is the rest of a sentence that begins with the element's tag."""
         name = ""
         if "name" in self.attributes:
             name = f" name={shorten(self.attributes['name'])!r}"
         return ConfigError(
-            f"{self.source}, line {self.line}: <{self.tag}{name}> {why}", code="urdf/invalid"
+            f"{self.source}, line {self.line}: <{self.tag}{name}> {reason}", code="urdf/invalid"
         )
 
     def mark_all_as_read(self) -> None:

@@ -158,41 +158,41 @@ class MessageConverter:
             message = self._decoders[recorded.key].decode(recorded.payload, recorded.encoding)
         except WireError:
             return []
-        stamp_ns = (
+        timestamp_ns = (
             recorded.wall_time_ns
             if self._wall_time
             else getattr(message, "timestamp_ns", recorded.robot_time_ns)
         )
         if isinstance(message, m.RobotDescription):
-            return self._use_robot(message, stamp_ns)
+            return self._use_robot(message, timestamp_ns)
         robot = self._robot
         frames = self._frames
         if robot is None or frames is None or find_mismatch(message, robot) is not None:
             return []
         match message:
             case m.JointState():
-                return self._convert_joints(message, robot, frames, stamp_ns)
+                return self._convert_joints(message, robot, frames, timestamp_ns)
             case m.Pose():
                 transforms = [frames.make_base_transform(message)]
-                return [("/tf", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, transforms))]
+                return [("/tf", ros.TRANSFORMS, ros.encode_transforms(timestamp_ns, transforms))]
             case m.Contacts():
-                return _convert_contacts(message, robot, frames, stamp_ns)
+                return _convert_contacts(message, robot, frames, timestamp_ns)
             case m.Imu():
-                return self._convert_imus(message, frames, stamp_ns)
+                return self._convert_imus(message, frames, timestamp_ns)
             case m.RobotStatus():
                 return [
                     (
                         "/diagnostics",
                         ros.DIAGNOSTICS,
-                        robot_in_ros.encode_diagnostics(stamp_ns, message),
+                        robot_in_ros.encode_diagnostics(timestamp_ns, message),
                     )
                 ]
             case m.Clock() if not self._wall_time:
-                return [("/clock", ros.CLOCK, ros.encode_clock(stamp_ns))]
+                return [("/clock", ros.CLOCK, ros.encode_clock(timestamp_ns))]
             case _:
                 return []
 
-    def _use_robot(self, robot: m.RobotDescription, stamp_ns: int) -> list[BagMessage]:
+    def _use_robot(self, robot: m.RobotDescription, timestamp_ns: int) -> list[BagMessage]:
         """Use this description from now on, and return it as URDF with the fixed frames."""
         if len(robot.links) != len(robot.joints) + 1:
             return []
@@ -200,11 +200,15 @@ class MessageConverter:
         self._frames = RobotFrames(robot)
         return [
             ("/robot_description", ros.STRING, ros.encode_string(make_urdf(robot))),
-            ("/tf_static", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, self._frames.fixed)),
+            ("/tf_static", ros.TRANSFORMS, ros.encode_transforms(timestamp_ns, self._frames.fixed)),
         ]
 
     def _convert_joints(
-        self, joints: m.JointState, robot: m.RobotDescription, frames: RobotFrames, stamp_ns: int
+        self,
+        joints: m.JointState,
+        robot: m.RobotDescription,
+        frames: RobotFrames,
+        timestamp_ns: int,
     ) -> list[BagMessage]:
         names = [joint.name for joint in robot.joints]
         transforms = frames.make_joint_transforms(joints)
@@ -212,12 +216,14 @@ class MessageConverter:
             (
                 "/joint_states",
                 ros.JOINT_STATE,
-                robot_in_ros.encode_joint_state(stamp_ns, names, joints),
+                robot_in_ros.encode_joint_state(timestamp_ns, names, joints),
             ),
-            ("/tf", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, transforms)),
+            ("/tf", ros.TRANSFORMS, ros.encode_transforms(timestamp_ns, transforms)),
         ]
 
-    def _convert_imus(self, imus: m.Imu, frames: RobotFrames, stamp_ns: int) -> list[BagMessage]:
+    def _convert_imus(
+        self, imus: m.Imu, frames: RobotFrames, timestamp_ns: int
+    ) -> list[BagMessage]:
         """Return a message for each IMU, and its frame with the first one."""
         outputs: list[BagMessage] = []
         for entry, link in enumerate(imus.link):
@@ -225,20 +231,20 @@ class MessageConverter:
                 self._known_imu_links.add(link)
                 transforms = [frames.make_imu_transform(link)]
                 outputs.append(
-                    ("/tf_static", ros.TRANSFORMS, ros.encode_transforms(stamp_ns, transforms))
+                    ("/tf_static", ros.TRANSFORMS, ros.encode_transforms(timestamp_ns, transforms))
                 )
             topic = f"/{make_ros_name(frames.get_link_frame(link))}/imu"
-            data = robot_in_ros.encode_imu(stamp_ns, frames.get_imu_frame(link), imus, entry)
+            data = robot_in_ros.encode_imu(timestamp_ns, frames.get_imu_frame(link), imus, entry)
             outputs.append((topic, ros.IMU, data))
         return outputs
 
 
 def _convert_contacts(
-    contacts: m.Contacts, robot: m.RobotDescription, frames: RobotFrames, stamp_ns: int
+    contacts: m.Contacts, robot: m.RobotDescription, frames: RobotFrames, timestamp_ns: int
 ) -> list[BagMessage]:
     """Return a wrench for each link."""
     link_frames = [frames.get_link_frame(link) for link in range(len(robot.links))]
-    wrenches = encode_wrenches(stamp_ns, link_frames, contacts)
+    wrenches = encode_wrenches(timestamp_ns, link_frames, contacts)
     return [
         (f"/{make_ros_name(link.name)}/contact", ros.WRENCH, data)
         for link, data in zip(robot.links, wrenches, strict=True)

@@ -99,10 +99,10 @@ def render_report(record: RunRecord, summary: RunSummary) -> str:
         propelled=len(propelling_joints),
         begin_s=get_time_origin_s(record),
         # Explanations of numbers that are not good.
-        why_empty=explain_push_points_without_contact(record),
-        why_at_limit=explain_torque_limit(record),
-        why_late=explain_late_commands(summary),
-        why_refused=explain_refused_commands(summary),
+        empty_reason=explain_push_points_without_contact(record),
+        at_limit_reason=explain_torque_limit(record),
+        late_reason=explain_late_commands(summary),
+        refused_reason=explain_refused_commands(summary),
         # Lists and tables.
         tick_times=TICK_TIMES,
         first_faults=len(summary.faults)

@@ -75,7 +75,7 @@ def test_record_of_killed_host_misses_only_the_last_second(tmp_path: Path) -> No
         assert run.end() == 1, run.printed()
         said = run.printed()
     assert "host was ended by SIGKILL" in said
-    assert "may lack the last second" in said
+    assert "the last second may be missing" in said
     assert "Traceback" not in said
     record, summary = RunRecord.load(tmp_path / "run"), read_summary(tmp_path / "run")
     assert round(record.time_s[-1] * RATE_HZ) > tick - RATE_HZ

@@ -129,12 +129,12 @@ def _list_alarms(snapshot: RobotSnapshot) -> list[str]:
     return lines
 
 
-def _format_state(word: str, color: str, why: str, margin_top: str) -> str:
+def _format_state(word: str, color: str, reason: str, margin_top: str) -> str:
     """Format a state as a word on a color, with the reason next to it. `margin_top` is a CSS length."""
     return (
         f"<div style='display:flex;gap:.5em;align-items:baseline;margin-top:{margin_top}'>"
         f"<span style='background:{color};color:#fff;border-radius:4px;padding:.05em .5em;font-weight:600;"
-        f"white-space:nowrap'>{escape_text(word)}</span><span>{escape_text(why)}</span></div>"
+        f"white-space:nowrap'>{escape_text(word)}</span><span>{escape_text(reason)}</span></div>"
     )
 
 

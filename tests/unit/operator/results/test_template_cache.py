@@ -18,8 +18,9 @@ def render(folder: Path, options: str = "same") -> str:
 
 
 @pytest.fixture
-def compiled(tmp_path: Path) -> Path:
+def compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The compiled form of a template that was rendered once."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)  # whatever PYTHONDONTWRITEBYTECODE is
     (tmp_path / "page.html").write_text("first {{ value }}")
     assert render(tmp_path) == "first 7"
     return Path(importlib.util.cache_from_source(str(tmp_path / "page.html.py")))
