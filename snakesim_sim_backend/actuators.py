@@ -3,7 +3,7 @@
 Each joint has a `dcmotor` with motor constant 1, so that its current is its torque. At every physics step
 
     demand = kp (position - angle) + kd (velocity - speed) + feed-forward       the mode chooses the gains
-    demand is limited by the line that falls from `roll_off` times full torque at rest to 0 at the speed limit
+    demand is limited by the line that falls from the roll-off times full torque at rest to 0 at the speed limit
     torque follows the demand as a first-order lag of `response_time_s`, integrated exactly
     torque is clipped to the command's limit and the joint's derated one
 

@@ -1,4 +1,4 @@
-"""Docstrings that name a member of one of our classes name one that exists, also after a renaming."""
+"""What docstrings name exists, also after a renaming: members of our classes, and constants."""
 
 import ast
 import re
@@ -7,6 +7,16 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[1]
 MEMBER = re.compile(r"`(?:\w+\.)*([A-Z]\w+)\.(\w+)(?:\([^`]*\))?`")
+CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]*[A-Z]\b")
+CODE_SUFFIXES = (".py", ".c", ".h", ".toml", ".dbc", ".js", ".html")
+EXTERNAL_CONSTANTS = {
+    "CAP_SYS_TIME",
+    "MFD_CLOEXEC",
+    "PCAN_USBBUS1",
+    "PIPE_BUF",
+    "XDG_STATE_HOME",
+}
+PLACEHOLDERS = {"C_N", "C_L", "RUN_A", "RUN_B"}  # of equations and command lines
 
 
 def shipped_trees() -> dict[str, ast.Module]:
@@ -63,3 +73,29 @@ def test_members_that_docstrings_name_exist() -> None:
                     missing.append(f"{path}: {owner}.{name}")
     assert checked > 20
     assert not missing
+
+
+def names_in_code() -> set[str]:
+    """Return every capitalized name in code, strings and comments of the product, without docstrings."""
+    names: set[str] = set()
+    for folder in ("snakesim*", "schemas", "deploy"):
+        for path in REPOSITORY.glob(f"{folder}/**/*"):
+            if path.suffix not in CODE_SUFFIXES or "vendor" in path.parts:
+                continue
+            text = path.read_text(encoding="utf-8", errors="replace")
+            if path.suffix == ".py":
+                text = re.sub(r'""".*?"""', "", text, flags=re.DOTALL)
+            names.update(re.findall(r"\b[A-Z]\w+\b", text))
+    return names
+
+
+def test_constants_that_docstrings_name_exist() -> None:
+    known = names_in_code() | EXTERNAL_CONSTANTS | PLACEHOLDERS
+    named = [
+        (path, name)
+        for path, tree in shipped_trees().items()
+        for text in docstrings(tree)
+        for name in CONSTANT.findall(text)
+    ]
+    assert len(named) > 50
+    assert not [f"{path}: {name}" for path, name in named if name not in known]

@@ -97,7 +97,7 @@ class EnvironmentSetup:
         vector. Otherwise the space is a dict of the parts.
 
         Args:
-            observe: Names of the parts of an observation. None takes the default parts of `select_parts`.
+            observe: Names of the parts of an observation. None takes the default parts of `select_observation_parts`.
             flat: Whether an observation is one vector instead of a dict.
         """
         self.action_space = _make_box(self.commands.low, self.commands.high)

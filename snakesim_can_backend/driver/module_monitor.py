@@ -80,7 +80,7 @@ class ModuleMonitor:
     def reset(self, sync: int) -> None:
         """Report persistent findings again, because the robot's fault was reset at this Sync.
 
-        The modules get CLEAR_GRACE Syncs to follow the clear.
+        The modules get CLEAR_GRACE_SYNCS Syncs to follow the clear.
         """
         self._reported_findings.reset()
         self._restarted_joints.clear()
@@ -288,7 +288,7 @@ class ModuleMonitor:
         """Return whether a module has restarted, once for every restart.
 
         A second module with the same id also makes the uptime decrease, but then every Sync is answered twice. So the
-        decision waits for IN_A_ROW Syncs.
+        decision waits for MIN_CONSECUTIVE_ERRORS Syncs.
         """
         if module.restarts > self._restart_counts[joint_index]:
             self._restart_counts[joint_index] = module.restarts

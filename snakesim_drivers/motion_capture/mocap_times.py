@@ -99,7 +99,7 @@ class CaptureTimes:
     def _detect_clock_jump(self, timestamp_ns: int, now_ns: int) -> bool:
         """Detect a jump of the other clock after a reading whose timestamps were all rejected.
 
-        A jump is detected after READINGS_TO_BELIEVE such readings in a row whose timestamps are consistent with one
+        A jump is detected after MIN_CONSISTENT_READINGS such readings in a row whose timestamps are consistent with one
         another. Then the new clock offset replaces the old one.
 
         Args:

@@ -1,7 +1,7 @@
 """The net force of the measured contacts on a body, and why a body does not move.
 
 All forces on a stationary body are in balance: the ground friction takes up the sum of the contact forces.
-Forces are means over FORCE_MEAN_S, because the force of one moment depends on how hard the surfaces are
+Forces are means over FORCE_WINDOW_S, because the force of one moment depends on how hard the surfaces are
 (see `measured_force`).
 """
 

@@ -91,7 +91,9 @@ class HostOptions:
     # The robot.
     # Injected ones, as `create_host_faults` returns them; None: requests are refused.
     faults: InjectedFaults | None = None
-    unchecked_reason: str = ""  # why only an explicit word arms it, as `why_unchecked` returns it
+    unchecked_reason: str = (
+        ""  # why only an explicit word arms it, as `find_unchecked_reason` returns it
+    )
     cable_file: CableFile | None = None  # of joints without end stops
 
 

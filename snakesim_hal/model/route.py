@@ -55,7 +55,7 @@ class Route:
         self._min_along_m[0] = -np.inf
         self._max_along_m[-1] = np.inf
 
-        # The same as lists, for `point_at`: Python floats are faster for a single point.
+        # The same as lists, for `compute_point`: Python floats are faster for a single point.
         self._arc_length_list: list[float] = self._arc_lengths_m.tolist()
         self._segment_start_list: list[tuple[float, float]] = [
             (x, y) for x, y in self.points_w.tolist()

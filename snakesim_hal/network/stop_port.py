@@ -236,7 +236,7 @@ def _open_udp_socket(address: Address) -> socket.socket:
 def _repeat_stop_request(
     opened: socket.socket, address: Address, requester: str, timeout_s: float
 ) -> StopAnswer | None:
-    """Send a stop request, and repeat it every REPEAT_S until it is answered.
+    """Send a stop request, and repeat it every REPEAT_PERIOD_S until it is answered.
 
     Args:
         opened: UDP socket of the requester.
@@ -277,7 +277,7 @@ def _repeat_stop_request(
 
 
 def _receive_answer(opened: socket.socket, nonce: bytes) -> StopAnswer | None:
-    """Wait for the answer to the request with this nonce for REPEAT_S. Other datagrams are ignored.
+    """Wait for the answer to the request with this nonce for REPEAT_PERIOD_S. Other datagrams are ignored.
 
     Returns:
         The answer, or None if only other datagrams have arrived.

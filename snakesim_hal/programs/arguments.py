@@ -307,7 +307,7 @@ def add_service_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check_network(arguments: argparse.Namespace) -> None:
-    """Raise ConfigError unless the arguments of `add_network` are valid and do not contradict each other."""
+    """Raise ConfigError unless the arguments of `add_network_arguments` are valid and do not contradict each other."""
     for flag, address in (("--endpoint", arguments.endpoint), ("--router", arguments.router)):
         if address is not None:
             check_endpoint(address, flag)

@@ -103,7 +103,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None,
         _make_quantity_meta(
             "1",
-            "share of the time in which the center of mass moved 2 cm or more within a second, as measured",
+            "fraction of the time in which the center of mass moved 2 cm or more within a second, as measured",
         ),
     ]
     propulsion_joints: Annotated[
@@ -153,7 +153,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
         float | None, _make_quantity_meta("1", "|measured - desired| over desired there, median")
     ]
     empty_push_points: Annotated[
-        float | None, _make_quantity_meta("1", "share of those push-points without contact")
+        float | None, _make_quantity_meta("1", "fraction of those push-points without contact")
     ]
     energy_j: Annotated[
         float | None,
@@ -258,7 +258,7 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
     lateral_slip: Annotated[
         float | None,
-        _make_quantity_meta("1", "share of the links' paths that is across their own axes"),
+        _make_quantity_meta("1", "fraction of the links' paths that is across their own axes"),
     ] = None
     body_lengths_s: Annotated[
         float | None, _make_quantity_meta("1/s", "`advance_m_s` in lengths of the body")
@@ -281,20 +281,21 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     torque_headroom: Annotated[
         float | None,
         _make_quantity_meta(
-            "1", "share of its limit that every joint had left in 95 % of the ticks until then"
+            "1", "fraction of its limit that every joint had left in 95 % of the ticks until then"
         ),
     ] = None
     form_closure: Annotated[
         float | None,
         _make_quantity_meta(
             "1",
-            "share of the time until then in which obstacles within 2 cm would hold a stiff body",
+            "fraction of the time until then in which obstacles within 2 cm would hold a stiff body",
         ),
     ] = None
     planning_fraction: Annotated[
         float | None,
         _make_quantity_meta(
-            "1", "share of navigation's turns until then in which it searched for a path"
+            "1",
+            "fraction of the planning cycles until then in which navigation searched for a path",
         ),
     ] = None
     state_to_command_us: Annotated[

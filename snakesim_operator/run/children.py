@@ -16,7 +16,7 @@ from snakesim_hal.base.workers import start_restarting_thread
 
 STOP_TIMEOUT_S = 5.0  # a child that has not ended by then is killed
 MAX_LINES_SHOWN = 15  # of the output of a child that failed
-OUTPUT_TAIL_BYTES = 16384  # held in memory, more than LINES_SHOWN usually take
+OUTPUT_TAIL_BYTES = 16384  # held in memory, more than MAX_LINES_SHOWN lines usually take
 PIPE_BYTES = 2**20  # holds a child's output while this process is frozen
 READ_BYTES = 65536
 
@@ -61,7 +61,7 @@ class ChildProcess:
     process: subprocess.Popen[bytes]
     output: ProcessOutput
     is_end_requested: bool = False  # by this process, while the child ran
-    was_killed: bool = False  # by this process, because it did not end within STOP_LIMIT_S
+    was_killed: bool = False  # by this process, because it did not end within STOP_TIMEOUT_S
 
     def describe_exit(self) -> str | None:
         """Describe how the process ended, with its last error message; None while it runs."""

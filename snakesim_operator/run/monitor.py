@@ -319,7 +319,7 @@ class RunMonitor:
     def _waits_for_recorder(self) -> bool:
         """Return whether arming waits for the recorder, so that the recording has every tick.
 
-        A recorder that does not connect within RECORDER_LIMIT_S is not waited for.
+        A recorder that does not connect within RECORDER_TIMEOUT_S is not waited for.
         """
         if self._recorder_is_ready or RECORDER in self._supervisor.losses_by_process:
             return False

@@ -245,10 +245,11 @@ class Observer:
                 h.message.sequence is not None for h in self.applied
             )
 
-        self.until(
-            lambda: follows() or self.state() == "fault", "commands applied after arm_session", 5.0
-        )
-        return self.state() != "fault"
+        def is_stopped() -> bool:  # also by an earlier stop, of which the status arrives only now
+            return self.state() in ("fault", "estop")
+
+        self.until(lambda: follows() or is_stopped(), "commands applied after arming", 5.0)
+        return not is_stopped()
 
     def _make_ready(self, limit_s: float) -> None:
         """Reset until no further fault is reported: a fault of the meantime is reported after the reset.
