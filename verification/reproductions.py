@@ -56,12 +56,12 @@ There are three kinds of published values:
 - **model**: we solve the equations of the source for our gait
 
 The page [reproduced experiments](reproduction-experiments.md) describes each experiment: what we have read of its
-source, the conditions, the method and the reasons for a difference. We quote only numbers that we have read ourselves.
-For this reason, the speeds of real snakes and robots are missing.
+source, the conditions, the method and the reasons for the difference. We quote only numbers that we have read
+ourselves. For this reason, the speeds of real snakes and robots are missing.
 
 `python -m verification.reproductions --write` measured the results on {day}. If a result depends on the sensor noise,
-it was measured with {seeds} seeds. Gaits without feedback move in the same way with every seed, so they have only one
-run and no interval.
+we measured it with {seeds} seeds. Gaits without feedback move in the same way with every seed. They have only one run
+and no interval.
 
 {table}
 
@@ -83,9 +83,9 @@ EXPERIMENTS_TEMPLATE = """\
 
 # Reproduced experiments
 
-This page describes the experiments behind the table in [Published results, reproduced](reproductions.md). Each section
-lists what we have read of the source, the published result, and the conditions of both experiments. The table in a
-section lists the computed reasons for a difference.
+Use this page to check how we reproduced a published result. It describes the experiments behind the table in
+[Published results, reproduced](reproductions.md). Each section lists what we have read of the source, the published
+result, and the conditions of both experiments. The table in a section lists the computed reasons for the difference.
 {sections}"""
 
 
@@ -155,7 +155,7 @@ def _conclude(comparisons: Sequence[PublishedComparison]) -> str:
     )
     different = [comparison.quantity for comparison in texts if not comparison.agrees]
     if different:
-        sentence += f" Not the same: {', '.join(different)}."
+        sentence += f" The results that differ: {', '.join(different)}."
     return sentence
 
 
@@ -180,14 +180,14 @@ def _make_section(experiment: Experiment, findings: ExperimentFindings) -> str:
         "",
         f"{source.authors}, *{source.title}*, {source.published_in}, {source.year}: {source.place}.",
         "",
-        f"- **Read.** {source.seen}",
+        f"- **What we have read.** {source.seen}",
         f"- **Published.** {experiment.claim} Value: {BASIS_TEXTS[findings.comparisons[0].basis]}.",
-        f"- **Conditions there.** {experiment.published_conditions}",
-        f"- **Conditions here.** {experiment.our_conditions}",
-        f"- **Measured.** {experiment.method}",
+        f"- **Published conditions.** {experiment.published_conditions}",
+        f"- **Our conditions.** {experiment.our_conditions}",
+        f"- **What is measured.** {experiment.method}",
         *(f"- {note}" for note in findings.notes),
         "",
-        "| Effect on ours | Reason for a difference |",
+        "| Effect on our value | Reason for the difference |",
         "|---|---|",
         *(f"| {format_effect(reason)} | {reason.cause} |" for reason in findings.reasons),
         "",

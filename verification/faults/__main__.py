@@ -219,7 +219,7 @@ def _parse_arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--write",
         action="store_true",
-        help="write docs/benchmarks/faults.md and docs/fault-table.csv from all results",
+        help="write docs/benchmarks/faults.md and docs/benchmarks/fault-table.csv from all results",
     )
     parser.add_argument(
         "--json",

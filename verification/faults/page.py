@@ -42,27 +42,29 @@ INTRODUCTION = """\
 
 # The fault table
 
-This page summarizes [fault-table.csv]({table}){days}. The table has
-deadline, median, worst value, recovery, machine and notes of each measurement. [faults.json](faults.json) has every
-trial.
+This page shows how the robot reacts to each fault that we injected, and whether it reacted in time. It answers the
+question: if a process, the network, a bus or a drive fails, does the robot stop?
 
-**{met} of {count} measurements met**, {failed} not met, {left} not run. A measurement is met if the robot reacted as
-expected within the deadline in its worst trial.
+**{met} of {count} measurements are met**, {failed} are not met, and {left} were not run{left_backends}. A measurement
+is met if the robot reacted as expected within the deadline, in its worst trial.
 
 Each row injects a fault at least {trials} times on each backend. The robot is the 13-joint snake of the scenario
-`triplet` at 100 Hz in real time (T = {period:.0f} ms, lease {lease:.0f} ms); `can` has emulated joint modules on a
-virtual bus.
+`triplet` at 100 Hz in real time. The period T is {period:.0f} ms, and the lease lasts {lease:.0f} ms. The backend `can`
+has emulated joint modules on a virtual bus.
+
+This page is the summary{days}. [{table}]({table}) contains the deadline, the median, the worst value, the recovery, the
+machine and notes of each measurement. [faults.json](faults.json) contains every trial.
 """
 
 EXPLANATION = """\
-* **Times are upper bounds**, from just before the injection until an observer process has received the first setpoints
-  of the host's own stop mode. The host checks the lease once a period.
-* **Recovery.** After each trial an operator resets the fault and arms the robot. `max_step_rad` is the largest change
-  of an angle target in one tick after that, `max_first_rad` the largest distance of a first target from the measured
-  angle (allowed: 0.35 rad).
-* **Retried.** A trial is repeated if the robot had stopped before the injection, as on a busy machine.
+* **Times are upper bounds.** They begin just before the injection. They end when an observer process has received the
+  first setpoints of the stop mode of the host. The host checks the lease once a period.
+* **Recovery.** After each trial, an operator resets the fault and arms the robot. `max_step_rad` is the largest change
+  of an angle target in one tick after that. `max_first_rad` is the largest distance between a first target and the
+  measured angle (allowed: 0.35 rad).
+* **Repeated trials.** A trial is repeated if the robot had stopped before the injection, for example on a busy machine.
 
-Measure one row again with `python -m verification.faults --rows NAME --write`.
+To measure one row again, run `python -m verification.faults --rows NAME --write`.
 """
 
 Results = Mapping[tuple[str, str], RowResult]
@@ -80,6 +82,9 @@ def _page_lines(results: Results) -> Iterator[str]:
     measurable = [pair for heading in HEADINGS for pair in _measurable(heading)]
     done = [pair for pair in measurable if _key(pair) in results]
     met = sum(_is_met(pair, results) for pair in done)
+    backends_not_run = sorted(
+        {backend for row, backend in measurable if (row.name, backend) not in results}
+    )
     yield INTRODUCTION.format(
         days=_format_days(list(results.values())),
         table=TABLE_NAME,
@@ -87,6 +92,7 @@ def _page_lines(results: Results) -> Iterator[str]:
         count=len(measurable),
         failed=len(done) - met,
         left=len(measurable) - len(done),
+        left_backends=f" ({', '.join(backends_not_run)})" if backends_not_run else "",
         trials=TRIALS,
         period=PERIOD_MS,
         lease=LEASE_MS,

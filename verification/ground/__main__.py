@@ -17,91 +17,122 @@ TEMPLATE = """\
 
 # Laws of ground and friction: comparisons
 
-These tables compare each law of the [contact and friction model](../concepts/physics.md) with a computation that does
-not use it. `python -m verification.ground --write` wrote this page on {day}. The robot is `planar13`, with physics
-steps of 2 ms. Scales have the coefficients of Hu et al. (2009): {forward} forward, {backward} backward and {sideways}
+This page shows maintainers of the simulator that it computes each law of the [contact and friction
+model](../concepts/physics.md) correctly. Each table compares a law with an independent computation that does not use
+the simulator.
+
+In short: slow waves, gliding bodies, drag, slopes and the forces of fluids agree. There are three larger differences:
+
+- Fast waves with isotropic friction and with scales differ by 6 to 8 %. The cause was not examined.
+- In fluids, coarse physics steps and soft servos change the speed of a swimming body.
+- Wheels that are modeled as bodies are 6 to 13 % faster in waves than wheels that are modeled as friction.
+
+`python -m verification.ground --write` wrote this page on {day}. The robot is `planar13`, with physics steps of 2 ms.
+The ground law "scales" has the coefficients of Hu et al. (2009): {forward} forward, {backward} backward and {sideways}
 sideways.
 
 ## Waves on flat ground
 
-Stiff servos hold the joints to a wave. The momentum balance integrates links in the plane, with friction at the joints
-and ends, and without MuJoCo. A positive number is a motion towards the head. With the slow wave, the simulator agrees
-within 0.3 mm/s, and with wheels within 0.9 mm/s. With the fast wave, isotropic friction and scales differ by 6
-to 8 %, and the others by less than 1 %. The balance is planar, and its loads are constant. The cause was not examined.
+With the slow wave (4 rad/s), the simulator agrees with the momentum balance within 0.3 mm/s, and with wheels within
+0.9 mm/s. With the fast wave (6.28 rad/s), isotropic friction and scales differ by 6 to 8 %, and the other laws by less
+than 1 %. Unlike the simulator, the balance is planar, and its loads are constant.
+
+In the simulator, stiff servos make the joints follow a wave. The momentum balance integrates the motion of links in
+the plane, without MuJoCo. Its friction acts at the joints and at the ends of the body. A positive number is a motion
+towards the head.
 
 {waves}
 
-The viscous ground has no dry friction, 0.5 s/m along the links and 3 s/m across them.
+The viscous ground has no dry friction. Its viscous friction is 0.5 s/m along the links and 3 s/m across them.
 
 ## Bodies that glide
 
-A straight body is thrown obliquely to its axis, and comes to rest. Its path is curved, because friction is not opposite
-to the velocity. The displacements are along the body and across it. The classical Runge-Kutta method integrates the
-equation of motion without MuJoCo. The last column is the length of the difference, divided by that of the path.
+The simulator agrees with the equation of motion within 0.3 %. In this test, a straight body with scales is thrown
+obliquely to its axis, and comes to rest. Its path is curved, because friction is not opposite to the velocity.
+
+The classical Runge-Kutta method integrates the equation of motion without MuJoCo. The two numbers in a cell are the
+displacement along the body and across it. The last column is the length of the difference divided by the length of the
+path.
 
 {gliding}
 
 ## Drag
 
-The force that drags a straight body at 0.2 m/s, divided by its weight, is within 1 % of the coefficient.
+The force that drags a straight body at 0.2 m/s, divided by the weight of the body, is within 1 % of the friction
+coefficient.
 
 {drag}
 
 ## Slopes
 
-The body with scales is thrown 1.0 m/s ahead and 0.6 m/s to its left, and glides for 1 s on ground that slopes. Friction
-holds it on the slopes of 0.1 rad, and not on the third one. The differences are as small as on level ground.
+On slopes, the differences are as small as on level ground. The body with scales is thrown at 1.0 m/s ahead and 0.6 m/s
+to its left, and glides for 1 s on sloping ground. Friction can hold the body on the slopes of 0.1 rad, but not on the
+slope of 0.3 rad.
 
 {slopes}
 
 ## Swimming
 
-The force on a straight body of 9 links in a fluid is that of the formulas in MuJoCo's documentation, which are
-programmed here without MuJoCo. One of them is corrected: the largest area of an ellipsoid is pi r_max r_mid. Honey has
-1400 kg/m³ and 10 Pa·s.
+The forces on a straight body of 9 links in a fluid are equal to those of the formulas in MuJoCo's documentation. The
+comparison computes the formulas without MuJoCo. One formula is corrected: the largest area of an ellipsoid is pi r_max
+r_mid. Honey has 1400 kg/m³ and 10 Pa·s.
 
 {fluid_forces}
 
-The body is thrown, and glides for 0.3 s without turning. In honey, it stops within a few hundredths of a second, so
-that physics steps of 2 ms are coarse.
+In the next table, the body is thrown, and glides for 0.3 s without turning. The differences are below 0.5 % in water
+and below 2 % in honey. In honey, the body stops within a few hundredths of a second, so physics steps of 2 ms are
+coarse.
 
 {fluid_gliding}
 
-The momentum balance integrates links in the plane, as above, with the forces of the formulas. With finer steps and
-servos that are ten times as stiff, the simulator agrees within 3 %. In honey, the servos of the first column bend under
-the drag.
+In the third test, the body swims with a wave. The momentum balance integrates links in the plane, as above, with the
+forces of the formulas. With finer steps and servos that are ten times as stiff, the simulator agrees within 3 %. With
+the default steps and servos (first column), the differences in honey are larger, because the servos yield under the
+drag.
 
 {fluid_waves}
 
-A wave and its reverse should drift oppositely. MuJoCo computes the forces of the fluid from velocities that belong to a
-moment half a step away, so the sum is not zero, and is proportional to the step.
+A wave and its reverse should drift in opposite directions with the same speed. The sum of both velocities should
+therefore be zero. It is not, because MuJoCo computes the forces of the fluid from velocities that belong to a time
+half a step away. The sum is proportional to the step:
 
 {fluid_steps}
 
 ## Wheels
 
-Wheels as bodies are spheres on axles in plain MuJoCo, one pair in the middle of each link, with a tire friction of 0.6,
-bearings of a constant torque, and MuJoCo's own friction (elliptic cone, `impratio` 20, steps of 1 ms). Wheels as
-friction are the section `[wheels]` of a robot file.
+There are two ways to model wheels, and this section compares them:
+
+- **Wheels as bodies** are spheres on axles in plain MuJoCo, with one pair in the middle of each link. The tire
+  friction is 0.6, and the bearings have a constant torque. MuJoCo's own friction is used (elliptic cone, `impratio`
+  20, steps of 1 ms).
+- **Wheels as friction** are the section `[wheels]` of a robot file. They are a friction law of the ground. With the
+  option `separate_limits`, the law limits rolling and side slip separately.
 
 {wheels}
 
-All models brake a rolling body equally, and none creeps by more than 0.1 mm/s. In waves, wheels as bodies are 6 to 13 %
-faster than wheels as friction, and 13 to 16 % slower than those with `separate_limits`. The momentum balances show the
-reasons. The law of SnakeSIM agrees with the balance of the same law within 1 %, with or without separate limits. The
-bodies have their wheels in the middle of the links, and there separate limits come within 1 to 7 % of them. At joints
-and ends, where flat ground carries a robot, wheels hold a wave better.
+All models brake a rolling body equally, and none creeps by more than 0.1 mm/s. In waves, wheels as bodies are 6 to 13
+% faster than wheels as friction. They are 13 to 16 % slower than wheels as friction with `separate_limits`. The
+behavior of real wheels is therefore between both laws.
 
-So the truth is between both laws. A wheel rolls, so its tire slips sideways only, and its whole friction acts sideways.
-In the law of scales, a link that moves forward and slips a little sideways has only the sideways part of the velocity's
-direction.
+The momentum balances show the reasons:
+
+- **SnakeSIM computes both laws correctly.** With or without separate limits, it agrees with the balance of the same
+  law within 1 %.
+- **The position of the wheels matters.** The wheels as bodies are in the middle of the links. If the law with separate
+  limits also acts there, it is within 1 to 7 % of them. Flat ground carries a robot at the joints and ends. There,
+  wheels hold the body on its wave better.
+- **The direction of the friction matters.** A wheel rolls, so its tire slips sideways only, and its whole friction
+  acts sideways. The law without separate limits is that of scales. If a link moves forward and slips a little
+  sideways, only a part of this friction acts sideways, because it has the direction of the velocity.
 
 ## Cost
 
-CPU time of one physics step of 2 ms, with a wave of 13 joints, as medians of {rounds} rounds of {steps} steps, on a
-busy machine. The times include what MuJoCo computes. In the Python version, laws that depend on direction cost more
-than isotropic friction, because each foot is computed alone. In water, most of the time is MuJoCo's: forces of each
-link, and their derivatives for the implicit integrator.
+The table shows the CPU time of one physics step of 2 ms, with a wave of 13 joints. The numbers are medians of {rounds}
+rounds of {steps} steps, on a busy machine. They include the computations of MuJoCo.
+
+In the C version, all laws on flat ground take nearly the same time. In the Python version, laws that depend on the
+direction take longer than isotropic friction, because each foot is computed alone. In water, MuJoCo takes most of the
+time. It computes the forces on each link, and their derivatives for the implicit integrator.
 
 {cost}
 """

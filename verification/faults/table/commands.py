@@ -6,7 +6,8 @@ from verification.faults.table.row_kinds import FRAMES_THROUGH, both
 
 TWO_CONTROLLERS = FaultHeading(
     fault="two controllers",
-    expected="first wins, typed refusal, zero frames from the second in 100,000 interleavings",
+    expected="the first controller keeps the lease. The second one gets a reason in the answer, and none of its "
+    "commands passes in 100,000 interleavings",
     deadline="at once",
     rows=(
         FaultRow(
@@ -31,8 +32,8 @@ TWO_CONTROLLERS = FaultHeading(
 )
 
 COMMANDS_OUT_OF_TIME = FaultHeading(
-    fault="stale, replayed, reordered, duplicated, future command",
-    expected="refused",
+    fault="a command is stale, replayed, reordered, duplicated or from the future",
+    expected="the command is refused",
     deadline="one message",
     rows=(
         FaultRow(
@@ -48,8 +49,9 @@ COMMANDS_OUT_OF_TIME = FaultHeading(
 )
 
 INVALID_COMMANDS = FaultHeading(
-    fault="NaN, infinity, out of range, wrong length, wrong joint order, malformed or huge bytes, unknown version",
-    expected="refused, counted; never an exception out of a callback",
+    fault="a command contains NaN, infinity, values out of range, a wrong length, a wrong joint order, malformed or "
+    "huge bytes, or an unknown version",
+    expected="the command is refused and counted. No exception leaves a callback",
     deadline="one message",
     rows=(
         FaultRow(

@@ -13,8 +13,10 @@ from verification.faults.table.row_kinds import (
 )
 
 DRIVE_FAILS = FaultHeading(
-    fault="drives of every type: host frozen for 1 s; a drive silent, restarted, too hot; the bus lost",
-    expected="drives stop by themselves; fault names the joint; no drive is enabled again before reset and arming",
+    fault="drives of every type: the host is frozen for 1 s, a drive is silent, restarts or is too hot, or the bus is "
+    "lost",
+    expected="the drives stop by themselves, and the fault names the joint. No drive is enabled again before reset "
+    "and arming",
     deadline="a watchdog, 100 ms; at 50 Hz (T = 20 ms) for the driver 3 T, and 100 ms for what drives report by "
     "themselves",
     rows=(
@@ -64,8 +66,8 @@ DRIVE_FAILS = FaultHeading(
 )
 
 JOINT_MODULE_FAILS = FaultHeading(
-    fault="joint module silent, restarted, frozen value, wrong counter",
-    expected="fault names the joint; group to safe stop",
+    fault="a joint module is silent, restarts, repeats its last value, or sends a wrong counter",
+    expected="the fault names the joint, and all joints stop",
     deadline="50 ms; restart: one frame",
     rows=(
         joint_row("joint_silent", "mute", "module_silent"),
@@ -88,7 +90,7 @@ JOINT_MODULE_FAILS = FaultHeading(
 
 JOINT_IS_ISOLATED = FaultHeading(
     fault="one joint fails, and the robot file allows for it (`max_isolated_joints = 1`)",
-    expected="that joint is disabled, the others continue",
+    expected="that joint is disabled, and the others continue",
     deadline="50 ms",
     rows=(
         isolated_row("isolated_silent", "a joint is silent", "mute"),
@@ -99,8 +101,9 @@ JOINT_IS_ISOLATED = FaultHeading(
 )
 
 BUS_FAILS = FaultHeading(
-    fault="bus-off, error-passive, transmit queue full, interface down, receive overflow, babbling node, duplicate id",
-    expected="fault; recovers only to disarmed; duplicate refused at arming",
+    fault="the bus has a fault: bus-off, error-passive, transmit queue full, interface down, receive overflow, "
+    "babbling node, duplicate id",
+    expected="the robot stops with a fault, and recovers only to disarmed. A duplicate id is refused at arming",
     deadline="2-3 T; flood 100 ms",
     rows=(
         bus_row("bus_off", "the controller leaves the bus", "bus_off", "bus_off"),

@@ -6,8 +6,9 @@ from verification.faults.rows import guest, simulator, streams
 from verification.faults.table.row_kinds import LEASE_MS, PERIOD_MS, both, stream_row
 
 STREAM_STOPS = FaultHeading(
-    fault="a stream that control acts on stops: of a sensor, of guidance, of navigation",
-    expected="without joint states: safe stop; without another: the controller holds, and continues when it is back",
+    fault="a stream that control needs stops: from a sensor, from guidance or from navigation",
+    expected="without joint states, the robot stops. Without another stream, the controller holds, and continues when "
+    "the stream is back",
     deadline="joints: 30 ms and the lease; others: their `max_age`",
     rows=(
         FaultRow(
@@ -28,8 +29,8 @@ STREAM_STOPS = FaultHeading(
 )
 
 WALL_CLOCK_STEPS = FaultHeading(
-    fault="wall clock steps by an hour either way",
-    expected="nothing",
+    fault="the wall clock steps by an hour in either direction",
+    expected="no effect on the robot",
     deadline="-",
     rows=(
         FaultRow(
@@ -46,8 +47,8 @@ WALL_CLOCK_STEPS = FaultHeading(
 )
 
 SLOW_SIMULATOR = FaultHeading(
-    fault="simulator slower than real time in lockstep (0.1x)",
-    expected="no false stop",
+    fault="the simulator is slower than real time in lockstep (0.1x)",
+    expected="the robot does not stop",
     deadline="-",
     rows=(
         FaultRow(
@@ -63,8 +64,8 @@ SLOW_SIMULATOR = FaultHeading(
 )
 
 SIMULATION_DIVERGES = FaultHeading(
-    fault="simulation diverges",
-    expected="stop, fault, last good state stays",
+    fault="the simulation diverges",
+    expected="the robot stops with a fault, and the last good state stays",
     deadline="one step",
     rows=(
         FaultRow(

@@ -11,8 +11,8 @@ from verification.faults.table.row_kinds import (
 )
 
 NETWORK_CUT = FaultHeading(
-    fault="network cut between controller and robot (namespaces with a veth pair, link down)",
-    expected="safe stop on the robot side",
+    fault="the network between controller and robot is cut (namespaces with a veth pair, link down)",
+    expected="the host stops the robot",
     deadline="lease",
     rows=(
         lease_row(
@@ -25,8 +25,8 @@ NETWORK_CUT = FaultHeading(
 )
 
 SLOW_CONSUMER = FaultHeading(
-    fault="slow subscriber (sleeping callback, full disk at a consumer, frozen process)",
-    expected="only that consumer suffers; zero missed control cycles",
+    fault="a subscriber is slow (sleeping callback, full disk, frozen process)",
+    expected="only that subscriber is affected. No control cycle is missed",
     deadline="-",
     rows=(
         consumer_row(
@@ -46,8 +46,8 @@ SLOW_CONSUMER = FaultHeading(
 )
 
 STOP_UNDER_ATTACK = FaultHeading(
-    fault="an emergency stop while the network is flooded, occupied or held up",
-    expected="stopped at once, regardless of traffic",
+    fault="an emergency stop while the network is flooded, occupied or blocked",
+    expected="the robot stops at once, regardless of the traffic",
     deadline=f"{STOP_MS:.0f} ms",
     rows=(
         flood_row("stop_half_open", "300 half-open connections", "half_open"),

@@ -12,8 +12,8 @@ from verification.faults.table.row_kinds import (
 )
 
 CONTROLLER_STOPS = FaultHeading(
-    fault="controller killed; controller frozen (SIGSTOP; busy interpreter)",
-    expected="safe stop, lease freed, latched",
+    fault="the controller is killed or frozen (SIGSTOP, busy interpreter)",
+    expected="the robot stops, the lease becomes free, and the fault is latched",
     deadline="lease",
     rows=(
         lease_row("controller_killed", "control: SIGKILL", controller.killed),
@@ -28,8 +28,8 @@ CONTROLLER_STOPS = FaultHeading(
 )
 
 HOST_STOPS = FaultHeading(
-    fault="HAL host killed or frozen",
-    expected="modules' own watchdog",
+    fault="the HAL host is killed or frozen",
+    expected="the watchdog of each joint module stops it",
     deadline="100 ms",
     rows=(
         watchdog_row(
@@ -41,8 +41,9 @@ HOST_STOPS = FaultHeading(
 )
 
 ROUTER_RESTARTS = FaultHeading(
-    fault="router dies, restarts, 50 times",
-    expected="safe stop if the stream stops; reconnects; no re-arm",
+    fault="the router is killed and restarts, 50 times",
+    expected="if the stream of commands stops, the robot stops. The sessions reconnect, and the robot is not armed "
+    "again",
     deadline="lease; 5 s to reconnect",
     rows=(
         lease_row(
@@ -56,7 +57,7 @@ ROUTER_RESTARTS = FaultHeading(
 
 SECOND_RUN = FaultHeading(
     fault="a second run on a robot's network, or at its endpoint",
-    expected="refuses to start; the robot stays as it is",
+    expected="the second run refuses to start, and the robot stays as it is",
     deadline="-",
     rows=(
         FaultRow(
@@ -72,8 +73,8 @@ SECOND_RUN = FaultHeading(
 )
 
 HOST_RESTARTS = FaultHeading(
-    fault="HAL restarts while moving",
-    expected="boots disarmed; old commands void; no jump",
+    fault="the HAL host restarts while the robot moves",
+    expected="the robot is disarmed, old commands have no effect, and no joint jumps",
     deadline="before first frame",
     rows=(
         FaultRow(

@@ -46,7 +46,7 @@ class AlbenAmplitude(Experiment):
         published_in="Proceedings of the Royal Society A 469",
         year=2013,
         place="abstract, and that of the preprint arXiv:1304.4479, which has deflection",
-        seen="Abstract and introduction of both.",
+        seen="The abstract and the introduction of both.",
     )
     claim = (
         "For large transverse friction, the wave that travels with the least work is retrograde, and its optimal "
@@ -61,9 +61,9 @@ class AlbenAmplitude(Experiment):
         "the body, and 1/20 to 1/160 along it in both directions."
     )
     method = (
-        "Work against friction per distance at five amplitudes for each ratio, from the measured motion of the links "
-        "and the law of friction, and the minimum of a cubic through them in logarithms. The exponent is that of the "
-        "deflections at the minima, by least squares."
+        "For each ratio, the work against friction per distance is computed at five amplitudes, from the measured "
+        "motion of the links and the law of friction. The minimum of a cubic through these values, in logarithms, "
+        "gives the best amplitude. A least-squares fit of the deflections at these minima gives the exponent."
     )
 
     def run(self, trials: ExperimentTrials) -> ExperimentFindings:
@@ -89,7 +89,7 @@ class AlbenAmplitude(Experiment):
             chain_costs = trials.call(find_chain_cost, cases)
             steps.append(
                 (
-                    "The body ends, and has 31 straight links and mass.",
+                    "The body has a finite length, 31 straight links, and mass.",
                     fit_exponent(ratios, _find_optima(ratios, chain_costs)),
                 )
             )

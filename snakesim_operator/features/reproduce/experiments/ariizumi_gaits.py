@@ -52,7 +52,7 @@ class AriizumiGaits(Experiment):
         published_in="IEEE Transactions on Robotics 33",
         year=2017,
         place="abstract",
-        seen="The abstract, in a copy of the manuscript. Not the parameters and the diagrams.",
+        seen="The abstract, in a copy of the manuscript. We have not read the parameters and the diagrams.",
     )
     claim = (
         "If the anisotropy in friction is large enough, sinus-lifting is the most energy efficient gait. Otherwise "
@@ -64,11 +64,12 @@ class AriizumiGaits(Experiment):
     )
     our_conditions = (
         "Mamba with 18 joints on flat ground with a friction of 0.6 sideways. Friction is the same forward and "
-        "backward. Each gait has its shipped parameters, and its own speed."
+        "backward. Each gait has its default parameters, and its own speed."
     )
     method = (
-        "Energy of all joints, the sum of |torque x speed|, over the distance of the center of mass in 8 s, as the "
-        "mean over seeds of the sensors' noise. A gait that moves less than 0.1 m has no value."
+        "The energy of all joints (the sum of |torque x speed|), divided by the distance of the center of mass in 8 "
+        "s. The value is the mean over several seeds of the sensor noise. A gait that moves less than 0.1 m has no "
+        "value."
     )
     depends_on_seed = True
 

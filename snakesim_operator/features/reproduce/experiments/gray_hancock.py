@@ -51,8 +51,8 @@ class GrayHancock(Experiment):
         year=1955,
         place="speed of a filament without a head, from normal and tangential drag",
         seen=(
-            "The formula as other works quote it, not the paper. It follows from the balance of drag along the axis, "
-            "which a test confirms for small bends."
+            "The formula as other works quote it. We have not read the paper. The formula follows from the balance of "
+            "drag along the axis, which a test confirms for small bends."
         ),
     )
     claim = (
@@ -63,9 +63,7 @@ class GrayHancock(Experiment):
     our_conditions = (
         "31 links of planar13, three waves on the body, and viscous ground with a ratio of 2."
     )
-    method = (
-        "Speed of the center of mass along the body over two periods, after two that do not count."
-    )
+    method = "The speed of the center of mass along the body over two periods, after two periods that are not counted."
 
     def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Measure the speed at several amplitudes."""
@@ -131,11 +129,11 @@ def _find_steps(run: GaitRun, motion: GaitMotion) -> list[tuple[str, float]]:
     return [
         ("The bends are not small, and the curve is a serpenoid.", endless),
         (
-            "The body ends, and has 31 straight links and mass.",
+            "The body has a finite length, 31 straight links, and mass.",
             find_chain_motion(robot, commanded, run.friction).speed_m_s / wave_m_s,
         ),
         (
-            "The servos do not follow exactly.",
+            "The servos do not follow their targets exactly.",
             find_chain_motion(robot, measured, run.friction).speed_m_s / wave_m_s,
         ),
     ]

@@ -41,8 +41,8 @@ class HiroseSerpenoid(Experiment):
         year=1993,
         place="serpenoid curve, whose length along the axis is J0(alpha) times that of the body",
         seen=(
-            "The curve as other works quote it, not the book. The ratio of the lengths is the mean of cos(alpha cos "
-            "phase), which is a Bessel function."
+            "The curve as other works quote it. We have not read the book. The ratio of the lengths is the mean of "
+            "cos(alpha cos phase), which is a Bessel function."
         ),
     )
     claim = (
@@ -54,9 +54,7 @@ class HiroseSerpenoid(Experiment):
         "31 links of planar13, two waves on the body, wheels with a tire friction of 0.6, and bearings that brake "
         "with 1 % of the weight."
     )
-    method = (
-        "Speed of the center of mass along the body over two periods, after two that do not count."
-    )
+    method = "The speed of the center of mass along the body over two periods, after two periods that are not counted."
 
     def run(self, trials: ExperimentTrials) -> ExperimentFindings:
         """Measure the speed at several winding angles."""
@@ -119,15 +117,15 @@ def _find_steps(run: GaitRun, motion: GaitMotion, wave_m_s: float) -> list[tuple
     measured = JointWaves(motion.angle_harmonics, PERIOD_S)
     return [
         (
-            "The wheels brake, and slip sideways.",
+            "The wheels brake the body and slip sideways.",
             wave_m_s * find_endless_motion(COMPARED_RAD, run.friction).speed,
         ),
         (
-            "The body ends, and has 31 straight links and mass.",
+            "The body has a finite length, 31 straight links, and mass.",
             find_chain_motion(robot, commanded, run.friction).speed_m_s,
         ),
         (
-            "The servos do not follow exactly.",
+            "The servos do not follow their targets exactly.",
             find_chain_motion(robot, measured, run.friction).speed_m_s,
         ),
     ]

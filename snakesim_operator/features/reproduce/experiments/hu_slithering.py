@@ -37,13 +37,14 @@ class HuSlithering(Experiment):
         year=2009,
         place="equation 1 and the law of sliding friction, with coefficients of milk snakes on cloth",
         seen=(
-            "Abstract, equation 1 and the law of sliding friction, and the coefficients as this project cites them. "
-            "No table and no figure, so that no measured speed of a snake is quoted."
+            "The abstract, equation 1, the law of sliding friction, and the coefficients as this project cites them. "
+            "We have not read any table or figure, so we do not quote a measured speed of a snake."
         ),
     )
     claim = (
-        "Each piece of the body is braked by its weight times 0.11 forward, 0.14 backward and 0.19 sideways, against "
-        "its direction of sliding. With the shape prescribed, Newton's law gives the motion of the body."
+        "Friction acts on each piece of the body against its direction of sliding. It is the weight of the piece "
+        "times 0.11 forward, 0.14 backward and 0.19 sideways. If the shape is prescribed, Newton's law gives the "
+        "motion of the body."
     )
     published_conditions = (
         "A snake of evenly distributed weight, whose shape is prescribed, on cloth."
@@ -53,8 +54,8 @@ class HuSlithering(Experiment):
         "We have not read the curve of the paper, so its equations are solved for our curve."
     )
     method = (
-        "Speed of the center of mass along the body over two periods, after two that do not count. The equations are "
-        "solved in the plane, without MuJoCo."
+        "The speed of the center of mass along the body over two periods, after two periods that are not counted. The "
+        "equations are solved in the plane, without MuJoCo."
     )
 
     def run(self, trials: ExperimentTrials) -> ExperimentFindings:
@@ -92,7 +93,7 @@ class HuSlithering(Experiment):
         reasons = explain_by_steps(
             [
                 ("", solved[compared]),
-                ("The servos do not follow exactly.", with_measured),
+                ("The servos do not follow their targets exactly.", with_measured),
                 ("", ours[compared]),
             ],
             unit=unit,

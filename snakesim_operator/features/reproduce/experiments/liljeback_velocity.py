@@ -37,7 +37,8 @@ class LiljebackVelocity(Experiment):
         published_in="IEEE/RSJ International Conference on Intelligent Robots and Systems",
         year=2011,
         place="abstract, properties 1 and 2",
-        seen="The abstract, in a copy that prints no year. Not the friction of the robot and its measured speeds.",
+        seen="The abstract, in a copy without a year. We have not read the friction of the robot and its measured "
+        "speeds.",
     )
     claim = (
         "The average forward velocity is proportional to the squared amplitude of the sinusoidal joint motion, and to "
@@ -53,8 +54,8 @@ class LiljebackVelocity(Experiment):
         "degrees."
     )
     method = (
-        "Exponents by least squares of logarithms. The speed is that of the center of mass along the body over two "
-        "periods, after two that do not count."
+        "The exponents come from a least-squares fit of the logarithms. The speed is that of the center of mass along "
+        "the body over two periods, after two periods that are not counted."
     )
 
     def run(self, trials: ExperimentTrials) -> ExperimentFindings:
@@ -97,13 +98,13 @@ class LiljebackVelocity(Experiment):
         )
         reasons = (
             DifferenceReason(
-                cause="Amplitude: the property is for small angles. A body with greater ones slips less, and its speed "
-                "approaches that of the wave.",
+                cause="Amplitude: the property is for small angles. With larger angles, a body slips less, and its "
+                "speed approaches that of the wave.",
                 effect=endless - 2.0,
                 unit="1",
             ),
             DifferenceReason(
-                cause="Amplitude: the body ends, and has 10 straight links, mass and servos.",
+                cause="Amplitude: the body has a finite length, 10 straight links, mass and servos.",
                 effect=chain_amplitude - endless,
                 unit="1",
             ),
@@ -113,7 +114,7 @@ class LiljebackVelocity(Experiment):
                 unit="1",
             ),
             DifferenceReason(
-                cause="Frequency: the body has mass, and servos.",
+                cause="Frequency: the body has mass and servos.",
                 effect=chain_frequency - 1.0,
                 unit="1",
             ),

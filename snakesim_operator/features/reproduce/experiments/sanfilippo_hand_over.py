@@ -45,7 +45,7 @@ class SanfilippoHandOver(Experiment):
         published_in="the paper that SnakeSIM is based on",
         year=2018,
         place="section V, Figures 12 and 13",
-        seen="The text of the paper, without the curves of the figures. The copy prints no year.",
+        seen="The text of the paper. We have not read the curves of the figures. Our copy does not contain the year.",
     )
     claim = (
         "Propulsion passes from joint 7 to joints 6, 5 and 4, backward along the body, until the snake loses contact "
@@ -57,8 +57,8 @@ class SanfilippoHandOver(Experiment):
     )
     our_conditions = "Scenario triplet with 35 N and 10 s, 13 joints 0.11 m apart, and dry friction of the ground."
     method = (
-        "Joints that control reports as propelling, over seeds of the sensors' noise. The order counts from joint 7 "
-        "on. An order that differs in a seed is printed."
+        "The joints that control reports as propulsion joints, for several seeds of the sensor noise. The order is "
+        "compared from joint 7 on. If a seed gives another order, this order is printed as well."
     )
     depends_on_seed = True
 
@@ -93,10 +93,10 @@ class SanfilippoHandOver(Experiment):
             ),
         )
         notes = (
-            f"The propulsion force of {FORCE_N:g} N is a setting in both, not a result. Times of the figures are not "
-            "compared, because their curves were not read.",
-            f"When propulsion ends, the obstacle is {1000 * tail_m:.0f} mm ahead of the tail end on average: there the "
-            "tail can no longer press on it.",
+            f"The propulsion force of {FORCE_N:g} N is a setting in both experiments, and not a result. The times in "
+            "the figures are not compared, because we have not read the curves.",
+            f"When propulsion ends, the obstacle is {1000 * tail_m:.0f} mm ahead of the end of the tail on average. "
+            "The tail can then no longer press on it.",
         )
         return ExperimentFindings(
             comparisons=comparisons, reasons=reasons, picture=_make_picture(found), notes=notes
