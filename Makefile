@@ -9,7 +9,7 @@ ARGS ?=
 UPGRADE ?=
 WORKERS ?= 2
 # More than cores: these tests wait for processes most of the time.
-SYSTEM_WORKERS ?= 3
+SYSTEM_WORKERS ?= 4
 PAYLOADS ?= 1000000
 MINUTES ?= 30
 TRIALS ?= 300
@@ -46,7 +46,7 @@ test-unit: compiled ## Run the pure tests: no process, no socket, no waiting (AR
 	$(pytest) tests/unit -n $(WORKERS) --dist worksteal $(ARGS)
 
 test-contract: compiled ## Run the contracts of backends and drives
-	$(pytest) tests/contract -n $(WORKERS) --dist worksteal $(ARGS)
+	$(pytest) tests/contract -n $(SYSTEM_WORKERS) --dist worksteal $(ARGS)
 
 test-system: compiled ## Run the tests with real processes, but those on a CAN bus
 	$(pytest) tests/system --ignore tests/system/can -n $(SYSTEM_WORKERS) --dist worksteal $(ARGS)

@@ -305,12 +305,16 @@ def _write(descriptor: int, content: bytes) -> None:
         content = content[os.write(descriptor, content) :]
 
 
+def die_with_parent() -> None:
+    """Have the kernel kill this process when its parent dies, however it dies. A machine costs a whole core."""
+    ctypes.CDLL(None).prctl(KILL_WITH_PARENT, signal.SIGKILL, 0, 0, 0)
+
+
 def _dying_with(parent: int) -> Callable[[], None]:
     """For the child to run before QEMU: the kernel kills it when `parent` dies, even of SIGKILL."""
-    library = ctypes.CDLL(None)
 
     def before_exec() -> None:
-        library.prctl(KILL_WITH_PARENT, signal.SIGKILL, 0, 0, 0)
+        die_with_parent()
         if os.getppid() != parent:
             os._exit(1)
 

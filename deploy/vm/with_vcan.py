@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))  # so that `deploy.vm` means the same here and in the tests
 
 from deploy.vm.kernel import Kernel, cache_folder, ready_kernel  # noqa: E402
-from deploy.vm.machine import Guest, GuestError, Request  # noqa: E402
+from deploy.vm.machine import Guest, GuestError, Request, die_with_parent  # noqa: E402
 from deploy.vm.packages import PreparationError, find_tool, need_tool  # noqa: E402
 
 BOOT_LIMIT_S = {True: 30.0, False: 120.0}  # with KVM, without
@@ -39,6 +39,7 @@ INTERRUPTED, BROKEN_PIPE, CANNOT = 130, 141, 125
 def main() -> int:
     """Choose the place and run the command there; its exit code, or 125 when it could not be started."""
     arguments = _parsed()
+    die_with_parent()
     try:
         need_tool("ip")
         only_guest = arguments.guest or arguments.controllers or arguments.forward

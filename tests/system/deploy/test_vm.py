@@ -12,6 +12,7 @@ import pytest
 
 from deploy.vm import cpio, kernel, machine, with_vcan
 from deploy.vm.packages import PreparationError
+from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
 KERNEL = kernel.Kernel(
@@ -166,3 +167,43 @@ def test_a_command_is_needed() -> None:
     )
     assert done.returncode == 2
     assert "it comes after --" in done.stderr
+
+
+PROGRAM_WITHOUT_MACHINE = """
+import os, sys, time
+from deploy.vm import with_vcan
+def wait_in_place_of_a_machine(_arguments):
+    print(os.getpid(), flush=True)
+    time.sleep(60)
+with_vcan.run_in_guest = wait_in_place_of_a_machine
+sys.argv = ["with_vcan", "--guest", "--", "true"]
+with_vcan.main()
+"""
+PARENT = """
+import subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", sys.argv[1]])
+time.sleep(60)
+"""
+
+
+def test_vm_command_dies_with_its_killed_parent() -> None:
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT, PROGRAM_WITHOUT_MACHINE],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(machine.__file__).parents[2],
+    )
+    with parent:
+        assert parent.stdout is not None
+        child_pid = int(parent.stdout.readline())
+        parent.kill()
+    wait_until(lambda: not _is_running(child_pid), "the command has ended", 5)
+
+
+def _is_running(pid: int) -> bool:
+    """Whether the process exists; a zombie without a parent that waits for it has ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except FileNotFoundError:
+        return False
+    return fields[0] != "Z"

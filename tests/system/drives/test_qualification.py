@@ -49,8 +49,9 @@ def list_steps(record: Record, verdict: str) -> list[str]:
     "driver_type",
     [
         "odrive",
-        "moteus",
-        "dynamixel",
+        # Each takes 20 s of CPU time, and the steps themselves are the same for every type.
+        pytest.param("moteus", marks=pytest.mark.slow),
+        pytest.param("dynamixel", marks=pytest.mark.slow),
         pytest.param("can", marks=pytest.mark.slow),
         pytest.param("cia402", marks=pytest.mark.slow),
         pytest.param("feetech", marks=pytest.mark.slow),
