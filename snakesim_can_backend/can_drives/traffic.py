@@ -61,13 +61,17 @@ def compute_load(
         compute_frame_duration_s: Function that returns the maximum duration of a frame from its number of data bytes.
     """
     drive_count = max(bus_indices.count(bus) for bus in set(bus_indices))
-    each_drive_s = sum(map(compute_frame_duration_s, traffic.bytes_per_drive))
-    one_drive_s = sum(map(compute_frame_duration_s, traffic.bytes_per_cycle))
-    cycle_s = drive_count * each_drive_s + one_drive_s
+    frames_per_drive_s = sum(map(compute_frame_duration_s, traffic.bytes_per_drive))
+    frames_of_one_drive_in_turn_s = sum(map(compute_frame_duration_s, traffic.bytes_per_cycle))
+    cycle_s = drive_count * frames_per_drive_s + frames_of_one_drive_in_turn_s
     heartbeat_fraction = 0.0  # heartbeats have a rate of their own, whatever the control rate is
     if traffic.heartbeats_hz:
         heartbeat_fraction = (
             drive_count * traffic.heartbeats_hz * compute_frame_duration_s(HEARTBEAT_BYTES)
         )
     max_rate_hz = int((MAX_LOAD - heartbeat_fraction) / cycle_s)
-    return BusLoad(cycle_s * rate_hz + heartbeat_fraction, max_rate_hz, drive_count)
+    return BusLoad(
+        fraction=cycle_s * rate_hz + heartbeat_fraction,
+        max_rate_hz=max_rate_hz,
+        drive_count=drive_count,
+    )

@@ -114,17 +114,25 @@ class _DatasetWriter:
         *,
         seconds_per_frame: float,
     ) -> None:
+        """Prepare an empty dataset; nothing is written yet.
+
+        Args:
+            folder: Folder of the dataset.
+            write_table: Writes columns by name into a Parquet file, with the metadata of its schema.
+            content: Observations, actions and cameras of every frame.
+            seconds_per_frame: Duration of a frame.
+        """
         self._folder = folder
         self._write_table = write_table
         self._content = content
         self._seconds_per_frame = seconds_per_frame
         self._tasks: list[str] = []
-        self._frames_by_episode: list[Frames] = []  # of each episode
+        self._frames_by_episode: list[Frames] = []
         self._image_statistics: dict[str, list[Statistics]] = {
             camera: [] for camera in content.size_by_camera
         }
-        self._records: list[RunRecord] = []  # of each episode
-        self.episode_rows: list[dict[str, Any]] = []  # of meta/episodes, one for each episode
+        self._record_by_episode: list[RunRecord] = []
+        self.episode_rows: list[dict[str, Any]] = []  # the table meta/episodes, a row for each
         self.frame_count = 0
 
     def add_episode(
@@ -178,7 +186,7 @@ class _DatasetWriter:
             columns, self._folder / DATA_PATTERN.format(chunk_index=chunk, file_index=file), None
         )
         self._frames_by_episode.append(frames)
-        self._records.append(episode.record)
+        self._record_by_episode.append(episode.record)
         self.episode_rows.append(row)
         self.frame_count += frame_count
 
@@ -225,7 +233,7 @@ class _DatasetWriter:
     def _write_missing_data(self) -> None:
         """Write the missing data of incomplete episodes, if there are any."""
         missing_by_episode: dict[int, list[str]] = {}
-        for episode_index, record in enumerate(self._records):
+        for episode_index, record in enumerate(self._record_by_episode):
             if record.missing:
                 missing_by_episode[episode_index] = record.missing
         if missing_by_episode:

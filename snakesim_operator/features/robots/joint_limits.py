@@ -20,7 +20,7 @@ MAX_LIMIT_RAD = 6.2832  # one revolution; a larger number must be in degrees
 
 
 @dataclass(frozen=True)
-class JointNumber:
+class JointQuantity:
     """A number that a URDF has for a joint, and its place in a robot file."""
 
     tag: str
@@ -38,12 +38,12 @@ class JointNumber:
         return self.section == "limits"
 
 
-JOINT_NUMBERS = (
-    JointNumber(
+JOINT_QUANTITIES = (
+    JointQuantity(
         "limit", "velocity", "limits", "speed_rad_s", "rad/s", 100.0, 20.0, "degrees per second"
     ),
-    JointNumber("limit", "effort", "limits", "torque_nm", "N·m", 1000.0, 50.0, "N·mm"),
-    JointNumber(
+    JointQuantity("limit", "effort", "limits", "torque_nm", "N·m", 1000.0, 50.0, "N·mm"),
+    JointQuantity(
         "dynamics",
         "damping",
         "motor",
@@ -53,7 +53,7 @@ JOINT_NUMBERS = (
         5.0,
         "N·mm·s/rad",
     ),
-    JointNumber("dynamics", "friction", "motor", "friction_nm", "N·m", 100.0, 5.0, "N·mm"),
+    JointQuantity("dynamics", "friction", "motor", "friction_nm", "N·m", 100.0, 5.0, "N·mm"),
 )
 
 
@@ -90,16 +90,14 @@ def convert_joint_limits(
         _set_common_range(result, ranges, source)
     joints_so_far = decode_table(result.table, RobotFile).joint_table
     columns: dict[str, list[float]] = {}  # by the key of the robot file, one value for each joint
-    for joint_number in JOINT_NUMBERS:
-        columns[joint_number.key] = _read_number_of_all_joints(
-            result, joint_number, joints, joints_so_far, is_exported=is_exported
+    for quantity in JOINT_QUANTITIES:
+        columns[quantity.key] = _read_number_of_all_joints(
+            result, quantity, joints, joints_so_far, is_exported=is_exported
         )
     if not is_exported:
-        for joint_number in JOINT_NUMBERS:
-            [(most_common, _)] = Counter(columns[joint_number.key]).most_common(1)
-            result.table.set_value(
-                f"{joint_number.section}.{joint_number.key}", most_common, source
-            )
+        for quantity in JOINT_QUANTITIES:
+            [(most_common, _)] = Counter(columns[quantity.key]).most_common(1)
+            result.table.set_value(f"{quantity.section}.{quantity.key}", most_common, source)
     _set_joint_exceptions(result, joints, ranges, columns, source)
 
 
@@ -175,7 +173,7 @@ def _read_limit_rad(
 
 def _read_number_of_all_joints(
     result: ImportResult,
-    joint_number: JointNumber,
+    quantity: JointQuantity,
     joints: Sequence[UrdfJoint],
     joints_so_far: Sequence[BuiltJoint],
     *,
@@ -185,7 +183,7 @@ def _read_number_of_all_joints(
 
     Args:
         result: Result of the import, whose report is extended.
-        joint_number: Kind of the number, such as the torque limit.
+        quantity: Kind of the number, such as the torque limit.
         joints: The joints of the URDF.
         joints_so_far: The joints by the values so far: of the same robot if `is_exported`, otherwise of the robot
             that the user named with `--like`.
@@ -194,59 +192,60 @@ def _read_number_of_all_joints(
     Raises:
         ConfigError: A limit is 0, which means that the joint has no motor, while other joints have one.
     """
-    values = [_read_number(result, joint_number, joint) for joint in joints]
+    values = [_read_number(result, quantity, joint) for joint in joints]
     positive_values = [value for value in values if value]
-    numbers: list[float] = []
+    complete_values: list[float] = []
     for joint, value, joint_so_far in zip(joints, values, joints_so_far, strict=True):
-        is_usable = value is not None and (value > 0 or not joint_number.is_limit)
-        if value is not None and is_usable:
-            numbers.append(value)
-            continue
-        if value is not None and positive_values:
-            raise _make_motorless_error(joint_number, joint, max(positive_values))
+        if value is not None:
+            is_zero_limit = quantity.is_limit and value == 0
+            if not is_zero_limit:
+                complete_values.append(value)
+                continue
+            if positive_values:
+                raise _make_motorless_error(quantity, joint, max(positive_values))
         assumed, origin = _assume_number(
-            joint_number, joint_so_far, positive_values, is_exported=is_exported
+            quantity, joint_so_far, positive_values, is_exported=is_exported
         )
         value_text = "no value" if value is None else f"{value:g}"
         result.assumptions.add(
-            f"<{joint_number.tag} {joint_number.attribute}> has {value_text}: {assumed:g} {joint_number.unit}, "
+            f"<{quantity.tag} {quantity.attribute}> has {value_text}: {assumed:g} {quantity.unit}, "
             f"{origin}",
-            joint.format_place(joint_number.tag),
+            joint.format_place(quantity.tag),
         )
-        numbers.append(assumed)
-    return numbers
+        complete_values.append(assumed)
+    return complete_values
 
 
 def _assume_number(
-    number: JointNumber, built: BuiltJoint, known: Sequence[float], *, is_exported: bool
+    quantity: JointQuantity, built: BuiltJoint, known: Sequence[float], *, is_exported: bool
 ) -> tuple[float, str]:
     """Return the value for a joint for which the file gives none, and the origin of this value."""
-    section = built.limits if number.is_limit else built.motor
-    default = getattr(section, number.key)
+    section = built.limits if quantity.is_limit else built.motor
+    default = getattr(section, quantity.key)
     if is_exported:
-        return default, f"from {number.section}.{number.key} of its <snakesim> element"
-    if not number.is_limit:
+        return default, f"from {quantity.section}.{quantity.key} of its <snakesim> element"
+    if not quantity.is_limit:
         return 0.0, "the URDF default for a missing value"
     if known:
         return min(known), "the smallest of the other joints; is there a motor in this joint?"
     return default, "from the robot of --like, because no joint has a value"
 
 
-def _make_motorless_error(number: JointNumber, joint: UrdfJoint, other: float) -> Exception:
+def _make_motorless_error(quantity: JointQuantity, joint: UrdfJoint, other: float) -> Exception:
     limit = joint.element.find_child("limit") or joint.element
     return limit.make_error(
-        f"of joint {joint.name!r} has `{number.attribute}` = 0 {number.unit}, and other joints have up to {other:g}: a "
-        f"joint without a motor. A robot file has a motor in every joint; give a value above 0 and at most "
-        f'{number.maximum:g} {number.unit}, or make the joint type="fixed"'
+        f"of joint {joint.name!r} has `{quantity.attribute}` = 0 {quantity.unit}, and other joints have up to "
+        f"{other:g}: a joint without a motor. A robot file has a motor in every joint; give a value above 0 and "
+        f'at most {quantity.maximum:g} {quantity.unit}, or make the joint type="fixed"'
     )
 
 
-def _read_number(result: ImportResult, joint_number: JointNumber, joint: UrdfJoint) -> float | None:
+def _read_number(result: ImportResult, quantity: JointQuantity, joint: UrdfJoint) -> float | None:
     """Read a number of a joint, such as its torque limit, and report a doubt if it is unusually large.
 
     Args:
         result: Result of the import, whose report gets a doubt about a number that is unusually large.
-        joint_number: Kind of the number, with its element, unit and range.
+        quantity: Kind of the number, with its element, unit and range.
         joint: The joint of the URDF.
 
     Returns:
@@ -255,22 +254,22 @@ def _read_number(result: ImportResult, joint_number: JointNumber, joint: UrdfJoi
     Raises:
         ConfigError: The number is out of its range.
     """
-    element = joint.element.find_child(joint_number.tag)
-    if element is None or joint_number.attribute not in element.attributes:
+    element = joint.element.find_child(quantity.tag)
+    if element is None or quantity.attribute not in element.attributes:
         return None
-    value = element.read_number(joint_number.attribute)
-    unit = joint_number.unit
-    other_unit = joint_number.other_unit
-    if not 0 <= value <= joint_number.maximum:
-        bound = "above 0" if joint_number.is_limit else "0 or more"
+    value = element.read_number(quantity.attribute)
+    unit = quantity.unit
+    other_unit = quantity.other_unit
+    if not 0 <= value <= quantity.maximum:
+        bound = "above 0" if quantity.is_limit else "0 or more"
         raise element.make_error(
-            f"of joint {joint.name!r} has `{joint_number.attribute}` = {value:g} {unit}; expected {bound} and at most "
-            f"{joint_number.maximum:g} {unit}. Is it in {other_unit}, or does it stand for no limit?"
+            f"of joint {joint.name!r} has `{quantity.attribute}` = {value:g} {unit}; expected {bound} and at most "
+            f"{quantity.maximum:g} {unit}. Is it in {other_unit}, or does it stand for no limit?"
         )
-    if value > joint_number.usual:
+    if value > quantity.usual:
         result.doubts.add(
-            f"`{joint_number.attribute}` = {value:g} {unit} is much for a snake robot; is it in {other_unit}?",
-            joint.format_place(joint_number.tag),
+            f"`{quantity.attribute}` = {value:g} {unit} is much for a snake robot; is it in {other_unit}?",
+            joint.format_place(quantity.tag),
         )
     return value
 
@@ -313,14 +312,14 @@ def _set_joint_exceptions(
             ("angle_min_rad", ranges[joint_index].lower_rad, common_joint.limits.lower_rad, "rad"),
             ("angle_max_rad", ranges[joint_index].upper_rad, common_joint.limits.upper_rad, "rad"),
         ]
-        for joint_number in JOINT_NUMBERS:
-            section = common_joint.limits if joint_number.is_limit else common_joint.motor
+        for quantity in JOINT_QUANTITIES:
+            section = common_joint.limits if quantity.is_limit else common_joint.motor
             compared_values.append(
                 (
-                    joint_number.key,
-                    columns[joint_number.key][joint_index],
-                    getattr(section, joint_number.key),
-                    joint_number.unit,
+                    quantity.key,
+                    columns[quantity.key][joint_index],
+                    getattr(section, quantity.key),
+                    quantity.unit,
                 )
             )
         for key, urdf_value, common_value, unit in compared_values:

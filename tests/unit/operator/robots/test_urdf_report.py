@@ -25,7 +25,7 @@ from snakesim_operator.features.robots.command import import_robot
 from snakesim_operator.features.robots.exporting import format_urdf
 from snakesim_operator.features.robots.imported import ImportOptions, ImportResult
 from snakesim_operator.features.robots.importing import import_urdf
-from snakesim_operator.features.robots.joint_limits import JOINT_NUMBERS
+from snakesim_operator.features.robots.joint_limits import JOINT_QUANTITIES
 from snakesim_testing.messages import raises_error
 
 SNAKE = (Path(__file__).parent / "urdf" / "every_attribute.urdf").read_text()
@@ -434,10 +434,10 @@ def test_bounds_are_those_of_a_robot_file() -> None:
         ),
         "motor": (JointMotor, dict.fromkeys((*motor, "armature_kg_m2"), 0.5)),
     }
-    for number in JOINT_NUMBERS:
+    for number in JOINT_QUANTITIES:
         struct, values = good[number.section]
         values = values | {
-            other.key: 0.5 for other in JOINT_NUMBERS if other.section == number.section
+            other.key: 0.5 for other in JOINT_QUANTITIES if other.section == number.section
         }
         msgspec.convert({**values, number.key: number.maximum}, struct)
         with pytest.raises(msgspec.ValidationError):
