@@ -13,7 +13,6 @@ judge are reported as UNKNOWN.
 """
 
 import argparse
-import importlib
 import json
 import os
 import platform
@@ -88,7 +87,8 @@ def check_version_everywhere(version: str) -> None:
 def build_distributions() -> None:
     """Build the source distribution and the wheels."""
     sys.path.insert(0, str(ROOT))
-    wheels = importlib.import_module("deploy.wheels")
+    from deploy import wheels  # here, because its folder must be searched first
+
     wheels.build_wheels(OUT / "dist")
     options = (
         "--quiet",

@@ -5,7 +5,6 @@ One wheel for each kind of processor, into `build/wheels/`. The compiler is zig,
 libraries fit the version of MuJoCo in the lock. With another version SnakeSIM compiles its sources, or uses Python.
 """
 
-import importlib
 import os
 import re
 import shutil
@@ -72,12 +71,15 @@ def install_zig() -> None:
 def compile_libraries(processor: Processor, folder: Path) -> None:
     """Compile all libraries for a kind of processor into an empty folder."""
     sys.path[:0] = [str(ROOT), str(ZIG)]
+    # Here, because the folders above must be searched first.
+    from snakesim_native.compile import CompileTarget, compile_library
+    from snakesim_native.libraries import LIBRARIES
+
     os.environ["PYTHONPATH"] = str(ZIG)  # for the compiler's process
-    native = importlib.import_module("snakesim_native.compile")
     shutil.rmtree(folder, ignore_errors=True)
-    target = native.Target(processor.machine, f"gnu.{OLDEST_GLIBC[0]}.{OLDEST_GLIBC[1]}")
-    for library in native.LIBRARIES:
-        native.compile_library(library, folder, target, extra_flags=("-s",))
+    target = CompileTarget(processor.machine, f"gnu.{OLDEST_GLIBC[0]}.{OLDEST_GLIBC[1]}")
+    for library in LIBRARIES:
+        compile_library(library, folder, target, extra_flags=("-s",))
     del os.environ["PYTHONPATH"]
 
 
