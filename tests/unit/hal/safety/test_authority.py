@@ -159,6 +159,16 @@ def test_arming_unchecked_robot_needs_explicit_request() -> None:
     assert ", unchecked" in rig.authority.reason
 
 
+def test_arming_waits_until_backend_reports_no_obstacle() -> None:
+    rig = make_commanded_rig()
+    rig.authority.set_backend_obstacles(["joint_2 is at step `home`"])
+    answer = rig.arm()
+    assert (answer.ok, answer.refusal) == (False, "not_ready")
+    assert "joint_2 is at step `home`" in answer.reason
+    rig.authority.set_backend_obstacles([])
+    assert rig.arm().ok
+
+
 def test_arming_with_unknown_cable_is_refused_even_unchecked() -> None:
     rig = make_commanded_rig(
         unchecked="nobody has checked it", cables=CableTracker((), {}, {"joint_2": "unknown"})
