@@ -257,7 +257,7 @@ def calibrate_directions(path: Path, selection: RobotSelection, names: Sequence[
         for joint in select_joints(robot.joints, names, path):
             direction = POSITIVE_DIRECTION_BY_AXIS[joint.axis]
             instruction = (
-                f"turn what is ahead of it {direction}, 10 degrees or more, and hold it still"
+                f"turn the link in front of it {direction} by 10 degrees or more, and hold it still"
             )
             turn = _wait_for_hand_turn(robot, joint, instruction)
             if turn is None:
@@ -295,9 +295,7 @@ def check_gears(path: Path, selection: RobotSelection, names: Sequence[str], deg
     with _connect_to_disarmed_robot(path, selection, "robot calibrate gear") as robot:
         for joint in select_joints(robot.joints, names, path):
             direction = POSITIVE_DIRECTION_BY_AXIS[joint.axis]
-            instruction = (
-                f"turn what is ahead of it {direction} by {degrees:g} degrees, and hold it still"
-            )
+            instruction = f"turn the link in front of it {direction} by {degrees:g} degrees, and hold it still"
             turn = _wait_for_hand_turn(robot, joint, instruction)
             if turn is None:
                 unknown_joints.append(joint.name)

@@ -66,7 +66,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
         with calibrating(home, endpoint, "direction", "snake.toml") as process:
             for joint in range(JOINTS):
                 assert read_output_line(process).startswith(
-                    f"joint_{joint + 1}: turn what is ahead of it to the left"
+                    f"joint_{joint + 1}: turn the link in front of it to the left"
                 )
                 pose_rad[joint] += 0.3
                 set_joint_angles(home, pose_rad)
@@ -93,7 +93,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
             home, endpoint, "gear", "snake.toml", "joint_3", "--degrees", "45"
         ) as process:
             assert read_output_line(process).startswith(
-                "joint_3: turn what is ahead of it to the left by 45 degrees"
+                "joint_3: turn the link in front of it to the left by 45 degrees"
             )
             set_joint_angles(home, [1.2, 0.4, np.pi / 4, 0.0])
             assert "45 of 45 degrees: matches the file" in read_output_line(process)

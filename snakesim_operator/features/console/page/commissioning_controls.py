@@ -51,7 +51,7 @@ class CommissioningControls:
         self._is_in_control = is_in_control
         self._run_operation = run_operation
         with tab:
-            self._folder = client.gui.add_folder("Do it here", order=2, visible=False)
+            self._folder = client.gui.add_folder("Run a step", order=2, visible=False)
         with self._folder:
             self._add_controls(client.gui)
         self._admit_controls(admission, on_late_press)

@@ -28,10 +28,10 @@ from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 MAX_IDLE_JOG_S = 60.0
 NO_VIEWER_ID = -1  # viewer of a step that is being ended already
 DESCRIPTION_BY_STEP = {
-    "direction": "turn joints by hand, as it asks; Enter skips one",
-    "zero": "lay the robot straight, take your hands off it, then Enter",
-    "limits": "move joints by hand from end to end, then Enter",
-    "jog": "ARMS the robot, checked or not, and moves one joint while a button below is held",
+    "direction": "turn each joint by hand when you are asked to; press Enter to skip a joint",
+    "zero": "lay the robot straight, take your hands off it, then press Enter",
+    "limits": "move each joint by hand from end to end, then press Enter",
+    "jog": "ARMS the robot, checked or not, and moves one joint while you hold a button below",
 }
 
 
