@@ -148,6 +148,10 @@ class ForwardKinematics:
         """Read the lengths of the links and the axes of the joints."""
         self._lengths_m = np.array([link.length_m for link in robot.links])
         self._axes = [joint.axis for joint in robot.joints]
+        # Of each joint: its number, and the coordinates (0 for x) that it rotates, the first one towards the second.
+        self._joint_indices = np.arange(len(self._axes))
+        self._first = np.array([0 if axis == "yaw" else 2 for axis in self._axes], dtype=np.intp)
+        self._second = np.array([1 if axis == "yaw" else 0 for axis in self._axes], dtype=np.intp)
 
     def compute_body_points_w(
         self, positions_w: Floats, wxyz: Floats, angles_rad: Floats
@@ -169,11 +173,36 @@ class ForwardKinematics:
             body_points_w[:, 1:-1] = positions_w[:, None] + link_vectors.cumsum(axis=1)
             body_points_w[:, -1] = body_points_w[:, -2] + lengths_m[-1] * forward[:, -1]
             return body_points_w
-        for i, axis in enumerate(self._axes):
-            body_points_w[:, i + 1] = body_points_w[:, i] + rotations[:, :, 0] * lengths_m[i]
-            rotations = rotations @ _compute_joint_rotations(axis, angles_rad[:, i])
-        body_points_w[:, -1] = body_points_w[:, -2] + lengths_m[-1] * rotations[:, :, 0]
-        return body_points_w
+        forward = self._compute_link_axes(rotations, angles_rad)
+        body_points_w[:, 1:] = forward * lengths_m[:, None]
+        # A cumulative sum adds one link after the other, as a loop would.
+        return body_points_w.cumsum(axis=1)
+
+    def _compute_link_axes(self, base_rotations: Floats, angles_rad: Floats) -> Floats:
+        """Return the x axes of all links, (n, n_links, 3), of robots with any joints."""
+        rotations = np.empty((len(self._axes) + 1, *base_rotations.shape))
+        rotations[0] = base_rotations
+        for i, joint_rotations in enumerate(self._compute_joint_rotations(angles_rad)):
+            np.matmul(rotations[i], joint_rotations, out=rotations[i + 1])
+        return rotations[:, :, :, 0].swapaxes(0, 1)
+
+    def _compute_joint_rotations(self, angles_rad: Floats) -> Floats:
+        """Return the rotations of all joints at many angles about their own axes, (n_joints, n, 3, 3).
+
+        All joints are computed at once: NumPy's calls would take longer than the arithmetic of a single joint.
+        """
+        rotations = np.zeros((len(self._axes), len(angles_rad), 3, 3))
+        rotations[:, :, [0, 1, 2], [0, 1, 2]] = 1.0  # what a joint does not rotate
+        joints = self._joint_indices
+        first = self._first
+        second = self._second
+        cosine = np.cos(angles_rad.T)
+        sine = np.sin(angles_rad.T)
+        rotations[joints, :, first, first] = cosine
+        rotations[joints, :, first, second] = -sine
+        rotations[joints, :, second, first] = sine
+        rotations[joints, :, second, second] = cosine
+        return rotations
 
     def _compute_planar_link_axes(self, rotations: Floats, angles_rad: Floats) -> Floats:
         """Return the x axes of all links, (n, n_links, 3), of robots whose joints all yaw."""
@@ -203,20 +232,6 @@ def _rotations_from_quaternions(wxyz: Floats) -> Floats:
     )
     elements[:, DIAGONAL] = 1 - elements[:, DIAGONAL]
     return elements.reshape(-1, 3, 3)
-
-
-def _compute_joint_rotations(axis: str, angles_rad: Floats) -> Floats:
-    """Return the rotations (n, 3, 3) of one joint at many angles about its own axis."""
-    rotations = np.zeros((len(angles_rad), 3, 3))
-    cosine = np.cos(angles_rad)
-    sine = np.sin(angles_rad)
-    first, second, fixed = (0, 1, 2) if axis == "yaw" else (2, 0, 1)
-    rotations[:, first, first] = cosine
-    rotations[:, first, second] = -sine
-    rotations[:, second, first] = sine
-    rotations[:, second, second] = cosine
-    rotations[:, fixed, fixed] = 1.0
-    return rotations
 
 
 def _compute_planar_link_frames(
