@@ -16,7 +16,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from benchmarks.sections import MAX_LOCKSTEP_US, MAX_OWN_US, MIN_RECORDED_SPEED, MIN_SPEED
+from benchmarks.sections import (
+    MAX_BATCH_RATIO,
+    MAX_ENVIRONMENT_RATIO,
+    MAX_LOCKSTEP_US,
+    MAX_OWN_US,
+    MIN_RECORDED_SPEED,
+    MIN_SPEED,
+)
 from benchmarks.table import format_interval, replace_section
 from snakesim_hal.base.process import make_child_environment, make_python_command
 
@@ -73,6 +80,20 @@ GOALS = (
         title="CPU time of a simulator tick of `triplet` without physics",
         unit="µs",
         limit=MAX_OWN_US,
+        is_minimum=False,
+    ),
+    Goal(
+        name="environment",
+        title="CPU time of a step of one environment of `mamba_flat`, in steps of the bare chain",
+        unit="steps",
+        limit=MAX_ENVIRONMENT_RATIO,
+        is_minimum=False,
+    ),
+    Goal(
+        name="environments",
+        title="CPU time of a step of 64 environments of `peg_row`, in steps of a bare `Batch`",
+        unit="steps",
+        limit=MAX_BATCH_RATIO,
         is_minimum=False,
     ),
 )

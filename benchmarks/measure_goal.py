@@ -12,7 +12,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import physics, whole
+from benchmarks import environments, physics, whole
+from benchmarks.sections import MANY, ROUND_S, ROUNDS
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
@@ -47,11 +48,37 @@ def measure_simulator_tick_us() -> float:
     return statistics.median(physics.measure_tick_times(physics.load_config()).own_us)
 
 
+def measure_environment_ratio() -> float:
+    """Return the CPU time of a step of one environment of `mamba_flat`, divided by that of the bare chain."""
+    return measure_ratio(
+        environments.make_environment_step("mamba_flat"), environments.make_bare_step("mamba_flat")
+    )
+
+
+def measure_environments_ratio() -> float:
+    """Return the CPU time of a step of 64 environments of `peg_row`, divided by that of a bare `Batch`."""
+    return measure_ratio(
+        environments.make_vector_step("peg_row", MANY),
+        environments.make_bare_batch_step("peg_row", MANY),
+    )
+
+
+def measure_ratio(step: environments.Step, other_step: environments.Step) -> float:
+    """Return the median ratio of the CPU times of two steps, which are measured in turn."""
+    ratios: list[float] = []
+    for _ in range(ROUNDS):
+        steps_per_s = environments.measure_steps_per_s(step, ROUND_S)
+        ratios.append(environments.measure_steps_per_s(other_step, ROUND_S) / steps_per_s)
+    return statistics.median(ratios)
+
+
 MEASUREMENTS: dict[str, Callable[[], float]] = {
     "loop": whole.measure_loop_in_process,
     "recorded": measure_recorded_loop,
     "lockstep": measure_lockstep_tick_us,
     "simulator": measure_simulator_tick_us,
+    "environment": measure_environment_ratio,
+    "environments": measure_environments_ratio,
 }
 
 if __name__ == "__main__":

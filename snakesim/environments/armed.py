@@ -104,7 +104,8 @@ class ArmedRobots:
         self.joints: Floats = np.zeros((robot_count, 3 * joints))
         self.is_armed: Mask = np.zeros(robot_count, dtype=np.bool_)
         self.reasons = [""] * robot_count
-        self.is_limited: Masks = np.zeros((robot_count, joints), dtype=np.bool_)
+        self._no_limited_joints: Masks = np.zeros((robot_count, joints), dtype=np.bool_)
+        self.is_limited = self._no_limited_joints
         self._active_limits: NDArray[np.int64] = np.zeros((robot_count, joints), dtype=np.int64)
         self._last_decision: _LimiterDecision | None = None
         self._command_digests = CommandDigests(robot_count, joints)
@@ -293,7 +294,8 @@ class ArmedRobots:
             target = limit_targets(
                 mode, requested, self._target, torque_limit_nm, measured, self._limits
             )
-            is_limited = target != requested
+            # Usually no target is limited, and no comparison is needed.
+            is_limited = self._no_limited_joints if target is requested else target != requested
             if self._is_derated:
                 # A motor that is derated counts as limited, also if its target is not changed.
                 full_nm = self._limits.torque_nm
@@ -303,7 +305,7 @@ class ArmedRobots:
             requested = self._commands[-1]  # the newest, without latency
             torque_limit_nm = self._limits.torque_nm
             target = requested.copy()
-            is_limited = np.zeros_like(self.is_limited)
+            is_limited = self._no_limited_joints
 
         # In the usual case the mask is the object `_all_robots`, and no row has to be restored.
         has_other_robots = robots is not self._all_robots

@@ -40,18 +40,23 @@ class LimitArrays:
     period_s: float
     angle_min_rad: Floats
     angle_max_rad: Floats
-    max_step_rad: Floats  # maximum distance of an angle target from the measured angle
     angle_rate_rad: Floats  # maximum change of an angle target in a period
     speed_rad_s: Floats
     acceleration_rad_s2: Floats
     torque_nm: Floats
     torque_rate_nm_s: Floats
     velocity_gain: Floats  # N·m·s/rad, of the torque bounds near the ends
+    # Minimum and maximum distance of an angle target from the measured angle, (2, robots, joints).
+    step_bounds_rad: Floats
 
     @staticmethod
     def allocate(robot_count: int, joint_count: int, period_s: float) -> "LimitArrays":
         """Return arrays of placeholder limits, which `set_robot` fills in."""
-        return LimitArrays(period_s, *(np.ones((robot_count, joint_count)) for _ in range(9)))
+        shape = (robot_count, joint_count)
+        step_bounds_rad = np.ones((2, *shape))
+        return LimitArrays(
+            period_s, *(np.ones(shape) for _ in range(8)), step_bounds_rad=step_bounds_rad
+        )
 
     def set_robot(self, robot_index: int, description: RobotDescription) -> None:
         """Fill in the limits of one robot."""
@@ -59,7 +64,8 @@ class LimitArrays:
             max_speed = max(joint.speed_limit_rad_s, MIN_SPEED_LIMIT_RAD_S)
             self.angle_min_rad[robot_index, i] = joint.angle_min_rad
             self.angle_max_rad[robot_index, i] = joint.angle_max_rad
-            self.max_step_rad[robot_index, i] = description.max_step_rad
+            self.step_bounds_rad[0, robot_index, i] = -description.max_step_rad
+            self.step_bounds_rad[1, robot_index, i] = description.max_step_rad
             self.angle_rate_rad[robot_index, i] = joint.speed_limit_rad_s * self.period_s
             self.speed_rad_s[robot_index, i] = joint.speed_limit_rad_s
             self.acceleration_rad_s2[robot_index, i] = joint.acceleration_limit_rad_s2
@@ -105,6 +111,8 @@ def limit_targets(
 ) -> Floats:
     """Return the targets within all limits that are nearest to the requested targets, (robots, joints).
 
+    If no target has to be changed, that is the array `requested` itself.
+
     Args:
         mode: Control mode of all joints. PASSIVE is not allowed.
         requested: Targets of the commands, in rad, rad/s or N·m depending on the mode.
@@ -118,11 +126,11 @@ def limit_targets(
     """
     match mode:
         case JointMode.POSITION:
-            low = _clamp(
-                measured.angle_rad - limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad
-            )
-            high = _clamp(
-                measured.angle_rad + limits.max_step_rad, limits.angle_min_rad, limits.angle_max_rad
+            # Both bounds in one array, because that takes half as many calls.
+            low, high = _clamp(
+                measured.angle_rad + limits.step_bounds_rad,
+                limits.angle_min_rad,
+                limits.angle_max_rad,
             )
             max_change = limits.angle_rate_rad
         case JointMode.VELOCITY:
@@ -137,7 +145,10 @@ def limit_targets(
             max_change = limits.torque_rate_nm_s * limits.period_s
         case JointMode.PASSIVE:
             raise ValueError("passive joints have no targets")
-    return _clamp(_clamp(requested, last_target - max_change, last_target + max_change), low, high)
+    # The same array as in the last period: all targets have been reached, and none changes.
+    if last_target is not requested:
+        requested = _clamp(requested, last_target - max_change, last_target + max_change)
+    return _clamp(requested, low, high)
 
 
 def find_active_limit_indices(
@@ -240,8 +251,16 @@ def _compute_stoppable_speed(distance_rad: Floats, limits: LimitArrays) -> Float
 
 
 def _clamp(value: Floats, low: Floats, high: Floats) -> Floats:
-    """Return the values within bounds. Unlike `np.clip` it keeps the sign of a zero that equals its bound."""
+    """Return the values within bounds: the same array if all of them are.
+
+    Unlike `np.clip` it keeps the sign of a zero that equals its bound.
+    """
+    is_above = value > high
+    is_below = value < low
+    # Usually no value is out of bounds, and counting is faster than copying.
+    if not np.count_nonzero(is_above) and not np.count_nonzero(is_below):
+        return value
     clamped: Any = value.copy()
-    np.copyto(clamped, high, where=value > high)
-    np.copyto(clamped, low, where=value < low)
+    np.copyto(clamped, high, where=is_above)
+    np.copyto(clamped, low, where=is_below)
     return clamped

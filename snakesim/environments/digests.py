@@ -73,16 +73,19 @@ class CommandDigests:
         """Add the collected ticks to the digests, and drop the ticks."""
         if not self._pending_ticks:
             return
-        packed_ticks = np.empty(
-            (len(self._hashes), len(self._pending_ticks)), dtype=self._tick_dtype
-        )
-        for i, tick in enumerate(self._pending_ticks):
-            packed_ticks["tick"][:, i] = tick.ticks
-            packed_ticks["mode"][:, i] = tick.modes
-            packed_ticks["target"][:, i] = tick.target
-            packed_ticks["torque_limit_nm"][:, i] = tick.torque_limit_nm
-        # (robots, ticks).
-        got_setpoints = np.stack([tick.robots for tick in self._pending_ticks], axis=1)
+        ticks = self._pending_ticks
+        robot_count = len(self._hashes)
+        packed_ticks = np.empty((len(ticks), robot_count), dtype=self._tick_dtype)
+        packed_ticks["tick"] = [tick.ticks for tick in ticks]
+        # To concatenate many small arrays takes less time than to copy each of them into its place.
+        per_joint = (len(ticks), robot_count, -1)
+        packed_ticks["mode"] = np.concatenate([tick.modes for tick in ticks]).reshape(per_joint)
+        packed_ticks["target"] = np.concatenate([tick.target for tick in ticks]).reshape(per_joint)
+        packed_ticks["torque_limit_nm"] = np.concatenate(
+            [tick.torque_limit_nm for tick in ticks]
+        ).reshape(per_joint)
+        got_setpoints = np.array([tick.robots for tick in ticks])  # (ticks, robots)
         self._pending_ticks = []
-        for robot_hash, rows, mask in zip(self._hashes, packed_ticks, got_setpoints, strict=True):
-            robot_hash.update(rows[mask].tobytes())
+        for robot_index, robot_hash in enumerate(self._hashes):
+            rows = packed_ticks[got_setpoints[:, robot_index], robot_index]
+            robot_hash.update(rows.tobytes())

@@ -141,7 +141,8 @@ class EpisodeBatch:
         Args:
             actions: Targets of all joints, (environments, joints), in the unit of the actions. The array must not
                 change afterwards.
-            environments: Which environments take the step, (environments,). None of their episodes may be over.
+            environments: Which environments take the step, (environments,). None of their episodes may be over. The
+                array must not change afterwards. A call with the array of the last step is faster.
 
         Returns:
             Observations, rewards and ends of episodes. Rows of environments that took no step are not valid.
@@ -202,6 +203,7 @@ class EpisodeBatch:
         is_everyone_active = True
         # No robot's time is over before this tick of the step.
         min_remaining_ticks = int(self._remaining_ticks[environments].min(initial=frame_skip))
+        environment_count = np.count_nonzero(environments)
         active = environments
         is_armed: Mask | None = None  # as of the last computation of `active`
         for tick in range(frame_skip):
@@ -209,9 +211,13 @@ class EpisodeBatch:
             if is_armed is not self.robots.is_armed or tick >= min_remaining_ticks:
                 is_armed = self.robots.is_armed
                 active = environments & is_armed & (count_by_environment < self._remaining_ticks)
-                is_everyone_active = is_everyone_active and bool(active.all())
-                if not np.count_nonzero(active):
+                active_count = np.count_nonzero(active)
+                is_everyone_active = is_everyone_active and active_count == self._count
+                if not active_count:
                     break
+                # If possible the object of the last step, for which the robots have cached their masks.
+                if active_count == environment_count:
+                    active = environments
             self.robots.step(self._setup.commands.mode, actions, active)
             self._active_by_tick[tick] = active
             self._joints_by_tick[tick] = self.robots.joints
@@ -296,7 +302,7 @@ class EpisodeBatch:
             active = self._active_by_tick[:tick_count]
             energy_j = np.where(active, energy_j, 0.0)
             is_limited = is_limited & active[:, :, None]
-        return energy_j.cumsum(axis=0)[-1], is_limited.sum(axis=2).sum(axis=0)
+        return energy_j.cumsum(axis=0)[-1], is_limited.sum(axis=(0, 2))
 
 
 def sum_terms(terms: dict[str, Floats]) -> Floats:

@@ -29,8 +29,8 @@ class EnvironmentRobots:
     Attributes:
         joints: Newest angles, velocities and torques of all robots, (robots, 3 * joints). A new array in each tick.
         is_armed: Whether each robot follows commands, (robots,). False once a fault has stopped the robot.
-        is_limited: Whether the target of each joint was limited in the last tick, (robots, joints). A new array in each
-            tick.
+        is_limited: Whether the target of each joint was limited in the last tick, (robots, joints). The array never
+            changes afterwards.
     """
 
     def __init__(

@@ -444,14 +444,15 @@ def _rotate(wxyz: Floats, vector: Floats) -> Floats:
 
 
 # In the product of a quaternion and (1, a, b, c): the three terms that are added to each component, in order.
-FACTOR_OF_TERM = [[0, 0, 1, 2], [1, 1, 2, 0], [2, 2, 0, 1]]  # index in (a, b, c)
-COMPONENT_OF_TERM = [[1, 0, 0, 0], [2, 3, 1, 2], [3, 2, 3, 1]]  # index in the quaternion
+FACTOR_OF_TERM = np.array([[0, 0, 1, 2], [1, 1, 2, 0], [2, 2, 0, 1]])  # index in (a, b, c)
+COMPONENT_OF_TERM = np.array([[1, 0, 0, 0], [2, 3, 1, 2], [3, 2, 3, 1]])  # index in the quaternion
 SIGN_OF_TERM = np.array([[-1.0, 1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, -1.0, -1.0]])
 
 
 def _perturb_orientation(wxyz: Floats, half_angles: Floats) -> Floats:
     """Return the unit quaternions along wxyz * (1, half angles): small rotations about axes of the base are added."""
-    terms = SIGN_OF_TERM * (half_angles[:, FACTOR_OF_TERM] * wxyz[:, COMPONENT_OF_TERM])
+    factors = half_angles.take(FACTOR_OF_TERM, axis=1)  # (n, 3, 4)
+    terms = SIGN_OF_TERM * (factors * wxyz.take(COMPONENT_OF_TERM, axis=1))
     quaternion = wxyz + terms[:, 0] + terms[:, 1] + terms[:, 2]
     # In order, so that it does not depend on how many there are.
     squares = np.cumsum(quaternion * quaternion, axis=1)
