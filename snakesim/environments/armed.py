@@ -105,6 +105,7 @@ class ArmedRobots:
         self.is_armed: Mask = np.zeros(robot_count, dtype=np.bool_)
         self.reasons = [""] * robot_count
         self._no_limited_joints: Masks = np.zeros((robot_count, joints), dtype=np.bool_)
+        self._no_limited_joints.flags.writeable = False  # many ticks share it
         self.is_limited = self._no_limited_joints
         self._active_limits: NDArray[np.int64] = np.zeros((robot_count, joints), dtype=np.int64)
         self._last_decision: _LimiterDecision | None = None

@@ -14,7 +14,8 @@ from snakesim_hal.base import arithmetic
 from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.base.workers import start_restarting_thread
 
-STOP_TIMEOUT_S = 5.0  # a child that has not ended by then is killed
+# A child that has not ended by then is killed. A recorder on a busy computer once took over 5 s to close its file.
+STOP_TIMEOUT_S = 15.0
 MAX_LINES_SHOWN = 15  # of the output of a child that failed
 OUTPUT_TAIL_BYTES = 16384  # held in memory, more than MAX_LINES_SHOWN lines usually take
 PIPE_BYTES = 2**20  # holds a child's output while this process is frozen
