@@ -223,12 +223,15 @@ class IdentifyTrial:
 
     @property
     def named(self) -> list[int]:
-        """Joints that are said to have backlash."""
-        return [
-            joint
-            for joint, one in enumerate(self.found)
-            if any("backlash" in text for text in one.unknown)
-        ]
+        """Joints that are reported to have backlash."""
+        return find_named_joints(self.found)
+
+
+def find_named_joints(found: Sequence[JointIdentification]) -> list[int]:
+    """Return the indices of the joints that the identification reports to have backlash."""
+    return [
+        joint for joint, one in enumerate(found) if any("backlash" in text for text in one.unknown)
+    ]
 
 
 @dataclass(frozen=True)
