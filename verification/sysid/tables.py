@@ -1,6 +1,6 @@
 """Tables of the comparison, as lines of Markdown."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from statistics import median
 
 from snakesim_operator.features.evaluate.table import compute_wilson_interval
@@ -28,13 +28,15 @@ def is_intact(robot: RobotComparison, joint_index: int) -> bool:
 
 def make_report(robots: Sequence[RobotComparison]) -> Iterator[str]:
     """Yield all tables. Robots with backlash have separate tables for joints with backlash and without."""
-    yield from make_verdict_table(robots)
-    groups: dict[str, JointFilter] = {"all joints": is_any_joint}
+    groups: dict[str, JointFilter] = {"all": is_any_joint}
     if any(robot.loose is not None for robot in robots):
-        groups = {"joints with backlash": is_loose, "joints without backlash": is_intact}
+        groups = {"with backlash": is_loose, "without backlash": is_intact}
+    yield from make_verdict_table(robots)
+    yield ""
+    yield from make_value_table(robots, groups)
     for label, accepts in groups.items():
-        yield from ("", f"{label}, errors:", "", *make_error_table(robots, accepts))
-        yield from ("", f"{label}, intervals:", "", *make_interval_table(robots, accepts))
+        yield from ("", f"Errors, joints: {label}", "", *make_error_table(robots, accepts))
+        yield from ("", f"Intervals, joints: {label}", "", *make_interval_table(robots, accepts))
     yield ""
     yield from describe_costs(robots)
 
@@ -76,28 +78,40 @@ def make_interval_table(
 
 
 def make_verdict_table(robots: Sequence[RobotComparison]) -> Iterator[str]:
-    """Yield the table of the robots of which a method warns, and of the values that mislead."""
-    yield (
-        "| method | robots | warns | names the joint | names another joint | values "
-        f"| more than {CLOSE:.0%} off | of these, not covered |"
-    )
-    yield "|---|---|---|---|---|---|---|---|"
+    """Yield the table of the robots of which a method warns, and of the joints that it names."""
+    yield "| method | robots | warns | names the joint | names another joint |"
+    yield "|---|---|---|---|---|"
     for method in METHODS:
         found = [(robot, robot.by_method[method]) for robot in robots]
-        estimates = [one for _, identified in found for one in identified.estimates]
-        known = [one for one in estimates if one.value is not None]
-        suspects = [
-            (robot, identified.suspect)
-            for robot, identified in found
-            if identified.suspect is not None
-        ]
-        named = sum(suspect == robot.loose for robot, suspect in suspects)
         warned = sum(identified.warns for _, identified in found)
-        yield (
-            f"| {method} | {len(found)} | {warned} | {named} | {len(suspects) - named} "
-            f"| {len(known)} of {len(estimates)} | {sum(not one.is_close for one in known)} "
-            f"| {sum(one.misleads for one in known)} |"
+        named = sum(identified.suspect is not None for _, identified in found)
+        named_right = sum(
+            identified.suspect is not None and identified.suspect == robot.loose
+            for robot, identified in found
         )
+        yield f"| {method} | {len(found)} | {warned} | {named_right} | {named - named_right} |"
+
+
+def make_value_table(
+    robots: Sequence[RobotComparison], groups: Mapping[str, JointFilter]
+) -> Iterator[str]:
+    """Yield the table of the values that are far off, and of those of them whose intervals do not cover the truth."""
+    yield f"| method | joints | values | more than {_percent(CLOSE, 0)} off | of these, not covered |"
+    yield "|---|---|---|---|---|"
+    for method in METHODS:
+        for label, accepts in groups.items():
+            estimates = [
+                one
+                for robot in robots
+                for one in robot.by_method[method].estimates
+                if accepts(robot, one.joint_index)
+            ]
+            known = [one for one in estimates if one.value is not None]
+            yield (
+                f"| {method} | {label} | {len(known)} of {len(estimates)} "
+                f"| {sum(not one.is_close for one in known)} "
+                f"| {sum(one.misleads for one in known)} |"
+            )
 
 
 def describe_costs(robots: Sequence[RobotComparison]) -> Iterator[str]:
@@ -136,7 +150,7 @@ def _describe_errors(estimates: Sequence[Estimate]) -> str:
     errors = [one.error for one in estimates if one.error is not None]
     if not errors:
         return "- | -"
-    return f"{median(errors):.2%} | {max(errors):.1%}"
+    return f"{_percent(median(errors), 2)} | {_percent(max(errors), 1)}"
 
 
 def _describe_closer(ours: Sequence[Estimate], theirs: Sequence[Estimate]) -> str:
@@ -157,4 +171,10 @@ def _describe_intervals(estimates: Sequence[Estimate]) -> str:
     covered = sum(one.covers for one in known)
     low, high = compute_wilson_interval(covered, len(known))
     width = median(one.half_width / abs(one.truth) for one in known)
-    return f"{covered} of {len(known)} ({low:.0%} to {high:.0%}) | {width:.2%}"
+    interval = f"{100 * low:.0f} to {_percent(high, 0)}"
+    return f"{covered} of {len(known)} ({interval}) | {_percent(width, 1)}"
+
+
+def _percent(fraction: float, digits: int) -> str:
+    """Return a fraction as the documentation has it."""
+    return f"{100 * fraction:.{digits}f} %"
