@@ -1,6 +1,7 @@
 """Emulated robots with a hidden fault, and what the joint check and the system identification find of it.
 
-    python -m verification.commissioning_trials check|identify --first 1000 --trials 70
+    python -m verification.commissioning_trials check --first 1000 --trials 70 [--backend odrive]
+    python -m verification.commissioning_trials identify --first 1000 --trials 70
 
 Every trial is a robot of its own, by its number, which is its seed: the joint, the size of its fault, the friction of
 the floor, how straight a person laid the robot, and what its motors are. It prints each trial in which something was
@@ -10,7 +11,7 @@ missed or a sound joint was blamed, then a table.
 import argparse
 import random
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,6 +52,9 @@ FAULTS: Mapping[str, tuple[JointProperty, str]] = {
     "backlash": ("gear", "backlash of"),
     "dead motor": ("drive", "did not move"),
 }
+# Of these, only emulated joint modules have a setting.
+FAULTS_OF_JOINT_MODULES = ("order", "dead motor")
+JOINT_MODULES = "can"  # the only backend whose drives report IMUs
 
 
 # --- the joint check -------------------------------------------------------------------------------------------
@@ -75,6 +79,12 @@ class CheckTrial:
         )
 
     @property
+    def undecided(self) -> bool:
+        """Whether the property of a joint with the fault is unknown, so that the robot cannot be armed."""
+        name, _ = FAULTS[self.fault]
+        return any(self.rows[joint].findings[name].state == "unknown" for joint in self.joints)
+
+    @property
     def blamed(self) -> list[str]:
         """Sound joints of which something is wrong."""
         rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
@@ -88,9 +98,23 @@ class CheckTrial:
 
 
 def check_trial(
-    number: int, fault: str, *sets: str, module_count: int = 8, seconds: float = 13.0
+    number: int,
+    fault: str,
+    *sets: str,
+    backend: str = JOINT_MODULES,
+    module_count: int = 8,
+    seconds: float = 13.0,
 ) -> CheckTrial:
-    """Check a robot with a hidden fault. sets: as `--set` of a run."""
+    """Check a robot with a hidden fault.
+
+    Args:
+        number: Number of the robot, which is its seed.
+        fault: The fault, of `FAULTS` or `NONE`.
+        *sets: As `--set` of a run.
+        backend: Backend of the run, which is the type of its drives.
+        module_count: Number of joints.
+        seconds: Duration of the run.
+    """
     pick = random.Random(number)
     zeros = [pick.uniform(-LAID_RAD, LAID_RAD) for _ in range(module_count)]
     joint, other = pick.sample(range(module_count), 2)
@@ -116,9 +140,9 @@ def check_trial(
         f"scene.ground.friction={pick.uniform(0.2, 0.8)}",
         f"robot.chain.modules={module_count}",
     ]
-    run += [f"duration_s={seconds}", *(f"backends.can.mounted.{text}" for text in truth)]
+    run += [f"duration_s={seconds}", *(f"backends.{backend}.mounted.{text}" for text in truth)]
     with_fault = {NONE: [], "order": [joint, other]}.get(fault, [joint])
-    return CheckTrial(fault, with_fault, _checked("backend=can", *sets, *run))
+    return CheckTrial(fault, with_fault, _checked(f"backend={backend}", *sets, *run))
 
 
 def _checked(*sets: str) -> list[JointVerdict]:
@@ -140,13 +164,15 @@ def _checked(*sets: str) -> list[JointVerdict]:
     )
 
 
-def check_table(first: int, trial_count: int, *sets: str) -> list[str]:
-    """Return the table of trials with every fault, and as many without any."""
+def check_table(first: int, trial_count: int, *sets: str, backend: str) -> list[str]:
+    """Return the table of trials with every fault that drives of a backend can have, and as many without any."""
     made: list[CheckTrial] = []
     kinds = [*FAULTS, NONE]
+    if backend != JOINT_MODULES:
+        kinds = [kind for kind in kinds if kind not in FAULTS_OF_JOINT_MODULES]
     for number in range(first, first + trial_count):
         fault = kinds[number % len(kinds)]
-        trial = check_trial(number, fault, *sets)
+        trial = check_trial(number, fault, *sets, backend=backend)
         made.append(trial)
         if trial.blamed or trial.unsure or (trial.joints and not trial.found):
             said = [
@@ -157,12 +183,15 @@ def check_table(first: int, trial_count: int, *sets: str) -> list[str]:
                 flush=True,
             )
     lines = [
-        "| hidden fault | robots | found by name | robots with a sound joint blamed | with one unknown |"
+        "| hidden fault | robots | found by name | undecided | robots with a sound joint blamed | with one unknown |"
     ]
-    lines.append("|---|---|---|---|---|")
+    lines.append("|---|---|---|---|---|---|")
     for fault in kinds:
         those = [trial for trial in made if trial.fault == fault]
-        found = "-" if fault == NONE else str(sum(trial.found for trial in those))
+        found = "- | -"
+        if fault != NONE:
+            undecided = sum(trial.undecided for trial in those)
+            found = f"{sum(trial.found for trial in those)} | {undecided}"
         blamed, unsure = (
             sum(bool(trial.blamed) for trial in those),
             sum(bool(trial.unsure) for trial in those),
@@ -223,12 +252,15 @@ class IdentifyTrial:
 
     @property
     def named(self) -> list[int]:
-        """Joints that are said to have backlash."""
-        return [
-            joint
-            for joint, one in enumerate(self.found)
-            if any("backlash" in text for text in one.unknown)
-        ]
+        """Joints that are reported to have backlash."""
+        return find_named_joints(self.found)
+
+
+def find_named_joints(found: Sequence[JointIdentification]) -> list[int]:
+    """Return the indices of the joints that the identification reports to have backlash."""
+    return [
+        joint for joint, one in enumerate(found) if any("backlash" in text for text in one.unknown)
+    ]
 
 
 @dataclass(frozen=True)
@@ -391,9 +423,8 @@ def _identified_row(trials: Sequence[IdentifyTrial], *, backlash: bool) -> str:
 
 def main() -> int:
     """Print the table of the check or of the identification."""
-    tables: dict[str, Callable[..., list[str]]] = {"check": check_table, "identify": identify_table}
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("table", choices=tables)
+    parser.add_argument("table", choices=("check", "identify"))
     parser.add_argument(
         "--first", type=int, default=1000, help="number of the first trial (default: 1000)"
     )
@@ -401,8 +432,17 @@ def main() -> int:
     parser.add_argument(
         "--set", action="append", default=[], dest="sets", metavar="PATH=VALUE", help="as of a run"
     )
+    parser.add_argument(
+        "--backend", default=JOINT_MODULES, help="drive type of the checked robots (default: can)"
+    )
     arguments = parser.parse_args()
-    print("\n".join(tables[arguments.table](arguments.first, arguments.trials, *arguments.sets)))
+    if arguments.table == "check":
+        lines = check_table(
+            arguments.first, arguments.trials, *arguments.sets, backend=arguments.backend
+        )
+    else:
+        lines = identify_table(arguments.first, arguments.trials, *arguments.sets)
+    print("\n".join(lines))
     return 0
 
 

@@ -1,0 +1,50 @@
+"""Identifies a robot as `snakesim robot identify` does."""
+
+import time
+from collections.abc import Mapping
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_operator.features.commissioning.identification import (
+    JointIdentification,
+    identify_joints,
+)
+from verification.commissioning_trials import HiddenRobot, find_named_joints
+from verification.sysid.estimates import PARAMETERS, Estimate, Identified, get_truth
+
+
+def identify_by_equations(
+    robot: HiddenRobot, columns: Mapping[str, Floats], link_rates: Floats | None
+) -> Identified:
+    """Identify a robot as `snakesim robot identify` does.
+
+    Args:
+        robot: The robot.
+        columns: The record.
+        link_rates: What the gyros of the links measured; None for links without IMUs.
+    """
+    begun_s = time.process_time()
+    joints = identify_joints(robot.config, columns, link_rates)
+    cpu_s = time.process_time() - begun_s
+    estimates = [
+        _make_estimate(robot, i, joint, parameter)
+        for i, joint in enumerate(joints)
+        for parameter in PARAMETERS
+    ]
+    named = find_named_joints(joints)
+    return Identified(
+        estimates,
+        cpu_s,
+        warns=any(joint.fails or not joint.complete for joint in joints),  # exit code 1
+        suspect=named[0] if named else None,
+    )
+
+
+def _make_estimate(
+    robot: HiddenRobot, joint_index: int, joint: JointIdentification, parameter: str
+) -> Estimate:
+    """Return a value of a joint; it is unknown if `--write` would not write it into the robot file."""
+    truth = get_truth(robot, joint_index, parameter)
+    value = None if joint.fails else joint.fields.get(parameter)
+    if value is None:
+        return Estimate(joint_index, parameter, None, 0.0, truth)
+    return Estimate(joint_index, parameter, value.value, value.half_width, truth)
