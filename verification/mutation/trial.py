@@ -38,7 +38,7 @@ TRIED_BY = {
     "fault_log.py": ("test_fault_log.py", "test_authority.py", "test_authority_machine.py"),
     "isolation.py": ("test_isolation.py", "test_authority_machine.py"),
     "plausibility.py": ("test_plausibility.py", "test_isolation.py", "test_authority_machine.py"),
-    "stop_ramp.py": ("test_stop_ramp.py", "test_authority_machine.py"),
+    "stop_ramp.py": ("test_stop_ramp.py", "test_authority.py", "test_authority_machine.py"),
     "derating.py": ("test_derating.py", "test_authority_machine.py"),
     "thermal.py": ("test_thermal.py",),
 }

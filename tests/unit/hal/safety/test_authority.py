@@ -192,6 +192,21 @@ def test_arming_in_lockstep_does_not_wait_for_power_reports() -> None:
     assert rig.arm().ok
 
 
+@pytest.mark.parametrize("was_used", [True, False])
+def test_arming_in_lockstep_forgets_commands_of_the_last_session(was_used: bool) -> None:
+    rig = make_armed_rig()
+    rig.send(0.3)
+    if was_used:
+        rig.authority.compute_setpoints(rig.tick)
+    assert rig.authority.handle_lifecycle_request(DISARM, rig.now_ns).ok
+    rig.authority.compute_setpoints(rig.tick)  # the stop goes out
+    rig.send(0.1)
+    assert rig.arm().ok
+    decision = rig.authority.compute_setpoints(rig.tick)
+    assert decision.command_sequence is None, "a command of the last arm session was applied"
+    assert decision.setpoints.target == pytest.approx([0.1] * JOINTS)
+
+
 # --- commands and the lease ------------------------------------------------------------------------------------
 
 
