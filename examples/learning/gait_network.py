@@ -16,7 +16,7 @@ from snakesim.training.form import OBSERVE, RAMP_PER_S, PolicyArrays
 from snakesim_gnc.control import policy as policy_file
 from snakesim_hal.model.textfiles import export_atomically
 
-HARMONICS = 3  # of the wave
+HARMONICS = 2  # of the wave
 BEARING_GAIN = 3.0  # so that a bearing of 20 degrees counts as 1
 OPSET_VERSION = 18  # one that every onnxruntime from 1.20 on reads
 
@@ -40,7 +40,9 @@ class PhaseFeatures(BaseFeaturesExtractor):
         bearing_sine = observations[:, 2:3]
         phases_rad = time_s * self.omegas_rad_s
         ramp = torch.clamp(RAMP_PER_S * time_s, max=1.0)
-        harmonics = [torch.sin(phases_rad), torch.cos(phases_rad)]
+        # A higher harmonic moves the joints faster, so it counts less.
+        weights = 1.0 / torch.arange(1.0, HARMONICS + 1)
+        harmonics = [weights * torch.sin(phases_rad), weights * torch.cos(phases_rad)]
         return torch.cat([*harmonics, ramp, BEARING_GAIN * bearing_sine], dim=1)
 
 

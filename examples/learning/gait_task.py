@@ -31,7 +31,7 @@ ENVIRONMENT: dict[str, Any] = {
     "scenario": SCENARIO,
     "frame_skip": FRAME_SKIP,
     "duration": DURATION_S,
-    "randomize": {"scene.ground.friction": (0.1, 0.4)},
+    "randomize": {"scene.ground.friction": (0.15, 0.25)},
 }
 
 # First seeds of four sets of episodes that have no seed in common.

@@ -29,7 +29,7 @@ from snakesim.training.form import PolicyArrays
 ENVIRONMENT_COUNT = 32
 VALIDATION_EPISODES = 8
 FILM_S = 5.0
-ENERGY_WEIGHT_M_PER_J = 0.006  # advance for which the policy may spend a joule
+ENERGY_WEIGHT_M_PER_J = 0.005  # advance for which the policy may spend a joule
 REWARD_PER_M = 20.0  # so that the discounted return is about 1
 REWARD = {
     "advance": REWARD_PER_M,
@@ -37,18 +37,18 @@ REWARD = {
     "limited": 0.0,
 }
 # The policy is linear in its features, so it learns a Fourier series for each shape of the body.
-NETWORK = {"net_arch": {"pi": [], "vf": [64, 64]}, "log_std_init": -3.5}
+NETWORK = {"net_arch": {"pi": [], "vf": [64, 64]}, "log_std_init": -2.7}
 HYPERPARAMETERS = {
-    "n_steps": 125,  # of each environment: 4000 samples for an update
-    "batch_size": 1000,
+    "n_steps": 200,  # of each environment, about one period: 6400 samples for an update
+    "batch_size": 1600,
     "n_epochs": 8,
-    "learning_rate": 3e-4,
-    "gamma": 0.995,  # a horizon of 2 s, about one period of the wave
-    "gae_lambda": 0.98,
-    "target_kl": 0.03,
+    "learning_rate": 1e-3,
+    "gamma": 0.998,  # a horizon of 5 s
+    "gae_lambda": 0.995,
+    "target_kl": 0.05,
     # Exploration that depends on the phase is smooth in time. White noise at 100 Hz would only shake the joints.
     "use_sde": True,
-    "sde_sample_freq": 64,
+    "sde_sample_freq": -1,  # new exploration for each update, since each change is a jump
 }
 CHECKPOINT_FILE = "checkpoint.zip"
 POLICY_FILE = "policy.onnx"
@@ -72,13 +72,14 @@ class GaitCallback(BaseCallback):
         self._check_ticks = check_ticks
         self._film_ticks = film_ticks
         rows = read_rows(out / CURVE_FILE)
+        self._is_curve_empty = not rows
         self._best_score_m = max((row.score_m for row in rows), default=-np.inf)
         self._earlier_processor_s = rows[-1].processor_s if rows else 0.0
 
     def _on_training_start(self) -> None:
         self._next_check = self.num_timesteps + self._check_ticks
         self._next_film = self.num_timesteps + self._film_ticks
-        if self.num_timesteps == 0:
+        if self._is_curve_empty:
             self._check()  # the wave alone: the corrections are still almost 0
 
     def _on_rollout_start(self) -> None:
@@ -115,18 +116,19 @@ class GaitCallback(BaseCallback):
         self.logger.dump(self.num_timesteps)
 
         self.model.save(self._out / CHECKPOINT_FILE)
+        row = CurveRow(self.num_timesteps, advance_m, energy_j, score_m, processor_s)
+        append_row(self._out / CURVE_FILE, row)
         if score_m > self._best_score_m:
             self._best_score_m = score_m
             self._export(self._out / POLICY_FILE)
-        row = CurveRow(self.num_timesteps, advance_m, energy_j, score_m, processor_s)
-        append_row(self._out / CURVE_FILE, row)
 
     def _film(self) -> None:
         """Run the policy as a controller, with the HAL and its limiter, and write a video of the run."""
         policy = self._out / "filmed.onnx"
         self._export(policy)
         run = snakesim.run(gait_task.SCENARIO, controller=f"policy:{policy}", duration=FILM_S)
-        run.video(self._out / f"gait-{self.num_timesteps}.mp4", width=640, height=360)
+        video = self._out / f"gait-{self.num_timesteps}.mp4"
+        run.video(video, width=480, height=270, fps=15.0)  # small, since it is drawn without a GPU
 
     def _export(self, out: Path) -> None:
         export_policy(self.model.policy, self._wave, " ".join(sys.argv), out)
@@ -175,7 +177,10 @@ def main() -> None:
     callback = GaitCallback(wave, arguments.out, arguments.check_ticks, arguments.film_ticks)
     is_new = arguments.resume is None
     remaining_ticks = arguments.ticks - model.num_timesteps
-    model.learn(max(remaining_ticks, 0), callback=callback, reset_num_timesteps=is_new)
+    try:
+        model.learn(max(remaining_ticks, 0), callback=callback, reset_num_timesteps=is_new)
+    except KeyboardInterrupt:
+        print(f"stopped; continue with --resume {arguments.out / CHECKPOINT_FILE}")
 
 
 if __name__ == "__main__":

@@ -168,15 +168,15 @@ def test_training_resumes_and_its_policy_drives_the_robot(wave_file: Path, tmp_p
         pytest.importorskip(package, reason=MISSING)
     out = tmp_path / "ppo"
     command = [sys.executable, str(EXAMPLE / "learn_gait_ppo.py"), "--wave", str(wave_file)]
-    command += ["--out", str(out), "--check-ticks", "4000", "--tensorboard", str(tmp_path / "log")]
-    subprocess.run([*command, "--ticks", "8000", "--film-ticks", "4000"], check=True, timeout=400)
-    assert (out / "gait-4000.mp4").stat().st_size > 1000
-    resume = ["--resume", str(out / "checkpoint.zip"), "--ticks", "12000"]
+    command += ["--out", str(out), "--check-ticks", "6400", "--tensorboard", str(tmp_path / "log")]
+    subprocess.run([*command, "--ticks", "12800", "--film-ticks", "6400"], check=True, timeout=400)
+    assert (out / "gait-6400.mp4").stat().st_size > 1000
+    resume = ["--resume", str(out / "checkpoint.zip"), "--ticks", "19200"]
     subprocess.run([*command, *resume], check=True, timeout=400)
 
     with (out / "curve.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [int(row["ticks"]) for row in rows] == [0, 4000, 8000, 12000]
+    assert [int(row["ticks"]) for row in rows] == [0, 6400, 12800, 19200]
     processor_s = [float(row["processor_s"]) for row in rows]
     assert processor_s == sorted(processor_s)
     assert len(list((tmp_path / "log").rglob("events.out.tfevents.*"))) == 2
