@@ -18,6 +18,14 @@ def windings(count: int = 1, **exceptions: Any) -> ThermalModel:
     return ThermalModel(robot.joint_table)
 
 
+@pytest.mark.parametrize(
+    ("winding_c", "fraction"), [(20.0, 1.0), (80.0, 1.0), (90.0, 0.6), (100.0, 0.2), (150.0, 0.2)]
+)
+def test_thermal_torque_fraction_falls_from_one_to_a_fifth(winding_c: float, fraction: float):
+    limits = HeatLimits(derate_from_c=80.0, stop_at_c=100.0)
+    assert limits.compute_remaining_fraction(winding_c) == pytest.approx(fraction)
+
+
 def test_thermal_half_rated_torque_settles_at_80_degrees() -> None:
     heat = windings()
     heat.advance_temperatures(3600.0, np.array([2.0**2]))

@@ -20,6 +20,7 @@ from snakesim_testing.hal.small_robots import (
     make_description,
     make_joint_state,
 )
+from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 REACH = 0.05 + 2 * 5.0 * 0.01  # rad in a period
 WORD = "state_invalid"
@@ -475,10 +476,10 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, AppliedS
         yield seen, targets(target) if rng.random() < 0.9 else None
 
 
-@pytest.mark.slow
+@pytest.mark.trials
 def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
     rng = random.Random(5)
-    for _ in range(300):
+    for _ in range(choose_trial_count(300)):
         quick, whole = PlausibilityChecker(LIMITS), Whole(LIMITS)
         for seen, applied in walk(rng, 24):
             taken = [
