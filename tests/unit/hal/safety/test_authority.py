@@ -384,6 +384,15 @@ def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
     assert at_rest.target == [0.0] * JOINTS
 
 
+def test_fault_holds_a_moving_joint_where_it_comes_to_rest() -> None:
+    """From 1 rad/s at 50 rad/s² a joint needs 0.01 rad and two periods of 10 ms."""
+    rig = make_armed_rig(safety__action="hold", limits__acceleration_rad_s2=50.0)
+    rig.observe(0.1, 1.0)
+    rig.authority.latch_fault(HOT)
+    targets = [rig.pass_tick().setpoints.target[0] for _ in range(4)]
+    assert targets == pytest.approx([0.1075, 0.11, 0.11, 0.11])
+
+
 def test_fault_after_the_first_does_not_replace_the_reason() -> None:
     rig = make_armed_rig()
     for what in ("bus_off", *["watchdog"] * 40):

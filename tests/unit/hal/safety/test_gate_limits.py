@@ -473,3 +473,14 @@ def test_a_range_without_width_leaves_no_torque() -> None:
         low, high = compute_torque_bounds(stuck, 0.0, velocity, 0.01)
         assert low <= 0.0 >= high
         assert low <= high
+
+
+def test_joint_limits_are_those_of_the_description() -> None:
+    robot = make_description(joints={"joint_2": {"speed_rad_s": 2.0}})
+    limits = JointLimits.from_description(robot)
+    assert limits.angle_min_rad.tolist() == [-1.5] * 3
+    assert limits.angle_max_rad.tolist() == [1.5] * 3
+    assert limits.speed_rad_s.tolist() == [5.0, 2.0, 5.0]
+    assert limits.acceleration_rad_s2.tolist() == [100.0] * 3
+    assert limits.torque_nm.tolist() == [4.0] * 3
+    assert limits.clip_angles(np.array([-9.0, 9.0, 0.5])).tolist() == [-1.5, 1.5, 0.5]
