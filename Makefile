@@ -9,7 +9,7 @@ ARGS ?=
 UPGRADE ?=
 WORKERS ?= 2
 # More than cores: these tests wait for processes most of the time.
-SYSTEM_WORKERS ?= 4
+SYSTEM_WORKERS ?= 3
 PAYLOADS ?= 1000000
 MINUTES ?= 30
 TRIALS ?= 300
