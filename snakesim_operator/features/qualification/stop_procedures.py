@@ -165,10 +165,11 @@ def check_supply(rig: Rig, assistant: Assistant) -> list[Check]:
     lowered_ns = assistant.perform("lower_supply")
     state = rig.wait_for_lifecycle("fault", timeout_s=DRIVE_FAULT_TIMEOUT_S)
     faults = _check_faults(rig)
-    watched_ns = time.monotonic_ns()
-    readings = rig.watch_torque(0.5)
+    # The robot may still brake, if the host has stopped it and not the drive itself.
+    braked_ns = time.monotonic_ns() + round(steps.SUPPLY_LIMIT_S * 1e9)
+    readings = rig.watch_torque(steps.SUPPLY_LIMIT_S + steps.WATCHED_S)
     timeline = rig.make_timeline(readings)
-    stays_off = _check_stays_off(timeline, watched_ns)
+    stays_off = _check_stays_off(timeline, braked_ns)
     assistant.perform("restore_supply")
     checks = [
         _check_state(state, "fault"),
