@@ -102,6 +102,6 @@ def run(file: str, source: str, folder: str) -> None:
     sys.meta_path.insert(0, InPlaceOf(file, source))
     tests = [str(next(TESTS.rglob(name))) for name in TRIED_BY[file]]
     options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "pytest_timeout"]
-    code = pytest.main([*options, "-m", "", *tests])  # the slow tests, too
+    code = pytest.main([*options, *tests])
     sys.stdout.flush()
     os._exit(code)
