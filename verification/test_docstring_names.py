@@ -5,6 +5,8 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
+import pytest
+
 REPOSITORY = Path(__file__).parents[1]
 MEMBER = re.compile(r"`(?:\w+\.)*([A-Z]\w+)\.(\w+)(?:\([^`]*\))?`")
 CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]*[A-Z]\b")
@@ -19,8 +21,9 @@ EXTERNAL_CONSTANTS = {
 PLACEHOLDERS = {"C_N", "C_L", "RUN_A", "RUN_B"}  # of equations and command lines
 
 
-def shipped_trees() -> dict[str, ast.Module]:
-    """Return the syntax tree of every shipped file, by its path."""
+@pytest.fixture(scope="module")
+def trees() -> dict[str, ast.Module]:
+    """The syntax tree of every shipped file, by its path."""
     paths = sorted(REPOSITORY.glob("snakesim*/**/*.py"))
     return {str(path.relative_to(REPOSITORY)): ast.parse(path.read_text()) for path in paths}
 
@@ -58,8 +61,7 @@ def docstrings(tree: ast.Module) -> list[str]:
     return [text for text in found if text]
 
 
-def test_members_that_docstrings_name_exist() -> None:
-    trees = shipped_trees()
+def test_members_that_docstrings_name_exist(trees: dict[str, ast.Module]) -> None:
     members = members_by_class(trees)
     checked = 0
     missing: list[str] = []
@@ -89,11 +91,11 @@ def names_in_code() -> set[str]:
     return names
 
 
-def test_constants_that_docstrings_name_exist() -> None:
+def test_constants_that_docstrings_name_exist(trees: dict[str, ast.Module]) -> None:
     known = names_in_code() | EXTERNAL_CONSTANTS | PLACEHOLDERS
     named = [
         (path, name)
-        for path, tree in shipped_trees().items()
+        for path, tree in trees.items()
         for text in docstrings(tree)
         for name in CONSTANT.findall(text)
     ]

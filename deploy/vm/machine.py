@@ -57,6 +57,7 @@ NOT_FOR_THE_GUEST = {
     "_",
 }
 KILL_WITH_PARENT = 1  # PR_SET_PDEATHSIG
+LIBC = ctypes.CDLL(None)  # loaded here, because a forked child must not load anything before `exec`
 
 
 class GuestError(RuntimeError):
@@ -307,7 +308,7 @@ def _write(descriptor: int, content: bytes) -> None:
 
 def die_with_parent() -> None:
     """Have the kernel kill this process when its parent dies, however it dies. A machine costs a whole core."""
-    ctypes.CDLL(None).prctl(KILL_WITH_PARENT, signal.SIGKILL, 0, 0, 0)
+    LIBC.prctl(KILL_WITH_PARENT, signal.SIGKILL, 0, 0, 0)
 
 
 def _dying_with(parent: int) -> Callable[[], None]:

@@ -45,9 +45,8 @@ class WaveCorrection(VectorWrapper):
 
 def make_shapes_rad(joint_count: int) -> NDArray[np.float32]:
     """Return the joint angles of each shape, (SHAPE_COUNT, joints): cosines with 0, 1, 2, ... half waves."""
-    position = (
-        np.arange(joint_count) + 0.5
-    ) / joint_count  # of each joint on the body, tail to head
+    # Of each joint on the body, from 0 at the tail to 1 at the head.
+    position = (np.arange(joint_count) + 0.5) / joint_count
     half_waves = np.arange(SHAPE_COUNT)
     shapes = np.cos(np.pi * half_waves[:, None] * position)
     return (MAX_CORRECTION_RAD * shapes).astype(np.float32)

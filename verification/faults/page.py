@@ -82,9 +82,7 @@ def _page_lines(results: Results) -> Iterator[str]:
     measurable = [pair for heading in HEADINGS for pair in _measurable(heading)]
     done = [pair for pair in measurable if _key(pair) in results]
     met = sum(_is_met(pair, results) for pair in done)
-    backends_not_run = sorted(
-        {backend for row, backend in measurable if (row.name, backend) not in results}
-    )
+    backends_not_run = sorted({pair[1] for pair in measurable if _key(pair) not in results})
     yield INTRODUCTION.format(
         days=_format_days(list(results.values())),
         table=TABLE_NAME,

@@ -101,7 +101,8 @@ def run(file: str, source: str, folder: str) -> None:
     os.dup2(log, 2)
     sys.meta_path.insert(0, InPlaceOf(file, source))
     tests = [str(next(TESTS.rglob(name))) for name in TRIED_BY[file]]
-    options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "pytest_timeout"]
-    code = pytest.main([*options, *tests])
+    code = pytest.main(
+        ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "pytest_timeout", *tests]
+    )
     sys.stdout.flush()
     os._exit(code)

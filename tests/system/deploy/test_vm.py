@@ -12,6 +12,7 @@ import pytest
 
 from deploy.vm import cpio, kernel, machine, with_vcan
 from deploy.vm.packages import PreparationError
+from snakesim_testing.harness.processes import find_processes_with
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
@@ -197,13 +198,8 @@ def test_vm_command_dies_with_its_killed_parent() -> None:
         assert parent.stdout is not None
         child_pid = int(parent.stdout.readline())
         parent.kill()
-    wait_until(lambda: not _is_running(child_pid), "the command has ended", 5)
-
-
-def _is_running(pid: int) -> bool:
-    """Whether the process exists; a zombie without a parent that waits for it has ended."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except FileNotFoundError:
-        return False
-    return fields[0] != "Z"
+    wait_until(
+        lambda: child_pid not in dict(find_processes_with("cmdline", "with_vcan.main()")),
+        "the command has ended",
+        5,
+    )
