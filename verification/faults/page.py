@@ -23,6 +23,7 @@ COLUMNS: tuple[str, ...] = (
     "unit",
     "median",
     "worst",
+    "max_late_ms",
     "trials",
     "trials_wanted",
     "retried",
@@ -58,7 +59,10 @@ machine and notes of each measurement. [faults.json](faults.json) contains every
 
 EXPLANATION = """\
 * **Times are upper bounds.** They begin just before the injection. They end when an observer process has received the
-  first setpoints of the stop mode of the host. The host checks the lease once a period.
+  first setpoints of the stop mode of the host, or when the host has told its starter about the stop. The host checks
+  the lease once a period.
+* **Late ticks.** If a busy computer delays a tick of the host, the time contains this delay, but the deadline does not
+  count it. The column `max_late_ms` contains the largest delay of the rows about the controller.
 * **Recovery.** After each trial, an operator resets the fault and arms the robot. `max_step_rad` is the largest change
   of an angle target in one tick after that. `max_first_rad` is the largest distance between a first target and the
   measured angle (allowed: 0.35 rad).
@@ -167,6 +171,7 @@ def _measured_cells(row: FaultRow, result: RowResult) -> dict[str, Any]:
     return {
         "median": _format_number(verdict.median),
         "worst": _format_number(verdict.worst),
+        "max_late_ms": _format_number(_max_late_ms(result)),
         "trials": len(result.trials),
         "trials_wanted": max(TRIALS, row.min_trials),
         "retried": result.retried,
@@ -178,6 +183,12 @@ def _measured_cells(row: FaultRow, result: RowResult) -> dict[str, Any]:
         "load_before": f"{result.load:g}",
         "machine": result.machine,
     }
+
+
+def _max_late_ms(result: RowResult) -> float | None:
+    """Return the largest delay of a tick of the host; None if the row does not measure it."""
+    late_ms = [trial.late_ms for trial in result.trials if trial.late_ms]
+    return max(late_ms, default=None)
 
 
 def _recovery_cells(result: RowResult) -> dict[str, Any]:

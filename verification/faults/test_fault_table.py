@@ -59,6 +59,8 @@ def test_fault_table_row_is_judged_by_its_worst_trial() -> None:
     good, late = InjectionTrial(value=40.0, recovered=True), InjectionTrial(value=50.1)
     assert judged(good, good) == (True, "")
     assert judged(good, late) == (False, "1 of 2 trials over 50 ms")
+    assert judged(good, InjectionTrial(value=50.1, late_ms=0.2)) == (True, "")
+    assert judged(good, InjectionTrial(value=50.3, late_ms=0.2))[0] is False
     assert judged(good, InjectionTrial(value=None)) == (False, "nothing measured in 1 of 2 trials")
     assert "no recovery" in judged(InjectionTrial(value=1.0, recovered=False))[1]
     assert "odd" in judged(good, InjectionTrial(value=1.0, failure="odd"))[1]

@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from signal import SIGCONT, SIGKILL, SIGSTOP
 
+import msgspec
+
 from snakesim_hal.wire.messages import JointMode
 from verification.faults.observer import Observer, TrialError
 from verification.faults.robot import START_LIMIT_S, ProcessRobot, recovered, robot
@@ -26,7 +28,12 @@ def _trial(
 ) -> InjectionTrial:
     started_robot.set_in_motion(observer)
     failed_ns = fail(started_robot, observer)
-    value = observer.safe_after_ms(failed_ns)
+    # From the host itself: a controller that fills a processor also delays what the network brings.
+    stopped = started_robot.host.first(
+        lambda status: status.lifecycle == "fault", failed_ns, "a fault because of the lease"
+    )
+    value = (stopped.at_ns - failed_ns) / 1e6
+    observer.safe_after_ms(failed_ns)
     status = observer.first_fault(failed_ns)
     failures: list[str] = []
     if not any(fault.what == "lease_expired" for fault in status.faults):
@@ -42,7 +49,8 @@ def _trial(
     observer.watch(LATCHED_S)
     if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
         failures.append(f"not latched: {observer.in_words()}")
-    return recovered(observer, value, "; ".join(failures))
+    trial = recovered(observer, value, "; ".join(failures))
+    return msgspec.structs.replace(trial, late_ms=started_robot.host.late_ms(stopped))
 
 
 def _failing(fail: Fail, mend: Mend, request: MeasurementRequest) -> Iterator[InjectionTrial]:
