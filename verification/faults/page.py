@@ -58,11 +58,8 @@ machine and notes of each measurement. [faults.json](faults.json) contains every
 """
 
 EXPLANATION = """\
-* **Times are upper bounds.** They begin just before the injection. They end when an observer process has received the
-  first setpoints of the stop mode of the host, or when the host has told its starter about the stop. The host checks
-  the lease once a period.
-* **Late ticks.** If a busy computer delays a tick of the host, the time contains this delay, but the deadline does not
-  count it. The column `max_late_ms` contains the largest delay of the rows about the controller.
+* **Times are upper bounds.** They begin just before the injection, and end when the reaction of the host has arrived.
+  The host checks the lease once a period. `max_late_ms`, by which a busy computer delayed a tick, is not counted.
 * **Recovery.** After each trial, an operator resets the fault and arms the robot. `max_step_rad` is the largest change
   of an angle target in one tick after that. `max_first_rad` is the largest distance between a first target and the
   measured angle (allowed: 0.35 rad).
