@@ -311,9 +311,6 @@ class _JumpDetector:
         Returns:
             (n_joints,) True for joints that have jumped and settled.
         """
-        if not np.count_nonzero(jumped):
-            self._consecutive_count[:] = 0
-            return jumped
         newest_rad = np.where(jumped, angle_rad, 0.0)
         elapsed_s = measured_s - self._last_rejected_times_s
         is_near_last = np.abs(

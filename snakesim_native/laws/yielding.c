@@ -19,8 +19,7 @@ static mjtNum maximum(mjtNum a, mjtNum b) { return a >= b || isnan(a) ? a : b; }
 
 static mjtNum minimum(mjtNum a, mjtNum b) { return a <= b || isnan(a) ? a : b; }
 
-// Return the length of a vector. NumPy's `einsum` adds the squares in this order.
-static mjtNum compute_length(const mjtNum v[3]) { return sqrt(v[0] * v[0] + v[2] * v[2] + v[1] * v[1]); }
+static mjtNum compute_length(const mjtNum v[3]) { return sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
 
 // Compute one obstacle, with its displacement q (x and y in m, rotation in rad) and L = (1, 1, mean radius of the foot):
 //

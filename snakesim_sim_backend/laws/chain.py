@@ -68,6 +68,7 @@ class LinkChain:
         if self._wrenches is None:
             return
         np.add.accumulate(self._wrenches.T[::-1], 0, None, self._sums)
-        self._base_forces += np.vecdot(self._base_axes, self._sum_of_all)
-        self._joint_forces += np.vecdot(self._joint_axes, self._sums_beyond_joints)
+        # The products are added one by one: `np.vecdot` rounds in another way on each kind of processor.
+        self._base_forces += np.add.reduce(self._base_axes * self._sum_of_all, 1)
+        self._joint_forces += np.add.reduce(self._joint_axes * self._sums_beyond_joints, 1)
         self._wrenches = None

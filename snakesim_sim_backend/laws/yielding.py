@@ -17,6 +17,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.placement import PlacedObstacle
 from snakesim_hal.wire.messages import KnownObstacle
@@ -159,14 +160,20 @@ class YieldingObstacles:
         max_force_n = self._max_force_n
 
         stretch = lengths * (self._displacements - self._anchors)
-        pull_n = self._stiffness[:, 0] * np.sqrt(np.einsum("ij,ij->i", stretch, stretch))
+        pull_n = self._stiffness[:, 0] * _compute_lengths(stretch)
         stretch *= np.minimum(1.0, max_force_n / np.maximum(pull_n, MIN_FORCE_N))[:, None]
         self._anchors[:] = self._displacements - stretch / lengths
 
         force = self._stiffness * stretch + self._damping * lengths * self._velocities
-        size_n = np.sqrt(np.einsum("ij,ij->i", force, force))
+        size_n = _compute_lengths(force)
         scale = np.minimum(1.0, max_force_n / np.maximum(size_n, MIN_FORCE_N))
         self._passive_forces -= lengths * force * scale[:, None]
+
+
+def _compute_lengths(vectors: Floats) -> Floats:
+    """Return the length of each vector, (n, 3). `np.einsum` rounds in another way on each kind of processor."""
+    x, y, z = vectors.T
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def _compute_max_friction_n(placed: PlacedObstacle, normal_gravity_m_s2: float) -> float:

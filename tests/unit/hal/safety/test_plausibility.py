@@ -161,6 +161,17 @@ def test_places_that_do_not_agree_are_not_believed() -> None:
     assert bench.see(-5.0) is None
 
 
+@pytest.mark.parametrize(("farther_rad", "agrees"), [(0.0, True), (1e-12, False)])
+def test_places_that_are_just_within_reach_agree(farther_rad: float, agrees: bool) -> None:
+    bench = Bench(angle=-3.0)
+    bench.timestamp_ns = -5 * PERIOD_NS
+    assert bench.see(5.0) is not None
+    for _ in range(4):
+        assert bench.see(0.0) is not None
+    assert bench.timestamp_ns == 0  # so that the time to the next sample is exact
+    assert (bench.see(REACH + farther_rad) is None) == agrees
+
+
 def test_a_sample_that_is_repeated_does_not_count_again() -> None:
     bench = Bench()
     for k in range(8):
@@ -310,10 +321,12 @@ def stuck(
     step: float = 0.02,
     torque: float = 0.5,
     mode: JointMode = JointMode.POSITION,
+    aside: JointMask = NOBODY,
 ) -> Fault | None:
-    return [bench.see(0.0, 0.0, torque, applied=targets(step * k, mode)) for k in range(periods)][
-        -1
-    ]
+    return [
+        bench.see(0.0, 0.0, torque, applied=targets(step * k, mode), aside=aside)
+        for k in range(periods)
+    ][-1]
 
 
 def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
@@ -325,6 +338,56 @@ def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
     assert (
         fault.cause == "the same state repeated while its target moves: joint_1, joint_2, joint_3"
     )
+
+
+def test_plausibility_isolated_joint_is_not_reported_as_frozen() -> None:
+    isolated = NOBODY.copy()
+    isolated[1] = True
+    bench = Bench(torque=0.5)
+    assert stuck(bench, FAR_PERIODS + LEASE_PERIODS + 2, aside=isolated) is not None
+    assert bench.doubted == [0, 2]
+    everybody = ~NOBODY
+    assert stuck(Bench(torque=0.5), FAR_PERIODS + LEASE_PERIODS + 2, aside=everybody) is None
+
+
+def test_plausibility_joint_freezes_while_an_isolated_joint_is_frozen() -> None:
+    isolated = NOBODY.copy()
+    isolated[0] = True
+    bench = Bench(torque=0.5)
+    faults: list[Fault | None] = []
+    for k in range(60):
+        angle = [0.0, 0.01 * min(k, 30), 0.01 * k]  # the second joint stops after a while
+        faults.append(bench.see(angle, 0.0, 0.5, applied=targets(0.02 * k), aside=isolated))
+    assert not any(faults[:30])
+    assert faults[-1] is not None
+    assert bench.doubted == [1]
+
+
+def test_plausibility_joint_freezes_after_its_mode_has_changed() -> None:
+    isolated = NOBODY.copy()
+    isolated[0] = True
+    bench = Bench(torque=0.5)
+    fault = None
+    for k in range(60):
+        applied = targets(0.02 * k)
+        if k < 30:
+            applied.mode[1] = JointMode.VELOCITY
+        fault = bench.see([0.0, 0.0, 0.01 * k], 0.0, 0.5, applied=applied, aside=isolated)
+        assert fault is None or k > 30
+    assert fault is not None
+    assert bench.doubted == [1]
+
+
+def test_plausibility_state_may_repeat_for_exactly_one_lease() -> None:
+    bench = Bench(torque=0.5)
+    # The target is far at time 0, so that the sum of the times is exact.
+    bench.timestamp_ns = -2 * PERIOD_NS
+    for target in (0.0, 0.2):
+        assert bench.see(0.0, 0.0, 0.5, applied=targets(target)) is None
+    assert bench.timestamp_ns == 0
+    lease_periods = LEASE_NS / PERIOD_NS
+    assert bench.see(0.0, 0.0, 0.5, applied=targets(0.2), periods=lease_periods) is None
+    assert bench.see(0.0, 0.0, 0.5, applied=targets(0.2), periods=1e-6) is not None
 
 
 @pytest.mark.parametrize("step", [0.02, -0.02])
