@@ -1,6 +1,6 @@
 """Compare a learned gait with a serpenoid that is tuned for the same energy, on seeds that no search has used.
 
-    python examples/learning/compare_gaits.py --policy runs/gait/ppo/policy.onnx --ticks 2000000 \
+    python examples/learning/compare_gaits.py --policy runs/gait/ppo/policy.onnx --ticks 705600 \
         --out runs/gait/serpenoid.onnx
 
 First, the energy of the policy is measured on the validation seeds. The serpenoid is then tuned for the farthest

@@ -163,7 +163,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--wave", required=True, help="policy file of tune_serpenoid.py")
     parser.add_argument("--out", type=Path, required=True, help="folder of what is learned")
-    parser.add_argument("--ticks", type=int, default=1_500_000, help="control cycles to train on")
+    parser.add_argument("--ticks", type=int, default=500_000, help="control cycles to train on")
     parser.add_argument("--check-ticks", type=int, default=100_000, help="between two checks")
     parser.add_argument("--film-ticks", type=int, default=0, help="between two videos; 0: none")
     parser.add_argument("--resume", type=Path, metavar="FILE", help="checkpoint to continue from")
