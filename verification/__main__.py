@@ -89,6 +89,11 @@ PARTS = {
         4,
         (*PYTEST, "verification/computers", "-m", ""),
     ),
+    "aarch64": CampaignPart(
+        "the wheel for ARM, on an emulated processor (needs qemu-user-static)",
+        4,
+        ("verification.computers.aarch64",),
+    ),
     "commissioning": CampaignPart(
         "hidden faults of joints",
         3,
