@@ -158,6 +158,7 @@ def _checked(*sets: str) -> list[JointVerdict]:
             rows += box.read_rows(len(rows) // box.layout.row_bytes)[1]
         columns = box.layout.decode_rows(rows)
         robot = run.host.description
+        config = run.config
     ticks = columns.pop("tick").tolist()
     return judge_joints(
         collect_measurements(config, robot, ticks, columns, imus), was_laid_straight=True

@@ -33,7 +33,11 @@ from snakesim_hal.model.fault_plan import parse_planned_faults
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.local_network import LocalNetwork
 from snakesim_hal.programs.host_program import open_backend
-from snakesim_hal.programs.preflight import load_backend_class, load_service_class
+from snakesim_hal.programs.preflight import (
+    apply_backend_modes,
+    load_backend_class,
+    load_service_class,
+)
 from snakesim_hal.service import SERVICE_START_LIMIT_S, ServiceLoop
 from snakesim_hal.wire.messages import make_arm_request
 
@@ -75,7 +79,11 @@ def validate_single_process_config(config: RunConfig) -> None:
 
 
 class InProcessRun:
-    """One run in this process. Its `with` opens and closes the backend and all services."""
+    """One run in this process. Its `with` opens and closes the backend and all services.
+
+    Attributes:
+        config: The configuration, limited to what the drives of its backend can do and measure.
+    """
 
     def __init__(
         self,
@@ -93,10 +101,12 @@ class InProcessRun:
                 `start_limit_s` of the configuration.
 
         Raises:
-            ConfigError: The run needs several processes, real time or a network.
+            ConfigError: The run needs several processes, real time or a network; or its backend cannot drive the robot.
         """
         validate_single_process_config(config)
-        self.config = config
+        self._backend_class = load_backend_class(config.backend)
+        # A host that awaits a torque that no drive measures would never be ready to arm.
+        self.config = apply_backend_modes(config, self._backend_class)
         self._watchdog = StepWatchdog(SERVICE_START_LIMIT_S, step_times)
         self._turn_timeout_s = turn_limit_s or max(TURN_TIMEOUT_S, config.start_limit_s)
         self.network = LocalNetwork()
@@ -147,7 +157,7 @@ class InProcessRun:
             RefusedError: The backend moves real hardware.
         """
         config = self.config
-        backend = open_backend(load_backend_class(config.backend), config)
+        backend = open_backend(self._backend_class, config)
         opened.callback(backend.close)
         if not backend.describe().emulated:
             raise RefusedError(

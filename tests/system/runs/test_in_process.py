@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from snakesim_hal.model.scenario import KeyOverride, load_scenario, parse_set_option
+from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.results.run_reader import CONFIG_FILENAME, REPORT_FILENAME, SUMMARY_FILENAME
@@ -40,6 +41,30 @@ def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
     assert "in one process" in ended.out
     assert str(out / REPORT_FILENAME) in ended.out
     assert not ended.err
+
+
+@pytest.mark.parametrize("backend", ["odrive", "dynamixel", "feetech"])
+def test_robot_of_emulated_drives_arms_in_one_process_also_without_torque_sensors(
+    backend: str,
+) -> None:
+    """Feetech servos do not measure their torque, although the robot file lists it."""
+    sets = [
+        f"backend={backend}",
+        f"backends.{backend}.physics_model=inertia",
+        "controller=hold",
+        "robot.chain.modules=3",
+        "duration_s=0.3",
+    ]
+    config = load_scenario("joint_check", [parse_set_option(text) for text in sets]).config
+    with InProcessRun(config) as run:
+        for _ in run.iterate_ticks():
+            pass
+        assert run.host.authority.arm_session, run.host.build_status().reason
+        measures_torque = ["torque" in joint.measures for joint in run.host.description.joints]
+    assert measures_torque == [backend != "feetech"] * 3
+    assert [
+        "torque" in joint.drive.measures for joint in run.config.robot.joint_table
+    ] == measures_torque
 
 
 FAILING = """
