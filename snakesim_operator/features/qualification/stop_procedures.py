@@ -301,12 +301,14 @@ def _check_estop(rig: Rig, start_ns: int, claim: str = "") -> list[Check]:
 def _check_restarted(rig: Rig) -> list[Check]:
     state = rig.wait_for_lifecycle("fault", timeout_s=DRIVE_FAULT_TIMEOUT_S)
     faults = _check_faults(rig)
-    begun_ns = time.monotonic_ns()
-    timeline = rig.make_timeline(rig.watch_torque(steps.WATCHED_S))
+    # The robot may still brake, if the host has stopped it before the drive has restarted.
+    braking_s = rig.setup.bounds.torque_off_s
+    braked_ns = time.monotonic_ns() + round(braking_s * 1e9)
+    timeline = rig.make_timeline(rig.watch_torque(braking_s + steps.WATCHED_S))
     return [
         _check_state(state, "fault", "stop-is-a-fault"),
         faults,
-        _check_stays_off(timeline, begun_ns),
+        _check_stays_off(timeline, braked_ns),
     ]
 
 
