@@ -13,6 +13,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.joints import (
     Backlash,
+    DeadZone,
     Friction,
     Gear,
     Joint,
@@ -22,6 +23,7 @@ from snakesim_hal.model.joints import (
     Lag,
     RotorInertia,
     Sign,
+    SlipTorque,
     TorqueConstant,
     Viscosity,
     Zero,
@@ -62,6 +64,12 @@ class MountedDrive(FileStruct, frozen=True, kw_only=True):
 
     backlash_rad: Backlash | None = None
     """Whole backlash of the gear, between the encoder on the motor and the link. None: no backlash."""
+
+    coupling_slip_nm: SlipTorque | None = None
+    """Torque of the joint at which the coupling between gear and link slips. None: it does not slip."""
+
+    encoder_dead_zone_rad: DeadZone | None = None
+    """Motion of the joint by which the angle of its encoder lags, before it jumps to the shaft. None: no dead zone."""
 
 
 def build_actual_joints(robot: RobotFile, mounted: Mapping[str, MountedDrive]) -> list[Joint]:

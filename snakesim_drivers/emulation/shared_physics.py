@@ -1,5 +1,6 @@
 """What all emulated drives of a robot share: physics model, motors, heat and camera, on one clock that is passed in."""
 
+import math
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
@@ -19,9 +20,14 @@ from snakesim_hal.model.plugins import (
     require_base_class,
 )
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.backlash import BacklashModel, move_rotor_inertia_to_motor_side
+from snakesim_hal.physics.loose_gear import (
+    LooseGearModel,
+    Looseness,
+    move_rotor_inertia_to_motor_side,
+)
 from snakesim_hal.physics.motors import PowerStages
 from snakesim_hal.physics.physics_model import PhysicsModel
+from snakesim_hal.physics.sticking_encoder import StickingEncoderModel
 from snakesim_hal.physics.thermal import ThermalModel
 
 # Physics steps from one step of the windings' heat to the next: they heat up slowly.
@@ -63,7 +69,7 @@ def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: st
         backend: Name of the backend, used in error messages.
 
     Returns:
-        The model, with backlash in the gears if the settings name any.
+        The model, with the loose gears and the dead zones of encoders that the settings name.
 
     Raises:
         ConfigError: There is no such physics model, or it does not accept its settings.
@@ -77,18 +83,36 @@ def make_physics_model(config: RunConfig, settings: PhysicsSettings, backend: st
     )
     # As really built, unlike what the controller assumes.
     actual_config = build_actual_config(config, settings.mounted)
-    backlash_rad = {
-        name: mounted.backlash_rad
-        for name, mounted in settings.mounted.items()
-        if mounted.backlash_rad
-    }
-    if not backlash_rad:
-        return model_type(actual_config, model_settings)
     joints = build_actual_joints(config.robot, settings.mounted)
-    rigid_gear_model = model_type(
-        move_rotor_inertia_to_motor_side(actual_config, joints, backlash_rad), model_settings
-    )
-    return BacklashModel(rigid_gear_model, joints, backlash_rad, config.seed)
+    looseness = _collect_loose_gears(settings.mounted)
+    if looseness:
+        links_config = move_rotor_inertia_to_motor_side(actual_config, joints, looseness)
+        links_model = model_type(links_config, model_settings)
+        model: PhysicsModel = LooseGearModel(links_model, joints, looseness, config.seed)
+    else:
+        model = model_type(actual_config, model_settings)
+    dead_zone_rad = {
+        name: mounted.encoder_dead_zone_rad
+        for name, mounted in settings.mounted.items()
+        if mounted.encoder_dead_zone_rad
+    }
+    if dead_zone_rad:
+        return StickingEncoderModel(model, joints, dead_zone_rad)
+    return model
+
+
+def _collect_loose_gears(mounted: Mapping[str, MountedDrive]) -> dict[str, Looseness]:
+    """Return how loose each gear with backlash or a slipping coupling is, by the name of its joint."""
+    looseness: dict[str, Looseness] = {}
+    for name, drive in mounted.items():
+        if drive.backlash_rad or drive.coupling_slip_nm is not None:
+            slip_torque_nm = math.inf
+            if drive.coupling_slip_nm is not None:
+                slip_torque_nm = drive.coupling_slip_nm
+            looseness[name] = Looseness(
+                backlash_rad=drive.backlash_rad or 0.0, slip_torque_nm=slip_torque_nm
+            )
+    return looseness
 
 
 class SharedPhysics:

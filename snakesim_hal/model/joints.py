@@ -32,6 +32,8 @@ Sign = Literal[1, -1]
 Zero = Annotated[float, bounded(-1e4, 1e4, "rad")]
 Gear = Annotated[float, above(1e4, "1")]
 Backlash = Annotated[float, from_zero(0.5, "rad")]
+DeadZone = Annotated[float, from_zero(0.5, "rad")]
+SlipTorque = Annotated[float, from_zero(1000, "N·m")]
 
 
 class MotionLimits(FileStruct, frozen=True, kw_only=True):

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from snakesim_hal.physics.backlash import LINK_SIDE_INERTIA_RATIO
+from snakesim_hal.physics.loose_gear import LINK_SIDE_INERTIA_RATIO
 from verification.commissioning_trials import HiddenRobot
 
 PARAMETERS = (
