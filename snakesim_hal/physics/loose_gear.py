@@ -6,8 +6,8 @@ of such a joint therefore has an angle of its own:
 
     rotor_inertia * rotor_acceleration = motor torque - rotor friction - tooth torque
 
-The tooth torque acts on the link. It is 0 while the teeth are apart, that of a stiff, damped spring otherwise, and never
-more than the torque at which the coupling slips.
+The tooth torque acts on the link. It is 0 while the teeth are apart, and that of a stiff, damped spring otherwise. It
+never exceeds the torque at which the coupling slips.
 """
 
 from collections.abc import Collection, Mapping, Sequence
