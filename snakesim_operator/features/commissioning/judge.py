@@ -2,10 +2,11 @@
 
 Five properties of a joint are judged, each from its own evidence, and each is confirmed, wrong or unknown:
 
-    drive   it follows its targets, and measures no torque that brakes while it drives
+    drive   it follows its targets, its encoder does not stick, and it measures no torque that brakes while it drives
     order   the links on both sides of it turn, and not those of a joint whose module may be exchanged with its own
     sign    they turn in the direction in which its encoder counts
-    gear    they turn as far as its encoder counts, and lose nothing when the load reverses
+    gear    they turn as far as its encoder counts, and lose nothing when the load reverses; without IMUs, the torque
+            shows backlash and a coupling that slips, but not the ratio
     zero    its angle agrees with gravity, or is 0 on a robot that was laid straight
 
 A property without evidence is unknown, with a sentence on how it could be confirmed. It never counts as confirmed.
@@ -19,6 +20,8 @@ import numpy as np
 
 from snakesim_hal.model.checked import PROPERTIES, JointProperty
 from snakesim_hal.model.joints import JointDrive
+from snakesim_operator.features.commissioning.encoder_dead_zone import find_dead_zone_rad
+from snakesim_operator.features.commissioning.gear_play import GearPlay, judge_gear_plays
 from snakesim_operator.features.commissioning.link_shares import (
     MIN_RATE_RAD_S,
     LinkMotionFractions,
@@ -27,7 +30,12 @@ from snakesim_operator.features.commissioning.link_shares import (
     find_swap_candidates,
     measure_link_motion_fractions,
 )
-from snakesim_operator.features.commissioning.lost_motion import LostMotion, measure_lost_motion
+from snakesim_operator.features.commissioning.load_response import measure_load_response
+from snakesim_operator.features.commissioning.lost_motion import (
+    LostMotion,
+    measure_lost_motion,
+    measure_small_motion_ratio,
+)
 from snakesim_operator.features.commissioning.measured import CheckMeasurements, Mask
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
@@ -37,6 +45,7 @@ MIN_MOVED_RAD = 0.012  # a fifth of the default motion to one side
 MIN_FOLLOWED_FRACTION = 0.3
 # Between the fraction of the motion that the links made and the expected one.
 MAX_RATIO_ERROR = 0.12
+MIN_SLIPPING_RATIO = 0.5  # of link and drive in the small motion; within backlash it is near 0
 # Mean along the motion; a light link's inertia may be a tenth of it against the motion.
 MIN_TORQUE_NM = 0.1
 MAX_STRAIGHT_ERROR_RAD = 0.08  # a robot that was laid straight by hand is straight within that
@@ -54,6 +63,8 @@ class PropertyFinding:
     reason: str = ""
     by_hand: bool = False  # confirmed by a person
     by_shape: bool = False  # confirmed by drawn shapes
+    # False: unknown because of backlash, which drawn shapes do not show.
+    shapes_suffice: bool = True
 
 
 CONFIRMED = PropertyFinding("confirmed")
@@ -70,8 +81,11 @@ CONFIRM_DIRECTION_BY_HAND = (
     NO_LINK + "turn it with `snakesim robot calibrate direction`, then add --by-hand"
 )
 CONFIRM_GEAR_BY_HAND = (
-    NO_LINK + "measure it with `snakesim robot calibrate gear`, then add --gear-by-hand"
+    NO_LINK
+    + "measure it with `snakesim robot calibrate gear`, shake the link, then add --gear-by-hand"
 )
+NO_BACKLASH = "no backlash found"
+ENCODER_STICKS = "its encoder has a dead zone; correct it, and run the check again"
 NO_REST = "the robot did not rest before the first motion; run the check again"
 NOT_STRAIGHT = "lay the robot straight, run the check again, and add --straight"
 
@@ -115,8 +129,14 @@ class JointVerdict:
         return self._confirm_unknown(properties, PropertyFinding("confirmed", by_hand=True))
 
     def confirm_by_shape(self, properties: Iterable[JointProperty]) -> "JointVerdict":
-        """Return a copy in which drawn shapes have confirmed those of the properties that were unknown."""
-        return self._confirm_unknown(properties, PropertyFinding("confirmed", by_shape=True))
+        """Return a copy in which drawn shapes have confirmed those of the properties that were unknown.
+
+        A gear whose backlash is unknown stays unknown, because drawn shapes show only its ratio.
+        """
+        visible: list[JointProperty] = [
+            name for name in properties if self.findings[name].shapes_suffice
+        ]
+        return self._confirm_unknown(visible, PropertyFinding("confirmed", by_shape=True))
 
     def _confirm_unknown(
         self, properties: Iterable[JointProperty], finding: PropertyFinding
@@ -167,12 +187,16 @@ class _JointEvaluator:
         self._measurements = measurements
         self._was_laid_straight = was_laid_straight
         self._allowed_backlash_rad = allowed_backlash_rad
+        joints = range(len(measurements.joint_names))
+        self._dead_zones_rad = [find_dead_zone_rad(measurements, joint) for joint in joints]
+        self._load_responses = [measure_load_response(measurements, joint) for joint in joints]
+        self._gear_plays = judge_gear_plays(self._load_responses, measurements.axes)
         # A joint that brakes while it drives moves all the same, so its links can be judged.
         self._motion_fractions: list[LinkMotionFractions | None] = [
             measure_link_motion_fractions(measurements, joint)
-            if _has_followed_target(measurements, joint)
+            if self._dead_zones_rad[joint] is None and _has_followed_target(measurements, joint)
             else None
-            for joint in range(len(measurements.joint_names))
+            for joint in joints
         ]
         self._module_order: ModuleOrder = find_module_order(self._motion_fractions)
         link_order = [0, *(self._module_order + 1)]
@@ -198,12 +222,14 @@ class _JointEvaluator:
         torque_nm = _compute_mean_driving_torque_nm(measurements, joint_index)
         motion_ratio = self._measure_motion_ratio(joint_index)
         motion_range_rad = None
-        if measurements.is_moved_by_target(joint_index).any():
+        if measurements.is_in_large_motion(joint_index).any():
             motion_range_rad = measurements.measure_motion_range_rad(joint_index)
         return JointVerdict(
             joint=measurements.joint_names[joint_index],
             findings={
-                "drive": _judge_drive(measurements, joint_index, torque_nm),
+                "drive": _judge_drive(
+                    measurements, joint_index, torque_nm, self._dead_zones_rad[joint_index]
+                ),
                 **self._judge_mounting(joint_index, motion_ratio),
             },
             moved_rad=motion_range_rad,
@@ -235,10 +261,8 @@ class _JointEvaluator:
             self._reordered_measurements, joint_index, was_laid_straight=self._was_laid_straight
         )
         if self._motion_fractions[joint_index] is None:
-            was_commanded = self._measurements.is_moved_by_target(joint_index).any()
-            unknown = PropertyFinding("unknown", NO_MOTION if was_commanded else NO_END)
+            unknown = PropertyFinding("unknown", self._explain_missing_motion(joint_index))
             return {"order": unknown, "sign": unknown, "gear": unknown, "zero": zero}
-        drive = self._measurements.drives[joint_index]
         candidates = [
             self._measurements.joint_names[other]
             for other in find_swap_candidates(
@@ -248,10 +272,36 @@ class _JointEvaluator:
         lost_motion = measure_lost_motion(self._reordered_measurements, joint_index)
         return {
             "order": _judge_order(motion_ratio, candidates),
-            "sign": _judge_sign(motion_ratio, drive),
-            "gear": _judge_gear(motion_ratio, lost_motion, drive, self._allowed_backlash_rad),
+            "sign": _judge_sign(motion_ratio, self._measurements.drives[joint_index]),
+            "gear": self._judge_gear(joint_index, motion_ratio, lost_motion),
             "zero": zero,
         }
+
+    def _explain_missing_motion(self, joint_index: int) -> str:
+        """Return why the motion of a joint does not show how it is mounted."""
+        if self._dead_zones_rad[joint_index] is not None:
+            return ENCODER_STICKS
+        if self._measurements.is_in_large_motion(joint_index).any():
+            return NO_MOTION
+        return NO_END
+
+    def _judge_gear(
+        self, joint_index: int, motion_ratio: float, lost_motion: LostMotion | None
+    ) -> PropertyFinding:
+        """Judge the gear of a joint: from the links if they were measured, otherwise from its torque."""
+        if not np.isnan(motion_ratio):
+            drive = self._measurements.drives[joint_index]
+            small_motion_ratio = measure_small_motion_ratio(
+                self._reordered_measurements, joint_index
+            )
+            return _judge_gear(
+                motion_ratio, lost_motion, small_motion_ratio, drive, self._allowed_backlash_rad
+            )
+        response = self._load_responses[joint_index]
+        small_motion_rad = 0.0 if response is None else response.small_motion_rad
+        return _judge_gear_by_torque(
+            self._gear_plays[joint_index], small_motion_rad, self._allowed_backlash_rad
+        )
 
     def _make_swapped_findings(self, joint_index: int) -> dict[JointProperty, PropertyFinding]:
         """Return the findings on a joint whose module is swapped with that of another joint: the order is wrong."""
@@ -273,7 +323,7 @@ class _JointEvaluator:
 
 def _has_followed_target(measurements: CheckMeasurements, joint_index: int) -> bool:
     """Return whether a joint's encoder followed its target."""
-    commanded = measurements.is_moved_by_target(joint_index)
+    commanded = measurements.is_in_large_motion(joint_index)
     if not commanded.any():
         return False
     target_range_rad = float(np.ptp(measurements.target_rad[commanded, joint_index]))
@@ -290,7 +340,7 @@ def _compute_mean_driving_torque_nm(
 ) -> float | None:
     """Return the mean of a joint's torque, positive where it drives; None if it is not measured."""
     velocity = measurements.velocity_rad_s[:, joint_index]
-    is_moving = measurements.is_moved_by_target(joint_index) & (np.abs(velocity) > MIN_RATE_RAD_S)
+    is_moving = measurements.is_in_large_motion(joint_index) & (np.abs(velocity) > MIN_RATE_RAD_S)
     if "torque" not in measurements.drives[joint_index].measures or not is_moving.any():
         return None
     return float(
@@ -299,11 +349,27 @@ def _compute_mean_driving_torque_nm(
 
 
 def _judge_drive(
-    measurements: CheckMeasurements, joint_index: int, torque_nm: float | None
+    measurements: CheckMeasurements,
+    joint_index: int,
+    torque_nm: float | None,
+    dead_zone_rad: float | None,
 ) -> PropertyFinding:
-    """Judge whether a joint's drive moves it. `torque_nm` is the mean along the motion; None if it is not measured."""
-    if not measurements.is_moved_by_target(joint_index).any():
+    """Judge whether a joint's drive moves it, and measures its angle.
+
+    Args:
+        measurements: Measurements of the check.
+        joint_index: Index of the joint.
+        torque_nm: Mean torque along the motion; None if it is not measured.
+        dead_zone_rad: Dead zone of its encoder; None if it has none.
+    """
+    if not measurements.is_in_large_motion(joint_index).any():
         return PropertyFinding("unknown", NO_END)
+    if dead_zone_rad is not None:
+        return PropertyFinding(
+            "wrong",
+            f"its encoder has a dead zone: its angle sticks, and then jumps by {dead_zone_rad:.3f} rad "
+            f"({np.rad2deg(dead_zone_rad):.1f} degrees); fasten the encoder and its magnet, or replace it",
+        )
     if not _has_followed_target(measurements, joint_index):
         return PropertyFinding("wrong", "did not move: motor, brake, power, or a link that is held")
     if torque_nm is not None and torque_nm < -MIN_TORQUE_NM:
@@ -339,28 +405,36 @@ def _judge_sign(motion_ratio: float, drive: JointDrive) -> PropertyFinding:
 def _judge_gear(
     motion_ratio: float,
     lost_motion: LostMotion | None,
+    small_motion_ratio: float | None,
     drive: JointDrive,
     allowed_backlash_rad: float,
 ) -> PropertyFinding:
     """Judge whether a joint's links turn as far as its encoder measures.
 
     Args:
-        motion_ratio: Motion of the links divided by the motion by the encoder, with its sign; NaN if unknown.
+        motion_ratio: Motion of the links divided by the motion by the encoder, with its sign.
         lost_motion: Backlash of the joint; None if it is not known.
+        small_motion_ratio: The same ratio as `motion_ratio` in the small motion; None if it is not known.
         drive: The drive as the robot file has it.
         allowed_backlash_rad: Largest backlash that is not judged as wrong.
     """
-    if np.isnan(motion_ratio):
-        return PropertyFinding("unknown", CONFIRM_GEAR_BY_HAND)
     ratio = abs(motion_ratio)
     if ratio < MAX_RATIO_ERROR:
         return PropertyFinding(
-            "wrong", "its drive turns and no link does: coupling, a gear that slips, or backlash"
+            "wrong",
+            "its coupling slips: its drive turns and no link does; fasten the coupling, and check the gear",
         )
     reasons: list[str] = []
     if lost_motion is not None and lost_motion.lost_rad > max(
         allowed_backlash_rad, lost_motion.noise_rad
     ):
+        # Within backlash a link does not move at all, so it does not follow a small motion either.
+        if small_motion_ratio is not None and abs(small_motion_ratio) > MIN_SLIPPING_RATIO:
+            return PropertyFinding(
+                "wrong",
+                f"its coupling slips: its link follows a small motion, and stays behind by {lost_motion.lost_rad:.3f} "
+                "rad in a large one; fasten the coupling, and check the gear",
+            )
         ratio = abs(lost_motion.ratio)  # not reduced by the backlash
         backlash = (
             f"{lost_motion.lost_rad:.3f} rad ({np.rad2deg(lost_motion.lost_rad):.1f} degrees)"
@@ -379,6 +453,50 @@ def _judge_gear(
     if reasons:
         return PropertyFinding("wrong", "; ".join(reasons))
     return CONFIRMED
+
+
+def _judge_gear_by_torque(
+    play: GearPlay, small_motion_rad: float, allowed_backlash_rad: float
+) -> PropertyFinding:
+    """Judge a gear whose links were not measured. Its ratio stays unknown.
+
+    Args:
+        play: What the torques show.
+        small_motion_rad: Range of the joint's small motion.
+        allowed_backlash_rad: Largest backlash that is not judged as wrong.
+    """
+    match play.kind:
+        case "backlash" if small_motion_rad > allowed_backlash_rad:
+            return PropertyFinding(
+                "wrong",
+                f"backlash of {small_motion_rad:.3f} rad or more: within it, its drive turns without the load of its "
+                f"link, {allowed_backlash_rad:g} rad are allowed; repair the gear, or allow more with --allow-backlash",
+            )
+        case "slipping":
+            return PropertyFinding(
+                "wrong",
+                "its coupling slips: its torque stays low and does not follow its angle, unlike that of other joints; "
+                "fasten the coupling, and check the gear",
+            )
+        case "loose":
+            return PropertyFinding(
+                "wrong", "its link is loose: coupling, a gear that slips, or backlash"
+            )
+        case "tight":
+            return PropertyFinding(
+                "unknown", f"{NO_BACKLASH}, ratio unknown: {CONFIRM_GEAR_BY_HAND}"
+            )
+        case "backlash":
+            reason = f"backlash of {small_motion_rad:.3f} rad or more, and {allowed_backlash_rad:g} rad are allowed"
+            return PropertyFinding(
+                "unknown", f"{reason}: {CONFIRM_GEAR_BY_HAND}", shapes_suffice=False
+            )
+        case "unknown":
+            return PropertyFinding(
+                "unknown",
+                f"backlash and ratio unknown, as {play.reason}: {CONFIRM_GEAR_BY_HAND}",
+                shapes_suffice=False,
+            )
 
 
 def _judge_zero(

@@ -58,7 +58,7 @@ def measure_link_motion_fractions(
     measurements: CheckMeasurements, joint_index: int
 ) -> LinkMotionFractions:
     """Measure the motion of all links and encoders while one joint moved, as fractions of that joint's motion."""
-    is_commanded = measurements.is_moved_by_target(joint_index)
+    is_commanded = measurements.is_in_large_motion(joint_index)
     speed_rad_s = measurements.velocity_rad_s[:, joint_index]
     is_moving = is_commanded & (np.abs(speed_rad_s) > MIN_RATE_RAD_S)
     encoder_fractions = np.array(

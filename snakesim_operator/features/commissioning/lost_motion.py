@@ -30,6 +30,7 @@ RATIO_STEP = 0.01
 MIN_AGREEING_FRACTION = 0.2  # fraction of the fast samples
 MAX_DELAY_S = 0.03  # between IMU and encoder
 NOISE_FACTOR = 4.0  # standard deviations; less lost motion may be noise
+MIN_SQUARES = 1e-12  # of a drive that does not move at all
 MAD_TO_SD = 1.4826  # standard deviation of a normal distribution, of its median absolute deviation
 
 
@@ -56,7 +57,7 @@ def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> Lo
     Returns:
         The backlash and its noise; None if the joint moved too little, or no gyro measured its link.
     """
-    moved_rows = np.flatnonzero(measurements.is_moved_by_target(joint_index))
+    moved_rows = np.flatnonzero(measurements.is_in_large_motion(joint_index))
     link_angle = _integrate_link_angle(measurements, joint_index)
     if link_angle is None or len(moved_rows) < MIN_SAMPLES:
         return None
@@ -89,6 +90,22 @@ def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> Lo
     encoder_noise_rad = _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
     noise_rad = NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
     return LostMotion(float(np.ptp(difference_rad)), noise_rad, ratio)
+
+
+def measure_small_motion_ratio(measurements: CheckMeasurements, joint_index: int) -> float | None:
+    """Return the motion of a joint's links divided by that of its drive, in the second cycle of its small motion.
+
+    Returns:
+        The ratio, which is near 0 within backlash; None if the joint made no small motion, or a link was not measured.
+    """
+    small = measurements.find_second_small_cycle(joint_index)
+    link_angle = _integrate_link_angle(measurements, joint_index)
+    if small is None or link_angle is None:
+        return None
+    link_rad = link_angle[0][small]
+    drive_rad = measurements.angle_rad[small, joint_index]
+    centered_rad = drive_rad - np.mean(drive_rad)
+    return float(link_rad @ centered_rad / max(float(centered_rad @ centered_rad), MIN_SQUARES))
 
 
 def _measure_encoder_noise(measurements: CheckMeasurements, joint_index: int) -> float:

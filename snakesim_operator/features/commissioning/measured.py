@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import JointDrive
+from snakesim_hal.model.joints import JointDrive, JointMotor
 from snakesim_hal.model.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys
@@ -20,6 +20,7 @@ SIGNAL_NAMES = ("angle_rad", "velocity_rad_s", "torque_nm", "target", "orientati
 MIN_TARGET_MOTION_RAD = 1e-6  # a target that is further from its rest moves its joint
 # Of the largest step from the measured angle; beyond, the command limiter set the target.
 CLAMPED_FRACTION = 0.9
+SMALL_MOTION_SPEED_RATIO = 0.5  # of the fastest motion of a joint; a slower one is a small motion
 PITCH = 1  # y, component of a vector in a link's frame
 YAW = 2  # z
 Mask = NDArray[np.bool_]
@@ -33,6 +34,7 @@ class CheckMeasurements:
     joint_names: Sequence[str]
     axes: Sequence[str]  # "yaw" or "pitch"
     drives: Sequence[JointDrive]  # from the robot file
+    motors: Sequence[JointMotor]  # from the robot file
     angle_rad: Floats  # (n, joints)
     velocity_rad_s: Floats  # (n, joints)
     torque_nm: Floats  # (n, joints)
@@ -48,6 +50,46 @@ class CheckMeasurements:
         target_rad = self.target_rad[:, joint_index]
         return np.abs(target_rad - np.median(target_rad)) > MIN_TARGET_MOTION_RAD
 
+    def is_in_large_motion(self, joint_index: int) -> Mask:
+        """Return the ticks of the joint's large motions, (n,)."""
+        return self._select_motions(joint_index, is_small=False)
+
+    def is_in_small_motion(self, joint_index: int) -> Mask:
+        """Return the ticks of the joint's small motions, (n,); none in recordings without them."""
+        return self._select_motions(joint_index, is_small=True)
+
+    def list_motions(self, joint_index: int) -> list[slice]:
+        """Return the ticks of each motion of the joint away from its rest and back, in order."""
+        is_moved = np.concatenate(([False], self.is_moved_by_target(joint_index), [False]))
+        edges = np.flatnonzero(np.diff(is_moved.astype(np.int8)))
+        return [slice(start, end) for start, end in edges.reshape(-1, 2).tolist()]
+
+    def find_second_small_cycle(self, joint_index: int) -> slice | None:
+        """Return the ticks of the joint's second small motion to both sides; None without any.
+
+        The first one has moved the link to the middle of its backlash.
+        """
+        is_small = self.is_in_small_motion(joint_index)
+        small_motions = [
+            motion for motion in self.list_motions(joint_index) if is_small[motion.start]
+        ]
+        if len(small_motions) < 2:
+            return None
+        second_cycle = small_motions[len(small_motions) // 2 :]
+        return slice(second_cycle[0].start, second_cycle[-1].stop)
+
+    def _select_motions(self, joint_index: int, *, is_small: bool) -> Mask:
+        """Return the ticks of the small or of the large motions. In small ones, the target moves slowly."""
+        steps_rad = np.abs(np.diff(self.target_rad[:, joint_index], prepend=np.nan))
+        motions = self.list_motions(joint_index)
+        speeds = [float(np.nanmedian(steps_rad[motion])) for motion in motions]
+        max_small_speed = SMALL_MOTION_SPEED_RATIO * max(speeds, default=0.0)
+        selected = np.zeros(len(steps_rad), dtype=np.bool_)
+        for motion, speed in zip(motions, speeds, strict=True):
+            if (speed < max_small_speed) == is_small:
+                selected[motion] = True
+        return selected
+
     def is_at_rest(self) -> Mask:
         """Return the ticks in which no joint's target is away from its rest, (n,)."""
         moved = [self.is_moved_by_target(joint) for joint in range(len(self.joint_names))]
@@ -59,7 +101,7 @@ class CheckMeasurements:
 
     def measure_motion_range_rad(self, joint_index: int) -> float:
         """Return how far the joint moved by its encoder, from end to end."""
-        moved = self.is_moved_by_target(joint_index)
+        moved = self.is_in_large_motion(joint_index)
         if not moved.any():
             return 0.0
         return float(np.ptp(self.angle_rad[moved, joint_index]))
@@ -136,6 +178,7 @@ def collect_measurements(
         joint_names=[joint.name for joint in robot.joints],
         axes=[joint.axis for joint in robot.joints],
         drives=[joint.drive for joint in config.robot.joint_table],
+        motors=[joint.motor for joint in config.robot.joint_table],
         angle_rad=columns["angle_rad"],
         velocity_rad_s=columns["velocity_rad_s"],
         torque_nm=columns["torque_nm"],

@@ -30,7 +30,7 @@ def test_checked_robot_can_be_armed_until_file_or_drive_changes(home: Path) -> N
     assert "its joints have not been checked against its file" in refused.out
     assert moves(home, "word", "--unchecked")
 
-    checking = run(home, "check", "--controller", "joint_check", "--duration", "4")
+    checking = run(home, "check", "--controller", "joint_check", "--duration", "10")
     assert checking.code == 0, checking.out
     judged = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
     assert judged.code == 0 and f"{JOINTS} of {JOINTS} joints match the robot file" in judged.out, (

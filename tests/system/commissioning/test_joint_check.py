@@ -21,7 +21,7 @@ DEFECTS = {
 
 def check(out: Path, *sets: str) -> tuple[int, list[str]]:
     truth = [word for text in sets for word in ("--set", f"backends.can.mounted.{text}")]
-    short = ("--set", f"robot.chain.modules={JOINTS}", "--duration", "13")
+    short = ("--set", f"robot.chain.modules={JOINTS}", "--duration", "32")
     run, _ = run_to_summary(out, "joint_check", "--backend", "can", *short, *truth)
     assert "Every joint was moved. Judge the run with `snakesim robot check " in run.out
     assert "no fault." in run.out

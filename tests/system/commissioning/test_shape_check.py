@@ -76,9 +76,14 @@ def test_robot_without_imus_can_be_armed_after_shapes_and_start_check(tmp_path: 
     assert refused.code == 1
     assert "did not confirm of every joint: drive" in refused.out
 
-    checking = start(home, "check", "--controller", "joint_check", "--duration", "6")
+    checking = start(home, "check", "--controller", "joint_check", "--duration", "14")
     assert checking.code == 0, checking.out
-    judged = snakesim("robot", "check", "check", "--write", "snake.toml", cwd=home)
+    evaluate = ("robot", "check", "check", "--write", "snake.toml")
+    unknown = snakesim(*evaluate, cwd=home)
+    assert unknown.code == 1
+    assert "gear of every joint: backlash and ratio unknown, as the floor hardly" in unknown.out
+    assert "nothing was written" in unknown.out
+    judged = snakesim(*evaluate, "--gear-by-hand", cwd=home)
     assert judged.code == 0, judged.out
     assert f"{JOINTS} with properties that drawn shapes confirmed" in judged.out
     assert start(home, "moves", "--duration", "0.1").code == 0

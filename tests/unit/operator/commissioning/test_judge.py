@@ -7,7 +7,7 @@ import pytest
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import PROPERTIES
-from snakesim_hal.model.joints import JointDrive
+from snakesim_hal.model.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.check import format_report
 from snakesim_operator.features.commissioning.judge import MATCHES_FILE, JointVerdict, judge_joints
 from snakesim_operator.features.commissioning.measured import (
@@ -21,6 +21,13 @@ REST, LEG = 20, 40  # ticks
 MOTION = 2 * (LEG + REST)
 JOINTS = 3  # yaw, pitch, yaw
 TICKS = REST + JOINTS * MOTION
+MOTOR = JointMotor(
+    stiffness_nm_per_rad=60.0,
+    damping_nm_s_per_rad=1.5,
+    velocity_gain_nm_s_per_rad=1.5,
+    response_time_s=0.01,
+    armature_kg_m2=0.005,
+)
 SWING = np.concatenate((WAY_RAD * np.sin(np.linspace(0, np.pi, LEG)), np.zeros(REST)))
 TO_AND_FRO = np.concatenate((SWING, -SWING))
 
@@ -52,6 +59,7 @@ def measurements(
         joint_names=["joint_1", "joint_2", "joint_3"],
         axes=["yaw", "pitch", "yaw"],
         drives=[JointDrive(), JointDrive(sign=-1, zero_rad=0.3), JointDrive()],
+        motors=[MOTOR] * JOINTS,
         angle_rad=angle,
         velocity_rad_s=velocity,
         torque_nm=0.5 * np.sign(velocity),
@@ -167,6 +175,55 @@ def test_a_joint_beside_a_link_without_an_imu_is_unknown(link: int) -> None:
     assert row.turned is None
     assert not row.all_confirmed
     assert states(row) == {"sign": "unknown", "gear": "unknown"}
+
+
+def with_dead_zone(angle_rad: Floats, dead_zone_rad: float) -> Floats:
+    """The angles of an encoder that sticks, and then jumps to the shaft."""
+    measured_rad = np.zeros_like(angle_rad)
+    now_rad = 0.0
+    for tick, shaft_rad in enumerate(angle_rad):
+        if abs(shaft_rad - now_rad) >= dead_zone_rad:
+            now_rad = shaft_rad
+        measured_rad[tick] = now_rad
+    return measured_rad
+
+
+@pytest.mark.parametrize("has_imus", [True, False])
+def test_encoder_with_dead_zone_is_named_and_its_gear_is_not_judged(has_imus: bool) -> None:
+    run = measurements()
+    angle_rad = run.angle_rad.copy()
+    angle_rad[:, 1] = with_dead_zone(run.target_rad[:, 1], 0.02)
+    run = replace(run, angle_rad=angle_rad)
+    if not has_imus:
+        run = without_imus(run, *range(JOINTS + 1))
+    rows = judge_joints(run, was_laid_straight=True)
+    assert rows[1].summary.startswith("its encoder has a dead zone: its angle sticks")
+    assert "jumps by 0.02" in rows[1].summary
+    assert states(rows[1]) == {
+        "drive": "wrong",
+        "order": "unknown",
+        "sign": "unknown",
+        "gear": "unknown",
+    }
+    assert [rows[joint].findings["drive"].state for joint in (0, 2)] == ["confirmed"] * 2
+
+
+def test_few_late_samples_are_no_dead_zone() -> None:
+    run = measurements()
+    angle_rad = run.angle_rad.copy()
+    for tick in (REST + 5, REST + 30):
+        angle_rad[tick : tick + 4, 0] = angle_rad[tick, 0]
+    rows = judge_joints(replace(run, angle_rad=angle_rad), was_laid_straight=True)
+    assert rows[0].findings["drive"].state == "confirmed"
+
+
+def test_drawn_shapes_do_not_confirm_a_gear_whose_backlash_is_unknown() -> None:
+    run = without_imus(measurements(), *range(JOINTS + 1))
+    row = judge_joints(run, was_laid_straight=True)[0]
+    assert "backlash and ratio unknown, as it made no small motion" in row.findings["gear"].reason
+    row = row.confirm_by_shape(["order", "sign", "gear", "zero"])
+    assert states(row) == {"gear": "unknown"}
+    assert row.confirm_by_hand(["gear"]).all_confirmed
 
 
 def test_judge_two_imus_cannot_separate_joints_of_equal_effect() -> None:

@@ -1,0 +1,103 @@
+"""Measures how torques answer the large and the small motion of a joint, without IMUs. Pure.
+
+The floor loads a joint through its gear. A motion that reverses unloads and loads the gear again:
+
+    sound gear   even a small motion bends the body and its grip on the floor, so its torque follows the angle
+    backlash     a small motion stays within the backlash, so it needs only the torque of the drive's own friction
+
+The neighbors hold the same load, and their torques do not contain the friction of the joint that moves. A drive that
+does not measure its torque is judged by the torque that its servo must exert at its distance from the target.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_operator.features.commissioning.measured import CheckMeasurements
+
+SMOOTHING_TICKS = 5  # of torques; shorter than any change of the load
+SETTLING_TICKS = 5  # after a motion, in which the torque still changes
+
+
+@dataclass(frozen=True)
+class LoadResponse:
+    """The ranges of torques while one joint moved, in N·m; those of its neighbors are of the one that changes most."""
+
+    small_motion_rad: float  # range of the joint's encoder in the second cycle of the small motion
+    large_nm: float  # of the joint's torque in its large motions
+    small_nm: float  # of the joint's torque in that cycle
+    # Part of `small_nm` that follows the angle, as that of a spring does, and not its direction, as friction does.
+    elastic_nm: float
+    neighbors_large_nm: float
+    neighbors_small_nm: float
+    noise_nm: float  # largest range while the robot rested
+
+    @property
+    def load_nm(self) -> float:
+        """Range of the load that only the large motion meets: without the friction of the drive."""
+        return self.large_nm - self.small_nm
+
+
+def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> LoadResponse | None:
+    """Return how torques answered the motions of a joint; None if it did not make the large and the small motion."""
+    small = measurements.find_second_small_cycle(joint_index)
+    large_ticks = np.flatnonzero(measurements.is_in_large_motion(joint_index))
+    rest_ticks = np.flatnonzero(measurements.is_before_motion())
+    if small is None or not len(large_ticks) or len(rest_ticks) <= SMOOTHING_TICKS:
+        return None
+    large = slice(large_ticks[0], large_ticks[-1] + 1 + SETTLING_TICKS)
+    rest = slice(rest_ticks[0], rest_ticks[-1] + 1)
+
+    torque_nm = _smooth(_estimate_torques_nm(measurements))
+    angle_rad = measurements.angle_rad[small, joint_index]
+    small_motion_rad = float(np.ptp(angle_rad))
+    stiffness_nm_per_rad = _fit_slope(angle_rad, torque_nm[small, joint_index])
+    joint_count = len(measurements.joint_names)
+    neighbors = [i for i in (joint_index - 1, joint_index + 1) if 0 <= i < joint_count]
+    return LoadResponse(
+        small_motion_rad=small_motion_rad,
+        large_nm=float(np.ptp(torque_nm[large, joint_index])),
+        small_nm=float(np.ptp(torque_nm[small, joint_index])),
+        elastic_nm=stiffness_nm_per_rad * small_motion_rad,
+        neighbors_large_nm=_find_max_range(torque_nm[large][:, neighbors]),
+        neighbors_small_nm=_find_max_range(torque_nm[small][:, neighbors]),
+        noise_nm=_find_max_range(torque_nm[rest][:, [joint_index, *neighbors]]),
+    )
+
+
+def _estimate_torques_nm(measurements: CheckMeasurements) -> Floats:
+    """Return the torques of all joints, (n, joints): measured, or estimated from the distance to the target."""
+    torque_nm = measurements.torque_nm.copy()
+    for joint, (drive, motor) in enumerate(
+        zip(measurements.drives, measurements.motors, strict=True)
+    ):
+        if "torque" not in drive.measures:
+            lag_rad = measurements.target_rad[:, joint] - measurements.angle_rad[:, joint]
+            torque_nm[:, joint] = (
+                motor.stiffness_nm_per_rad * lag_rad
+                - motor.damping_nm_s_per_rad * measurements.velocity_rad_s[:, joint]
+            )
+    return torque_nm
+
+
+def _smooth(signals: Floats) -> Floats:
+    """Return moving averages of the columns; the first and the last value are repeated beyond the ends."""
+    margin = SMOOTHING_TICKS // 2
+    padded = np.pad(signals, ((margin, margin), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, SMOOTHING_TICKS, axis=0)
+    return windows.mean(axis=-1)
+
+
+def _find_max_range(signals: Floats) -> float:
+    """Return the largest range of the columns; 0 without any."""
+    return float(np.max(np.ptp(signals, axis=0), initial=0.0))
+
+
+def _fit_slope(x: Floats, y: Floats) -> float:
+    """Return the slope of the line through points by least squares; 0 if `x` does not change."""
+    centered = x - np.mean(x)
+    variance = float(centered @ centered)
+    if variance == 0.0:
+        return 0.0
+    return float(centered @ y) / variance

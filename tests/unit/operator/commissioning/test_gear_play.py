@@ -1,0 +1,106 @@
+"""What torques alone show of the gear of a joint."""
+
+from dataclasses import replace
+
+import pytest
+
+from snakesim_operator.features.commissioning.gear_play import (
+    MIN_CHANGE_NM,
+    PlayKind,
+    judge_gear_plays,
+)
+from snakesim_operator.features.commissioning.load_response import LoadResponse
+
+JOINTS = 5
+AXES = ["yaw"] * JOINTS
+# Typical numbers of emulated joints on a floor.
+TIGHT = LoadResponse(
+    small_motion_rad=0.011,
+    large_nm=1.0,
+    small_nm=0.4,
+    elastic_nm=0.35,
+    neighbors_large_nm=0.9,
+    neighbors_small_nm=0.25,
+    noise_nm=0.005,
+)
+BACKLASH = replace(TIGHT, small_nm=0.02, elastic_nm=-0.01, neighbors_small_nm=0.002)
+SLIPPING = replace(
+    TIGHT,
+    large_nm=0.1,
+    small_nm=0.06,
+    elastic_nm=0.003,
+    neighbors_large_nm=0.04,
+    neighbors_small_nm=0.03,
+)
+HARDLY_LOADED = replace(
+    SLIPPING, elastic_nm=0.007, neighbors_large_nm=0.025, neighbors_small_nm=0.02
+)
+AT_END = 0
+BETWEEN = 2
+
+
+def judge(response: LoadResponse | None, joint: int = BETWEEN) -> PlayKind:
+    """Judge one joint among tight ones."""
+    responses: list[LoadResponse | None] = [TIGHT] * JOINTS
+    responses[joint] = response
+    plays = judge_gear_plays(responses, AXES)
+    others = [play.kind for i, play in enumerate(plays) if i != joint]
+    assert others == ["tight"] * (JOINTS - 1)
+    return plays[joint].kind
+
+
+@pytest.mark.parametrize("joint", [AT_END, BETWEEN])
+def test_joint_whose_torque_follows_its_angle_is_tight(joint: int) -> None:
+    assert judge(TIGHT, joint) == "tight"
+
+
+@pytest.mark.parametrize("joint", [AT_END, BETWEEN])
+@pytest.mark.parametrize("friction_nm", [0.0, 0.2])
+def test_joint_without_load_in_the_small_motion_has_backlash(
+    joint: int, friction_nm: float
+) -> None:
+    response = replace(
+        BACKLASH,
+        small_nm=BACKLASH.small_nm + 2 * friction_nm,
+        large_nm=BACKLASH.large_nm + 2 * friction_nm,
+    )
+    assert judge(response, joint) == "backlash"
+
+
+def test_joint_with_the_same_low_torque_in_both_motions_slips() -> None:
+    assert judge(SLIPPING) == "slipping"
+
+
+def test_joint_between_both_patterns_is_loose() -> None:
+    assert judge(replace(SLIPPING, neighbors_small_nm=0.012)) == "loose"
+
+
+def test_joint_at_an_end_without_load_is_unknown() -> None:
+    assert judge(HARDLY_LOADED, AT_END) == "unknown"
+
+
+def test_joint_without_small_motion_is_unknown() -> None:
+    assert judge(None) == "unknown"
+
+
+def test_joint_whose_torque_follows_its_angle_little_is_unknown() -> None:
+    assert judge(replace(TIGHT, elastic_nm=0.15 * TIGHT.elastic_nm)) == "unknown"
+
+
+def test_pitch_joint_is_unknown() -> None:
+    axes = ["yaw", "pitch", "yaw", "pitch", "yaw"]
+    kinds = [play.kind for play in judge_gear_plays([TIGHT] * JOINTS, axes)]
+    assert kinds == ["tight", "unknown", "tight", "unknown", "tight"]
+
+
+@pytest.mark.parametrize("response", [HARDLY_LOADED, BACKLASH, SLIPPING])
+def test_robot_that_no_floor_loads_is_unknown(response: LoadResponse) -> None:
+    """So a robot that hangs, or in which every joint is loose, is not judged."""
+    assert response.elastic_nm < MIN_CHANGE_NM
+    plays = judge_gear_plays([response] * JOINTS, AXES)
+    assert [play.kind for play in plays] == ["unknown"] * JOINTS
+
+
+def test_load_that_may_be_noise_is_unknown() -> None:
+    noisy = replace(TIGHT, noise_nm=TIGHT.elastic_nm)
+    assert {play.kind for play in judge_gear_plays([noisy] * JOINTS, AXES)} == {"unknown"}
