@@ -26,7 +26,10 @@ import resource  # noqa: E402
 import signal  # noqa: E402
 
 from snakesim_hal.base.arithmetic import pin_common_arithmetic  # noqa: E402
-from snakesim_hal.base.process import isolate_children_from_working_folder  # noqa: E402
+from snakesim_hal.base.process import (  # noqa: E402
+    isolate_children_from_working_folder,
+    make_collections_rare,
+)
 from snakesim_hal.base.terminal import print_stderr  # noqa: E402
 
 
@@ -38,6 +41,7 @@ def main() -> int:
     down in order, handle the signal themselves.
     """
     _open_closed_streams()
+    make_collections_rare()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not if the shell ignores it
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     isolate_children_from_working_folder()

@@ -145,6 +145,15 @@ def raise_on_stop_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def make_collections_rare() -> None:
+    """Make garbage collections rare. A program calls this before its imports, of which nothing is ever garbage.
+
+    Otherwise the collector visits the new classes and functions again and again: a tenth of the processor time that a
+    run of one second takes.
+    """
+    gc.set_threshold(50_000, 10, 10)
+
+
 def tune_garbage_collector() -> None:
     """Keep the garbage collector out of the loop: freeze all current objects, and make collections rare."""
     gc.collect()

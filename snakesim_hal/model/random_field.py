@@ -2,11 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from msgspec import Meta
-from numpy.random import Generator
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.outlines import (
@@ -27,6 +26,9 @@ from snakesim_hal.model.solids import (
     make_peg,
 )
 from snakesim_hal.wire.messages import KnownObstacle
+
+if TYPE_CHECKING:
+    from numpy.random import Generator  # takes 10 ms, and most processes place no obstacles
 
 MAX_RANDOM_OBSTACLES = 1000
 MAX_TRIES_PER_OBSTACLE = 200  # random positions that are tried for each obstacle
@@ -200,7 +202,7 @@ def _validate_field(field: RandomField, context: str, route: Route | None) -> No
         )
 
 
-def _sample_obstacle(field: RandomField, rng: Generator, name: str) -> KnownObstacle:
+def _sample_obstacle(field: RandomField, rng: "Generator", name: str) -> KnownObstacle:
     """Sample a peg or a block at a random position in the field.
 
     The order of the random numbers is part of the result: a scene is the same for the same seed.

@@ -8,13 +8,12 @@ that another user left in that folder does not run unless the plugin imports it 
 import ast
 import sys
 from collections.abc import Iterator, Sequence
-from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
 
 
-class SiblingFinder(MetaPathFinder):
+class SiblingFinder:
     """Finds the modules beside a plugin's file, after every other finder."""
 
     def __init__(self, folder: Path) -> None:

@@ -12,15 +12,20 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from snakesim_hal.backend import Backend
-from snakesim_hal.base.errors import BackendError, RefusedError, SnakesimError
 from snakesim_hal.base.process import (
     HOST_PRIORITY,
     call_on_stop_signals,
     enter_realtime,
+    make_collections_rare,
     restart_process,
     tune_garbage_collector,
 )
+
+if __name__ == "__main__":
+    make_collections_rare()
+
+from snakesim_hal.backend import Backend
+from snakesim_hal.base.errors import BackendError, RefusedError, SnakesimError
 from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.faults.allowed import create_host_faults
 from snakesim_hal.host.cable_file import open_cable_file

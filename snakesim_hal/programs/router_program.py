@@ -6,7 +6,11 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 
-from snakesim_hal.base.process import call_on_stop_signals
+from snakesim_hal.base.process import call_on_stop_signals, make_collections_rare
+
+if __name__ == "__main__":
+    make_collections_rare()
+
 from snakesim_hal.base.terminal import run_tool
 from snakesim_hal.network.session import open_session
 from snakesim_hal.programs.arguments import (

@@ -12,16 +12,21 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
 
-from threadpoolctl import threadpool_limits
-
 from snakesim_hal.base.process import (
     SERVICE_PRIORITY,
     accept_interrupts,
     drop_priority_after,
     enter_realtime,
+    make_collections_rare,
     set_parent_death_signal,
     tune_garbage_collector,
 )
+
+if __name__ == "__main__":
+    make_collections_rare()
+
+from threadpoolctl import threadpool_limits
+
 from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.scenario import LoadedScenario, RunConfig
 from snakesim_hal.network.session import ConnectionSettings, Session

@@ -31,6 +31,9 @@ from mcap.writer import LIBRARY_IDENTIFIER, MCAP0_MAGIC
 from snakesim_operator.recording.disk import GrowingFile
 
 SNAKESIM_PROFILE = "snakesim"
+METADATA_NAME = "snakesim"  # the name of the metadata record
+# Entry of that record: what the recording lacked that this one was copied from.
+EARLIER_LOSSES_ENTRY = "lacked_before_copy"
 CHUNK_BYTES = 1024 * 1024
 COMPRESSION = "zstd"
 # Two thirds of the time of the default, 3, for files as small; with depth images 4 % larger.

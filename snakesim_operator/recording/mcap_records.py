@@ -20,7 +20,7 @@ from snakesim_operator.recording.chunks import (
     parse_record,
     read_chunk_length,
 )
-from snakesim_operator.recording.writer import METADATA_NAME
+from snakesim_operator.recording.mcap_file import METADATA_NAME
 
 OPCODES_TO_READ = (Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.MESSAGE)
 TRUNCATED = "the file ends in the middle of a record"

@@ -24,7 +24,11 @@ from snakesim_operator.recording.chunks import (
     unpack_chunk,
 )
 from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, RecordingLosses
-from snakesim_operator.recording.mcap_file import SNAKESIM_PROFILE
+from snakesim_operator.recording.mcap_file import (
+    EARLIER_LOSSES_ENTRY,
+    METADATA_NAME,
+    SNAKESIM_PROFILE,
+)
 from snakesim_operator.recording.mcap_records import (
     OPCODES_TO_READ,
     TRUNCATED,
@@ -35,7 +39,6 @@ from snakesim_operator.recording.mcap_records import (
 )
 from snakesim_operator.recording.message import RecordedMessage
 from snakesim_operator.recording.stamps import read_log_time_clock
-from snakesim_operator.recording.writer import EARLIER_LOSSES_ENTRY, METADATA_NAME
 
 MAX_ROBOT_TIME_NS = 2**62  # 146 years: no robot time is later
 NO_SCHEMA = 0  # MCAP's number for a channel without a schema

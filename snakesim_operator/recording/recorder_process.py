@@ -18,10 +18,14 @@ from importlib.metadata import version
 from itertools import count
 from pathlib import Path
 
+from snakesim_hal.base.process import call_on_stop_signals, make_collections_rare
+
+if __name__ == "__main__":
+    make_collections_rare()
+
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, NotConnectedError
-from snakesim_hal.base.process import call_on_stop_signals
 from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import make_own_entry, publish_process_entry

@@ -7,7 +7,11 @@ from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.recording.disk import GrowingFile
-from snakesim_operator.recording.mcap_file import McapFileWriter
+from snakesim_operator.recording.mcap_file import (
+    EARLIER_LOSSES_ENTRY,
+    METADATA_NAME,
+    McapFileWriter,
+)
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.shown_messages import ViewerMessageWriter
 from snakesim_operator.recording.stamps import (
@@ -16,7 +20,6 @@ from snakesim_operator.recording.stamps import (
     read_log_time_clock,
     with_log_time_clock,
 )
-from snakesim_operator.recording.writer import EARLIER_LOSSES_ENTRY, METADATA_NAME
 
 FLUSH_BYTES = 4 * 1024 * 1024  # bounds the memory that waiting messages take
 

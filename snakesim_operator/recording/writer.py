@@ -21,7 +21,7 @@ from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.recording.disk import GrowingFile
-from snakesim_operator.recording.mcap_file import McapFileWriter
+from snakesim_operator.recording.mcap_file import METADATA_NAME, McapFileWriter
 from snakesim_operator.recording.robot_time import MessageClock
 from snakesim_operator.recording.shown_messages import OnViewerMessage, ViewerMessageWriter
 from snakesim_operator.recording.stamps import LogTimeClock, order_times, with_log_time_clock
@@ -30,9 +30,6 @@ FLUSH_S = 0.5
 # Of custom sensors before the description; further ones get no schema of their own.
 MAX_EARLY_CUSTOM_SAMPLES = 1000
 MAX_ENCODING_NAME_CHARACTERS = 200  # characters; it comes from the network
-METADATA_NAME = "snakesim"  # the name of the metadata record
-# Entry of that record: what the recording lacked that this one was copied from.
-EARLIER_LOSSES_ENTRY = "lacked_before_copy"
 
 
 class RecordingWriter:

@@ -6,10 +6,10 @@ process are added, because its threads wait for one another.
 """
 
 import contextlib
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import NamedTuple
 
 HISTORY_S = 1.0
@@ -44,14 +44,21 @@ def read_usages(pid: int) -> dict[int, ThreadUsage]:
     """Return the counters of each thread of a process, by thread id; empty when the kernel does not provide them."""
     usages: dict[int, ThreadUsage] = {}
     with contextlib.suppress(OSError):
-        for task in Path(f"/proc/{pid}/task").iterdir():
+        for task in os.scandir(f"/proc/{pid}/task"):
             with contextlib.suppress(OSError, ValueError, IndexError):
-                ran_ns, waited_ns, *_ = (task / "schedstat").read_text().split()
-                state = (task / "stat").read_text().rpartition(")")[2].split()[0]
+                ran_ns, waited_ns, *_ = _read_file(f"{task.path}/schedstat").split()
+                state = _read_file(f"{task.path}/stat").rpartition(b")")[2].split()[0]
                 usages[int(task.name)] = ThreadUsage(
-                    int(ran_ns) * 1e-9, int(waited_ns) * 1e-9, state == "R"
+                    int(ran_ns) * 1e-9, int(waited_ns) * 1e-9, state == b"R"
                 )
     return usages
+
+
+def _read_file(path: str) -> bytes:
+    """Return the content of a small file of the kernel."""
+    # A run reads some 80 files 20 times a second. With `pathlib` that takes a tenth of a slow core.
+    with open(path, "rb", buffering=0) as file:  # noqa: PTH123
+        return file.read()
 
 
 class ProcessorWaits:

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 
-from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.arrays import Floats, choose_even_indices
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.placement import outline_pipes
 from snakesim_operator.results.report.top_view import find_outline_w
@@ -74,10 +74,9 @@ def _sample_body_points_w(record: RunRecord, span_s: tuple[float, float]) -> Flo
     start_s, end_s = span_s
     time_s = record.time_s - get_time_origin_s(record)
     rows = np.flatnonzero(record.has_pose & (time_s >= start_s) & (time_s <= end_s))
-    sample_count = min(len(rows), MAX_PATH_POINTS)
-    sampled_positions = np.unique(np.linspace(0, len(rows) - 1, sample_count).astype(int))
+    sampled_rows = rows[choose_even_indices(len(rows), MAX_PATH_POINTS)]
     samples_w: list[Floats] = []
-    for row in rows[sampled_positions].tolist():
+    for row in sampled_rows.tolist():
         body_points_w = record.find_body_points_w(row)
         if body_points_w is not None:
             samples_w.append(body_points_w)

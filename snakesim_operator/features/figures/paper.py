@@ -15,6 +15,7 @@ from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from snakesim_hal.base.arrays import choose_even_indices
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.figures.from_above import OBSTACLE_COLOR, plot_body, plot_obstacles
 from snakesim_operator.features.figures.legends import place_legend_beside_title
@@ -79,9 +80,7 @@ def draw_paper_figures(
             code="recording/missing-data",
         )
     first_snapshot = snapshots_with_balance[0]
-    selected_indices = np.unique(
-        np.linspace(0, len(snapshots_with_balance) - 1, MAX_SNAPSHOTS).astype(int)
-    )
+    selected_indices = choose_even_indices(len(snapshots_with_balance), MAX_SNAPSHOTS)
     selected_snapshots = [snapshots_with_balance[i] for i in selected_indices]
     intervals = find_propulsion_intervals(record)
     propelling_joints = find_most_propelling_joints(intervals, MAX_JOINTS)

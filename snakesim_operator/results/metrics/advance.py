@@ -47,16 +47,13 @@ class ForwardProgress:
         if len(rows_with_pose) < 2:
             return None
         row_step = max(round(SAMPLE_PERIOD_S * record.config.rate_hz), 1)
-        rows_at_gaps: list[int] = []
+        chosen_rows: set[int] = {int(rows_with_pose[-1]), *rows_with_pose[::row_step].tolist()}
         for rows_without_gap in record.contiguous_rows:
             for row in (rows_without_gap[0], rows_without_gap[-1]):
                 if record.has_pose[row]:
-                    rows_at_gaps.append(row)
-        periodic_rows = rows_with_pose[::row_step]
-        last_row = rows_with_pose[-1:]
-        end_rows = np.array(rows_at_gaps, dtype=np.int64)
-        rows = np.unique(np.concatenate([periodic_rows, last_row, end_rows]))
-        body_points_w = np.array([record.find_body_points_w(int(row)) for row in rows])
+                    chosen_rows.add(int(row))
+        rows = sorted(chosen_rows)
+        body_points_w = np.array([record.find_body_points_w(row) for row in rows])
         time_s = record.time_s[rows] - record.time_s[0]
         return ForwardProgress.from_body_points(
             record.config.mission.goal, record.description, time_s, body_points_w

@@ -2,6 +2,9 @@
 
 import math
 
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
 from snakesim_operator.results.page.svg import Point, draw_text, estimate_text_width
 
 TEXT_HEIGHT = 13.0
@@ -19,11 +22,13 @@ class LabelPlacer:
 
     def __init__(self, width: float, height: float) -> None:
         self._frame: Box = (2.0, 2.0, width - 2.0, height - 2.0)
-        self._occupied: list[tuple[Box, float]] = []  # each with the cost weight of covering it
+        self._occupied_boxes: list[Box] = []
+        self._weights: list[float] = []  # of each occupied box: the cost of covering it, per area
 
     def reserve_box(self, box: Box, weight: float = 1.0) -> None:
         """Keep later labels away from a box. `weight` is the cost of covering it, per area."""
-        self._occupied.append((box, weight))
+        self._occupied_boxes.append(box)
+        self._weights.append(weight)
 
     def reserve_line(
         self, a: Point, b: Point, half_width: float = 4.0, weight: float = 1.0
@@ -33,8 +38,8 @@ class LabelPlacer:
         for k in range(steps + 1):
             x = a[0] + (b[0] - a[0]) * k / steps
             y = a[1] + (b[1] - a[1]) * k / steps
-            self._occupied.append(
-                ((x - half_width, y - half_width, x + half_width, y + half_width), weight)
+            self.reserve_box(
+                (x - half_width, y - half_width, x + half_width, y + half_width), weight
             )
 
     def place_label(
@@ -62,8 +67,8 @@ class LabelPlacer:
             The label as SVG.
         """
         width = estimate_text_width(words, TEXT_HEIGHT)
-        min_cost = math.inf
-        best_box: Box = (0.0, 0.0, 0.0, 0.0)
+        boxes: list[Box] = []
+        position_costs: list[float] = []
         for gap in gaps:
             for direction_deg in DIRECTIONS_DEG:
                 cos = math.cos(math.radians(direction_deg))
@@ -72,26 +77,29 @@ class LabelPlacer:
                 center_y = at[1] + sin * (gap + TEXT_HEIGHT / 2)
                 left = center_x - width / 2
                 top = center_y - TEXT_HEIGHT / 2
-                box = (left, top, center_x + width / 2, center_y + TEXT_HEIGHT / 2)
-                cost = (
-                    self._compute_covering_cost(box)
-                    + GAP_WEIGHT * gap
-                    + _compute_direction_cost(at, (cos, sin), away_from)
-                )
-                if cost < min_cost:
-                    min_cost = cost
-                    best_box = box
+                boxes.append((left, top, center_x + width / 2, center_y + TEXT_HEIGHT / 2))
+                direction_cost = _compute_direction_cost(at, (cos, sin), away_from)
+                position_costs.append(GAP_WEIGHT * gap + direction_cost)
+        costs = self._compute_covering_costs(np.array(boxes)) + position_costs
+        best_box = boxes[int(np.argmin(costs))]
         self.reserve_box(best_box, LABEL_WEIGHT)
         left, _, right, bottom = best_box
         return draw_text((left + right) / 2, bottom - 2.5, words, class_, anchor="middle")
 
-    def _compute_covering_cost(self, box: Box) -> float:
-        """Return the cost of a label in a box: the weighted areas that it covers, and its area outside the drawing."""
-        covered = sum(
-            weight * _compute_overlap_area(box, occupied) for occupied, weight in self._occupied
-        )
-        area = (box[2] - box[0]) * (box[3] - box[1])
-        return covered + OUTSIDE_WEIGHT * (area - _compute_overlap_area(box, self._frame))
+    def _compute_covering_costs(self, boxes: Floats) -> Floats:
+        """Return the cost of a label in each box: the weighted areas that it covers, and its area outside the drawing.
+
+        Args:
+            boxes: Possible boxes of the label, shape (n, 4).
+
+        Returns:
+            Costs, shape (n,).
+        """
+        occupied = np.array(self._occupied_boxes).reshape(-1, 4)
+        covered = (_compute_overlap_areas(boxes, occupied) * self._weights).sum(axis=1)
+        areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+        areas_inside = _compute_overlap_areas(boxes, np.array([self._frame]))[:, 0]
+        return covered + OUTSIDE_WEIGHT * (areas - areas_inside)
 
 
 def _compute_direction_cost(at: Point, direction: Point, away_from: Point | None) -> float:
@@ -103,8 +111,8 @@ def _compute_direction_cost(at: Point, direction: Point, away_from: Point | None
     return DIRECTION_WEIGHT * (direction[0] * x + direction[1] * y) / max(math.hypot(x, y), 1e-9)
 
 
-def _compute_overlap_area(a: Box, b: Box) -> float:
-    """Return the area that two boxes share."""
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    return max(width, 0.0) * max(height, 0.0)
+def _compute_overlap_areas(a: Floats, b: Floats) -> Floats:
+    """Return the area that each of n boxes shares with each of m boxes, shape (n, m)."""
+    widths = np.minimum.outer(a[:, 2], b[:, 2]) - np.maximum.outer(a[:, 0], b[:, 0])
+    heights = np.minimum.outer(a[:, 3], b[:, 3]) - np.maximum.outer(a[:, 1], b[:, 1])
+    return np.maximum(widths, 0.0) * np.maximum(heights, 0.0)

@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.arrays import Floats, choose_even_indices
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, WorldContact, WorldModel
 from snakesim_operator.results.metrics.motion import (
@@ -68,10 +68,7 @@ def make_playback(record: RunRecord) -> MapPlayback | None:
     rows_with_pose = np.flatnonzero(record.has_pose)
     if not len(rows_with_pose):
         return None
-    evenly_spaced = np.linspace(
-        0, len(rows_with_pose) - 1, min(len(rows_with_pose), MAX_FRAMES)
-    ).astype(int)
-    rows = rows_with_pose[np.unique(evenly_spaced)]
+    rows = rows_with_pose[choose_even_indices(len(rows_with_pose), MAX_FRAMES)]
     body_points_w = [find_body_points_xy_w(record, int(row)) for row in rows]
     states = _find_latest_messages(record, rows, record.control_states)
     worlds = _find_latest_messages(record, rows, record.worlds)

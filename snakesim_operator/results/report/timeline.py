@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from snakesim_hal.base.arrays import Floats
+from snakesim_hal.base.arrays import Floats, choose_even_indices
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.metrics.motion import StopIntervals
@@ -181,8 +181,7 @@ def measure_distance(record: RunRecord) -> TimelineSeries | None:
     tick_count = len(record.time_s)
     if not tick_count:
         return read_reported_distance(record)
-    sample_count = min(tick_count, POSE_SAMPLES)
-    sampled_rows = np.unique(np.linspace(0, tick_count - 1, sample_count).astype(int))
+    sampled_rows = choose_even_indices(tick_count, POSE_SAMPLES)
     rows = sampled_rows[record.has_pose[sampled_rows]]
     if len(rows) < 2:
         return read_reported_distance(record)
