@@ -32,6 +32,7 @@ from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Imu, JointMode, JointState
 from snakesim_operator.features.commissioning.identification import (
+    MAX_CONSTANT_ERROR,
     JointIdentification,
     identify_joints,
 )
@@ -244,11 +245,12 @@ def check_table(
 # --- system identification -------------------------------------------------------------------------------------
 
 IDENTIFY_MODULES = 5
+FILE_CONSTANT_NM_PER_A = 0.5
 IDENTIFY_ROBOT = (
     f"robot.chain.modules={IDENTIFY_MODULES}",
     "robot.motor.friction_nm=0.15",
     "robot.motor.viscous_nm_s_per_rad=0.1",
-    "robot.motor.torque_constant_nm_per_a=0.5",
+    f"robot.motor.torque_constant_nm_per_a={FILE_CONSTANT_NM_PER_A}",
 )
 FIELDS = (
     "friction_nm",
@@ -275,10 +277,23 @@ class IdentifyTrial:
     covered: int = field(init=False, default=0)
     # Torque constants that are written, and off by more than 10 %.
     constants_off: int = field(init=False, default=0)
+    # Joints whose torque constant differs by more than 10 % from the file's, and those of them that are reported.
+    wrong_constants: int = field(init=False, default=0)
+    reported_constants: int = field(init=False, default=0)
+    # Joints whose torque constant is reported, although it differs by less.
+    falsely_reported_constants: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
         """Compare what would be written with the truth."""
         for one in self.found:
+            constant = self.truth[one.joint].torque_constant_nm_per_a
+            assert constant is not None
+            is_reported = any("torque constant" in text for text in one.wrong)
+            if abs(constant / FILE_CONSTANT_NM_PER_A - 1) > MAX_CONSTANT_ERROR:
+                self.wrong_constants += 1
+                self.reported_constants += is_reported
+            else:
+                self.falsely_reported_constants += is_reported
             if one.fails:
                 continue
             for name, value in one.fields.items():
@@ -436,9 +451,10 @@ def record_motion(hidden: HiddenRobot) -> tuple[dict[str, Floats], Floats]:
 def identify_table(first: int, trial_count: int, *sets: str) -> list[str]:
     """Return the table of trials with backlash in one of five joints, and without, with IMUs and without."""
     lines = [
-        "| hidden fault | IMUs | robots | named | named falsely | values written | they cover | constants off |"
+        "| hidden fault | IMUs | robots | named | named falsely | values written | they cover | constants off "
+        "| wrong constants reported | reported falsely |"
     ]
-    lines.append("|---|---|---|---|---|---|---|---|")
+    lines.append("|---|---|---|---|---|---|---|---|---|---|")
     for backlash in (True, False):
         made = [
             identify_trials(number, *sets, backlash=backlash)
@@ -459,7 +475,13 @@ def _identified_row(trials: Sequence[IdentifyTrial], *, backlash: bool) -> str:
     possible = len(FIELDS) * sum(len(trial.found) for trial in trials)
     off = sum(trial.constants_off for trial in trials)
     share = f"{100 * covered / written:.0f} %" if written else "-"
-    return f"{len(trials)} | {named} | {falsely} | {written} of {possible} | {share} | {off}"
+    reported = sum(trial.reported_constants for trial in trials)
+    wrong = sum(trial.wrong_constants for trial in trials)
+    falsely_reported = sum(trial.falsely_reported_constants for trial in trials)
+    return (
+        f"{len(trials)} | {named} | {falsely} | {written} of {possible} | {share} | {off} "
+        f"| {reported} of {wrong} | {falsely_reported}"
+    )
 
 
 def main() -> int:

@@ -13,6 +13,28 @@ def test_hidden_fault_is_named_without_blaming_sound_joints(fault: str) -> None:
 
 
 @pytest.mark.slow
+def test_wrong_torque_constants_are_reported_and_no_right_one() -> None:
+    for trial in identify_trials(4, "duration_s=12", backlash=False):
+        assert trial.reported_constants == trial.wrong_constants == 4
+        assert not trial.falsely_reported_constants
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("backend", "number", "fault"),
+    [
+        ("feetech", 30, "backlash"),  # which do not measure their torque
+        ("odrive", 6, "dead zone"),
+        ("odrive", 40, "coupling"),
+    ],
+)
+def test_hidden_fault_of_robot_without_imus_is_named(backend: str, number: int, fault: str) -> None:
+    trial = check_trial(number, fault, backend=backend)
+    assert trial.found, [row.summary for row in trial.rows]
+    assert not trial.blamed
+
+
+@pytest.mark.slow
 def test_backlash_spoils_no_values_of_other_joints() -> None:
     named, unnamed = identify_trials(4, "duration_s=12", backlash=True)
     assert named.named == [named.loose]

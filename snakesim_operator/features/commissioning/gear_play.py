@@ -5,7 +5,7 @@ robot are compared with each other, because the friction of the floor is unknown
 
     torque follows the angle   tight: the load comes back with every motion
     it does not, and the neighbors' load is missing, too, until the large motion        backlash
-    it does not, and the large motion loads the neighbors no more than the small one    the coupling slips
+    it does not, and even the large motion loads the neighbors no more than that        the coupling slips
 
 The joints at both ends carry only one link, which may slide without any such torque. So a coupling that slips is found
 only between two other joints. A pitch joint is not judged: the weight of its links presses the teeth to one side.
@@ -28,6 +28,8 @@ MAX_LOOSE_FRACTION = 0.1
 # Of the neighbors' change of torque in the large motion, in the small one.
 MAX_BACKLASH_FRACTION = 0.2
 MIN_SLIPPING_FRACTION = 0.4
+# Of the elastic torque of a typical joint, in the neighbors in the large motion; behind a gear that holds, it is more.
+MAX_SLIPPING_LOAD_FRACTION = 0.5
 PlayKind = Literal["tight", "backlash", "slipping", "loose", "unknown"]
 
 
@@ -71,23 +73,33 @@ def _judge_gear_play(
         return GearPlay("tight")
     if response.elastic_nm > MAX_LOOSE_FRACTION * typical_nm:
         return GearPlay("unknown", "its torque hardly follows its angle")
-    return _judge_loose_gear(
-        response, min_change_nm, is_at_end=joint_index in (0, len(responses) - 1)
-    )
+    is_at_end = joint_index in (0, len(responses) - 1)
+    return _judge_loose_gear(response, typical_nm, min_change_nm, is_at_end=is_at_end)
 
 
-def _judge_loose_gear(response: LoadResponse, min_change_nm: float, *, is_at_end: bool) -> GearPlay:
-    """Judge a joint whose torque does not follow its angle in the small motion."""
-    neighbors_fraction = response.neighbors_small_nm / max(response.neighbors_large_nm, 1e-9)
-    is_load_missing = (
-        neighbors_fraction <= MAX_BACKLASH_FRACTION and response.load_nm >= min_change_nm
-    )
-    if is_load_missing and response.neighbors_large_nm >= min_change_nm:
+def _judge_loose_gear(
+    response: LoadResponse, typical_nm: float, min_change_nm: float, *, is_at_end: bool
+) -> GearPlay:
+    """Judge a joint whose torque does not follow its angle in the small motion.
+
+    Args:
+        response: How torques answered its motions.
+        typical_nm: Elastic torque of a typical joint.
+        min_change_nm: Change of a torque that proves a load.
+        is_at_end: Whether it is the first or the last joint.
+    """
+    large_nm = response.neighbors_large_nm
+    small_nm = response.neighbors_small_nm
+    if not is_at_end and (
+        large_nm <= MAX_SLIPPING_LOAD_FRACTION * typical_nm
+        or small_nm >= MIN_SLIPPING_FRACTION * large_nm
+    ):
+        return GearPlay("slipping")
+    is_loaded_late = large_nm >= min_change_nm and response.load_nm >= min_change_nm
+    if is_loaded_late and small_nm <= MAX_BACKLASH_FRACTION * large_nm:
         return GearPlay("backlash")
     if is_at_end:
         return GearPlay("unknown", "the floor hardly loads its only link")
-    if neighbors_fraction >= MIN_SLIPPING_FRACTION:
-        return GearPlay("slipping")
     return GearPlay("loose")
 
 

@@ -32,6 +32,8 @@ from snakesim_operator.features.commissioning.torque_balance import (
 
 # Half of an interval, of its value; a torque constant that is less certain is unknown.
 MAX_RELATIVE_WIDTH = 0.3
+# Of the torque constant in the file. An error that surely exceeds it is reported.
+MAX_CONSTANT_ERROR = 0.1
 # Fraction of the torque; below, the robot was not suspended as it is supposed to be.
 MIN_EXPLAINED = 0.8
 TOO_LIGHT = "what it carries is too light to tell"
@@ -51,6 +53,7 @@ class JointIdentification:
     # Fields of the robot file; those that could not be identified are missing.
     fields: Mapping[str, IntervalEstimate]
     unknown: Sequence[str]  # why fields are missing
+    wrong: Sequence[str] = ()  # what the robot file has wrong
     bandwidth_hz: float | None = None
     balance: TorqueBalance | None = None
     servo: ServoResponse | None = None
@@ -70,7 +73,7 @@ class JointIdentification:
 
     def without_values(self, reason: str) -> "JointIdentification":
         """Return this result without its values, which would be wrong, and with the reason."""
-        return replace(self, fields={}, unknown=[f"everything: {reason}"], complete=False)
+        return replace(self, fields={}, unknown=[f"everything: {reason}"], wrong=(), complete=False)
 
 
 def identify_joints(
@@ -244,11 +247,32 @@ def _identify_joint(
         joint=name,
         fields=fields,
         unknown=unknown,
+        wrong=_describe_wrong_constant(balance.torque_scale, torque_constant_nm_per_a),
         bandwidth_hz=estimate_bandwidth_hz(record),
         balance=balance,
         servo=servo,
         complete=complete,
     )
+
+
+def _describe_wrong_constant(
+    scale: IntervalEstimate, torque_constant_nm_per_a: float | None
+) -> list[str]:
+    """Return what is wrong with the torque constant in the file; nothing if it may be right.
+
+    Args:
+        scale: Real torque divided by measured torque.
+        torque_constant_nm_per_a: Torque constant in the robot file; None if the real torque is unknown.
+    """
+    if torque_constant_nm_per_a is None:
+        return []
+    if abs(scale.value - 1) - scale.half_width <= MAX_CONSTANT_ERROR:
+        return []
+    true_nm_per_a = scale.value * torque_constant_nm_per_a
+    return [
+        f"torque constant: {true_nm_per_a:.3g} N·m/A, and the file has {torque_constant_nm_per_a:.3g}; the real "
+        f"torque is {scale.value:.2f} of the measured one"
+    ]
 
 
 def _collect_robot_file_fields(

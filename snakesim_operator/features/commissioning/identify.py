@@ -139,6 +139,8 @@ def _print_joint(result: JointIdentification) -> None:
         print_line(
             f"  {'servo bandwidth':<17} {result.bandwidth_hz:.3g} Hz, of this joint with what it carries"
         )
+    for reason in result.wrong:
+        print_line(f"  wrong: {reason}")
     for reason in result.unknown:
         print_line(f"  unknown: {reason}")
     if result.explained is not None and result.explained < MIN_EXPLAINED:

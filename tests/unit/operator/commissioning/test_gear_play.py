@@ -71,8 +71,12 @@ def test_joint_with_the_same_low_torque_in_both_motions_slips() -> None:
     assert judge(SLIPPING) == "slipping"
 
 
+def test_joint_that_never_loads_its_neighbors_slips_also_if_their_torque_is_coarse() -> None:
+    assert judge(replace(SLIPPING, neighbors_large_nm=0.09, neighbors_small_nm=0.0)) == "slipping"
+
+
 def test_joint_between_both_patterns_is_loose() -> None:
-    assert judge(replace(SLIPPING, neighbors_small_nm=0.012)) == "loose"
+    assert judge(replace(SLIPPING, neighbors_large_nm=0.2, neighbors_small_nm=0.06)) == "loose"
 
 
 def test_joint_at_an_end_without_load_is_unknown() -> None:
