@@ -178,28 +178,31 @@ class ChainMotion:
     ground_power_w: float  # work against friction per time
 
 
-def find_chain_motion(robot: RobotFile, waves: JointWaves, friction: GroundFriction) -> ChainMotion:
+def find_chain_motion(
+    robot: RobotFile, waves: JointWaves, friction: GroundFriction, step_s: float = STEP_S
+) -> ChainMotion:
     """Return how a chain moves that starts at rest, over the periods after SKIPPED_PERIODS.
 
     Args:
         robot: Lengths and masses of the links.
         waves: Angles of the joints.
         friction: Friction of the ground.
+        step_s: Duration of the explicit steps. Longer ones are stable on ground without dry friction.
     """
     chain = PlanarChain(robot)
     orders = np.arange(len(waves.harmonics))
     phase_rate = 2 * np.pi / waves.period_s
-    steps_per_period = round(waves.period_s / STEP_S)
+    steps_per_period = round(waves.period_s / step_s)
 
     def find_friction(slips: NDArray[np.complex128]) -> NDArray[np.complex128]:
         return find_friction_per_load(slips, friction, SMOOTH_M_S)
 
     instants: list[ChainInstant] = []
     for step in range((SKIPPED_PERIODS + MEASURED_PERIODS) * steps_per_period + 1):
-        waves_now = np.exp(1j * orders * phase_rate * step * STEP_S)
+        waves_now = np.exp(1j * orders * phase_rate * step * step_s)
         angles_rad = (waves_now @ waves.harmonics).real
         rates_rad_s = (1j * phase_rate * orders * waves_now @ waves.harmonics).real
-        instants.append(chain.advance(angles_rad, rates_rad_s, find_friction, STEP_S))
+        instants.append(chain.advance(angles_rad, rates_rad_s, find_friction, step_s))
 
     speeds_m_s: list[float] = []
     for period in range(SKIPPED_PERIODS, SKIPPED_PERIODS + MEASURED_PERIODS):
@@ -209,5 +212,5 @@ def find_chain_motion(robot: RobotFile, waves: JointWaves, friction: GroundFrict
         axis = sum(instant.axis for instant in instants[first:last])
         speeds_m_s.append((displacement * axis.conjugate()).real / abs(axis) / waves.period_s)
     measured = instants[SKIPPED_PERIODS * steps_per_period :]
-    work_j = STEP_S * sum(instant.friction_power_w for instant in measured)
+    work_j = step_s * sum(instant.friction_power_w for instant in measured)
     return ChainMotion(float(np.mean(speeds_m_s)), work_j / (MEASURED_PERIODS * waves.period_s))

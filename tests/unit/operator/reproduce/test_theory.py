@@ -76,7 +76,7 @@ def test_a_chain_travels_only_on_ground_that_rubs_more_sideways(
 ) -> None:
     run = make_serpenoid_run(0.6, 1.0, 1.0, set_viscous(2.0, 2.0 * drag_ratio), module_count=6)
     motion = find_chain_motion(
-        run.robot, JointWaves.from_serpenoid(run.robot, 0.6, 1.0, 1.0), run.friction
+        run.robot, JointWaves.from_serpenoid(run.robot, 0.6, 1.0, 1.0), run.friction, step_s=0.002
     )
     wave_m_s = run.robot.length_m
     assert motion.speed_m_s / wave_m_s == pytest.approx(0.15 * sign, abs=0.1 if sign else 0.01)
