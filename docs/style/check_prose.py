@@ -31,6 +31,7 @@ GENERATED_MARK = "<!-- generated"  # the first line of a page that a program wri
 # Of a page that is read from top to bottom; reference pages are looked up instead.
 MAX_PAGE_WORDS = 1200
 MAX_SENTENCE_WORDS = 45
+MIN_REPEATED_WORDS = 8  # shorter sentences may occur twice
 MAX_SEMICOLONS_PER_1000_WORDS = 3.0
 
 
@@ -136,7 +137,7 @@ def _list_tracked(*patterns: str) -> list[Path]:
 
 
 def check_page(page: Path, rejected: list[Rejected]) -> Iterator[Problem]:
-    """Yield the problems of a page: rejected words, long sentences, tables without header, too many words."""
+    """Yield the problems of a page: words, sentences, headings and tables that readers stumble over."""
     file = page.relative_to(ROOT).as_posix()
     lines = page.read_text(encoding="utf-8").splitlines()
     prose = remove_code(lines)
@@ -145,6 +146,11 @@ def check_page(page: Path, rejected: list[Rejected]) -> Iterator[Problem]:
             yield Problem(file, number, problem)
     for number in find_tables_without_header(prose):
         yield Problem(file, number, "a table has an empty header cell; name the column")
+    for number in find_empty_sections(lines):
+        yield Problem(file, number, "a heading without text; remove it, or write the section")
+    if not _is_looked_up(file):
+        for number, sentence in find_repeated_sentences(prose):
+            yield Problem(file, number, f"this page says it twice: {sentence}")
     for number, words in find_long_sentences(prose):
         yield Problem(
             file, number, f"a sentence of {words} words; at most {MAX_SENTENCE_WORDS}, better 20"
@@ -216,6 +222,34 @@ def find_tables_without_header(prose: list[str]) -> Iterator[int]:
         is_header = line.lstrip().startswith("|") and re.fullmatch(r"\s*\|[\s:|-]+\|\s*", following)
         if is_header and any(not cell.strip() for cell in line.strip().strip("|").split("|")):
             yield number
+
+
+def find_empty_sections(lines: list[str]) -> Iterator[int]:
+    """Yield the line numbers of headings whose section ends before it has any text."""
+    last_line = last_level = 0  # of a heading without text so far; level 0: there is none
+    fence = False
+    for number, line in enumerate([*lines, "# end"], start=1):
+        fence ^= line.lstrip().startswith(("```", "~~~"))
+        heading = None if fence else re.match(r"(#+) ", line)
+        if heading:
+            level = len(heading.group(1))
+            if last_level and level <= last_level:
+                yield last_line
+            last_line, last_level = number, level
+        elif line.strip():
+            last_level = 0
+
+
+def find_repeated_sentences(prose: list[str]) -> Iterator[tuple[int, str]]:
+    """Yield the line number of each paragraph that repeats a sentence of its page, with the sentence."""
+    seen: set[str] = set()
+    for number, paragraph in _list_paragraphs(prose):
+        for sentence in _split_sentences(paragraph):
+            if len(sentence.split()) < MIN_REPEATED_WORDS:
+                continue
+            if sentence in seen:
+                yield number, sentence
+            seen.add(sentence)
 
 
 def find_long_sentences(prose: list[str]) -> Iterator[tuple[int, int]]:

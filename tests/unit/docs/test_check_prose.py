@@ -54,6 +54,32 @@ def test_long_sentence_is_found_with_its_line(checker: ModuleType) -> None:
     ]
 
 
+def test_heading_without_text_is_found(checker: ModuleType) -> None:
+    page = [
+        "# Page",
+        "",
+        "## Old name",
+        "",
+        "## New name",
+        "",
+        "Text.",
+        "",
+        "### Part",
+        "",
+        "## End",
+    ]
+    assert list(checker.find_empty_sections(page)) == [3, 9, 11]
+    assert not list(checker.find_empty_sections(["# Page", "## Part", "```sh", "# comment", "```"]))
+
+
+def test_repeated_sentence_is_found_with_its_line(checker: ModuleType) -> None:
+    sentence = "The host checks the lease once in each period."
+    found = list(
+        checker.find_repeated_sentences([sentence, "", f"Again. {sentence}", "", "Again."])
+    )
+    assert found == [(3, sentence)]
+
+
 def test_headings_follow_an_empty_line() -> None:
     """A heading directly after a table would be a row of it on the site."""
     root = CHECKER.parents[2]
