@@ -17,6 +17,9 @@ from snakesim_hal.programs.arguments import (
 )
 from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 
+DEFAULT_FRAME_SKIP = 5  # control cycles: at 100 Hz, 20 decisions a second
+MAX_FRAME_SKIP = 1000  # as a policy file allows
+
 
 def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snakesim policy train`."""
@@ -26,6 +29,13 @@ def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("feeling", "wave"),
         default="feeling",
         help="what is learned (default: feeling)",
+    )
+    parser.add_argument(
+        "--frame-skip",
+        type=make_number_parser(1, MAX_FRAME_SKIP),
+        default=DEFAULT_FRAME_SKIP,
+        metavar="N",
+        help=f"control cycles for which a target is held (default: {DEFAULT_FRAME_SKIP})",
     )
     _add_count_option(parser, "--generations", 1, 20, "generations of the search")
     _add_count_option(parser, "--population", 4, 12, "policies in a generation")
@@ -115,6 +125,7 @@ def _run_train(arguments: argparse.Namespace) -> int:
     environment = {
         "scenario": arguments.scenario,
         "duration": arguments.duration,
+        "frame_skip": arguments.frame_skip,
         "reward": {
             override.key: override.value for override in map(parse_set_option, arguments.reward)
         },
@@ -146,6 +157,8 @@ def _list_search_options(arguments: argparse.Namespace) -> list[str]:
     for name in ("generations", "population", "fields", "check_fields", "seed"):
         flag = f"--{name.replace('_', '-')}"
         options += [flag, str(getattr(arguments, name))]
+    if arguments.frame_skip != DEFAULT_FRAME_SKIP:
+        options += ["--frame-skip", str(arguments.frame_skip)]
     if arguments.begin:
         options += ["--init", arguments.begin]
     if arguments.spread != 1.0:

@@ -17,7 +17,6 @@ from snakesim_hal.base.process import raise_on_stop_signals
 from snakesim_hal.base.terminal import print_line
 from snakesim_operator.run.conclusion import EXIT_INTERRUPTED
 
-FRAME_SKIP = 5  # ticks: at 100 Hz, 20 decisions a second
 POLICY_FILE = "policy.onnx"
 
 
@@ -36,7 +35,7 @@ def train_policy(
     """Run the search for a policy, and write the best policy and the learning curve after each generation.
 
     Args:
-        arguments: Arguments of `SnakeEnv`, by name.
+        arguments: Arguments of `SnakeEnv`, by name, among them `frame_skip`.
         form: Name of the form in FORMS whose parameters are learned.
         begin: Shipped policy, or path of a policy file, with whose parameters the search starts. None starts with those
             of the form.
@@ -60,9 +59,7 @@ def train_policy(
     with raise_on_stop_signals():
         try:
             with (
-                EpisodeRunner(
-                    {**arguments, "frame_skip": FRAME_SKIP}, worker_count, cluster
-                ) as episodes,
+                EpisodeRunner(arguments, worker_count, cluster) as episodes,
                 kept_search.open_search_file(folder, again, resume=resume) as kept,
             ):
                 known_count = len(kept.generations)
@@ -77,7 +74,9 @@ def train_policy(
                         policy = PolicyArrays.make_from_parameters(
                             step.best, episodes.axes, episodes.sizes
                         )
-                        write_onnx_file(folder / POLICY_FILE, policy, step.best, FRAME_SKIP, again)
+                        write_onnx_file(
+                            folder / POLICY_FILE, policy, step.best, arguments["frame_skip"], again
+                        )
                         write_curve(folder, curve)
                         kept.add(step.kept)
                     newest = step

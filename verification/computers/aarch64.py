@@ -1,7 +1,7 @@
-"""Runs the wheel for ARM on this computer: `python -m verification.computers.aarch64`.
+"""Tests the wheel for ARM on an emulated processor: `python -m verification.computers.aarch64`.
 
-It runs, under the emulator of QEMU for single programs, the tests that compare the C libraries with their Python
-versions, and then the same scenario with the C libraries and without them: both must have the same digest.
+First it runs the tests that compare the C libraries with their Python versions. Then it runs the same scenario with the
+C libraries and without them: both runs must have the same digest. The emulator is QEMU's for single programs.
 
 The emulated Python and its libraries are packages of Debian for arm64. They are downloaded and unpacked into
 `build/aarch64`, and not installed. The wheels of other projects come from the package index.
@@ -17,18 +17,18 @@ from pathlib import Path
 from snakesim_native.load import SWITCH_VARIABLE
 
 ROOT = Path(__file__).parents[2]
-FOLDER = ROOT / "build" / "aarch64"
-SYSTEM = FOLDER / "system"  # Debian's files
-SITE = FOLDER / "site"  # Python packages
-PYTHON = FOLDER / "python"  # a script that runs the emulated Python
+BUILD_FOLDER = ROOT / "build" / "aarch64"
+DEBIAN_ROOT = BUILD_FOLDER / "system"  # Debian's files
+SITE_PACKAGES = BUILD_FOLDER / "site"  # Python packages
+PYTHON_SCRIPT = BUILD_FOLDER / "python"  # a script that runs the emulated Python
 UV = ROOT / ".tools" / "bin" / "uv"
 EMULATOR = "qemu-aarch64-static"
 TESTS = ("tests/unit/sim_backend/test_laws.py", "tests/unit/gnc/test_native_growth.py")
 SCENARIO = "peg_row"
-SECONDS = "0.3"  # of robot time; the emulator is slow
-LONGEST_S = 1800
+DURATION_S = "0.3"  # of robot time; the emulator is slow
+MAX_COMMAND_S = 1800  # on a slow computer
 # A program of the emulated computer cannot be started directly, only through the script.
-SITE_CUSTOMIZATION = f"import sys\nsys.executable = {str(PYTHON)!r}\n"
+SITE_CUSTOMIZATION = f"import sys\nsys.executable = {str(PYTHON_SCRIPT)!r}\n"
 
 
 class MissingToolError(Exception):
@@ -38,7 +38,7 @@ class MissingToolError(Exception):
 def main() -> int:
     """Prepare the emulated computer, and run the tests and both runs. Returns the exit code."""
     try:
-        unpack_system()
+        download_debian_python()
         install_packages(build_wheel())
     except MissingToolError as error:
         print(f"aarch64: {error}")
@@ -48,29 +48,37 @@ def main() -> int:
     )
     if tests.returncode:
         return 1
-    with_library, without_library = run_scenario("on"), run_scenario("off")
+    # With a named folder, a library that cannot be loaded is an error.
+    with_library = run_scenario(str(SITE_PACKAGES / "snakesim_native" / "compiled"), "run-c")
+    without_library = run_scenario("off", "run-python")
     print(f"{SCENARIO}: digest {with_library} with the C libraries, {without_library} without")
     return 0 if with_library == without_library else 1
 
 
 def build_wheel() -> Path:
     """Build the wheels of this repository, as `make wheels` does. Returns the one for ARM."""
-    run(sys.executable, ROOT / "deploy" / "wheels.py")
+    run_on_host(sys.executable, ROOT / "deploy" / "wheels.py")
     (wheel,) = (ROOT / "build" / "wheels").glob("*_aarch64.whl")
     return wheel
 
 
-def unpack_system() -> None:
+def download_debian_python() -> None:
     """Download Debian's Python for arm64 with all that it needs, and unpack it.
 
     apt gets folders of its own, so the lists and the architecture of this computer stay as they are.
     """
-    for tool in ("apt-get", "dpkg-deb", EMULATOR):
-        if shutil.which(tool) is None:
-            raise MissingToolError(f"{tool} is missing. Run: sudo apt-get install qemu-user-static")
-    shutil.rmtree(FOLDER, ignore_errors=True)
-    state, cache = FOLDER / "apt" / "state", FOLDER / "apt" / "cache"
-    for folder in (state / "lists" / "partial", cache / "archives" / "partial", SYSTEM, SITE):
+    if shutil.which("apt-get") is None:
+        raise MissingToolError("apt-get is missing: this needs Debian")
+    if shutil.which(EMULATOR) is None:
+        raise MissingToolError(f"{EMULATOR} is missing. Run: sudo apt-get install qemu-user-static")
+    shutil.rmtree(BUILD_FOLDER, ignore_errors=True)
+    state, cache = BUILD_FOLDER / "apt" / "state", BUILD_FOLDER / "apt" / "cache"
+    for folder in (
+        state / "lists" / "partial",
+        cache / "archives" / "partial",
+        DEBIAN_ROOT,
+        SITE_PACKAGES,
+    ):
         folder.mkdir(parents=True)
     (state / "status").touch()
     apt = [
@@ -90,12 +98,14 @@ def unpack_system() -> None:
             }
         ),
     ]
-    run(*apt, "update")
-    run(*apt, "--download-only", "install", "python3", "libgcc-s1", "libstdc++6", "libgomp1")
+    run_on_host(*apt, "update")
+    run_on_host(
+        *apt, "--download-only", "install", "python3", "libgcc-s1", "libstdc++6", "libgomp1"
+    )
     for package in sorted((cache / "archives").glob("*.deb")):
-        run("dpkg-deb", "--extract", package, SYSTEM)
-    if not (SYSTEM / "lib").exists():  # since Debian 13, everything is below usr
-        (SYSTEM / "lib").symlink_to("usr/lib")
+        run_on_host("dpkg-deb", "--extract", package, DEBIAN_ROOT)
+    if not (DEBIAN_ROOT / "lib").exists():  # since Debian 13, everything is below usr
+        (DEBIAN_ROOT / "lib").symlink_to("usr/lib")
 
 
 def make_apt_options(values: dict[str, str]) -> Iterator[str]:
@@ -107,40 +117,53 @@ def make_apt_options(values: dict[str, str]) -> Iterator[str]:
 
 def install_packages(wheel: Path) -> None:
     """Install a wheel, the packages of its extra [sim] and pytest, for the emulated computer."""
-    python = max((SYSTEM / "usr" / "bin").glob("python3.*[0-9]"))
-    run(
-        *(UV, "pip", "install", "--quiet", "--target", SITE),
+    (python,) = (DEBIAN_ROOT / "usr" / "bin").glob("python3.[0-9]*[0-9]")
+    run_on_host(
+        *(UV, "pip", "install", "--quiet", "--target", SITE_PACKAGES),
         *("--python-platform", "aarch64-manylinux_2_28"),
         *("--python-version", python.name.removeprefix("python")),
         *("--only-binary", ":all:", "--constraint", ROOT / "requirements.lock"),
         *(f"{wheel}[sim]", "pytest", "pytest-timeout", "hypothesis"),
     )
-    (SITE / "sitecustomize.py").write_text(SITE_CUSTOMIZATION)
-    PYTHON.write_text(
+    (SITE_PACKAGES / "sitecustomize.py").write_text(SITE_CUSTOMIZATION)
+    PYTHON_SCRIPT.write_text(
         "#!/bin/sh\n"
-        f"export PYTHONHOME={SYSTEM}/usr PYTHONPATH={SITE}\n"
-        f'exec {EMULATOR} -L {SYSTEM} {python} "$@"\n'
+        f"export PYTHONHOME={DEBIAN_ROOT}/usr PYTHONPATH={SITE_PACKAGES}\n"
+        f'exec {EMULATOR} -L {DEBIAN_ROOT} {python} "$@"\n'
     )
-    PYTHON.chmod(0o755)
-    shutil.copytree(ROOT / "tests", FOLDER / "tests")
-    shutil.copy(ROOT / "pyproject.toml", FOLDER)
+    PYTHON_SCRIPT.chmod(0o755)
+    shutil.copytree(ROOT / "tests", BUILD_FOLDER / "tests")
+    shutil.copy(ROOT / "pyproject.toml", BUILD_FOLDER)
 
 
-def run_scenario(library: str) -> str:
-    """Run a scenario with the C libraries ("on") or without them ("off"). Returns the command digest."""
-    ended = run_emulated(
-        *(SITE / "bin" / "snakesim", "run", SCENARIO, "--in-process", "--duration", SECONDS),
-        *("--no-record", "--out", f"run-{library}"),
-        extra_env={SWITCH_VARIABLE: "off"} if library == "off" else {},
-        captures=True,
+def run_scenario(libraries: str, out: str) -> str:
+    """Run a scenario, and return its command digest.
+
+    Args:
+        libraries: Folder of the C libraries, or "off" for the Python versions.
+        out: Folder of the results.
+    """
+    completed = run_emulated(
+        *(
+            SITE_PACKAGES / "bin" / "snakesim",
+            "run",
+            SCENARIO,
+            "--in-process",
+            "--duration",
+            DURATION_S,
+        ),
+        *("--no-record", "--out", out),
+        extra_env={SWITCH_VARIABLE: libraries},
+        capture_output=True,
     )
-    if ended.returncode:
-        sys.exit(f"aarch64: the run failed:\n{ended.stdout}\n{ended.stderr}")
-    return ended.stdout.partition("command digest")[2].split(",")[0].strip()
+    digest = completed.stdout.partition("command digest")[2].split(",")[0].strip()
+    if completed.returncode or not digest:
+        sys.exit(f"aarch64: the run failed:\n{completed.stdout}\n{completed.stderr}")
+    return digest
 
 
 def run_emulated(
-    *arguments: str | Path, extra_env: dict[str, str] | None = None, captures: bool = False
+    *arguments: str | Path, extra_env: dict[str, str] | None = None, capture_output: bool = False
 ) -> subprocess.CompletedProcess[str]:
     """Run the emulated Python with these arguments in its folder, which has only the tests."""
     environment = {
@@ -149,19 +172,21 @@ def run_emulated(
         if not name.startswith(("PYTHON", "SNAKESIM_"))
     }
     return subprocess.run(
-        [PYTHON, *arguments],
-        cwd=FOLDER,
+        [PYTHON_SCRIPT, *arguments],
+        cwd=BUILD_FOLDER,
         env=environment | {"OMP_NUM_THREADS": "1"} | (extra_env or {}),
-        capture_output=captures,
+        capture_output=capture_output,
         text=True,
-        timeout=LONGEST_S,
+        timeout=MAX_COMMAND_S,
         check=False,
     )
 
 
-def run(*command: str | Path) -> None:
+def run_on_host(*command: str | Path) -> None:
     """Run a program of this computer. Raises CalledProcessError if it fails; its output is shown then."""
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
+    ended = subprocess.run(
+        command, capture_output=True, text=True, timeout=MAX_COMMAND_S, check=False
+    )
     if ended.returncode:
         sys.stderr.write(ended.stdout + ended.stderr)
     ended.check_returncode()

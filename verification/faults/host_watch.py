@@ -1,6 +1,6 @@
-"""Watches a host over its private channel, from outside of it: no network that fails or is flooded is in between.
+"""Records what a host sends over its private channel, a socket pair, so faults of the network do not affect it.
 
-The kernel notes when it took over a status from the host, so a busy processor does not delay what is measured here.
+The kernel notes when it took over a status from the host. A busy processor therefore does not change the times.
 """
 
 import contextlib
@@ -19,16 +19,17 @@ from verification.faults.observer import ReceivedMessage, TrialError
 
 SO_TIMESTAMPNS = 35  # on Linux; Python has no name for it
 TIMESPEC = struct.Struct("@qq")  # seconds and nanoseconds of the wall clock
-LOOK_S = 0.0005
-LIMIT_S = 10.0
+POLL_PERIOD_S = 0.0005  # a twentieth of a control period
+STATUS_TIMEOUT_S = 10.0  # longer than any fault takes to show
 OBSERVER_PRIORITY = 30  # of 99; host and control have 20
 
 
 @contextlib.contextmanager
-def urgently() -> Iterator[None]:
-    """Have this thread, and those that start meanwhile, outrank the robot's own where the system lets them.
+def raised_priority() -> Iterator[None]:
+    """Give this thread, and the threads that it starts, a higher priority than the robot's processes have.
 
-    So a busy controller does not delay an observer, and has priority. Processes do not inherit it.
+    A busy controller then does not delay the observer. The threads keep their priority afterwards, but the processes
+    that they start do not get it. Without the permission, the priority stays as it is.
     """
     priority = os.sched_param(OBSERVER_PRIORITY)
     with contextlib.suppress(OSError):
@@ -41,54 +42,63 @@ def urgently() -> Iterator[None]:
 
 
 class HostWatch:
-    """Keeps every status that the host tells its starter."""
+    """Records every status that the host sends over its private channel."""
 
     def __init__(self) -> None:
         self._socket, self.inherited = socket_pair()
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._socket.settimeout(0.1)
         self._statuses: list[ReceivedMessage[RobotStatus]] = []
-        self._over = threading.Event()
+        self._is_closed = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="host watch", daemon=True)
-        with urgently():
+        with raised_priority():
             self._thread.start()
 
     def close(self) -> None:
-        """End it."""
-        self._over.set()
+        """Stop the thread, and close both sockets."""
+        self._is_closed.set()
         self._thread.join()
         self._socket.close()
         self.inherited.close()
 
     def lifecycle(self) -> str | None:
-        """Return the newest status."""
+        """Return the lifecycle state in the newest status; None if there is none yet."""
         return self._statuses[-1].message.lifecycle if self._statuses else None
 
-    def first(
-        self, condition: Callable[[RobotStatus], bool], since_ns: int, what: str
+    def wait_for_status(
+        self, condition: Callable[[RobotStatus], bool], since_ns: int, description: str
     ) -> ReceivedMessage[RobotStatus]:
-        """The first status after a time of which a condition holds. Raises TrialError when none comes."""
-        deadline = time.monotonic() + LIMIT_S
+        """Wait for the first status after a time for which a condition holds.
+
+        Args:
+            condition: Condition on the status.
+            since_ns: Time by the monotonic clock; earlier statuses do not count.
+            description: What is awaited, for the error message.
+
+        Raises:
+            TrialError: No such status has come within STATUS_TIMEOUT_S.
+        """
+        deadline = time.monotonic() + STATUS_TIMEOUT_S
         while time.monotonic() < deadline:
             for received in list(self._statuses):
                 if received.at_ns >= since_ns and condition(received.message):
                     return received
-            time.sleep(LOOK_S)
+            time.sleep(POLL_PERIOD_S)
         raise TrialError(
-            f"the host did not say within {LIMIT_S:g} s: {what}; last: {self.lifecycle()}"
+            f"no status within {STATUS_TIMEOUT_S:g} s with {description}; newest: {self.lifecycle()}"
         )
 
-    def late_ms(self, status: ReceivedMessage[RobotStatus]) -> float:
-        """Return how much later the host sent a status, after the begin of its tick by the clock, than at its fastest.
+    def measure_extra_delay_ms(self, status: ReceivedMessage[RobotStatus]) -> float:
+        """Return how much longer after its tick a status was sent than the fastest of all statuses.
 
-        This is the delay of one tick on a busy computer. It does not depend on what the host decided in the tick.
+        This is the delay of the tick on a busy computer. It does not depend on what the host decided in the tick.
         """
         fastest_ns = min(other.at_ns - other.message.timestamp_ns for other in self._statuses)
         return (status.at_ns - status.message.timestamp_ns - fastest_ns) / 1e6
 
     def _listen(self) -> None:
         decoder = msgspec.msgpack.Decoder(HostMessage)
-        while not self._over.is_set():
+        while not self._is_closed.is_set():
             try:
                 data, ancillary, _, _ = self._socket.recvmsg(
                     MAX_BYTES, socket.CMSG_SPACE(TIMESPEC.size)
@@ -97,14 +107,14 @@ class HostWatch:
             except TimeoutError:
                 continue
             except (OSError, msgspec.DecodeError):  # the host is gone
-                self._over.wait(0.1)
+                self._is_closed.wait(0.1)
                 continue
             if host_message.status is not None:
-                sent_ns = _sent_at_ns(ancillary)
+                sent_ns = _read_send_time_ns(ancillary)
                 self._statuses.append(ReceivedMessage(sent_ns, host_message.status))
 
 
-def _sent_at_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
+def _read_send_time_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
     """Return when the kernel took over a message, by the monotonic clock."""
     wall_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
     for level, kind, data in ancillary:

@@ -16,7 +16,7 @@ from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_operator.run import children
 from snakesim_operator.run.children import ChildProcess
 from snakesim_testing.harness.endpoint import find_free_endpoint
-from verification.faults.host_watch import HostWatch, urgently
+from verification.faults.host_watch import HostWatch, raised_priority
 from verification.faults.observer import Observer, TrialError
 from verification.faults.row import InjectionTrial, MeasurementRequest
 
@@ -100,7 +100,7 @@ class ProcessRobot:
         link = ConnectionSettings(self.endpoint, self.config.robot.name)
         while True:
             try:
-                with urgently():
+                with raised_priority():
                     session = self._stack.enter_context(open_session(link, connect_timeout_s=0.5))
                 return Observer(session)
             except NotConnectedError:

@@ -20,7 +20,7 @@ from snakesim_testing.runs.documents import REPOSITORY
 
 RANDOMIZE = ("--randomize", "scene.ground.friction=0.1:0.4")
 FEW = ("--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1")
-SMALL = (*FEW, "--duration", "0.5", *RANDOMIZE)
+SMALL = (*FEW, "--duration", "0.5", "--frame-skip", "4", *RANDOMIZE)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,8 @@ def test_a_search_leaves_a_policy_and_its_learning_curve(trained: Path) -> None:
     assert told["snakesim.trained_by"].startswith(
         "snakesim policy train surveyed_clutter --form feeling --duration 0.5 "
     )
-    assert " ".join(RANDOMIZE) in told["snakesim.trained_by"]
+    assert " ".join(("--frame-skip 4", *RANDOMIZE)) in told["snakesim.trained_by"]
+    assert told["snakesim.frame_skip"] == "4"
     assert set(json.loads(told["snakesim.learned"])) == set(FORMS["feeling"])
 
 

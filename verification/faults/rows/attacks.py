@@ -103,10 +103,10 @@ def _stopped(
 
     asking = threading.Thread(target=ask, daemon=True)
     asking.start()
-    stop = started_robot.host.first(
+    stop = started_robot.host.wait_for_status(
         lambda status: status.lifecycle != "armed", requested_ns, "a stop"
     )
-    started_robot.host.first(
+    started_robot.host.wait_for_status(
         lambda status: status.lifecycle == "estop", requested_ns, "the emergency stop"
     )
     asking.join(ANSWER_S)

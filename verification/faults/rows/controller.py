@@ -29,7 +29,7 @@ def _trial(
     started_robot.set_in_motion(observer)
     failed_ns = fail(started_robot, observer)
     # From the host itself: a controller that fills a processor also delays what the network brings.
-    stopped = started_robot.host.first(
+    stopped = started_robot.host.wait_for_status(
         lambda status: status.lifecycle == "fault", failed_ns, "a fault because of the lease"
     )
     value = (stopped.at_ns - failed_ns) / 1e6
@@ -50,7 +50,9 @@ def _trial(
     if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
         failures.append(f"not latched: {observer.in_words()}")
     trial = recovered(observer, value, "; ".join(failures))
-    return msgspec.structs.replace(trial, late_ms=started_robot.host.late_ms(stopped))
+    return msgspec.structs.replace(
+        trial, late_ms=started_robot.host.measure_extra_delay_ms(stopped)
+    )
 
 
 def _failing(fail: Fail, mend: Mend, request: MeasurementRequest) -> Iterator[InjectionTrial]:

@@ -36,7 +36,7 @@ def router_restarts(request: MeasurementRequest) -> Iterator[InjectionTrial]:
             observer.watch(0.05)
             dead_ns = started_robot.signal("router", signal.SIGKILL)
             observer.watch(DOWN_S)
-            stop = started_robot.host.first(
+            stop = started_robot.host.wait_for_status(
                 lambda status: status.lifecycle != "armed", dead_ns, "a stop"
             )
             observer.forget()
