@@ -1,7 +1,8 @@
 """Guidance: makes a world model of pose, contacts and obstacles for the other services.
 
-`service`             the process
-`core`                the world model on a known map
+`service`             the process, which makes world models with a `world_source`
+`surveyed_source`     the source on a known map; `core` is its world model
+`perceived_source`    the source for a map that begins empty
 
 For a robot without a pose sensor or contact sensors on a known map:
 
