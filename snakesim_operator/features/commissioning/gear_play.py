@@ -25,11 +25,15 @@ NOISE_FACTOR = 2.0  # of the range of a torque at rest; a smaller change may be 
 # thirtieth or less.
 MIN_TIGHT_FRACTION = 0.2
 MAX_LOOSE_FRACTION = 0.1
+# The same for a joint at an end, where a sound one may have a tenth.
+MAX_LOOSE_FRACTION_AT_END = 0.05
 # Of the neighbors' change of torque in the large motion, in the small one.
-MAX_BACKLASH_FRACTION = 0.2
+MAX_BACKLASH_FRACTION = 0.25
+MAX_BACKLASH_FRACTION_AT_END = 0.1
 MIN_SLIPPING_FRACTION = 0.4
 # Of the elastic torque of a typical joint, in the neighbors in the large motion; behind a gear that holds, it is more.
 MAX_SLIPPING_LOAD_FRACTION = 0.5
+NO_CLEAR_LOAD = "its torque hardly follows its angle"
 PlayKind = Literal["tight", "backlash", "slipping", "loose", "unknown"]
 
 
@@ -71,36 +75,55 @@ def _judge_gear_play(
         return GearPlay("unknown", "the floor hardly loads the joints")
     if response.elastic_nm >= max(MIN_TIGHT_FRACTION * typical_nm, min_change_nm):
         return GearPlay("tight")
+    if joint_index in (0, len(responses) - 1):
+        return _judge_loose_end(response, typical_nm, min_change_nm)
     if response.elastic_nm > MAX_LOOSE_FRACTION * typical_nm:
-        return GearPlay("unknown", "its torque hardly follows its angle")
-    is_at_end = joint_index in (0, len(responses) - 1)
-    return _judge_loose_gear(response, typical_nm, min_change_nm, is_at_end=is_at_end)
+        return GearPlay("unknown", NO_CLEAR_LOAD)
+    return _judge_loose_gear(response, typical_nm, min_change_nm)
 
 
-def _judge_loose_gear(
-    response: LoadResponse, typical_nm: float, min_change_nm: float, *, is_at_end: bool
-) -> GearPlay:
-    """Judge a joint whose torque does not follow its angle in the small motion.
+def _judge_loose_end(response: LoadResponse, typical_nm: float, min_change_nm: float) -> GearPlay:
+    """Judge the first or the last joint, if its torque does not clearly follow its angle in the small motion."""
+    is_loose = response.elastic_nm <= MAX_LOOSE_FRACTION_AT_END * typical_nm
+    if is_loose and _has_backlash(response, MAX_BACKLASH_FRACTION_AT_END, min_change_nm):
+        return GearPlay("backlash")
+    return GearPlay("unknown", "the floor hardly loads its only link")
+
+
+def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: float) -> GearPlay:
+    """Judge a joint between others whose torque does not follow its angle in the small motion.
 
     Args:
         response: How torques answered its motions.
         typical_nm: Elastic torque of a typical joint.
         min_change_nm: Change of a torque that proves a load.
-        is_at_end: Whether it is the first or the last joint.
+    """
+    max_slipping_nm = MAX_SLIPPING_LOAD_FRACTION * typical_nm
+    min_slipping_nm = MIN_SLIPPING_FRACTION * response.neighbors_large_nm
+    is_never_loaded = max(response.neighbors_large_nm, response.noise_nm) <= max_slipping_nm
+    is_loaded_alike = response.neighbors_small_nm >= max(min_slipping_nm, response.noise_nm)
+    if is_never_loaded or is_loaded_alike:
+        return GearPlay("slipping")
+    if _has_backlash(response, MAX_BACKLASH_FRACTION, min_change_nm):
+        return GearPlay("backlash")
+    if response.noise_nm > MAX_LOOSE_FRACTION * typical_nm:
+        return GearPlay("unknown", NO_CLEAR_LOAD)
+    return GearPlay("loose")
+
+
+def _has_backlash(response: LoadResponse, max_fraction: float, min_change_nm: float) -> bool:
+    """Return whether the load of a joint is missing in the small motion, and comes in the large one.
+
+    Args:
+        response: How torques answered its motions.
+        max_fraction: Largest change of the neighbors' torque in the small motion, as a fraction of that in the large
+            one. It must be more than noise.
+        min_change_nm: Change of a torque that proves a load.
     """
     large_nm = response.neighbors_large_nm
-    small_nm = response.neighbors_small_nm
-    if not is_at_end and (
-        large_nm <= MAX_SLIPPING_LOAD_FRACTION * typical_nm
-        or small_nm >= MIN_SLIPPING_FRACTION * large_nm
-    ):
-        return GearPlay("slipping")
-    is_loaded_late = large_nm >= min_change_nm and response.load_nm >= min_change_nm
-    if is_loaded_late and small_nm <= MAX_BACKLASH_FRACTION * large_nm:
-        return GearPlay("backlash")
-    if is_at_end:
-        return GearPlay("unknown", "the floor hardly loads its only link")
-    return GearPlay("loose")
+    is_loaded_late = min(large_nm, response.load_nm) >= min_change_nm
+    is_load_missing = max(response.neighbors_small_nm, response.noise_nm) <= max_fraction * large_nm
+    return is_loaded_late and is_load_missing
 
 
 def _find_typical_elastic_nm(responses: Sequence[LoadResponse | None], joint_index: int) -> float:

@@ -17,6 +17,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_operator.features.commissioning.measured import CheckMeasurements
 
 SMOOTHING_TICKS = 5  # of torques; shorter than any change of the load
+MIN_STEP = 1e-9  # less is a rounding error
 SETTLING_TICKS = 5  # after a motion, in which the torque still changes
 
 
@@ -31,7 +32,7 @@ class LoadResponse:
     elastic_nm: float
     neighbors_large_nm: float
     neighbors_small_nm: float
-    noise_nm: float  # largest range while the robot rested
+    noise_nm: float  # largest range while the robot rested, or resolution of the torque if that is coarser
 
     @property
     def load_nm(self) -> float:
@@ -49,12 +50,16 @@ def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> 
     large = slice(large_ticks[0], large_ticks[-1] + 1 + SETTLING_TICKS)
     rest = slice(rest_ticks[0], rest_ticks[-1] + 1)
 
-    torque_nm = _smooth(_estimate_torques_nm(measurements))
+    estimated_torque_nm = _estimate_torques_nm(measurements)
+    torque_nm = _smooth(estimated_torque_nm)
     angle_rad = measurements.angle_rad[small, joint_index]
     small_motion_rad = float(np.ptp(angle_rad))
     stiffness_nm_per_rad = _fit_slope(angle_rad, torque_nm[small, joint_index])
     joint_count = len(measurements.joint_names)
     neighbors = [i for i in (joint_index - 1, joint_index + 1) if 0 <= i < joint_count]
+    resolution_nm = max(
+        _find_resolution_nm(measurements, estimated_torque_nm, i) for i in [joint_index, *neighbors]
+    )
     return LoadResponse(
         small_motion_rad=small_motion_rad,
         large_nm=float(np.ptp(torque_nm[large, joint_index])),
@@ -62,7 +67,7 @@ def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> 
         elastic_nm=stiffness_nm_per_rad * small_motion_rad,
         neighbors_large_nm=_find_max_range(torque_nm[large][:, neighbors]),
         neighbors_small_nm=_find_max_range(torque_nm[small][:, neighbors]),
-        noise_nm=_find_max_range(torque_nm[rest][:, [joint_index, *neighbors]]),
+        noise_nm=max(resolution_nm, _find_max_range(torque_nm[rest][:, [joint_index, *neighbors]])),
     )
 
 
@@ -79,6 +84,23 @@ def _estimate_torques_nm(measurements: CheckMeasurements) -> Floats:
                 - motor.damping_nm_s_per_rad * measurements.velocity_rad_s[:, joint]
             )
     return torque_nm
+
+
+def _find_resolution_nm(
+    measurements: CheckMeasurements, torque_nm: Floats, joint_index: int
+) -> float:
+    """Return the smallest step of a joint's torque; of an estimated one, that of its encoder as a torque."""
+    if "torque" in measurements.drives[joint_index].measures:
+        return _find_smallest_step(torque_nm[:, joint_index])
+    stiffness_nm_per_rad = measurements.motors[joint_index].stiffness_nm_per_rad
+    return stiffness_nm_per_rad * _find_smallest_step(measurements.angle_rad[:, joint_index])
+
+
+def _find_smallest_step(signal: Floats) -> float:
+    """Return the smallest step from one value of a signal to another; 0 if it never changes."""
+    steps = np.abs(np.diff(signal))
+    steps = steps[steps > MIN_STEP]
+    return float(np.min(steps)) if len(steps) else 0.0
 
 
 def _smooth(signals: Floats) -> Floats:

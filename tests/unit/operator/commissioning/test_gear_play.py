@@ -71,6 +71,18 @@ def test_joint_with_the_same_low_torque_in_both_motions_slips() -> None:
     assert judge(SLIPPING) == "slipping"
 
 
+def test_stiff_joint_at_an_end_is_not_blamed() -> None:
+    """A sound joint at an end of an emulated robot was as close to backlash as this."""
+    end = replace(TIGHT, large_nm=0.45, small_nm=0.065, elastic_nm=0.03, neighbors_small_nm=0.036)
+    assert judge(end, AT_END) == "unknown"
+
+
+@pytest.mark.parametrize("response", [BACKLASH, SLIPPING])
+@pytest.mark.parametrize("joint", [AT_END, BETWEEN])
+def test_joint_whose_torque_is_too_coarse_is_unknown(response: LoadResponse, joint: int) -> None:
+    assert judge(replace(response, noise_nm=0.25), joint) == "unknown"
+
+
 def test_joint_that_never_loads_its_neighbors_slips_also_if_their_torque_is_coarse() -> None:
     assert judge(replace(SLIPPING, neighbors_large_nm=0.09, neighbors_small_nm=0.0)) == "slipping"
 
