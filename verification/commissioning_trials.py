@@ -43,6 +43,8 @@ from snakesim_operator.features.commissioning.judge import (
 )
 from snakesim_operator.features.commissioning.measured import collect_measurements
 
+CHECK_MODULES = 5
+SECONDS_PER_JOINT = 3.4  # of the joint check
 LAID_RAD = 0.03  # how straight a person lays a robot, at each joint
 OFFSET_RAD = 0.15
 GEARS = (0.5, 2 / 3, 0.8, 1.25, 1.5, 2.0)
@@ -126,8 +128,7 @@ def check_trial(
     fault: str,
     *sets: str,
     backend: str = JOINT_MODULES,
-    module_count: int = 5,
-    seconds: float = 17.0,
+    module_count: int = CHECK_MODULES,
 ) -> CheckTrial:
     """Check a robot with a hidden fault.
 
@@ -137,7 +138,6 @@ def check_trial(
         *sets: As `--set` of a run.
         backend: Backend of the run, which is the type of its drives.
         module_count: Number of joints.
-        seconds: Duration of the run.
     """
     pick = random.Random(number)
     zeros = [pick.uniform(-LAID_RAD, LAID_RAD) for _ in range(module_count)]
@@ -169,6 +169,7 @@ def check_trial(
         f"scene.ground.friction={pick.uniform(0.2, 0.8)}",
         f"robot.chain.modules={module_count}",
     ]
+    seconds = SECONDS_PER_JOINT * module_count
     run += [f"duration_s={seconds}", *(f"backends.{backend}.mounted.{text}" for text in truth)]
     with_fault = {NONE: [], "order": [joint, other]}.get(fault, [joint])
     return CheckTrial(fault, with_fault, _checked(f"backend={backend}", *sets, *run))
@@ -203,13 +204,18 @@ def list_possible_faults(backend: str) -> list[str]:
 
 
 def check_table(
-    first: int, trial_count: int, *sets: str, backend: str, kinds: Sequence[str]
+    first: int,
+    trial_count: int,
+    *sets: str,
+    backend: str,
+    kinds: Sequence[str],
+    module_count: int = CHECK_MODULES,
 ) -> list[str]:
     """Return the table of trials with each of these faults in turn, of `list_possible_faults`."""
     made: list[CheckTrial] = []
     for number in range(first, first + trial_count):
         fault = kinds[number % len(kinds)]
-        trial = check_trial(number, fault, *sets, backend=backend)
+        trial = check_trial(number, fault, *sets, backend=backend, module_count=module_count)
         made.append(trial)
         print(f"trial {number}, {fault}: {'found' if trial.found else 'not found'}", flush=True)
         if trial.blamed or trial.unsure or (trial.joints and not trial.found):
@@ -499,6 +505,12 @@ def main() -> int:
         "--backend", default=JOINT_MODULES, help="drive type of the checked robots (default: can)"
     )
     parser.add_argument(
+        "--joints",
+        type=int,
+        default=CHECK_MODULES,
+        help=f"number of joints of the checked robots (default: {CHECK_MODULES})",
+    )
+    parser.add_argument(
         "--fault",
         action="append",
         choices=[*FAULTS, NONE],
@@ -513,6 +525,7 @@ def main() -> int:
             *arguments.sets,
             backend=arguments.backend,
             kinds=arguments.faults or list_possible_faults(arguments.backend),
+            module_count=arguments.joints,
         )
     else:
         lines = identify_table(arguments.first, arguments.trials, *arguments.sets)

@@ -7,7 +7,7 @@ from verification.commissioning_trials import NONE, check_trial, identify_trials
 
 @pytest.mark.parametrize("fault", ["backlash", NONE])
 def test_hidden_fault_is_named_without_blaming_sound_joints(fault: str) -> None:
-    trial = check_trial(4, fault, module_count=4, seconds=14.0)
+    trial = check_trial(4, fault, module_count=4)
     assert not trial.blamed and not trial.unsure, (trial.blamed, trial.unsure)
     assert fault == NONE or trial.found, [row.summary for row in trial.rows]
 
