@@ -7,8 +7,8 @@ robot are compared with each other, because the friction of the floor is unknown
     it does not, and the neighbors' load is missing, too, until the large motion        backlash
     it does not, and even the large motion loads the neighbors no more than that        the coupling slips
 
-The joints at both ends carry only one link, which may slide without any such torque. So a coupling that slips is found
-only between two other joints. A pitch joint is not judged: the weight of its links presses the teeth to one side.
+The joints at both ends carry only one link, which may slide without any such torque. So they may be found tight, but
+not loose. A pitch joint is not judged: the weight of its links presses the teeth to one side.
 """
 
 from collections.abc import Sequence
@@ -25,11 +25,8 @@ NOISE_FACTOR = 2.0  # of the range of a torque at rest; a smaller change may be 
 # thirtieth or less.
 MIN_TIGHT_FRACTION = 0.2
 MAX_LOOSE_FRACTION = 0.1
-# The same for a joint at an end, where a sound one may have a tenth.
-MAX_LOOSE_FRACTION_AT_END = 0.05
 # Of the neighbors' change of torque in the large motion, in the small one.
 MAX_BACKLASH_FRACTION = 0.25
-MAX_BACKLASH_FRACTION_AT_END = 0.1
 MIN_SLIPPING_FRACTION = 0.4
 # Of the elastic torque of a typical joint, in the neighbors in the large motion; behind a gear that holds, it is more.
 MAX_SLIPPING_LOAD_FRACTION = 0.5
@@ -76,18 +73,10 @@ def _judge_gear_play(
     if response.elastic_nm >= max(MIN_TIGHT_FRACTION * typical_nm, min_change_nm):
         return GearPlay("tight")
     if joint_index in (0, len(responses) - 1):
-        return _judge_loose_end(response, typical_nm, min_change_nm)
+        return GearPlay("unknown", "the floor hardly loads its only link")
     if response.elastic_nm > MAX_LOOSE_FRACTION * typical_nm:
         return GearPlay("unknown", NO_CLEAR_LOAD)
     return _judge_loose_gear(response, typical_nm, min_change_nm)
-
-
-def _judge_loose_end(response: LoadResponse, typical_nm: float, min_change_nm: float) -> GearPlay:
-    """Judge the first or the last joint, if its torque does not clearly follow its angle in the small motion."""
-    is_loose = response.elastic_nm <= MAX_LOOSE_FRACTION_AT_END * typical_nm
-    if is_loose and _has_backlash(response, MAX_BACKLASH_FRACTION_AT_END, min_change_nm):
-        return GearPlay("backlash")
-    return GearPlay("unknown", "the floor hardly loads its only link")
 
 
 def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: float) -> GearPlay:
@@ -104,25 +93,20 @@ def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: 
     is_loaded_alike = response.neighbors_small_nm >= max(min_slipping_nm, response.noise_nm)
     if is_never_loaded or is_loaded_alike:
         return GearPlay("slipping")
-    if _has_backlash(response, MAX_BACKLASH_FRACTION, min_change_nm):
+    if _has_backlash(response, min_change_nm):
         return GearPlay("backlash")
     if response.noise_nm > MAX_LOOSE_FRACTION * typical_nm:
         return GearPlay("unknown", NO_CLEAR_LOAD)
     return GearPlay("loose")
 
 
-def _has_backlash(response: LoadResponse, max_fraction: float, min_change_nm: float) -> bool:
-    """Return whether the load of a joint is missing in the small motion, and comes in the large one.
-
-    Args:
-        response: How torques answered its motions.
-        max_fraction: Largest change of the neighbors' torque in the small motion, as a fraction of that in the large
-            one. It must be more than noise.
-        min_change_nm: Change of a torque that proves a load.
-    """
+def _has_backlash(response: LoadResponse, min_change_nm: float) -> bool:
+    """Return whether the load of a joint is missing in the small motion, and comes in the large one."""
     large_nm = response.neighbors_large_nm
+    # It must be more than noise.
+    max_small_nm = MAX_BACKLASH_FRACTION * large_nm
     is_loaded_late = min(large_nm, response.load_nm) >= min_change_nm
-    is_load_missing = max(response.neighbors_small_nm, response.noise_nm) <= max_fraction * large_nm
+    is_load_missing = max(response.neighbors_small_nm, response.noise_nm) <= max_small_nm
     return is_loaded_late and is_load_missing
 
 
