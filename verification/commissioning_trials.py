@@ -58,7 +58,7 @@ FAULTS: Mapping[str, tuple[JointProperty, str]] = {
     "sign": ("sign", "the other way"),
     "order": ("order", "swapped"),
     "zero": ("zero", "zero is off"),
-    "gear": ("gear", "as far as its drive says"),
+    "gear": ("gear", "as far as its drive measures"),
     "backlash": ("gear", "backlash"),
     "dead zone": ("drive", "dead zone"),
     "coupling": ("gear", "coupling slips"),
