@@ -3,9 +3,11 @@
 In the small motion, the torque of a tight joint follows its angle, because the floor holds the links. The joints of a
 robot are compared with each other, because the friction of the floor is unknown:
 
-    torque follows the angle   tight: the load comes back with every motion
-    it does not, and the neighbors' load is missing, too, until the large motion        backlash
-    it does not, and even the large motion loads the neighbors no more than that        the coupling slips
+    torque in the small motion   torque of the neighbors                            verdict
+    follows the angle            any                                                tight
+    does not follow it           changes only in the large motion                   backlash
+    does not follow it           hardly changes, or alike in both motions           the coupling slips
+    does not follow it           between these                                      loose
 
 The joints at both ends carry only one link, which may slide without any such torque. So they may be found tight, but
 not loose. A pitch joint is not judged: the weight of its links presses the teeth to one side.
@@ -19,27 +21,30 @@ import numpy as np
 
 from snakesim_operator.features.commissioning.load_response import LoadResponse
 
-MIN_CHANGE_NM = 0.03  # of torque, that proves a load
-NOISE_FACTOR = 2.0  # of the range of a torque at rest; a smaller change may be noise
+# Limits on the torques of emulated joints on a floor. A smaller change of a torque does not prove a load.
+MIN_CHANGE_NM = 0.03
+NOISE_FACTOR = 2.0  # times the range of the torque at rest, because a smaller change may be noise
 # Of the elastic torque of a typical joint between others. Sound joints have a third of it or more, loose ones a
 # thirtieth or less.
 MIN_TIGHT_FRACTION = 0.2
 MAX_LOOSE_FRACTION = 0.1
-# Of the neighbors' change of torque in the large motion, in the small one.
-MAX_BACKLASH_FRACTION = 0.25
-MIN_SLIPPING_FRACTION = 0.4
-# Of the elastic torque of a typical joint, in the neighbors in the large motion; behind a gear that holds, it is more.
-MAX_SLIPPING_LOAD_FRACTION = 0.5
+# The neighbors' range of torque in the small motion, divided by that in the large one.
+MAX_BACKLASH_NEIGHBOR_RATIO = 0.25
+MIN_SLIPPING_NEIGHBOR_RATIO = 0.4
+# The neighbors' range of torque in the large motion, divided by the elastic torque of a typical joint. Behind a gear
+# that holds, it is larger.
+MAX_SLIPPING_LOAD_RATIO = 0.5
 NO_CLEAR_LOAD = "its torque hardly follows its angle"
+# "loose": it has backlash or slips, which of them is not clear.
 PlayKind = Literal["tight", "backlash", "slipping", "loose", "unknown"]
 
 
 @dataclass(frozen=True)
 class GearPlay:
-    """Whether the gear of a joint is tight, and why it may not be known."""
+    """The verdict on the gear of a joint."""
 
     kind: PlayKind
-    reason: str = ""  # of "unknown"
+    reason: str = ""  # why it is unknown
 
 
 def judge_gear_plays(
@@ -48,25 +53,23 @@ def judge_gear_plays(
     """Judge the gears of all joints, tail to head.
 
     Args:
-        responses: How torques answered the motions of each joint; None where it did not make them.
+        responses: Response of the torques to the motions of each joint; None if it was not measured.
         axes: Axis of each joint, "yaw" or "pitch".
     """
-    return [
-        _judge_gear_play(responses, joint, is_yaw=axis == "yaw") for joint, axis in enumerate(axes)
-    ]
+    return [_judge_gear_play(responses, axes, joint) for joint in range(len(responses))]
 
 
 def _judge_gear_play(
-    responses: Sequence[LoadResponse | None], joint_index: int, *, is_yaw: bool
+    responses: Sequence[LoadResponse | None], axes: Sequence[str], joint_index: int
 ) -> GearPlay:
     response = responses[joint_index]
     if response is None:
-        return GearPlay("unknown", "it made no small motion")
-    if not is_yaw:
+        return GearPlay("unknown", "it made no small motion, or the robot did not rest before")
+    if axes[joint_index] != "yaw":
         return GearPlay(
             "unknown", "the weight of its links presses the teeth of its gear to one side"
         )
-    typical_nm = _find_typical_elastic_nm(responses, joint_index)
+    typical_nm = _compute_typical_elastic_nm(responses, axes, joint_index)
     min_change_nm = max(MIN_CHANGE_NM, NOISE_FACTOR * response.noise_nm)
     if typical_nm < min_change_nm:
         return GearPlay("unknown", "the floor hardly loads the joints")
@@ -83,15 +86,16 @@ def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: 
     """Judge a joint between others whose torque does not follow its angle in the small motion.
 
     Args:
-        response: How torques answered its motions.
+        response: Response of the torques to its motions.
         typical_nm: Elastic torque of a typical joint.
         min_change_nm: Change of a torque that proves a load.
     """
-    max_slipping_nm = MAX_SLIPPING_LOAD_FRACTION * typical_nm
-    min_slipping_nm = MIN_SLIPPING_FRACTION * response.neighbors_large_nm
-    is_never_loaded = max(response.neighbors_large_nm, response.noise_nm) <= max_slipping_nm
-    is_loaded_alike = response.neighbors_small_nm >= max(min_slipping_nm, response.noise_nm)
-    if is_never_loaded or is_loaded_alike:
+    large_nm, small_nm = response.neighbor_large_range_nm, response.neighbor_small_range_nm
+    max_slipping_nm = MAX_SLIPPING_LOAD_RATIO * typical_nm
+    are_neighbors_never_loaded = max(large_nm, response.noise_nm) <= max_slipping_nm
+    min_slipping_nm = MIN_SLIPPING_NEIGHBOR_RATIO * large_nm
+    is_load_alike_in_both_motions = small_nm >= max(min_slipping_nm, response.noise_nm)
+    if are_neighbors_never_loaded or is_load_alike_in_both_motions:
         return GearPlay("slipping")
     if _has_backlash(response, min_change_nm):
         return GearPlay("backlash")
@@ -102,19 +106,25 @@ def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: 
 
 def _has_backlash(response: LoadResponse, min_change_nm: float) -> bool:
     """Return whether the load of a joint is missing in the small motion, and comes in the large one."""
-    large_nm = response.neighbors_large_nm
-    # It must be more than noise.
-    max_small_nm = MAX_BACKLASH_FRACTION * large_nm
-    is_loaded_late = min(large_nm, response.load_nm) >= min_change_nm
-    is_load_missing = max(response.neighbors_small_nm, response.noise_nm) <= max_small_nm
-    return is_loaded_late and is_load_missing
+    large_nm = response.neighbor_large_range_nm
+    is_loaded_in_large_motion = min(large_nm, response.load_nm) >= min_change_nm
+    max_small_nm = MAX_BACKLASH_NEIGHBOR_RATIO * large_nm
+    # Noise as large as this could hide a load.
+    is_load_missing_in_small_motion = (
+        max(response.neighbor_small_range_nm, response.noise_nm) <= max_small_nm
+    )
+    return is_loaded_in_large_motion and is_load_missing_in_small_motion
 
 
-def _find_typical_elastic_nm(responses: Sequence[LoadResponse | None], joint_index: int) -> float:
-    """Return the median elastic torque of the other joints, without those at the ends; 0 if there are none."""
+def _compute_typical_elastic_nm(
+    responses: Sequence[LoadResponse | None], axes: Sequence[str], joint_index: int
+) -> float:
+    """Return the median elastic torque of the other yaw joints, without those at the ends; 0 if there are none."""
     elastic_nm = [
         response.elastic_nm
-        for joint, response in enumerate(responses)
-        if response is not None and joint not in (0, joint_index, len(responses) - 1)
+        for joint, (response, axis) in enumerate(zip(responses, axes, strict=True))
+        if response is not None
+        and axis == "yaw"
+        and joint not in (0, joint_index, len(responses) - 1)
     ]
     return float(np.median(elastic_nm)) if elastic_nm else 0.0

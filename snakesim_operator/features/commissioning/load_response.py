@@ -1,14 +1,16 @@
-"""Measures how torques answer the large and the small motion of a joint, without IMUs. Pure.
+"""Measures the response of torques to the large and the small motion of a joint, without IMUs. Pure.
 
 The floor loads a joint through its gear. A motion that reverses unloads and loads the gear again:
 
-    sound gear   even a small motion bends the body and its grip on the floor, so its torque follows the angle
+    sound gear   even a small motion bends the body against the friction of the floor, so its torque follows the angle
     backlash     a small motion stays within the backlash, so it needs only the torque of the drive's own friction
 
-The neighbors hold the same load, and their torques do not contain the friction of the joint that moves. A drive that
+Its neighbors are the nearest joints with the same axis. They hold the same load, and their torques do not contain the
+friction of the joint that moves. A drive that
 does not measure its torque is judged by the torque that its servo must exert at its distance from the target.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,25 +25,28 @@ SETTLING_TICKS = 5  # after a motion, in which the torque still changes
 
 @dataclass(frozen=True)
 class LoadResponse:
-    """The ranges of torques while one joint moved, in N·m; those of its neighbors are of the one that changes most."""
+    """The ranges of torques while one joint moved, in N·m. For its neighbors, that of the one that changes more."""
 
     small_motion_rad: float  # range of the joint's encoder in the second cycle of the small motion
-    large_nm: float  # of the joint's torque in its large motions
-    small_nm: float  # of the joint's torque in that cycle
-    # Part of `small_nm` that follows the angle, as that of a spring does, and not its direction, as friction does.
+    large_range_nm: float  # of the joint's torque in its large motions
+    small_range_nm: float  # of the joint's torque in that cycle
+    # Part of `small_range_nm` that follows the angle, like a spring, and not its direction, like friction.
     elastic_nm: float
-    neighbors_large_nm: float
-    neighbors_small_nm: float
+    neighbor_large_range_nm: float
+    neighbor_small_range_nm: float
     noise_nm: float  # largest range while the robot rested, or resolution of the torque if that is coarser
 
     @property
     def load_nm(self) -> float:
-        """Range of the load that only the large motion meets: without the friction of the drive."""
-        return self.large_nm - self.small_nm
+        """Torque range of the large motion minus that of the small one, which removes the friction of the drive."""
+        return self.large_range_nm - self.small_range_nm
 
 
 def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> LoadResponse | None:
-    """Return how torques answered the motions of a joint; None if it did not make the large and the small motion."""
+    """Return the response of the torques to the motions of a joint.
+
+    None if it did not make the large and the small motion, or if the robot did not rest long enough before.
+    """
     small = measurements.find_second_small_cycle(joint_index)
     large_ticks = np.flatnonzero(measurements.is_in_large_motion(joint_index))
     rest_ticks = np.flatnonzero(measurements.is_before_motion())
@@ -55,20 +60,26 @@ def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> 
     angle_rad = measurements.angle_rad[small, joint_index]
     small_motion_rad = float(np.ptp(angle_rad))
     stiffness_nm_per_rad = _fit_slope(angle_rad, torque_nm[small, joint_index])
-    joint_count = len(measurements.joint_names)
-    neighbors = [i for i in (joint_index - 1, joint_index + 1) if 0 <= i < joint_count]
+    neighbors = find_neighbors_of_same_axis(measurements.axes, joint_index)
     resolution_nm = max(
         _find_resolution_nm(measurements, estimated_torque_nm, i) for i in [joint_index, *neighbors]
     )
     return LoadResponse(
         small_motion_rad=small_motion_rad,
-        large_nm=float(np.ptp(torque_nm[large, joint_index])),
-        small_nm=float(np.ptp(torque_nm[small, joint_index])),
+        large_range_nm=float(np.ptp(torque_nm[large, joint_index])),
+        small_range_nm=float(np.ptp(torque_nm[small, joint_index])),
         elastic_nm=stiffness_nm_per_rad * small_motion_rad,
-        neighbors_large_nm=_find_max_range(torque_nm[large][:, neighbors]),
-        neighbors_small_nm=_find_max_range(torque_nm[small][:, neighbors]),
+        neighbor_large_range_nm=_find_max_range(torque_nm[large][:, neighbors]),
+        neighbor_small_range_nm=_find_max_range(torque_nm[small][:, neighbors]),
         noise_nm=max(resolution_nm, _find_max_range(torque_nm[rest][:, [joint_index, *neighbors]])),
     )
+
+
+def find_neighbors_of_same_axis(axes: Sequence[str], joint_index: int) -> list[int]:
+    """Return the nearest joints towards the tail and the head that turn about the same axis as a joint."""
+    same = [i for i, axis in enumerate(axes) if axis == axes[joint_index]]
+    position = same.index(joint_index)
+    return [*same[max(position - 1, 0) : position], *same[position + 1 : position + 2]]
 
 
 def _estimate_torques_nm(measurements: CheckMeasurements) -> Floats:
@@ -112,7 +123,7 @@ def _smooth(signals: Floats) -> Floats:
 
 
 def _find_max_range(signals: Floats) -> float:
-    """Return the largest range of the columns; 0 without any."""
+    """Return the largest range of the columns; 0 if there are no columns."""
     return float(np.max(np.ptp(signals, axis=0), initial=0.0))
 
 

@@ -9,31 +9,34 @@ from snakesim_operator.features.commissioning.gear_play import (
     PlayKind,
     judge_gear_plays,
 )
-from snakesim_operator.features.commissioning.load_response import LoadResponse
+from snakesim_operator.features.commissioning.load_response import (
+    LoadResponse,
+    find_neighbors_of_same_axis,
+)
 
 JOINTS = 5
 AXES = ["yaw"] * JOINTS
 # Typical numbers of emulated joints on a floor.
 TIGHT = LoadResponse(
     small_motion_rad=0.011,
-    large_nm=1.0,
-    small_nm=0.4,
+    large_range_nm=1.0,
+    small_range_nm=0.4,
     elastic_nm=0.35,
-    neighbors_large_nm=0.9,
-    neighbors_small_nm=0.25,
+    neighbor_large_range_nm=0.9,
+    neighbor_small_range_nm=0.25,
     noise_nm=0.005,
 )
-BACKLASH = replace(TIGHT, small_nm=0.02, elastic_nm=-0.01, neighbors_small_nm=0.002)
+BACKLASH = replace(TIGHT, small_range_nm=0.02, elastic_nm=-0.01, neighbor_small_range_nm=0.002)
 SLIPPING = replace(
     TIGHT,
-    large_nm=0.1,
-    small_nm=0.06,
+    large_range_nm=0.1,
+    small_range_nm=0.06,
     elastic_nm=0.003,
-    neighbors_large_nm=0.04,
-    neighbors_small_nm=0.03,
+    neighbor_large_range_nm=0.04,
+    neighbor_small_range_nm=0.03,
 )
 HARDLY_LOADED = replace(
-    SLIPPING, elastic_nm=0.007, neighbors_large_nm=0.025, neighbors_small_nm=0.02
+    SLIPPING, elastic_nm=0.007, neighbor_large_range_nm=0.025, neighbor_small_range_nm=0.02
 )
 AT_END = 0
 BETWEEN = 2
@@ -58,8 +61,8 @@ def test_joint_whose_torque_follows_its_angle_is_tight(joint: int) -> None:
 def test_joint_without_load_in_the_small_motion_has_backlash(friction_nm: float) -> None:
     response = replace(
         BACKLASH,
-        small_nm=BACKLASH.small_nm + 2 * friction_nm,
-        large_nm=BACKLASH.large_nm + 2 * friction_nm,
+        small_range_nm=BACKLASH.small_range_nm + 2 * friction_nm,
+        large_range_nm=BACKLASH.large_range_nm + 2 * friction_nm,
     )
     assert judge(response) == "backlash"
 
@@ -74,11 +77,17 @@ def test_joint_whose_torque_is_too_coarse_is_unknown(response: LoadResponse) -> 
 
 
 def test_joint_that_never_loads_its_neighbors_slips_also_if_their_torque_is_coarse() -> None:
-    assert judge(replace(SLIPPING, neighbors_large_nm=0.09, neighbors_small_nm=0.0)) == "slipping"
+    assert (
+        judge(replace(SLIPPING, neighbor_large_range_nm=0.09, neighbor_small_range_nm=0.0))
+        == "slipping"
+    )
 
 
 def test_joint_between_both_patterns_is_loose() -> None:
-    assert judge(replace(SLIPPING, neighbors_large_nm=0.2, neighbors_small_nm=0.06)) == "loose"
+    assert (
+        judge(replace(SLIPPING, neighbor_large_range_nm=0.2, neighbor_small_range_nm=0.06))
+        == "loose"
+    )
 
 
 @pytest.mark.parametrize("response", [BACKLASH, SLIPPING, HARDLY_LOADED])
@@ -96,9 +105,9 @@ def test_joint_whose_torque_follows_its_angle_little_is_unknown() -> None:
 
 
 def test_pitch_joint_is_unknown() -> None:
-    axes = ["yaw", "pitch", "yaw", "pitch", "yaw"]
-    kinds = [play.kind for play in judge_gear_plays([TIGHT] * JOINTS, axes)]
-    assert kinds == ["tight", "unknown", "tight", "unknown", "tight"]
+    axes = ["yaw", "pitch", "yaw", "pitch", "yaw", "pitch", "yaw"]
+    kinds = [play.kind for play in judge_gear_plays([TIGHT] * len(axes), axes)]
+    assert kinds == ["tight" if axis == "yaw" else "unknown" for axis in axes]
 
 
 @pytest.mark.parametrize("response", [HARDLY_LOADED, BACKLASH, SLIPPING])
@@ -112,3 +121,16 @@ def test_robot_that_no_floor_loads_is_unknown(response: LoadResponse) -> None:
 def test_load_that_may_be_noise_is_unknown() -> None:
     noisy = replace(TIGHT, noise_nm=TIGHT.elastic_nm)
     assert {play.kind for play in judge_gear_plays([noisy] * JOINTS, AXES)} == {"unknown"}
+
+
+@pytest.mark.parametrize(("joint", "neighbors"), [(0, [2]), (1, [3]), (2, [0, 4]), (4, [2])])
+def test_neighbors_have_the_same_axis(joint: int, neighbors: list[int]) -> None:
+    axes = ["yaw", "pitch", "yaw", "pitch", "yaw"]
+    assert find_neighbors_of_same_axis(axes, joint) == neighbors
+
+
+def test_pitch_joints_do_not_count_as_typical() -> None:
+    axes = ["yaw", "yaw", "pitch", "pitch", "yaw"]
+    heavy = replace(TIGHT, elastic_nm=100.0)
+    plays = judge_gear_plays([TIGHT, TIGHT, heavy, heavy, TIGHT], axes)
+    assert plays[0].kind == "tight"
