@@ -12,7 +12,9 @@ If the obstacles can balance the push and the drives have a torque mode, the joi
     tau = tau_push + tau_shape,    tau_shape = k (theta(s) - q) + d (theta' v - q')
 
 with gains k and d so low that obstacles decide the shape. The component of tau_shape along theta' is removed, so that
-the shape does not push along the path and the desired forces are reached.
+the shape does not push along the path and the desired forces are reached. With `drive_damping`, the drives damp these
+torques: they are in position mode, with the targets q + tau / kp. The joints ahead of all pushing contacts may follow
+the path more strictly (`front_steering.py`).
 
 Otherwise the joints are in position mode, with the target theta(s + l) + tau_push / kp. The torques then only close
 gaps, and the shape itself pushes, by its look-ahead l: tau_i = kp_i (theta_i(s + l) - theta_i(s)), hence by virtual
@@ -32,6 +34,7 @@ from snakesim_gnc.control.bumpless import Blend, BumplessFollower
 from snakesim_gnc.control.climb import PlatformClimb
 from snakesim_gnc.control.contact_forces import MeasuredContacts
 from snakesim_gnc.control.contact_search import ContactSearch
+from snakesim_gnc.control.front_steering import FrontSteering
 from snakesim_gnc.control.progress import BodyLocation, PathProgress, SpeedFilter
 from snakesim_gnc.control.push import (
     BodyContacts,
@@ -156,6 +159,14 @@ class ObstacleAidedParameters(FileStruct, frozen=True, kw_only=True):
     shape_nm_s_per_rad: Annotated[float, from_zero(1000, "N*m*s/rad")] = 0.1
     """Damping of the shape in torque mode."""
 
+    drive_damping: bool = False
+    """True: the torques of torque mode are commanded as position targets, relative to the measured angles. The drives
+    then resist fast bending, so that the shape may be stiffer.
+    """
+
+    front_correction_m: Annotated[float, from_zero(10, "m")] = 0.0
+    """Distance over which the body ahead of all pushing contacts is led back to the path. 0: no such steering."""
+
 
 class ObstacleAided(Controller[ObstacleAidedParameters]):
     """Controls the speed along the path with all joints."""
@@ -180,11 +191,18 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         # Joints.
         self._yaw_joints = self._body.yaw_joints  # indices of the joints that bend
         self._stiffness = np.array([joint.stiffness_nm_per_rad for joint in robot.joints])
+        self._damping = np.array([joint.damping_nm_s_per_rad for joint in robot.joints])
         self._has_torque_mode = all(
             robot.joints[i].supports_mode(JointMode.TORQUE) for i in self._yaw_joints
         )
         self._bumpless_follower = BumplessFollower(robot, parameters.blend_s)
         self._is_holding = False  # the joints hold a pose; the next reference may jump
+        self._front_steering = FrontSteering(
+            robot,
+            self._body,
+            correction_m=parameters.front_correction_m,
+            blend_s=parameters.blend_s,
+        )
         # Look-ahead.
         self._look_ahead_integral_m = 0.0
         # Push along the path.
@@ -250,9 +268,12 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         # Derivative by the arc length, rad/m.
         theta_prime = (theta_ahead - theta) / DERIVATIVE_STEP_M
         push_torques_nm = scale * self._update_push_torques(observation, location, theta_prime)
+        self._update_front(location, observation.period_s)
+        theta = theta + self._front_steering.corrections_rad
         if self._can_use_torque_mode(observation.time_s) and not pitch_rad.any():
             return self._command_torques(observation, location, theta, theta_prime, push_torques_nm)
         reference = self._compute_angles_on_path(location, location.tail_s_m + look_ahead_m)
+        reference = reference + self._front_steering.corrections_rad
         reference = reference + push_torques_nm / self._stiffness + pitch_rad
         look_ahead_n = look_ahead_m * float(self._stiffness @ theta_prime**2)
         return self._command_positions(observation, location, reference, look_ahead_n)
@@ -260,6 +281,13 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     def _compute_angles_on_path(self, location: BodyLocation, tail_s_m: float) -> Floats:
         """Compute theta(s), (n_joints,) in rad: the angles of all joints with the tail at an arc length of the path."""
         return self._body.expand_joint_angles(location.body_on_path.compute_pose_at(tail_s_m))
+
+    def _update_front(self, location: BodyLocation, period_s: float) -> None:
+        snapshot = self._push_snapshot
+        if snapshot is None:
+            self._front_steering.update(location, None, None, period_s)
+        else:
+            self._front_steering.update(location, snapshot.contacts, snapshot.push, period_s)
 
     def _has_near_obstacles(self) -> bool:
         return self._push_snapshot is not None and len(self._push_snapshot.contacts) > 0
@@ -302,12 +330,12 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         """Command the torques tau_push + tau_shape to the joints that bend.
 
         tau_shape = k (theta - q) + d (theta' v - q') holds the shape of the body. Its component along theta', which
-        would move the body along the path, is removed.
+        would move the body along the path, is removed. The joints of the front follow theta in position mode instead.
 
         Args:
             observation: The inputs of this tick, with the joint angles q and velocities q'.
             location: Position of the body on the path, and its speed v.
-            theta: (n_joints,) joint angles of the body on the path, rad.
+            theta: (n_joints,) joint angles of the body on the path, rad, with the corrections of the front.
             theta_prime: (n_joints,) their derivatives by the arc length, rad/m.
             push_torques_nm: (n_joints,) tau_push.
         """
@@ -318,21 +346,57 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
             observation.joints.velocity_rad_s
         )
         shape_nm = k * angle_error_rad + d * velocity_error_rad_s
-        slope = theta_prime[self._yaw_joints]
+        pushing_joints = [i for i in self._yaw_joints if i not in self._front_steering.joints]
+        slope = theta_prime[pushing_joints]
         # Force of tau_shape along the path, by virtual work.
-        along_n = float(slope @ shape_nm[self._yaw_joints])
+        along_n = float(slope @ shape_nm[pushing_joints])
         shape_nm = shape_nm - theta_prime * along_n / (slope @ slope + MIN_SLOPE_SQUARED_PER_M2)
 
         setpoints = self._bumpless_follower.make_setpoints(observation, theta)
         self._bumpless_follower.leave_position_mode()
         self._limit_look_ahead_integral()
         self._is_holding = False
-        for i in self._yaw_joints:
+        velocity_rad_s = theta_prime * location.speed_m_s
+        front_targets_rad = self._front_steering.compute_targets_rad(
+            observation, theta, velocity_rad_s
+        )
+        for i, target_rad in front_targets_rad.items():
+            setpoints.target[i] = target_rad
+        # A body that is too fast must be braked by the damping, not driven on.
+        damped_speed_m_s = min(location.speed_m_s, location.trajectory.speed_m_s)
+        for i in pushing_joints:
             limit_nm = setpoints.torque_limit_nm[i]
             torque_nm = float(shape_nm[i] + push_torques_nm[i])
-            setpoints.mode[i] = JointMode.TORQUE
-            setpoints.target[i] = min(max(torque_nm, -limit_nm), limit_nm)
+            torque_nm = min(max(torque_nm, -limit_nm), limit_nm)
+            if self.parameters.drive_damping:
+                setpoints.target[i] = self._compute_damped_target_rad(
+                    i,
+                    observation.joints.angle_rad[i],
+                    torque_nm,
+                    float(theta_prime[i]) * damped_speed_m_s,
+                )
+            else:
+                setpoints.mode[i] = JointMode.TORQUE
+                setpoints.target[i] = torque_nm
         return ControllerCommand(setpoints, self._make_telemetry(observation, location, 0.0, theta))
+
+    def _compute_damped_target_rad(
+        self, joint: int, angle_rad: float, torque_nm: float, velocity_rad_s: float
+    ) -> float:
+        """Compute the position target with which the drive of a joint produces a torque.
+
+        The drive works against kp (q(t) - q(t - delay)) + kd q'. This damping is wanted, but not against the motion
+        along the path. The torque that it takes at the velocity of the joint on the path is therefore added.
+
+        Args:
+            joint: Index of the joint.
+            angle_rad: Its measured angle.
+            torque_nm: The torque to produce.
+            velocity_rad_s: Velocity of the joint on the path.
+        """
+        stiffness = float(self._stiffness[joint])
+        damping = stiffness * ACTUATION_DELAY_S + float(self._damping[joint])
+        return angle_rad + (torque_nm + damping * velocity_rad_s) / stiffness
 
     def _command_positions(
         self,

@@ -34,3 +34,33 @@ def test_obstacle_aided_body_without_push_holds_in_position_mode():
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
     commands = [controller.update(stage.make_observation(tick, 1.0)) for tick in range(40)]
     assert set(commands[-1].setpoints.mode) == {JointMode.POSITION}
+
+
+def test_drive_damping_gives_the_torques_of_torque_mode_to_a_body_at_rest():
+    """At rest the damping is zero, so the position targets must give the same torques."""
+    stage = make_stage()
+    soft = ObstacleAided(stage.robot, ObstacleAidedParameters(shape_nm_s_per_rad=0.0))
+    damped = ObstacleAided(
+        stage.robot, ObstacleAidedParameters(shape_nm_s_per_rad=0.0, drive_damping=True)
+    )
+    observations = [stage.make_observation(tick, 1.0) for tick in range(40)]
+    torques = [soft.update(observation) for observation in observations][-1].setpoints
+    targets = [damped.update(observation) for observation in observations][-1].setpoints
+    assert set(torques.mode) == {JointMode.TORQUE}
+    assert set(targets.mode) == {JointMode.POSITION}
+    assert np.abs(torques.target).max() > 0.1
+    stiffness = [joint.stiffness_nm_per_rad for joint in stage.robot.joints]
+    by_spring_nm = (np.array(targets.target) - observations[-1].joints.angle_rad) * stiffness
+    assert by_spring_nm == pytest.approx(torques.target, abs=0.02)
+
+
+def test_front_joints_are_in_position_mode_and_the_others_push():
+    stage = make_stage()
+    parameters = ObstacleAidedParameters(front_correction_m=0.25)
+    controller = ObstacleAided(stage.robot, parameters)
+    observations = [stage.make_observation(tick, 1.0) for tick in range(40)]
+    setpoints = [controller.update(observation) for observation in observations][-1].setpoints
+    is_stiff = [mode is JointMode.POSITION for mode in setpoints.mode]
+    # The front is one piece that ends at the head.
+    assert is_stiff == sorted(is_stiff)
+    assert not all(is_stiff)
