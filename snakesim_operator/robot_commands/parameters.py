@@ -61,6 +61,8 @@ class RobotParameter:
         """The values that are allowed, in words."""
         if self.choices:
             return " or ".join(self.choices)
+        if isinstance(self.value, bool):
+            return "true or false"
         if isinstance(self.value, str):
             return "a text"
         limits: list[str] = []
