@@ -29,9 +29,8 @@ def searching(
     """A body on its path that searches for contacts after a second, unless configured otherwise."""
     stage = make_stage()
     stage.pegs = stage.pegs if among_pegs else []
-    return stage, ObstacleAided(
-        stage.robot, ObstacleAidedParameters(**{"search_after_s": 1.0, **parameters})
-    )
+    defaults = ObstacleAidedParameters(search_after_s=1.0)
+    return stage, ObstacleAided(stage.robot, msgspec.structs.replace(defaults, **parameters))
 
 
 def stands(

@@ -20,7 +20,8 @@ from snakesim_hal.model.route import Route
 from snakesim_testing.gnc.stage import make_stage
 
 TAIL_S_M = 0.3
-BY_SHAPE = {"shape_nm_per_rad": 0.0}  # in position mode, whose targets show the push
+# With this stiffness of the shape, all joints are in position mode, and their targets show the push.
+POSITION_MODE_NM_PER_RAD = 0.0
 
 
 def references(controller, stage, ticks: int, speed_m_s: float = 0.0) -> np.ndarray:
@@ -57,7 +58,10 @@ def test_undulation_head_steers_to_path_and_against_its_bend(lag_rad: float, ben
 def test_undulation_standing_body_is_pushed_harder_up_to_limit() -> None:
     stage = make_stage()
     controller = ObstacleAided(
-        stage.robot, ObstacleAidedParameters(max_torque_nm=2.0, search_after_s=0.0, **BY_SHAPE)
+        stage.robot,
+        ObstacleAidedParameters(
+            max_torque_nm=2.0, search_after_s=0.0, shape_nm_per_rad=POSITION_MODE_NM_PER_RAD
+        ),
     )
     first, *_, last = [
         controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in range(400)
@@ -74,7 +78,10 @@ def pushed(push_scale: float, push_sign_s: float = 0.0) -> np.ndarray:
     """References of a body that stays where it is."""
     stage = make_stage()
     parameters = ObstacleAidedParameters(
-        push_scale=push_scale, push_sign_s=push_sign_s, search_after_s=0.0, **BY_SHAPE
+        push_scale=push_scale,
+        push_sign_s=push_sign_s,
+        search_after_s=0.0,
+        shape_nm_per_rad=POSITION_MODE_NM_PER_RAD,
     )
     return references(ObstacleAided(stage.robot, parameters), stage, 300)
 
