@@ -122,7 +122,7 @@ class LooseGearModel(PhysicsModel):
         self._physics_model.advance(link_torque_nm)
 
     def _advance_rotors(self, motor_torque_nm: Floats) -> None:
-        """Advance the angles, velocities and tooth torques of the rotors by a step, at constant velocity of the links.
+        """Advance angles, velocities and tooth torques of the rotors by a step, while the links keep their velocity.
 
         The step is implicit in the spring and the damper of the teeth, and in the viscous friction. Coulomb friction
         is applied afterwards, and at most stops the rotor.
@@ -135,25 +135,26 @@ class LooseGearModel(PhysicsModel):
         link_velocity_rad_s = self._physics_model.velocity_rad_s[self._loose_joints]
 
         # The teeth touch where the angle between rotor and link is larger than half of the backlash.
-        separation_rad = self._rotor_angle_rad - link_angle_rad - self._slipped_rad
-        penetration_rad = separation_rad - np.clip(
-            separation_rad, -self._half_backlash_rad, self._half_backlash_rad
+        relative_angle_rad = self._rotor_angle_rad - link_angle_rad - self._slipped_rad
+        penetration_rad = relative_angle_rad - np.clip(
+            relative_angle_rad, -self._half_backlash_rad, self._half_backlash_rad
         )
         is_touching = penetration_rad != 0.0
         stiffness = np.where(is_touching, TOOTH_STIFFNESS_NM_PER_RAD, 0.0)
         damping = np.where(is_touching, TOOTH_DAMPING_NM_S_PER_RAD, 0.0)
-        slip_rad_s = self._rotor_velocity_rad_s - link_velocity_rad_s
-        spring_torque_nm = (
-            stiffness * (penetration_rad + step_s * slip_rad_s) + damping * slip_rad_s
+        relative_velocity_rad_s = self._rotor_velocity_rad_s - link_velocity_rad_s
+        explicit_tooth_torque_nm = (
+            stiffness * (penetration_rad + step_s * relative_velocity_rad_s)
+            + damping * relative_velocity_rad_s
         )
         rotor_velocity_rad_s = self._compute_rotor_velocities(
-            motor_torque_nm - spring_torque_nm, step_s * damping + step_s**2 * stiffness
+            motor_torque_nm - explicit_tooth_torque_nm, step_s * damping + step_s**2 * stiffness
         )
 
         # Torque on the links at the end of the step.
-        slip_rad_s = rotor_velocity_rad_s - link_velocity_rad_s
-        tooth_torque_nm = stiffness * (penetration_rad + step_s * slip_rad_s)
-        tooth_torque_nm = tooth_torque_nm + damping * slip_rad_s
+        relative_velocity_rad_s = rotor_velocity_rad_s - link_velocity_rad_s
+        tooth_torque_nm = stiffness * (penetration_rad + step_s * relative_velocity_rad_s)
+        tooth_torque_nm = tooth_torque_nm + damping * relative_velocity_rad_s
         is_pushing = tooth_torque_nm * penetration_rad > 0.0  # teeth do not pull
         tooth_torque_nm = np.where(is_pushing, tooth_torque_nm, 0.0)
         is_slipping = np.abs(tooth_torque_nm) > self._slip_torque_nm
@@ -199,8 +200,10 @@ class LooseGearModel(PhysicsModel):
         """Let couplings slip until the spring of the teeth has only the torque at which they slip."""
         direction = np.sign(self._tooth_torque_nm)
         spring_rad = np.abs(self._tooth_torque_nm) / TOOTH_STIFFNESS_NM_PER_RAD
-        separation_rad = direction * (self._half_backlash_rad + spring_rad)
-        excess_rad = self._rotor_angle_rad - link_angle_rad - self._slipped_rad - separation_rad
+        max_relative_angle_rad = direction * (self._half_backlash_rad + spring_rad)
+        excess_rad = (
+            self._rotor_angle_rad - link_angle_rad - self._slipped_rad - max_relative_angle_rad
+        )
         excess_rad = np.where(is_slipping, excess_rad, 0.0)
         # Damping may exceed the torque while the spring does not, and a coupling never slips back.
         self._slipped_rad = self._slipped_rad + np.where(
@@ -223,7 +226,7 @@ class LooseGearModel(PhysicsModel):
 
     def shaft_torque_nm(self) -> Floats:
         """Return the torque through each joint's shaft; behind a loose gear, that of its teeth."""
-        torque_nm = self._physics_model.shaft_torque_nm()
+        torque_nm = self._physics_model.shaft_torque_nm().copy()
         torque_nm[self._loose_joints] = self._tooth_torque_nm
         return torque_nm
 
