@@ -1,7 +1,6 @@
 """An emergency stop on disk: written before it is answered, found again, and latched when in doubt."""
 
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from queue import SimpleQueue
@@ -16,6 +15,8 @@ from snakesim_hal.wire.messages import EstopRequest
 from snakesim_testing.hal.local_network import running_host
 from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.harness.wait import wait_until
+
+HANG_S = 60.0  # far longer than any answer takes on a busy computer
 
 
 def asked(latch: EstopLatch, what: str) -> str | None:
@@ -75,7 +76,7 @@ def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[Event]:
     should_continue, write = Event(), under_test.write_atomically
 
     def slow(path: Path, content: bytes, *, durable: bool = False) -> None:
-        should_continue.wait(30)
+        should_continue.wait(HANG_S)
         write(path, content, durable=durable)
 
     monkeypatch.setattr(under_test, "write_atomically", slow)
@@ -87,18 +88,17 @@ def hanging(monkeypatch: pytest.MonkeyPatch) -> Iterator[Event]:
 def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Event) -> None:
     answers: SimpleQueue[str | None] = SimpleQueue()
     threads = threading.active_count()
-    latch, began = EstopLatch(tmp_path), time.monotonic()
+    latch = EstopLatch(tmp_path)
     for _ in range(1000):  # a flood, too
         latch.engage("anna", 7, answers.put)
     for _ in range(1000):
-        said = answers.get(timeout=5)
+        said = answers.get(timeout=HANG_S / 2)
         assert said is not None
         assert "not stored yet" in said
         assert str(tmp_path / ESTOP) in said
-    assert time.monotonic() - began < 2.0
     assert threading.active_count() <= threads + 2
     latch.close()
-    assert time.monotonic() - began < 2.0
+    assert not (tmp_path / ESTOP).exists()  # closed without waiting for the disk
     hanging.set()
     wait_until(
         lambda: EstopLatch(tmp_path).left_by_earlier_host is not None, "the stop kept after all"
@@ -108,10 +108,8 @@ def test_a_stop_is_answered_although_the_disk_hangs(tmp_path: Path, hanging: Eve
 
 def test_latch_on_hanging_disk_stops_at_once_and_ends(tmp_path: Path, hanging: Event) -> None:
     with running_host(make_run_config(clock_mode="realtime"), latch=EstopLatch(tmp_path)) as run:
-        began = time.monotonic()
         answer = run.request(keys.ESTOP, EstopRequest(requester="anna"))
         assert answer.ok
         assert answer.lifecycle == "estop"
-        assert "not stored yet" in answer.reason
-        assert time.monotonic() - began < 2.0
+        assert "not stored yet" in answer.reason  # so it was given while the disk hung
         run.wait_for_lifecycle("estop")

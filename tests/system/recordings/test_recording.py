@@ -206,7 +206,7 @@ def test_recording_in_lockstep_waits_for_slow_disk_only(monkeypatch: pytest.Monk
     began = time.monotonic()
     for tick in range(200):
         publisher.put(TickDone(tick=tick))
-    assert 0.2 <= time.monotonic() - began < 0.5
+    assert 0.2 <= time.monotonic() - began < 10.0  # once, and not for each of the 200 messages
     assert tap.dropped_count_by_key.total() + len(tap.take_arrivals()) == 200
 
 

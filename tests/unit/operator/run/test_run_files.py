@@ -71,7 +71,10 @@ def test_run_files_are_written_in_order_after_settling(tmp_path: Path) -> None:
     ]
 
 
-def test_nothing_is_lost_when_a_full_disk_has_room_again(tmp_path: Path, disk: Disk) -> None:
+def test_nothing_is_lost_when_a_full_disk_has_room_again(
+    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(under_test, "DISK_TIMEOUT_S", 60.0)
     warned: list[str] = []
     files = RunFiles(tmp_path, warned.append)
     disk.space = 10
@@ -81,7 +84,7 @@ def test_nothing_is_lost_when_a_full_disk_has_room_again(tmp_path: Path, disk: D
     assert (tmp_path / "a.log").read_bytes() == b"0123456789"
     began = time.monotonic()
     files.wait_until_written()
-    assert time.monotonic() - began < 0.2  # it knows that it would be in vain
+    assert time.monotonic() - began < 30.0  # not the whole limit: writing has failed
     disk.space = 2**30
     wait_until(lambda: (tmp_path / "whole.json").exists(), "the second file")
     assert (tmp_path / "a.log").read_bytes() == b"0123456789abcdef"
@@ -108,13 +111,10 @@ def test_run_files_on_hanging_disk_block_nobody_within_bounded_memory(
     monkeypatch.setattr(under_test, "MAX_PENDING_BYTES", 10_000)
     files = RunFiles(tmp_path, lambda _: None)
     disk.hangs = True
-    began = time.monotonic()
-    for _ in range(1000):
+    for _ in range(1000):  # ends while the disk hangs, so no call waits for it
         files.append("a.log", b"x" * 100)
-    assert time.monotonic() - began < 0.2
     assert sum(len(task.content) for task in files._tasks) <= 10_000
     assert files.close() == f"{tmp_path}: the disk has not answered for 0.3 s"
-    assert time.monotonic() - began < 1.0
     disk.goes_on.set()
 
 
