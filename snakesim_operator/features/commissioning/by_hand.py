@@ -130,15 +130,17 @@ class HandMovedRobot:
                 for state in self._joint_state_reader.drain()
                 if state.has_joint_count(len(self.joints))
             ]
-            if states:
+            known_states = [state for state in states if all(state.valid)]
+            if known_states:
                 last_arrival_s = time.monotonic()
             elif time.monotonic() - last_arrival_s > MAX_SILENCE_S:
+                if states:
+                    self._raise_if_angles_unknown(states[-1])
                 raise RefusedError(
                     f"the robot has sent no joint angles for {MAX_SILENCE_S:g} s; see `snakesim status`",
                     code="network/no-answer",
                 )
-            for state in states:
-                self._raise_if_angles_unknown(state)
+            for state in known_states:
                 yield state.timestamp_ns * 1e-9, np.array(state.angle_rad)
             time.sleep(0.01)
 
