@@ -105,13 +105,10 @@ def _collect_loose_gears(mounted: Mapping[str, MountedDrive]) -> dict[str, Loose
     """Return how loose each gear with backlash or a slipping coupling is, by the name of its joint."""
     looseness: dict[str, Looseness] = {}
     for name, drive in mounted.items():
-        if drive.backlash_rad or drive.coupling_slip_nm is not None:
-            slip_torque_nm = math.inf
-            if drive.coupling_slip_nm is not None:
-                slip_torque_nm = drive.coupling_slip_nm
-            looseness[name] = Looseness(
-                backlash_rad=drive.backlash_rad or 0.0, slip_torque_nm=slip_torque_nm
-            )
+        backlash_rad = drive.backlash_rad or 0.0
+        slip_torque_nm = math.inf if drive.coupling_slip_nm is None else drive.coupling_slip_nm
+        if backlash_rad > 0.0 or slip_torque_nm < math.inf:
+            looseness[name] = Looseness(backlash_rad=backlash_rad, slip_torque_nm=slip_torque_nm)
     return looseness
 
 

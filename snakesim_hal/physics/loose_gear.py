@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint, JointExceptions
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
-from snakesim_hal.wire.messages import Imu, Pose
+from snakesim_hal.physics.physics_model import PhysicsModel
+from snakesim_hal.physics.wrapped_model import WrappedModel
 
 # Softer than most gears; an explicit step of 1 ms integrates it on a light link.
 TOOTH_STIFFNESS_NM_PER_RAD = 300.0
@@ -65,7 +65,7 @@ def move_rotor_inertia_to_motor_side(
     )
 
 
-class LooseGearModel(PhysicsModel):
+class LooseGearModel(WrappedModel):
     """Wraps another physics model. Its joint angles are those that encoders on the rotors measure."""
 
     def __init__(
@@ -84,8 +84,7 @@ class LooseGearModel(PhysicsModel):
             looseness: How loose a gear is, by joint name. The gears of joints that are missing are not loose.
             seed: Seed of the random start angles of the rotors.
         """
-        self._physics_model = physics_model
-        self.step_s = physics_model.step_s
+        super().__init__(physics_model)
 
         # Indices and rotor parameters of the joints with loose gears. Every array has one entry for each of them.
         loose_joints = [i for i, joint in enumerate(joints) if joint.name in looseness]
@@ -229,12 +228,3 @@ class LooseGearModel(PhysicsModel):
         torque_nm = self._physics_model.shaft_torque_nm().copy()
         torque_nm[self._loose_joints] = self._tooth_torque_nm
         return torque_nm
-
-    def loads(self) -> list[LinkLoad]:
-        return self._physics_model.loads()
-
-    def imu(self) -> Imu | None:
-        return self._physics_model.imu()
-
-    def pose(self) -> Pose | None:
-        return self._physics_model.pose()

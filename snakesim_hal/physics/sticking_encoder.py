@@ -11,11 +11,11 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
-from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
-from snakesim_hal.wire.messages import Imu, Pose
+from snakesim_hal.physics.physics_model import PhysicsModel
+from snakesim_hal.physics.wrapped_model import WrappedModel
 
 
-class StickingEncoderModel(PhysicsModel):
+class StickingEncoderModel(WrappedModel):
     """Wraps another physics model. Its joint angles are those that encoders measure."""
 
     def __init__(
@@ -31,8 +31,7 @@ class StickingEncoderModel(PhysicsModel):
             joints: Every joint, tail to head.
             dead_zone_rad: Dead zone of an encoder by joint name. Joints that are missing have none.
         """
-        self._physics_model = physics_model
-        self.step_s = physics_model.step_s
+        super().__init__(physics_model)
         sticking_joints = [i for i, joint in enumerate(joints) if joint.name in dead_zone_rad]
         self._sticking_joints = np.array(sticking_joints, dtype=np.intp)
         self._dead_zone_rad: Floats = np.array(
@@ -42,7 +41,7 @@ class StickingEncoderModel(PhysicsModel):
 
     def advance(self, torque_nm: Floats) -> None:
         """Advance by `step_s` under these motor torques, then read the encoders."""
-        self._physics_model.advance(torque_nm)
+        super().advance(torque_nm)
         shaft_rad = self._physics_model.angle_rad[self._sticking_joints]
         change_rad = shaft_rad - self._measured_angle_rad
         has_left_zone = np.abs(change_rad) >= self._dead_zone_rad
@@ -54,19 +53,3 @@ class StickingEncoderModel(PhysicsModel):
         angle_rad = self._physics_model.angle_rad.copy()
         angle_rad[self._sticking_joints] = self._measured_angle_rad
         return angle_rad
-
-    @property
-    def velocity_rad_s(self) -> Floats:
-        return self._physics_model.velocity_rad_s
-
-    def shaft_torque_nm(self) -> Floats:
-        return self._physics_model.shaft_torque_nm()
-
-    def loads(self) -> list[LinkLoad]:
-        return self._physics_model.loads()
-
-    def imu(self) -> Imu | None:
-        return self._physics_model.imu()
-
-    def pose(self) -> Pose | None:
-        return self._physics_model.pose()
