@@ -41,6 +41,9 @@ from snakesim_operator.features.commissioning.robot_edit import (
 
 ZERO_SAMPLING_S = 1.0  # samples for a zero are taken for that long
 MAX_SILENCE_S = 1.0  # without joint angles
+MAX_UNKNOWN_S = (
+    1.0  # that a joint may not know its angle: its drive is starting, or the computer is busy
+)
 HOST_TIMEOUT_S = 3.0  # for configuration and status of a running host
 REDRAW_PERIOD_S = 0.2
 # Of what is ahead of the joint, seen towards the head.
@@ -120,7 +123,7 @@ class HandMovedRobot:
         Raises:
             RefusedError: The robot is armed, sends no angles, or does not know one.
         """
-        last_arrival_s = time.monotonic()
+        last_arrival_s = last_known_s = time.monotonic()
         is_last_pass = False
         while not is_last_pass:
             is_last_pass = should_stop()  # samples that arrived before that are still read
@@ -130,18 +133,19 @@ class HandMovedRobot:
                 for state in self._joint_state_reader.drain()
                 if state.has_joint_count(len(self.joints))
             ]
-            known_states = [state for state in states if all(state.valid)]
-            if known_states:
+            if states:
                 last_arrival_s = time.monotonic()
             elif time.monotonic() - last_arrival_s > MAX_SILENCE_S:
-                if states:
-                    self._raise_if_angles_unknown(states[-1])
                 raise RefusedError(
                     f"the robot has sent no joint angles for {MAX_SILENCE_S:g} s; see `snakesim status`",
                     code="network/no-answer",
                 )
-            for state in known_states:
-                yield state.timestamp_ns * 1e-9, np.array(state.angle_rad)
+            for state in states:
+                if all(state.valid):
+                    last_known_s = time.monotonic()
+                    yield state.timestamp_ns * 1e-9, np.array(state.angle_rad)
+                elif time.monotonic() - last_known_s > MAX_UNKNOWN_S:
+                    raise self._make_unknown_angle_error(state)
             time.sleep(0.01)
 
     def _raise_if_armed(self) -> None:
@@ -156,15 +160,14 @@ class HandMovedRobot:
                     code="robot/not-disarmed",
                 )
 
-    def _raise_if_angles_unknown(self, state: JointState) -> None:
+    def _make_unknown_angle_error(self, state: JointState) -> RefusedError:
         unknown = [
             joint.name for joint, valid in zip(self.joints, state.valid, strict=True) if not valid
         ]
-        if unknown:
-            raise RefusedError(
-                f"{', '.join(unknown)}: the angle is not known; see `snakesim status`",
-                code="commissioning/not-possible",
-            )
+        return RefusedError(
+            f"{', '.join(unknown)}: the angle is not known; see `snakesim status`",
+            code="commissioning/not-possible",
+        )
 
 
 @contextmanager
