@@ -605,7 +605,7 @@ def measure_route_position_m(record: RunRecord, row: int) -> float | None:
     body_points_w = record.find_body_points_w(row)
     if body_points_w is None or record.route is None:
         return None
-    return float(np.mean(record.route.project_points(body_points_w[:, :2])))
+    return float(np.mean([record.route.project_point(point_w[:2]) for point_w in body_points_w]))
 
 
 def max_or_none(values: np.ndarray) -> float | None:

@@ -15,7 +15,6 @@ from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from snakesim_hal.base.arrays import choose_even_indices
 from snakesim_hal.base.errors import ConfigError
 from snakesim_operator.features.figures.from_above import OBSTACLE_COLOR, plot_body, plot_obstacles
 from snakesim_operator.features.figures.legends import place_legend_beside_title
@@ -36,6 +35,7 @@ from snakesim_operator.results.report.timeline import (
 )
 from snakesim_operator.results.report.view import find_body_points_xy_w
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.sampling import choose_even_indices
 from snakesim_operator.results.time_axis import get_run_end_s
 
 MAX_SNAPSHOTS = 4  # in figure 10

@@ -17,6 +17,7 @@ from snakesim_operator.results.report.timeline import find_jam_intervals
 from snakesim_operator.results.report.verdict import find_final_stop
 from snakesim_operator.results.report.view import find_body_points_xy_w
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.sampling import choose_even_indices
 from snakesim_operator.results.summary import RunSummary
 from snakesim_operator.results.time_axis import get_run_end_s
 
@@ -128,8 +129,7 @@ def select_snapshots_to_draw(
 def _hand_over_times_to_draw(events: Sequence[ReportEvent]) -> set[float]:
     """Return the times of at most MAX_HAND_OVERS_DRAWN hand-overs, evenly spaced in their order."""
     hand_overs = [event for event in events if event.joint_index is not None]
-    count = min(len(hand_overs), MAX_HAND_OVERS_DRAWN)
-    indices = np.linspace(0, len(hand_overs) - 1, count).astype(int)
+    indices = choose_even_indices(len(hand_overs), MAX_HAND_OVERS_DRAWN)
     return {hand_overs[index].time_s for index in indices}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from snakesim_hal.base.arrays import Floats, choose_even_indices
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import ControlState, WorldContact, WorldModel
 from snakesim_operator.results.metrics.motion import (
@@ -39,6 +39,7 @@ from snakesim_operator.results.report.view import (
     find_body_points_xy_w,
 )
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.sampling import choose_even_indices
 from snakesim_operator.results.time_axis import get_run_end_s, get_time_origin_s
 
 MessageT = TypeVar("MessageT", ControlState, WorldModel)

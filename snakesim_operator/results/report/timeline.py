@@ -5,12 +5,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from snakesim_hal.base.arrays import Floats, choose_even_indices
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.locomotion import STANDING_STILL
 from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.metrics.motion import StopIntervals
 from snakesim_operator.results.metrics.propulsion import PropulsionInterval
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.sampling import choose_even_indices
 from snakesim_operator.results.summary import measure_route_position_m
 from snakesim_operator.results.time_axis import (
     LabeledInterval,
