@@ -126,29 +126,6 @@ class Route:
         nearest = int(squared_distances.argmin())
         return float(self._arc_lengths_m[first + nearest] + along_m[nearest])
 
-    def project_points(self, points_w: Floats) -> Floats:
-        """Return the arc length of the route's nearest point for each of several points.
-
-        It is `project_point` without a window, and much faster for many points.
-
-        Args:
-            points_w: Points in the world, (n, 2), m.
-
-        Returns:
-            Arc lengths in m, (n,).
-        """
-        starts = self.points_w[:-1]
-        directions = self._segment_directions
-
-        # Distances along each segment to the feet of the perpendiculars, limited to the segment, (n, segments).
-        along_m = np.einsum("nij,ij->ni", points_w[:, None] - starts, directions)
-        along_m = np.clip(along_m, self._min_along_m, self._max_along_m)
-
-        offsets = starts + along_m[:, :, None] * directions - points_w[:, None]
-        squared_distances = np.einsum("nij,nij->ni", offsets, offsets)
-        nearest = squared_distances.argmin(axis=1)
-        return self._arc_lengths_m[nearest] + along_m[np.arange(len(points_w)), nearest]
-
     def _find_segments_near(self, near_s_m: float | None, window_m: float) -> tuple[int, int]:
         """Return the first segment of a window and the one after its last; of the whole route without a window."""
         count = len(self._arc_lengths_m) - 1

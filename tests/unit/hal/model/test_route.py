@@ -124,19 +124,15 @@ def test_projection_has_the_bits_of_measuring_every_segment(
         [np.cos(headings_rad), np.sin(headings_rad)]
     )
     route = Route(np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
-    points_w: list[Floats] = []
     for _ in range(8):
         place_w = route.points_w[random.integers(len(route.points_w))]
         point_w = place_w + random.normal(0.0, spread_m, 2) * random.integers(2)
         assert route.project_point(point_w) == project_by_measuring_all(route, point_w, 0, count)
-        points_w.append(point_w)
         near_s_m = float(random.uniform(-1.0, route.length_m + 1.0))
         first, last = route._find_segments_near(near_s_m, 0.3)
         assert route.project_point(point_w, near_s_m, 0.3) == project_by_measuring_all(
             route, point_w, first, last
         )
-    each = [route.project_point(point_w) for point_w in points_w]
-    assert route.project_points(np.array(points_w)).tolist() == each
 
 
 def test_projection_near_a_place_stays_on_its_branch() -> None:
