@@ -15,7 +15,7 @@ The joints between these links carry no contact force, so they can be in positio
 import numpy as np
 
 from snakesim_gnc.control.progress import BodyLocation
-from snakesim_gnc.control.push import BodyContacts, NormalizedPush
+from snakesim_gnc.control.push import PushSnapshot
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
@@ -57,29 +57,24 @@ class FrontSteering:
         self.corrections_rad = np.zeros(len(robot.joints))
         # With the target of a joint that has just become part of the front, its drive keeps its torque.
         self._target_offsets_rad = np.zeros(len(robot.joints))
-        # Those that had a target at the last time.
+        # Joints that had a target at the last update.
         self._led_joints: set[int] = set()
         self._last_time_s = -np.inf
 
     def update(
-        self,
-        location: BodyLocation,
-        contacts: BodyContacts | None,
-        push: NormalizedPush | None,
-        period_s: float,
+        self, location: BodyLocation, snapshot: PushSnapshot | None, period_s: float
     ) -> None:
         """Find the front of the body at this tick, and change the corrections at a limited rate.
 
         Args:
             location: The body on its path.
-            contacts: Contacts of the body; None if they are not known.
-            push: The push that they allow.
+            snapshot: Contacts of the body, and the push that they allow; None if they are not known.
             period_s: Time since the last update.
         """
         if self._correction_m == 0.0:
             return
         yaw_joints = self._body.yaw_joints
-        first = self._find_first_bend(contacts, push)
+        first = self._find_first_bend(snapshot)
         wanted_rad = np.zeros(len(self.corrections_rad))
         on_path = location.body_on_path.compute_pose_at(location.tail_s_at_pose_m)
         wanted_rad[yaw_joints] = compute_front_corrections_rad(
@@ -121,17 +116,17 @@ class FrontSteering:
         self._led_joints = set(self.joints)
         return targets_rad
 
-    def _find_first_bend(self, contacts: BodyContacts | None, push: NormalizedPush | None) -> int:
+    def _find_first_bend(self, snapshot: PushSnapshot | None) -> int:
         """Return the number of the rearmost joint that bends and that is ahead of all pushing contacts."""
         joint_count = len(self._body.yaw_joints)
         first = max(joint_count - MAX_FRONT_JOINTS, 1)
-        if contacts is None or push is None or not len(contacts):
+        if snapshot is None or not len(snapshot.contacts):
             return first
-        forces = push.contact_forces
+        forces = snapshot.push.contact_forces
         pushes = forces > MIN_FORCE_RATIO * forces.max()
         if not pushes.any():
             return first
-        foremost_s_m = float(contacts.body_s_m[pushes].max())
+        foremost_s_m = float(snapshot.contacts.body_s_m[pushes].max())
         return max(first, int(np.searchsorted(self._body.body_points_s_m[1:-1], foremost_s_m)))
 
 

@@ -24,7 +24,6 @@ A negative speed moves the body backward along its own path. A body that does no
 where it can push (`contact_search.py`). See `docs/concepts/propulsion-control.md`.
 """
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -37,9 +36,8 @@ from snakesim_gnc.control.contact_search import ContactSearch
 from snakesim_gnc.control.front_steering import FrontSteering
 from snakesim_gnc.control.progress import BodyLocation, PathProgress, SpeedFilter
 from snakesim_gnc.control.push import (
-    BodyContacts,
-    NormalizedPush,
     PushLowPassFilter,
+    PushSnapshot,
     find_body_contacts,
     solve_push,
 )
@@ -50,7 +48,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, Telemetry
 from snakesim_hal.model.files import FileStruct
 from snakesim_hal.model.outlines import ObstacleOutlines
-from snakesim_hal.wire.messages import JointMode, RobotDescription, WorldContact, WorldModel
+from snakesim_hal.wire.messages import JointMode, RobotDescription, WorldContact
 from snakesim_hal.wire.quantities import above, from_zero
 
 # A new path whose reference differs more than this starts with a small look-ahead.
@@ -79,15 +77,6 @@ MIN_SLOPE_SQUARED_PER_M2 = 20.0
 # A body that was slower than this for MIN_STANDSTILL_DURATION_S is reported as stationary.
 MAX_STANDSTILL_SPEED_M_S = 0.01
 MIN_STANDSTILL_DURATION_S = 0.5
-
-
-@dataclass(frozen=True)
-class PushSnapshot:
-    """The contacts of a world model, and the push that they allow."""
-
-    world: WorldModel
-    contacts: BodyContacts
-    push: NormalizedPush
 
 
 class ObstacleAidedParameters(FileStruct, frozen=True, kw_only=True):
@@ -268,7 +257,7 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
         # Derivative by the arc length, rad/m.
         theta_prime = (theta_ahead - theta) / DERIVATIVE_STEP_M
         push_torques_nm = scale * self._update_push_torques(observation, location, theta_prime)
-        self._update_front(location, observation.period_s)
+        self._front_steering.update(location, self._push_snapshot, observation.period_s)
         theta = theta + self._front_steering.corrections_rad
         if self._can_use_torque_mode(observation.time_s) and not pitch_rad.any():
             return self._command_torques(observation, location, theta, theta_prime, push_torques_nm)
@@ -281,13 +270,6 @@ class ObstacleAided(Controller[ObstacleAidedParameters]):
     def _compute_angles_on_path(self, location: BodyLocation, tail_s_m: float) -> Floats:
         """Compute theta(s), (n_joints,) in rad: the angles of all joints with the tail at an arc length of the path."""
         return self._body.expand_joint_angles(location.body_on_path.compute_pose_at(tail_s_m))
-
-    def _update_front(self, location: BodyLocation, period_s: float) -> None:
-        snapshot = self._push_snapshot
-        if snapshot is None:
-            self._front_steering.update(location, None, None, period_s)
-        else:
-            self._front_steering.update(location, snapshot.contacts, snapshot.push, period_s)
 
     def _has_near_obstacles(self) -> bool:
         return self._push_snapshot is not None and len(self._push_snapshot.contacts) > 0

@@ -32,6 +32,7 @@ from snakesim_hal.model.outlines import (
     ObstacleOutlines,
     find_nearest_points_on_chain,
 )
+from snakesim_hal.wire.messages import WorldModel
 
 # |n . t| of a contact; above it, the obstacle stands in front of the head.
 MAX_NORMAL_ALONG_BODY = 0.6
@@ -75,6 +76,15 @@ class NormalizedPush:
         return self.balance_residual < MAX_BALANCE_RESIDUAL and bool(
             (self.contact_forces > 0.0).any()
         )
+
+
+@dataclass(frozen=True)
+class PushSnapshot:
+    """The contacts of a world model, and the push that they allow."""
+
+    world: WorldModel
+    contacts: BodyContacts
+    push: NormalizedPush
 
 
 class PushLowPassFilter:

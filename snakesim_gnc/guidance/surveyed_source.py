@@ -76,8 +76,8 @@ class SurveyedSource(WorldSource):
     def make_world(self, clock: Clock) -> WorldModel | None:
         """Return the world model of surveyed obstacles, from the newest samples.
 
-        Without a contact sensor contacts are estimated, and without a pose sensor the pose is dead-reckoned. The world
-        model contains where they come from.
+        Without a contact sensor, contacts are estimated. Without a pose sensor, the pose comes from dead reckoning. The
+        world model contains where they come from.
 
         Args:
             clock: The current tick.
@@ -104,7 +104,7 @@ class SurveyedSource(WorldSource):
             pose = self._dead_reckoned_pose.update(
                 joints, contacts, are_contacts_estimated=estimated_contacts is not None
             )
-        assert pose is not None  # either measured or dead-reckoned
+        assert pose is not None  # measured, or by dead reckoning
         world = self._model.update(clock.tick, clock.timestamp_ns, joints, contacts, pose)
         if estimated_contacts is not None:
             world = mark_estimated(world, estimated_contacts)
