@@ -6,11 +6,11 @@ import random
 import pytest
 
 import snakesim_testing.isolation  # noqa: F401 - first: it fixes the arithmetic before NumPy is imported
+from snakesim_hal.base.process import make_collections_rare
 from snakesim_native.compile import SHIPPED_FOLDER, compile_all
 from snakesim_testing.hypothesis_profiles import load_profile
 
-# Otherwise the collector visits all that is imported for the tests again and again.
-gc.set_threshold(50_000, 10, 10)
+make_collections_rare()
 pytest_plugins = ["snakesim_testing.contract.plugin", "snakesim_testing.messages"]
 load_profile()
 

@@ -196,7 +196,7 @@ def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_recording_in_lockstep_waits_for_slow_disk_only(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tap_module, "MAX_QUEUED_BYTES", 100)
-    monkeypatch.setattr(tap_module, "DISK_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(tap_module, "DISK_TIMEOUT_S", 2.0)
     network = LocalNetwork()
     tap, publisher = (
         MessageTap(network.create_session()),
@@ -206,7 +206,7 @@ def test_recording_in_lockstep_waits_for_slow_disk_only(monkeypatch: pytest.Monk
     began = time.monotonic()
     for tick in range(200):
         publisher.put(TickDone(tick=tick))
-    assert 0.2 <= time.monotonic() - began < 10.0  # once, and not for each of the 200 messages
+    assert 2.0 <= time.monotonic() - began < 4.0  # it waits for the disk once
     assert tap.dropped_count_by_key.total() + len(tap.take_arrivals()) == 200
 
 

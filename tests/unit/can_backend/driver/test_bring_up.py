@@ -134,11 +134,11 @@ def test_bring_up_duplicate_module_id_is_detected_after_first_answer(modules: Mo
 
 def test_bring_up_ends_when_all_answered_or_at_timeout(modules: Modules) -> None:
     began = time.monotonic()
-    find_modules([modules.bus], 60.0)
-    assert time.monotonic() - began < 30.0
+    find_modules([modules.bus], 5.0)
+    assert time.monotonic() - began < 2.0
     began = time.monotonic()
     found = find_modules([ModuleBus(modules.near, range(1, 6))], 0.25)
-    assert 0.2 < time.monotonic() - began < 30.0
+    assert 0.2 < time.monotonic() - began < 2.0
     assert len(found) == 4
     assert 2 <= len(actions(modules.heard)) <= 6, "asks again, but not all the time"
 

@@ -12,6 +12,8 @@ from snakesim_operator.run import run_files as under_test
 from snakesim_operator.run.run_files import RunFiles
 from snakesim_testing.harness.wait import wait_until
 
+HANG_S = 30.0
+
 
 class Disk:
     """A disk that takes so many bytes more, or hangs."""
@@ -26,7 +28,7 @@ class Disk:
 
     def _take(self, size: int) -> int:
         if self.hangs:
-            self.goes_on.wait(30)
+            self.goes_on.wait(HANG_S)
         if self.space == 0:
             raise OSError(errno.ENOSPC, "No space left on device")
         taken = min(size, self.space)
@@ -111,10 +113,12 @@ def test_run_files_on_hanging_disk_block_nobody_within_bounded_memory(
     monkeypatch.setattr(under_test, "MAX_PENDING_BYTES", 10_000)
     files = RunFiles(tmp_path, lambda _: None)
     disk.hangs = True
-    for _ in range(1000):  # ends while the disk hangs, so no call waits for it
+    began = time.monotonic()
+    for _ in range(1000):
         files.append("a.log", b"x" * 100)
     assert sum(len(task.content) for task in files._tasks) <= 10_000
     assert files.close() == f"{tmp_path}: the disk has not answered for 0.3 s"
+    assert time.monotonic() - began < HANG_S / 2  # nobody waited until the disk went on
     disk.goes_on.set()
 
 
