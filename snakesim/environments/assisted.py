@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_gnc.control.service import SENSOR_MESSAGE_TYPES
+from snakesim_gnc.control.service.control_service import SENSOR_MESSAGE_TYPES
 from snakesim_hal.base.errors import BackendError, ControllerError, SnakesimError
 from snakesim_hal.controller import Controller, ControllerCommand, Observation, load_controller
 from snakesim_hal.model.fault_kinds import CONTROL

@@ -1,6 +1,6 @@
 """What the agents of many environments observe, and how far their robots have advanced, as rows of arrays.
 
-The parts of an observation are those of `snakesim_gnc.control.observations`, quantity_index policies read on a robot.
+The parts of an observation are those of `snakesim_gnc.control.observations`, which policies read on a robot.
 """
 
 import math

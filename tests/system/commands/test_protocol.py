@@ -10,7 +10,7 @@ from typing import Any, get_args
 import pytest
 import zenoh
 
-from snakesim_gnc.control.state_reports import TELEMETRY_PERIOD_S
+from snakesim_gnc.control.service.state_reports import TELEMETRY_PERIOD_S
 from snakesim_hal.host.status_reporter import STATUS_PERIOD_NS
 from snakesim_hal.network.endpoint import DEFAULT_ENDPOINT
 from snakesim_hal.network.session import ConnectionSettings, open_session

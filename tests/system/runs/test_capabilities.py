@@ -1,7 +1,7 @@
 """What joints can do and measure: what needs no more runs. Who says that it needs more is refused: refusals.toml."""
 
-from snakesim_gnc.control.guarded import GuardedController
 from snakesim_gnc.control.hold import HoldPose
+from snakesim_gnc.control.service.guarded import GuardedController
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.controller import NoParameters, Observation
 from snakesim_hal.model.robot import describe_robot

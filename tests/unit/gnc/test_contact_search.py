@@ -9,8 +9,8 @@ import onnxruntime
 import pytest
 
 from snakesim.training.form import PolicyArrays
-from snakesim_gnc.control.force_feedback_wave import ForceFeedbackWave
 from snakesim_gnc.control.obstacle_aided import ObstacleAided, ObstacleAidedParameters
+from snakesim_gnc.control.obstacle_aided.force_feedback_wave import ForceFeedbackWave
 from snakesim_gnc.control.policy import POLICY_FOLDER
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import ControllerCommand

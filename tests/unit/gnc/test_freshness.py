@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_gnc.control.freshness import AgeLimits
+from snakesim_gnc.control.service.freshness import AgeLimits
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import RobotDescription, SensorDescription, Trajectory, WorldModel
 from snakesim_testing.gnc.stage import make_world

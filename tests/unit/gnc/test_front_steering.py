@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.front_steering import compute_front_corrections_rad
+from snakesim_gnc.control.obstacle_aided.front_steering import compute_front_corrections_rad
 from snakesim_gnc.geometry.body_on_path import compute_chain_points
 
 SEGMENTS_M = [0.055, *[0.11] * 12, 0.055]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.guarded import GuardedController
+from snakesim_gnc.control.service.guarded import GuardedController
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.controller import (
     Controller,

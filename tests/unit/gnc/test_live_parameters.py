@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from snakesim_gnc.control.live_parameters import LiveParameters
+from snakesim_gnc.control.service.live_parameters import LiveParameters
 from snakesim_hal.model.scenario import load_scenario
 from snakesim_hal.network.client import HostClient
 from snakesim_hal.network.local_network import LocalNetwork, LocalSession

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from snakesim_gnc.control.push import BodyContacts, find_body_contacts, solve_push
+from snakesim_gnc.control.obstacle_aided.push import BodyContacts, find_body_contacts, solve_push
 from snakesim_gnc.geometry.planar import compute_wrenches
 from snakesim_gnc.navigation.path_search.margin import MAX_CONTACT_FORCE_N, compute_margins_n
 from snakesim_hal.model.outlines import ObstacleOutlines

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.control.contact_forces import NetContactForce
-from snakesim_gnc.control.push import find_body_contacts, solve_push
-from snakesim_gnc.control.push_report import explain_push_standstill, make_push_point_messages
+from snakesim_gnc.control.obstacle_aided.push import find_body_contacts, solve_push
+from snakesim_gnc.control.obstacle_aided.push_report import (
+    explain_push_standstill,
+    make_push_point_messages,
+)
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from snakesim_gnc.control.advance import RecentAdvance
-from snakesim_gnc.control.states import determine_locomotion_state
+from snakesim_gnc.control.service.advance import RecentAdvance
+from snakesim_gnc.control.service.states import determine_locomotion_state
 
 READY = {"usable_push_points": 3, "recent_displacement_m": 0.1}
 

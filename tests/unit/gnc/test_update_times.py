@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_gnc.control.update_times import UpdateTimes
+from snakesim_gnc.control.service.update_times import UpdateTimes
 from snakesim_testing.gnc.stage import make_stage
 
 ROBOT = make_stage(3).robot

@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_gnc.control.live_parameters import LiveParameters
+from snakesim_gnc.control.service.live_parameters import LiveParameters
 from snakesim_hal.base.errors import ControllerError, RefusedError
 from snakesim_hal.model.scenario import load_scenario
 from snakesim_hal.network.client import HostClient

@@ -18,7 +18,10 @@ import math
 import numpy as np
 from msgspec.structs import replace
 
-from snakesim_gnc.control.force_feedback_wave import ForceFeedbackWave, compute_joint_spacing_ratio
+from snakesim_gnc.control.obstacle_aided.force_feedback_wave import (
+    ForceFeedbackWave,
+    compute_joint_spacing_ratio,
+)
 from snakesim_gnc.control.standstill import StandstillDetector
 from snakesim_gnc.control.undulation import (
     HeadSteeredUndulation,

@@ -8,11 +8,11 @@ this process at once.
 import time
 from collections.abc import Sequence
 
-from snakesim_gnc.control.freshness import AgeLimits
-from snakesim_gnc.control.guarded import GuardedController
-from snakesim_gnc.control.live_parameters import LiveParameters
-from snakesim_gnc.control.state_reports import StateReports
-from snakesim_gnc.control.update_times import UpdateTimes
+from snakesim_gnc.control.service.freshness import AgeLimits
+from snakesim_gnc.control.service.guarded import GuardedController
+from snakesim_gnc.control.service.live_parameters import LiveParameters
+from snakesim_gnc.control.service.state_reports import StateReports
+from snakesim_gnc.control.service.update_times import UpdateTimes
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.controller import Observation, SensorSamples, Task

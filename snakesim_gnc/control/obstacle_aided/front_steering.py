@@ -14,8 +14,8 @@ The joints between these links carry no contact force, so they can be in positio
 
 import numpy as np
 
+from snakesim_gnc.control.obstacle_aided.push import PushSnapshot
 from snakesim_gnc.control.progress import BodyLocation
-from snakesim_gnc.control.push import PushSnapshot
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation

@@ -2,9 +2,9 @@
 
 import msgspec
 
-from snakesim_gnc.control.advance import RecentAdvance
 from snakesim_gnc.control.contact_forces import MeasuredContacts
-from snakesim_gnc.control.states import determine_locomotion_state
+from snakesim_gnc.control.service.advance import RecentAdvance
+from snakesim_gnc.control.service.states import determine_locomotion_state
 from snakesim_hal.controller import Telemetry
 from snakesim_hal.wire.messages import (
     Clock,

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_gnc.control.guarded import GuardedController
+from snakesim_gnc.control.service.guarded import GuardedController
 from snakesim_hal.base.errors import ConfigError, ControllerError, WireError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.controller import Controller, decode_parameters, load_controller
