@@ -2,9 +2,9 @@
 
 from typing import Any, get_args
 
-from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
-from snakesim_gnc.guidance.scan import RangeNoise, RangingSample
+from snakesim_gnc.guidance.pose.localization import PoseNoise
+from snakesim_gnc.guidance.ranging.scan import RangeNoise, RangingSample
 from snakesim_gnc.guidance.world_source import WorldSource, make_start_pose
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.sensors import DepthCamera, DistanceSensor

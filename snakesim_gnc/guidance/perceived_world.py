@@ -9,16 +9,16 @@ from collections import Counter
 
 import numpy as np
 
-from snakesim_gnc.guidance.body_history import BasePose, BodyFrames
-from snakesim_gnc.guidance.core import transform_contact
-from snakesim_gnc.guidance.depth_scan import CameraIntrinsics, DepthScanner, decode_depth_m
-from snakesim_gnc.guidance.ground import fit_plane_under_body
-from snakesim_gnc.guidance.localization import PoseLocalizer, PoseNoise
-from snakesim_gnc.guidance.obstacle_map import ObstacleMap
-from snakesim_gnc.guidance.scan import AzimuthScan, RangeNoise, RangingSample, make_scan
-from snakesim_gnc.guidance.scan_match import match_scan
+from snakesim_gnc.guidance.mapping.obstacle_map import ObstacleMap
+from snakesim_gnc.guidance.pose.body_history import BasePose, BodyFrames
+from snakesim_gnc.guidance.pose.localization import PoseLocalizer, PoseNoise, compute_confidence
+from snakesim_gnc.guidance.pose.scan_match import match_scan
+from snakesim_gnc.guidance.ranging.depth_scan import CameraIntrinsics, DepthScanner, decode_depth_m
+from snakesim_gnc.guidance.ranging.ground import fit_plane_under_body
+from snakesim_gnc.guidance.ranging.scan import AzimuthScan, RangeNoise, RangingSample, make_scan
+from snakesim_gnc.guidance.surveyed_world import transform_contact
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_hal.model.kinematics import quaternion_from_rotation, rotation_from_quaternion
 from snakesim_hal.wire.messages import (
     Contacts,
     DepthImage,
@@ -34,7 +34,6 @@ from snakesim_hal.wire.quantities import MAX_CONTACTS
 # Contacts are mapped this often: the body slides a few millimeters meanwhile.
 CONTACT_MAPPING_PERIOD_NS = 50_000_000
 OWN_BODY_MARGIN_M = 0.01  # beyond the body's radius: nearer points of a scan are on the body itself
-HALF_CONFIDENCE_SD_M = 0.05  # of the position, at which the confidence in it is one half
 # Part of a contact's normal: with more, the body lies on the obstacle.
 MAX_VERTICAL_NORMAL_PART = 0.7
 MAX_TRUSTED_POSE_AGE_NS = 300_000_000  # with a pose newer than this, scans do not correct the base
@@ -304,50 +303,6 @@ class PerceivedWorld:
     def _compute_position_variance_m2(self) -> float:
         """Return the mean variance of the base's position over x and y."""
         return 0.5 * float(np.trace(self.localizer.covariance[:2, :2]))
-
-
-def compute_confidence(position_sd_m: float) -> float:
-    """Return the confidence in a position, 0 to 1, by its standard deviation."""
-    return 1.0 / (1.0 + (position_sd_m / HALF_CONFIDENCE_SD_M) ** 2)
-
-
-def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, float]:
-    """Return the unit quaternion wxyz of a rotation matrix (3, 3).
-
-    The rows of a symmetric matrix are 4 q_i q for i = w, x, y, z. The one with the largest diagonal entry is the most
-    precise; it only has to be normalized.
-    """
-    m = rotation
-    four_times_products = np.array(
-        [
-            [
-                1 + m[0, 0] + m[1, 1] + m[2, 2],
-                m[2, 1] - m[1, 2],
-                m[0, 2] - m[2, 0],
-                m[1, 0] - m[0, 1],
-            ],
-            [
-                m[2, 1] - m[1, 2],
-                1 + m[0, 0] - m[1, 1] - m[2, 2],
-                m[1, 0] + m[0, 1],
-                m[0, 2] + m[2, 0],
-            ],
-            [
-                m[0, 2] - m[2, 0],
-                m[1, 0] + m[0, 1],
-                1 - m[0, 0] + m[1, 1] - m[2, 2],
-                m[2, 1] + m[1, 2],
-            ],
-            [
-                m[1, 0] - m[0, 1],
-                m[0, 2] + m[2, 0],
-                m[2, 1] + m[1, 2],
-                1 - m[0, 0] - m[1, 1] + m[2, 2],
-            ],
-        ]
-    )
-    best_row = four_times_products[np.argmax(np.diagonal(four_times_products))]
-    return tuple((best_row / np.linalg.norm(best_row)).tolist())
 
 
 def _compute_sensor_pose(body: BodyFrames, sensor: RangingSample) -> tuple[Floats, Floats]:

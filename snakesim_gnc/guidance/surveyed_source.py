@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
-from snakesim_gnc.guidance.core import SurveyedWorld
-from snakesim_gnc.guidance.dead_reckoned_pose import DeadReckonedPose
-from snakesim_gnc.guidance.estimated_contacts import (
+from snakesim_gnc.guidance.contacts.estimated_contacts import (
     ContactEstimator,
     EstimatedContacts,
     can_estimate_contacts,
     mark_estimated,
 )
+from snakesim_gnc.guidance.pose.dead_reckoned_pose import DeadReckonedPose
+from snakesim_gnc.guidance.surveyed_world import SurveyedWorld
 from snakesim_gnc.guidance.world_source import WorldSource, make_start_pose
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.model.scenario import RunConfig, get_noisy_obstacle_map

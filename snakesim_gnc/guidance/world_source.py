@@ -4,7 +4,7 @@ from typing import Protocol
 
 import numpy as np
 
-from snakesim_gnc.guidance.body_history import BasePose
+from snakesim_gnc.guidance.pose.body_history import BasePose
 from snakesim_hal.model.scenario import RunConfig, compute_start_pose
 from snakesim_hal.wire.messages import Clock, RobotDescription, WorldModel
 

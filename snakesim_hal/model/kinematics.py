@@ -34,36 +34,36 @@ def quaternion_from_yaw(yaw_rad: float) -> tuple[float, float, float, float]:
     return (float(np.cos(half_rad)), 0.0, 0.0, float(np.sin(half_rad)))
 
 
+def quaternion_from_rotation(rotation: Floats) -> tuple[float, float, float, float]:
+    """Return the unit quaternion wxyz of a rotation matrix (3, 3)."""
+    w, x, y, z = quaternions_from_rotations(rotation[None])[0].tolist()
+    return (w, x, y, z)
+
+
 def quaternions_from_rotations(rotations: Floats) -> Floats:
     """Convert rotation matrices (n, 3, 3) to unit quaternions wxyz (n, 4).
 
     The elements of a rotation matrix give all products 4 q_i q_j of two quaternion components. Every row of the
-    matrix of these products is a multiple of the quaternion. The row of the largest component is the most precise one,
-    so it is taken and normalized.
+    matrix of these products is a multiple of the quaternion. The row with the largest diagonal element is the most
+    precise one, so it is taken and normalized.
     """
-    r = rotations
-    trace = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
-    four_squares_minus_1 = [trace, *(2 * r[:, i, i] - trace for i in range(3))]  # of w, x, y, z
-    squares = np.stack(four_squares_minus_1, axis=1)
-    w, x, y, z = np.sqrt(np.maximum(1 + squares, 0)).T / 2
-    magnitudes = np.stack([w, x, y, z], axis=1)  # (n, 4)
-
-    four_wx = r[:, 2, 1] - r[:, 1, 2]
-    four_wy = r[:, 0, 2] - r[:, 2, 0]
-    four_wz = r[:, 1, 0] - r[:, 0, 1]
-    four_xy = r[:, 1, 0] + r[:, 0, 1]
-    four_xz = r[:, 0, 2] + r[:, 2, 0]
-    four_yz = r[:, 2, 1] + r[:, 1, 2]
-    product_rows = [
-        (4 * w * w, four_wx, four_wy, four_wz),
-        (four_wx, 4 * x * x, four_xy, four_xz),
-        (four_wy, four_xy, 4 * y * y, four_yz),
-        (four_wz, four_xz, four_yz, 4 * z * z),
-    ]
-    products = np.stack([np.stack(row, axis=1) for row in product_rows], axis=1)  # (n, 4, 4)
-
-    largest = np.argmax(magnitudes, axis=1)
-    multiples = products[np.arange(len(r)), largest]
+    m = np.moveaxis(rotations, 0, -1)  # (3, 3, n)
+    four_wx = m[2, 1] - m[1, 2]
+    four_wy = m[0, 2] - m[2, 0]
+    four_wz = m[1, 0] - m[0, 1]
+    four_xy = m[1, 0] + m[0, 1]
+    four_xz = m[0, 2] + m[2, 0]
+    four_yz = m[2, 1] + m[1, 2]
+    four_products = np.array(
+        [
+            [1 + m[0, 0] + m[1, 1] + m[2, 2], four_wx, four_wy, four_wz],
+            [four_wx, 1 + m[0, 0] - m[1, 1] - m[2, 2], four_xy, four_xz],
+            [four_wy, four_xy, 1 - m[0, 0] + m[1, 1] - m[2, 2], four_yz],
+            [four_wz, four_xz, four_yz, 1 - m[0, 0] - m[1, 1] + m[2, 2]],
+        ]
+    )  # (4, 4, n)
+    largest = np.argmax(np.diagonal(four_products), axis=1)  # (n,)
+    multiples = four_products[largest, :, np.arange(len(rotations))]  # (n, 4)
     return multiples / np.linalg.norm(multiples, axis=1, keepdims=True)
 
 

@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from snakesim_gnc.guidance.depth_scan import CameraIntrinsics
-from snakesim_gnc.guidance.scan import AzimuthScan, RangeNoise, make_scan
+from snakesim_gnc.guidance.ranging.depth_scan import CameraIntrinsics
+from snakesim_gnc.guidance.ranging.scan import AzimuthScan, RangeNoise, make_scan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage, KnownObstacle, RangeScan
 from snakesim_operator.features.robots.urdf_tree import make_rotation_from_rpy

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from snakesim_gnc.guidance.body_history import BasePose
-from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
-from snakesim_gnc.guidance.scan import RangeNoise
+from snakesim_gnc.guidance.pose.body_history import BasePose
+from snakesim_gnc.guidance.pose.localization import PoseNoise
+from snakesim_gnc.guidance.ranging.scan import RangeNoise
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import (
     compute_link_frames,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
+from snakesim_gnc.guidance.contacts.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.backend import Samples
 from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_hal.model.plugins import BACKENDS, register_plugin_temporarily

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
+from snakesim_gnc.guidance.contacts.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.model.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose

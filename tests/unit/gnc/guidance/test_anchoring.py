@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.anchoring import (
+from snakesim_gnc.guidance.pose.anchoring import (
     ESTIMATED_CONTACT_TRUST,
     MEASURED_CONTACT_TRUST,
     ObstacleAnchors,
 )
-from snakesim_gnc.guidance.body_history import BasePose
-from snakesim_gnc.guidance.localization import PoseLocalizer, PoseNoise
+from snakesim_gnc.guidance.pose.body_history import BasePose
+from snakesim_gnc.guidance.pose.localization import PoseLocalizer, PoseNoise
 from snakesim_hal.model.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import Contact, KnownObstacle
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_robot

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.body_history import BasePose, BodyHistory
-from snakesim_gnc.guidance.perceived_world import quaternion_from_rotation
-from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_gnc.guidance.pose.body_history import BasePose, BodyHistory
+from snakesim_hal.model.kinematics import quaternion_from_rotation, rotation_from_quaternion
 from snakesim_testing.gnc.rendered import make_rotation
 from snakesim_testing.gnc.sliding_snake import STEP_NS, SlidingSnake, make_random_obstacles
 

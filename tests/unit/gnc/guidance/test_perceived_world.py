@@ -4,8 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_gnc.guidance.localization import PoseNoise
 from snakesim_gnc.guidance.perceived_world import PerceivedWorld
+from snakesim_gnc.guidance.pose.localization import PoseNoise
 from snakesim_hal.wire.messages import Contacts, WorldModel
 from snakesim_operator.results.metrics.map_score import MapScore, align_map, score_map
 from snakesim_testing.gnc.rendered import make_cylinder, make_hills, render_lidar_scan

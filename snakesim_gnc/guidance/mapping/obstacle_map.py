@@ -13,11 +13,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.circle_fit import PRIOR_RADIUS_M, PRIOR_RADIUS_SD_M
-from snakesim_gnc.guidance.clusters import find_clusters
-from snakesim_gnc.guidance.scan import MAX_RANGE_M, AzimuthScan
-from snakesim_gnc.guidance.surfaces import MAX_SEEN_THROUGH_COUNT
-from snakesim_gnc.guidance.tracks import (
+from snakesim_gnc.guidance.mapping.circle_fit import PRIOR_RADIUS_M, PRIOR_RADIUS_SD_M
+from snakesim_gnc.guidance.mapping.clusters import find_clusters
+from snakesim_gnc.guidance.mapping.surfaces import MAX_SEEN_THROUGH_COUNT
+from snakesim_gnc.guidance.mapping.tracks import (
     HIT_LOG_ODDS,
     MIN_KEPT_LOG_ODDS,
     MIN_REPORTED_LOG_ODDS,
@@ -28,6 +27,7 @@ from snakesim_gnc.guidance.tracks import (
     get_position_sds_m,
     make_outlines,
 )
+from snakesim_gnc.guidance.ranging.scan import MAX_RANGE_M, AzimuthScan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle

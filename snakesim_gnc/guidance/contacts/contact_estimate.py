@@ -28,14 +28,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.planar_dynamics import (
+from snakesim_gnc.guidance.contacts.planar_dynamics import (
     ChainDynamics,
     compute_inertia_terms,
     compute_unit_friction,
     estimate_accelerations,
     estimate_angular_velocities,
 )
-from snakesim_gnc.guidance.sparse_fit import MIN_SIGNIFICANCE_SD, fit_fewest_columns
+from snakesim_gnc.guidance.contacts.sparse_fit import MIN_SIGNIFICANCE_SD, fit_fewest_columns
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import Imu, Pose, RobotDescription
 from snakesim_hal.wire.quantities import Vector

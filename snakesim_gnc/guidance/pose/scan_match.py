@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.scan import AzimuthScan
-from snakesim_gnc.guidance.tracks import ObstacleTrack, get_position_sds_m, make_outlines
+from snakesim_gnc.guidance.mapping.tracks import ObstacleTrack, get_position_sds_m, make_outlines
+from snakesim_gnc.guidance.ranging.scan import AzimuthScan
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import ObstacleOutlines
 

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from snakesim_gnc.guidance.anchoring import (
+from snakesim_gnc.guidance.pose.anchoring import (
     ESTIMATED_CONTACT_TRUST,
     MEASURED_CONTACT_TRUST,
     ObstacleAnchors,
 )
-from snakesim_gnc.guidance.body_history import BasePose
-from snakesim_gnc.guidance.localization import PoseLocalizer, PoseNoise
-from snakesim_gnc.guidance.perceived_world import compute_confidence, quaternion_from_rotation
+from snakesim_gnc.guidance.pose.body_history import BasePose
+from snakesim_gnc.guidance.pose.localization import PoseLocalizer, PoseNoise, compute_confidence
+from snakesim_hal.model.kinematics import quaternion_from_rotation
 from snakesim_hal.wire.messages import (
     Contacts,
     JointState,

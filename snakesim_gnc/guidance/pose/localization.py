@@ -11,13 +11,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from snakesim_gnc.guidance.body_history import (
+from snakesim_gnc.guidance.pose.body_history import (
     BasePose,
     BodyHistory,
     make_rotation_about_z,
     wrap_angle,
 )
-from snakesim_gnc.guidance.odometry import ChainOdometry, OdometryStep
+from snakesim_gnc.guidance.pose.odometry import ChainOdometry, OdometryStep
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
 from snakesim_hal.wire.messages import Contacts, Imu, JointState, Pose, RobotDescription
@@ -43,7 +43,13 @@ MAX_AGE_NS = 60_000_000  # contacts and gyroscope readings count for joint state
 # Leveling by the tail link's accelerometer.
 TILT_FILTER_TIME_CONSTANT_S = 0.5  # time over which accelerations are averaged
 IMU_PERIOD_S = 0.02  # between two readings
+HALF_CONFIDENCE_SD_M = 0.05  # of the position, at which the confidence in it is one half
 MIN_NORM = 1e-6  # of a vector that is normalized; avoids a division by zero
+
+
+def compute_confidence(position_sd_m: float) -> float:
+    """Return the confidence in a position, 0 to 1, by its standard deviation."""
+    return 1.0 / (1.0 + (position_sd_m / HALF_CONFIDENCE_SD_M) ** 2)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.circle_fit import OUTLIER_THRESHOLD_SD, soften_weights
+from snakesim_gnc.guidance.mapping.circle_fit import OUTLIER_THRESHOLD_SD, soften_weights
 from snakesim_hal.base.arrays import Floats
 
 Bools = NDArray[np.bool_]

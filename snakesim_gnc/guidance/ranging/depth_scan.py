@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.ground import MAX_FIT_RANGE_M, compute_tolerance_m, refine_plane
-from snakesim_gnc.guidance.scan import MAX_RANGE_M, OBSTACLE_BAND_M, AzimuthScan, RangeNoise
+from snakesim_gnc.guidance.ranging.ground import MAX_FIT_RANGE_M, compute_tolerance_m, refine_plane
+from snakesim_gnc.guidance.ranging.scan import MAX_RANGE_M, OBSTACLE_BAND_M, AzimuthScan, RangeNoise
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.wire.messages import DepthImage
 

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from snakesim_gnc.guidance.body_history import BodyFrames
-from snakesim_gnc.guidance.localization import PoseLocalizer
+from snakesim_gnc.guidance.pose.body_history import BodyFrames
+from snakesim_gnc.guidance.pose.localization import PoseLocalizer
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import Contact, KnownObstacle, RobotDescription

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_gnc.guidance.scan import AzimuthScan
+from snakesim_gnc.guidance.ranging.scan import AzimuthScan
 from snakesim_hal.base.arrays import Floats
 
 Indices = NDArray[np.intp]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from snakesim_gnc.guidance.contact_estimate import EstimatedPush, estimate_pushes
+from snakesim_gnc.guidance.contacts.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.model.kinematics import compute_contact_tangents
 from snakesim_hal.wire.messages import (
     Contact,
