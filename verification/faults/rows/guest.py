@@ -104,7 +104,7 @@ def _run_ended_host_trial(
             time.sleep(OBSERVED_S)
             return _judge_ended_host_trial(robot, signal_ns, fault_delays_ms)
     except TrialError as error:
-        print(f"    made again: {error}", flush=True)
+        print(f"    repeated: {error}", flush=True)
         return None
 
 
