@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from snakesim_hal.base.process import make_child_environment, make_python_command
-from verification.mutation.trial import TRIED_BY
+from verification.mutation.trial import TESTS_BY_FILE
 
 ROOT = Path(__file__).parents[1]
 WITH_VCAN = ("deploy/vm/with_vcan.py", "--", sys.executable, "-m")
@@ -131,7 +131,7 @@ PARTS = {
         (
             "verification.mutation",
             "--files",
-            *sorted(TRIED_BY.keys() - {"lease.py", "lifecycle.py", "stop_ramp.py"}),
+            *sorted(TESTS_BY_FILE.keys() - {"lease.py", "lifecycle.py", "stop_ramp.py"}),
         ),
     ),
 }

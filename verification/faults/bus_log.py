@@ -1,4 +1,4 @@
-"""What went over a robot's bus, from the driver's own log in candump's format."""
+"""Reads the frames of a robot's CAN bus from the log that the driver writes in the format of candump."""
 
 from pathlib import Path
 
@@ -6,27 +6,31 @@ from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, Opcode, parse_opcode
 
 
-def read(path: Path) -> list[CanFrame]:
-    """Every frame, in its order; none when nothing was logged. A last line that is torn is left out."""
-    found: list[CanFrame] = []
-    for line in path.read_text().splitlines(keepends=True) if path.is_file() else []:
-        if line.endswith("\n"):
-            number, _, data = line.split()[2].partition("#")
-            found.append(CanFrame(int(number, 16), bytes.fromhex(data)))
-    return found
+def read_frames(path: Path) -> list[CanFrame]:
+    """Return every complete frame of a log, oldest first. A missing log contains no frames."""
+    if not path.is_file():
+        return []
+    lines = path.read_text().splitlines(keepends=True)
+    return [_parse_frame(line) for line in lines if line.endswith("\n")]
 
 
-def commands(frames: list[CanFrame], action: CommandAction) -> int:
-    """How many Commands of a kind the driver sent."""
+def count_commands(frames: list[CanFrame], action: CommandAction) -> int:
+    """Return how many Command frames with an action the driver sent."""
     layout = load_layouts()[Opcode.COMMAND]
-    sent = [
-        layout.decode(frame.data)["action"]
+    return sum(
+        layout.decode(frame.data)["action"] == action
         for frame in frames
         if parse_opcode(frame.id) == Opcode.COMMAND
-    ]
-    return sent.count(action)
+    )
 
 
-def setpoints(frames: list[CanFrame]) -> int:
-    """How many setpoints the driver sent."""
+def count_setpoints(frames: list[CanFrame]) -> int:
+    """Return how many setpoint frames the driver sent."""
     return sum(parse_opcode(frame.id) == Opcode.SET_POINT for frame in frames)
+
+
+def _parse_frame(line: str) -> CanFrame:
+    """Parse a line such as `(1700000000.000000) can0 101#0102`."""
+    _, _, text = line.split()[:3]
+    frame_id, _, data = text.partition("#")
+    return CanFrame(int(frame_id, 16), bytes.fromhex(data))

@@ -1,4 +1,4 @@
-"""Writes the fault table from the raw results: all measurements as CSV, and a page that summarizes them."""
+"""Writes the fault table from the raw results: a CSV file with every measurement, and a page that summarizes them."""
 
 import csv
 import io
@@ -7,12 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from verification.faults.results import ROOT, FaultResults
-from verification.faults.row import TRIALS, FaultHeading, FaultRow, RowResult, judge
+from verification.faults.row import (
+    TRIALS,
+    Backend,
+    FaultHeading,
+    FaultRow,
+    RowResult,
+    judge_row,
+)
 from verification.faults.table import HEADINGS
 from verification.faults.table.row_kinds import LEASE_MS, PERIOD_MS
 
 PAGE = ROOT / "docs" / "benchmarks" / "faults.md"
-TABLE_NAME = "fault-table.csv"  # beside the page
+TABLE_NAME = "fault-table.csv"  # in the folder of the page
 COLUMNS: tuple[str, ...] = (
     "row",
     "fault",
@@ -46,7 +53,7 @@ INTRODUCTION = """\
 This page shows how the robot reacts to each fault that we injected, and whether it reacted in time. It answers the
 question: if a process, the network, a bus or a drive fails, does the robot stop?
 
-**{met} of {count} measurements are met**, {failed} are not met, and {left} were not run{left_backends}. A measurement
+**{met} of {count} measurements are met**, {failed} are not met, and {not_run} were not run{where}. A measurement
 is met if the robot reacted as expected within the deadline, in its worst trial.
 
 Each row injects a fault at least {trials} times on each backend. The robot is the 13-joint snake of the scenario
@@ -69,48 +76,59 @@ To measure one row again, run `python -m verification.faults --rows NAME --write
 """
 
 Results = Mapping[tuple[str, str], RowResult]
+"""Results by the name of the row and the backend."""
+
+Measurement = tuple[FaultRow, Backend]
 
 
-def write(store: FaultResults, page: Path = PAGE) -> Path:
-    """Write the page, and the table beside it. Return the path of the page."""
+def write_page(store: FaultResults, page: Path = PAGE) -> Path:
+    """Write the page, and the table into the same folder. Return the path of the page."""
     results = store.read()
     page.with_name(TABLE_NAME).write_text(_format_table(results), encoding="utf-8")
-    page.write_text("\n".join(_page_lines(results)), encoding="utf-8")
+    page.write_text("\n".join(_format_page(results)), encoding="utf-8")
     return page
 
 
-def _page_lines(results: Results) -> Iterator[str]:
-    measurable = [pair for heading in HEADINGS for pair in _measurable(heading)]
-    done = [pair for pair in measurable if _key(pair) in results]
-    met = sum(_is_met(pair, results) for pair in done)
-    backends_not_run = sorted({pair[1] for pair in measurable if _key(pair) not in results})
-    yield INTRODUCTION.format(
-        days=_format_days(list(results.values())),
-        table=TABLE_NAME,
-        met=met,
-        count=len(measurable),
-        failed=len(done) - met,
-        left=len(measurable) - len(done),
-        left_backends=f" ({', '.join(backends_not_run)})" if backends_not_run else "",
-        trials=TRIALS,
-        period=PERIOD_MS,
-        lease=LEASE_MS,
-    )
+# --- the page ------------------------------------------------------------------------------------------------------
+
+
+def _format_page(results: Results) -> Iterator[str]:
+    """Yield the paragraphs of the page, and one line for each heading."""
+    yield _format_introduction(results)
     yield "| fault | expected behavior | met |"
     yield "|---|---|---|"
     for heading in HEADINGS:
-        pairs = _measurable(heading)
-        count = sum(_is_met(pair, results) for pair in pairs)
-        text = f"{count} of {len(pairs)}"
-        if count < len(pairs):
-            text = f"**{text}**"
-        yield f"| {heading.fault} | {heading.expected} | {text} |"
+        measurements = _list_measurements(heading)
+        met_count = _count_met(measurements, results)
+        cell = f"{met_count} of {len(measurements)}"
+        if met_count < len(measurements):
+            cell = f"**{cell}**"
+        yield f"| {heading.fault} | {heading.expected} | {cell} |"
     yield ""
     yield EXPLANATION
 
 
+def _format_introduction(results: Results) -> str:
+    measurements = [pair for heading in HEADINGS for pair in _list_measurements(heading)]
+    not_run = [pair for pair in measurements if _find_result(pair, results) is None]
+    met_count = _count_met(measurements, results)
+    backends_not_run = sorted({backend for _, backend in not_run})
+    return INTRODUCTION.format(
+        days=_format_days(list(results.values())),
+        table=TABLE_NAME,
+        met=met_count,
+        count=len(measurements),
+        failed=len(measurements) - len(not_run) - met_count,
+        not_run=len(not_run),
+        where=f" ({', '.join(backends_not_run)})" if backends_not_run else "",
+        trials=TRIALS,
+        period=PERIOD_MS,
+        lease=LEASE_MS,
+    )
+
+
 def _format_days(results: Sequence[RowResult]) -> str:
-    """Return when the results were measured."""
+    """Return the first and the last day of the measurements as text, or an empty text without results."""
     days = sorted({result.when.split()[0] for result in results})
     if not days:
         return ""
@@ -119,19 +137,28 @@ def _format_days(results: Sequence[RowResult]) -> str:
     return f", measured from {days[0]} to {days[-1]}"
 
 
-def _measurable(heading: FaultHeading) -> list[tuple[FaultRow, str]]:
-    """Return row and backend of each measurement; a row that does not apply to a backend is left out."""
-    return [(row, backend) for row in heading.rows for backend in row.backends()]
+def _list_measurements(heading: FaultHeading) -> list[Measurement]:
+    """Return each row of a heading with each backend to which it applies."""
+    return [(row, backend) for row in heading.rows for backend in row.list_backends()]
 
 
-def _key(pair: tuple[FaultRow, str]) -> tuple[str, str]:
-    row, backend = pair
-    return row.name, backend
+def _find_result(measurement: Measurement, results: Results) -> RowResult | None:
+    row, backend = measurement
+    return results.get((row.name, backend))
 
 
-def _is_met(pair: tuple[FaultRow, str], results: Results) -> bool:
-    result = results.get(_key(pair))
-    return result is not None and judge(pair[0], result).met
+def _count_met(measurements: Sequence[Measurement], results: Results) -> int:
+    """Return how many measurements were made and are met."""
+    met_count = 0
+    for measurement in measurements:
+        row, _ = measurement
+        result = _find_result(measurement, results)
+        if result is not None and judge_row(row, result).met:
+            met_count += 1
+    return met_count
+
+
+# --- the table -----------------------------------------------------------------------------------------------------
 
 
 def _format_table(results: Results) -> str:
@@ -141,39 +168,46 @@ def _format_table(results: Results) -> str:
     writer.writeheader()
     for heading in HEADINGS:
         for row in heading.rows:
-            for backend, measure in row.measures.items():
-                cells: dict[str, Any] = {
-                    "row": row.name,
-                    "fault": row.fault,
-                    "backend": "sim and can" if backend == "both" else backend,
-                    "expected": row.expected,
-                    "deadline": row.deadline,
-                    "limit": f"{row.limit:g}",
-                    "unit": row.unit,
-                }
-                result = results.get((row.name, backend))
-                if isinstance(measure, str):
-                    cells["result"] = f"not applicable: {measure}"
-                elif result is None:
-                    cells["result"] = "not run"
-                else:
-                    cells |= _measured_cells(row, result)
-                writer.writerow(cells)
+            for backend in row.measures:
+                writer.writerow(_make_cells(row, backend, results))
     return text.getvalue()
 
 
-def _measured_cells(row: FaultRow, result: RowResult) -> dict[str, Any]:
-    """Return the cells of a measurement that was made."""
-    verdict = judge(row, result)
+def _make_cells(row: FaultRow, backend: Backend, results: Results) -> dict[str, Any]:
+    """Return the cells of a line of the table by column."""
+    cells: dict[str, Any] = {
+        "row": row.name,
+        "fault": row.fault,
+        "backend": "sim and can" if backend == "both" else backend,
+        "expected": row.expected,
+        "deadline": row.deadline,
+        "limit": f"{row.limit:g}",
+        "unit": row.unit,
+    }
+    measure = row.measures[backend]
+    result = _find_result((row, backend), results)
+    if isinstance(measure, str):
+        cells["result"] = f"not applicable: {measure}"
+    elif result is None:
+        cells["result"] = "not run"
+    else:
+        cells |= _make_result_cells(row, result)
+    return cells
+
+
+def _make_result_cells(row: FaultRow, result: RowResult) -> dict[str, Any]:
+    """Return the cells that a measurement adds to its line."""
+    verdict = judge_row(row, result)
+    late_ms = [trial.late_ms for trial in result.trials if trial.late_ms]
     return {
         "median": _format_number(verdict.median),
         "worst": _format_number(verdict.worst),
-        "max_late_ms": _format_number(_max_late_ms(result)),
+        "max_late_ms": _format_number(max(late_ms, default=None)),
         "trials": len(result.trials),
         "trials_wanted": max(TRIALS, row.min_trials),
         "retried": result.retried,
         "result": "met" if verdict.met else f"not met: {verdict.reason}",
-        **_recovery_cells(result),
+        **_make_recovery_cells(result),
         "notes": "; ".join(result.notes),
         "when": result.when,
         "took_s": f"{result.took_s:.0f}",
@@ -182,22 +216,16 @@ def _measured_cells(row: FaultRow, result: RowResult) -> dict[str, Any]:
     }
 
 
-def _max_late_ms(result: RowResult) -> float | None:
-    """Return the largest delay of a tick of the host; None if the row does not measure it."""
-    late_ms = [trial.late_ms for trial in result.trials if trial.late_ms]
-    return max(late_ms, default=None)
-
-
-def _recovery_cells(result: RowResult) -> dict[str, Any]:
-    """Return the cells about the recovery; none if there was nothing to recover from."""
-    tried = [trial for trial in result.trials if trial.recovered is not None]
-    if not tried:
+def _make_recovery_cells(result: RowResult) -> dict[str, Any]:
+    """Return the cells about the recovery. There are none if nothing had to recover."""
+    trials = [trial for trial in result.trials if trial.recovered is not None]
+    if not trials:
         return {}
-    recovered = sum(trial.recovered is True for trial in tried)
-    steps_rad = [trial.step_rad for trial in tried if trial.step_rad is not None]
-    firsts_rad = [trial.first_rad for trial in tried if trial.first_rad is not None]
+    recovered_count = sum(trial.recovered is True for trial in trials)
+    steps_rad = [trial.step_rad for trial in trials if trial.step_rad is not None]
+    firsts_rad = [trial.first_rad for trial in trials if trial.first_rad is not None]
     return {
-        "recovered": f"{recovered} of {len(tried)}",
+        "recovered": f"{recovered_count} of {len(trials)}",
         "max_step_rad": _format_number(max(steps_rad, default=None)),
         "max_first_rad": _format_number(max(firsts_rad, default=None)),
     }

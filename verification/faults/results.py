@@ -1,4 +1,7 @@
-"""Raw results: one JSON file, written again after each row, so that rows can be run on different days."""
+"""Stores the raw results in a JSON file, which is written again after each row.
+
+Single rows can therefore be measured on different days.
+"""
 
 import os
 import platform
@@ -9,36 +12,39 @@ import msgspec
 from verification.faults.row import RowResult
 
 ROOT = Path(__file__).resolve().parents[2]
-RAW = ROOT / "docs" / "benchmarks" / "faults.json"
+RESULTS_PATH = ROOT / "docs" / "benchmarks" / "faults.json"
 
 
 class FaultResults:
-    """Results by row and backend."""
+    """The stored result of each row on each backend."""
 
-    def __init__(self, path: Path = RAW) -> None:
+    def __init__(self, path: Path = RESULTS_PATH) -> None:
         self.path = path
 
     def read(self) -> dict[tuple[str, str], RowResult]:
-        """Return every stored result by row and backend."""
+        """Return every stored result by the name of its row and its backend."""
         if not self.path.is_file():
             return {}
         results = msgspec.json.decode(self.path.read_bytes(), type=list[RowResult])
         return {(result.row, result.backend): result for result in results}
 
     def save(self, result: RowResult) -> None:
-        """Store a result, in place of an older one of the same row and backend."""
-        results = self.read() | {(result.row, result.backend): result}
+        """Store a result. It replaces the older result of the same row and backend."""
+        results = self.read()
+        results[result.row, result.backend] = result
         ordered = [results[key] for key in sorted(results)]
+        lines = ",\n".join(msgspec.json.encode(entry).decode() for entry in ordered)
+        # Renaming replaces the file at once: an interrupted measurement leaves the older results intact.
         partial = self.path.with_suffix(".partial")
-        lines = ",\n".join(msgspec.json.encode(result).decode() for result in ordered)
         partial.write_text(f"[\n{lines}\n]\n", encoding="utf-8")
         partial.rename(self.path)
 
 
-def machine() -> str:
-    """Return the cores, the kernel and the interpreter of this machine, in words."""
-    emulated = ", emulated in a guest" if os.environ.get("SNAKESIM_VCAN") == "guest" else ""
+def describe_machine() -> str:
+    """Return the number of cores, the kernel and the interpreter of this machine as text."""
+    is_guest = os.environ.get("SNAKESIM_VCAN") == "guest"
+    suffix = ", emulated in a guest" if is_guest else ""
     return (
         f"{os.cpu_count()} cores, {platform.machine()}, Linux {platform.release()}, "
-        f"Python {platform.python_version()}{emulated}"
+        f"Python {platform.python_version()}{suffix}"
     )

@@ -1,11 +1,11 @@
-"""One robot's processes, started as `snakesim run` starts them, and an observer beside them."""
+"""Starts the processes of a robot as `snakesim run` starts them, and an observer on its network."""
 
 import contextlib
 import os
 import random
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -16,41 +16,68 @@ from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_operator.run import children
 from snakesim_operator.run.children import ChildProcess
 from snakesim_testing.harness.endpoint import find_free_endpoint
-from verification.faults.host_watch import HostWatch, raised_priority
+from verification.faults.host_watch import HostWatch, raise_priority
 from verification.faults.observer import Observer, TrialError
 from verification.faults.row import InjectionTrial, MeasurementRequest
 
 # An emulated machine is slow.
-START_LIMIT_S = 240.0 if os.environ.get("SNAKESIM_VCAN") == "guest" else 60.0
+START_TIMEOUT_S = 240.0 if os.environ.get("SNAKESIM_VCAN") == "guest" else 60.0
+CONNECT_TIMEOUT_S = 0.5  # of one attempt
 MOVING_S = 0.25  # from arming to the injection
-SETTLED_S = 0.3  # how long steps are watched after a recovery
+SETTLED_S = 0.3  # in which jumps of targets are measured after a recovery
 PERIOD_S = 0.01
+ROUNDING_RAD = 1e-9
 
 
-def configuration(backend: str, **dotted: Any) -> RunConfig:
-    """The triplet in real time at 100 Hz, for as long as anybody likes; `__` in a name stands for the dot."""
-    values = {"backend": backend, "clock_mode": "realtime", "duration_s": 3600.0, **dotted}
-    overrides = [
+def make_config(backend: str, **overrides: Any) -> RunConfig:
+    """Return the scenario `triplet` in real time at 100 Hz, for an hour.
+
+    Args:
+        backend: Name of the backend.
+        overrides: Other values of the scenario. In their names, `__` stands for a dot.
+    """
+    values = {"backend": backend, "clock_mode": "realtime", "duration_s": 3600.0, **overrides}
+    key_overrides = [
         KeyOverride(name.replace("__", "."), value, f"--{name}") for name, value in values.items()
     ]
-    return load_scenario("triplet", overrides).config
+    return load_scenario("triplet", key_overrides).config
 
 
 class ProcessRobot:
-    """Host, guidance, navigation and control, each a process of its own; any can be killed, frozen, started again."""
+    """Host, guidance, navigation and control as separate processes. A trial can kill, freeze and restart each of them.
+
+    Attributes:
+        running: Newest process of each name.
+        host_watch: Statuses that the first host sends over its private channel.
+        random: Source of the random phases of the injections.
+    """
 
     def __init__(
-        self, folder: Path, config: RunConfig, *, endpoint: str | None = None, router: bool = False
+        self,
+        folder: Path,
+        config: RunConfig,
+        *,
+        endpoint: str | None = None,
+        has_router_process: bool = False,
     ) -> None:
-        """router: another process listens at the endpoint."""
-        self.folder, self.config, self.router = folder, config, router
+        """Write the configuration. No process is started yet.
+
+        Args:
+            folder: Folder for the configuration, the logs and the run log.
+            config: Configuration of the run.
+            endpoint: Endpoint of the robot's network (default: a free port of this machine).
+            has_router_process: A separate process listens at the endpoint, instead of the host.
+        """
+        self.folder = folder
+        self.config = config
         self.endpoint = endpoint or find_free_endpoint()
         self.running: dict[str, ChildProcess] = {}
-        self._stack = ExitStack()
-        self.host = HostWatch()  # of the first host
-        self._stack.callback(self.host.close)
+        self.host_watch = HostWatch()
         self.random = random.Random(config.seed)
-        write_config(config, folder / "config.json")
+        self._has_router_process = has_router_process
+        self._stack = ExitStack()
+        self._stack.callback(self.host_watch.close)
+        write_config(config, self._config_path)
 
     def __enter__(self) -> "ProcessRobot":
         return self
@@ -62,120 +89,157 @@ class ProcessRobot:
         children.stop_children(list(self.running.values()))
         self._stack.close()
 
-    def start(self, name: str) -> ChildProcess:
-        """Start one of its processes."""
-        common = [str(self.folder / "config.json"), "--endpoint", self.endpoint]
-        inherits: list[int] = []
-        if name == "host":
-            module = [
-                "snakesim_hal.programs.host_program",
-                *common,
-                "--out",
-                str(self.folder),
-                "--insecure",
-            ]  # network_cut
-            module += ["--router", self.endpoint] if self.router else []
-            inherits = [self.host.inherited.fileno()]
-            module += ["--parent-socket", str(inherits[0])]
-        elif name == "router":
-            module = ["snakesim_hal.programs.router_program", *common]
-        else:
-            module = ["snakesim_hal.programs.service_program", name, *common]
+    @property
+    def _config_path(self) -> Path:
+        return self.folder / "config.json"
+
+    def start_process(self, name: str) -> ChildProcess:
+        """Start a process: `host`, `router`, or a service of the configuration."""
+        inherited_fds: list[int] = []
+        common = [str(self._config_path), "--endpoint", self.endpoint]
+        match name:
+            case "host":
+                command = ["snakesim_hal.programs.host_program", *common]
+                command += ["--out", str(self.folder)]
+                command += ["--insecure"]  # a cut network needs an endpoint that is not loopback
+                if self._has_router_process:
+                    command += ["--router", self.endpoint]
+                inherited_fds = [self.host_watch.inherited.fileno()]
+                command += ["--parent-socket", str(inherited_fds[0])]
+            case "router":
+                command = ["snakesim_hal.programs.router_program", *common]
+            case _:
+                command = ["snakesim_hal.programs.service_program", name, *common]
         log = self._stack.enter_context((self.folder / f"{name}.log").open("ab", buffering=0))
-        # What outlives a run must not outlive this one.
-        state = {"XDG_STATE_HOME": str(self.folder)}
-        self.running[name] = children.start_child(
-            name, module, log.write, pass_fds=inherits, extra_env=state
+        # State that outlives a run must not outlive the measurement.
+        environment = {"XDG_STATE_HOME": str(self.folder)}
+        child = children.start_child(
+            name, command, log.write, pass_fds=inherited_fds, extra_env=environment
         )
-        return self.running[name]
+        self.running[name] = child
+        return child
 
-    def start_all(self) -> None:
-        """All of them."""
+    def start_all_processes(self) -> None:
+        """Start the host and every service."""
         for name in ("host", *self.config.services):
-            self.start(name)
+            self.start_process(name)
 
-    def observe(self) -> Observer:
-        """Join the network as soon as there is one."""
-        deadline = time.monotonic() + START_LIMIT_S
-        link = ConnectionSettings(self.endpoint, self.config.robot.name)
+    def connect_observer(self) -> Observer:
+        """Connect an observer to the robot's network, as soon as the network exists.
+
+        Raises:
+            TrialError: A process has ended, or there is no network within START_TIMEOUT_S.
+        """
+        deadline_s = time.monotonic() + START_TIMEOUT_S
+        settings = ConnectionSettings(self.endpoint, self.config.robot.name)
         while True:
             try:
-                with raised_priority():
-                    session = self._stack.enter_context(open_session(link, connect_timeout_s=0.5))
+                with raise_priority():
+                    session = self._stack.enter_context(
+                        open_session(settings, connect_timeout_s=CONNECT_TIMEOUT_S)
+                    )
                 return Observer(session)
             except NotConnectedError:
-                if time.monotonic() > deadline or self.ended():
+                exits = self.describe_exits()
+                if exits or time.monotonic() > deadline_s:
                     raise TrialError(
-                        f"no network: {'; '.join(self.ended())}; {self.last_words()}"
+                        f"no network: {'; '.join(exits)}; {self.read_last_output()}"
                     ) from None
 
-    def ended(self) -> list[str]:
-        """Which of its processes are gone, and how."""
-        return [
-            ending
-            for child in self.running.values()
-            if (ending := child.describe_exit()) is not None
-        ]
+    def describe_exits(self) -> list[str]:
+        """Return a description of each process that has ended."""
+        exits = [child.describe_exit() for child in self.running.values()]
+        return [text for text in exits if text is not None]
 
-    def last_words(self) -> str:
-        """Of those that are gone."""
+    def read_last_output(self) -> str:
+        """Return the last lines that the ended processes printed."""
         ended = [child for child in self.running.values() if child.describe_exit()]
         return " | ".join(line for child in ended for line in child.output.last_lines())
 
-    def signal(self, name: str, number: signal.Signals) -> int:
-        """Send a signal to one of its processes; when, by the monotonic clock."""
-        pid = self.running[name].process.pid
-        now_ns = time.monotonic_ns()
-        os.kill(pid, number)
+    def send_signal(self, name: str, number: signal.Signals) -> int:
+        """Send a signal to a process. Return the time just before, by the monotonic clock in ns."""
+        process = self.running[name].process
+        signal_ns = time.monotonic_ns()
+        os.kill(process.pid, number)
         if number is signal.SIGKILL:
-            self.running[name].process.wait()
-        return now_ns
+            process.wait()
+        return signal_ns
 
     def set_in_motion(self, observer: Observer) -> None:
-        """Armed, and moving for a moment; what follows happens at any phase of a period."""
-        if observer.state() != "armed":
+        """Arm the robot if necessary, and let it move until a random phase of a control period.
+
+        Raises:
+            TrialError: The robot stopped meanwhile.
+        """
+        if observer.get_lifecycle() != "armed":
             observer.arm()
-        observer.watch(MOVING_S + self.random.random() * PERIOD_S)
+        observer.listen_for(MOVING_S + self.random.random() * PERIOD_S)
         observer.forget()
-        if observer.state() != "armed":
-            raise TrialError(f"the robot stopped before the injection: {observer.in_words()}")
+        if observer.get_lifecycle() != "armed":
+            raise TrialError(
+                f"the robot stopped before the injection: {observer.describe_status()}"
+            )
 
 
 @contextlib.contextmanager
-def robot(
+def start_robot(
     request: MeasurementRequest,
     config: RunConfig | None = None,
     *,
-    router: bool = False,
-    **dotted: Any,
+    has_router_process: bool = False,
+    **overrides: Any,
 ) -> Iterator[tuple[ProcessRobot, Observer]]:
-    """A robot with all its processes, and who watches it. config: other than `configuration` with these values."""
-    with ProcessRobot(
-        request.folder, config or configuration(request.backend, **dotted), router=router
-    ) as started_robot:
-        if router:
-            started_robot.start("router")
-            started_robot.observe().session.close()  # it is there
-        started_robot.start_all()
-        observer = started_robot.observe()
-        observer.arm(START_LIMIT_S)
-        yield started_robot, observer
-        request.retry(observer.stumbles)
+    """Start all processes of a robot, connect an observer, and arm the robot.
+
+    Args:
+        request: Measurement to which the robot belongs. Its failed armings are counted as retries.
+        config: Configuration of the run (default: `make_config` with the overrides).
+        has_router_process: The router is a separate process, instead of a part of the host.
+        overrides: Other values of the scenario, see `make_config`.
+
+    Yields:
+        The robot and its observer. All processes end with the context.
+    """
+    config = config or make_config(request.backend, **overrides)
+    with ProcessRobot(request.folder, config, has_router_process=has_router_process) as robot:
+        if has_router_process:
+            robot.start_process("router")
+            robot.connect_observer().session.close()  # waits until the router listens
+        robot.start_all_processes()
+        observer = robot.connect_observer()
+        observer.arm(START_TIMEOUT_S)
+        yield robot, observer
+        request.count_retries(observer.failed_armings)
 
 
-def recovered(observer: Observer, value: float | None, failure: str = "") -> InjectionTrial:
-    """Bring the robot back by an operator's commands, and look at how its targets step."""
+def recover_robot(
+    observer: Observer, value: float | None, failures: Sequence[str] = ()
+) -> InjectionTrial:
+    """Reset and arm the robot as an operator does, and check that no target jumps.
+
+    Args:
+        observer: Observer of the robot.
+        value: Measured value of the trial, in the unit of the row.
+        failures: What was wrong in the trial so far.
+
+    Returns:
+        The trial with the result of the recovery.
+    """
+    failures = list(failures)
     try:
-        observer.arm(START_LIMIT_S)
+        observer.arm(START_TIMEOUT_S)
     except TrialError as error:
-        return InjectionTrial(
-            value=value, failure="; ".join(filter(None, (failure, str(error)))), recovered=False
-        )
-    observer.watch(SETTLED_S)
-    steps = observer.steps()
-    bound = observer.description().max_step_rad
-    if max(steps.values()) > bound + 1e-9:
-        failure = "; ".join(
-            filter(None, (failure, f"a target jumped by more than {bound} rad at recovery"))
-        )
-    return InjectionTrial(value=value, failure=failure, recovered=True, **steps)
+        failures.append(str(error))
+        return InjectionTrial(value=value, failure="; ".join(failures), recovered=False)
+    observer.listen_for(SETTLED_S)
+    steps = observer.measure_target_steps()
+    max_step_rad = observer.get_description().max_step_rad
+    if max(steps.step_rad, steps.first_rad) > max_step_rad + ROUNDING_RAD:
+        failures.append(f"a target jumped by more than {max_step_rad} rad at recovery")
+    return InjectionTrial(
+        value=value,
+        failure="; ".join(failures),
+        recovered=True,
+        step_rad=steps.step_rad,
+        first_rad=steps.first_rad,
+    )

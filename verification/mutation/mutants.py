@@ -1,4 +1,4 @@
-"""Every mutant of a source file: one small change each, to the syntax tree."""
+"""Generates the mutants of a source file. Each mutant makes one small change in the syntax tree."""
 
 import ast
 import copy
@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+# Replacements of each operator.
 COMPARISONS: dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),
     ast.LtE: (ast.Lt, ast.Gt),
@@ -28,8 +29,8 @@ ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
     ast.BitAnd: ast.BitOr,
     ast.BitOr: ast.BitAnd,
 }
-TWINS = {"min": "max", "max": "min", "any": "all", "all": "any"}
-REMOVABLE = (
+OPPOSITE_FUNCTIONS = {"min": "max", "max": "min", "any": "all", "all": "any"}
+REMOVABLE_STATEMENTS = (
     ast.Expr,
     ast.Assign,
     ast.AugAssign,
@@ -40,168 +41,219 @@ REMOVABLE = (
     ast.Continue,
 )
 
-Change = Callable[[], object]  # makes one change, in place
+Change = Callable[[], object]
+"""Changes a syntax tree in place."""
 
 
 @dataclass(frozen=True)
 class SourceMutant:
-    """One change of one file."""
+    """A source file with one change."""
 
     file: str  # such as limiter.py
-    where: str  # the function or class around it
+    scope: str  # name of the function or class that contains the change
     line: int
-    change: str  # before -> after, and the statement that it is in
+    change: str  # code before -> code after, and the statement that contains it
     source: str  # the whole file with the change
 
     def __str__(self) -> str:
-        return f"{self.file}:{self.line} in {self.where}: {self.change}"
+        return f"{self.file}:{self.line} in {self.scope}: {self.change}"
 
 
-def mutants_of(file: str, source: str) -> Iterator[SourceMutant]:
-    """All mutants of a file, from top to bottom."""
+@dataclass(frozen=True)
+class CodeNode:
+    """A node of a syntax tree, and what surrounds it."""
+
+    node: ast.AST
+    block: list[Any] | None  # statements among which the node is one; None: it is not a statement
+    scope: str  # name of the function or class that contains the node
+    statement: ast.AST  # innermost statement that contains the node
+
+    def is_removed(self) -> bool:
+        """Return whether a change has replaced the statement in its block."""
+        if self.block is None:
+            return False
+        return not any(statement is self.node for statement in self.block)
+
+
+def generate_mutants(file: str, source: str) -> Iterator[SourceMutant]:
+    """Yield every different mutant of a source text, from top to bottom.
+
+    Args:
+        file: Name that the mutants get.
+        source: Source text of the file.
+    """
     tree = ast.parse(source)
-    seen = {ast.unparse(tree)}
-    for place, (original, _, where, statement) in enumerate(_walk(tree)):
-        for choice in range(len(_changes(original, None)) + _removable(original)):
-            changed = copy.deepcopy(tree)
-            node, block, _, _ = list(_walk(changed))[place]
-            before = _shown(node)
-            changes = _changes(node, block)
-            changes[choice]()
-            text = ast.unparse(ast.fix_missing_locations(changed))
-            if text not in seen:
-                seen.add(text)
-                removed = block is not None and not any(inner is node for inner in block)
-                change = f"{before} -> {'(removed)' if removed else _shown(node)}"
-                if original is not statement:
-                    change += f" in `{_shown(statement)}`"
-                yield SourceMutant(file, where, getattr(node, "lineno", 0), change, text)
+    known_sources = {ast.unparse(tree)}
+    for node_index, original in enumerate(_walk_code(tree)):
+        change_count = len(_list_changes(original.node, original.block))
+        for change_index in range(change_count):
+            changed_tree = copy.deepcopy(tree)
+            changed = list(_walk_code(changed_tree))[node_index]
+            code_before = _format_head(changed.node)
+            apply_change = _list_changes(changed.node, changed.block)[change_index]
+            apply_change()
+            changed_source = ast.unparse(ast.fix_missing_locations(changed_tree))
+            if changed_source in known_sources:
+                continue
+            known_sources.add(changed_source)
+            code_after = "(removed)" if changed.is_removed() else _format_head(changed.node)
+            change = f"{code_before} -> {code_after}"
+            if original.node is not original.statement:
+                change += f" in `{_format_head(original.statement)}`"
+            line = getattr(changed.node, "lineno", 0)
+            yield SourceMutant(file, original.scope, line, change, changed_source)
 
 
-def _walk(
+def _walk_code(
     node: ast.AST,
-    where: str = "module",
+    scope: str = "module",
     block: list[Any] | None = None,
     statement: ast.AST | None = None,
-) -> Iterator[tuple[ast.AST, list[Any] | None, str, ast.AST]]:
-    """Every node that is code: with the block that it is a statement of, the function and the statement around it."""
+) -> Iterator[CodeNode]:
+    """Yield a node and every node below it that affects the behavior of the program."""
     if isinstance(node, ast.FunctionDef | ast.ClassDef):
-        where = node.name if where == "module" else f"{where}.{node.name}"
+        scope = node.name if scope == "module" else f"{scope}.{node.name}"
     if isinstance(node, ast.stmt) or statement is None:
         statement = node
-    yield node, block, where, statement
+    yield CodeNode(node, block, scope, statement)
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns"):
             continue
-        for child in list(value) if isinstance(value, list) else [value]:
-            if (
-                isinstance(child, ast.Return)
-                and isinstance(node, ast.FunctionDef)
-                and _shown(child) == "return None"
-            ):
-                continue  # at the end of a function, which does so anyway
-            if isinstance(child, ast.AST) and not _is_no_code(child):
-                yield from _walk(
-                    child, where, value if isinstance(child, ast.stmt) else None, statement
-                )
+        children = list(value) if isinstance(value, list) else [value]
+        for child in children:
+            if not isinstance(child, ast.AST) or _has_no_effect(child, node):
+                continue
+            child_block = value if isinstance(child, ast.stmt) else None
+            yield from _walk_code(child, scope, child_block, statement)
 
 
-def _is_no_code(node: ast.AST) -> bool:
-    """Docstrings, texts for people, and aliases of types."""
-    if isinstance(node, ast.JoinedStr):
-        return True
-    if isinstance(node, ast.Expr):
-        return isinstance(node.value, ast.Constant)
-    return isinstance(node, ast.Assign) and isinstance(node.value, ast.Subscript)
+def _has_no_effect(node: ast.AST, parent: ast.AST) -> bool:
+    """Return whether a change of a node cannot change the behavior of the program."""
+    match node:
+        case ast.JoinedStr():  # a text for people
+            return True
+        case ast.Expr():  # a docstring
+            return isinstance(node.value, ast.Constant)
+        case ast.Assign():  # an alias of a type
+            return isinstance(node.value, ast.Subscript)
+        case ast.Return():  # a function without this return also returns None
+            return isinstance(parent, ast.FunctionDef) and _format_head(node) == "return None"
+        case _:
+            return False
 
 
-def _shown(node: ast.AST) -> str:
-    """A node in one line; of a compound statement only its head."""
-    return (ast.unparse(node).splitlines() or [""])[0]
+def _format_head(node: ast.AST) -> str:
+    """Return the code of a node in one line. A compound statement is reduced to its head."""
+    lines = ast.unparse(node).splitlines()
+    return lines[0] if lines else ""
 
 
-def _removable(node: ast.AST) -> bool:
-    return isinstance(node, REMOVABLE) and not (
-        isinstance(node, ast.AnnAssign) and node.value is None
-    )
+def _list_changes(node: ast.AST, block: list[Any] | None) -> list[Change]:
+    """Return every change of a node. The last change of a removable statement is its removal."""
+    changes = _list_changes_in_place(node)
+    if block is not None and _is_removable(node):
+        index = next(i for i, statement in enumerate(block) if statement is node)
+        changes.append(_replace_item(block, index, ast.Pass()))
+    return changes
 
 
-def _changes(node: ast.AST, block: list[Any] | None) -> list[Change]:
-    """What can be done to a node; last, where it is a statement of a block, its removal."""
-    found: list[Change] = []
+def _list_changes_in_place(node: ast.AST) -> list[Change]:
+    """Return the changes of a node that leave it in the tree."""
     match node:
         case ast.Compare():
-            for i, op in enumerate(node.ops):
-                found += [_put(node.ops, i, other()) for other in COMPARISONS[type(op)]]
+            return _list_comparison_changes(node)
         case ast.BoolOp():
-            found.append(_set(node, "op", ast.Or() if isinstance(node.op, ast.And) else ast.And()))
-            found += [_drop(node.values, i) for i in range(len(node.values))]
+            opposite = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+            operand_drops = [_drop_item(node.values, i) for i in range(len(node.values))]
+            return [_set_field(node, "op", opposite), *operand_drops]
         case ast.BinOp() | ast.AugAssign():
-            found.append(_set(node, "op", ARITHMETIC[type(node.op)]()))
+            return [_set_field(node, "op", ARITHMETIC[type(node.op)]())]
         case ast.UnaryOp(op=ast.Not()):
-            found.append(_set(node, "operand", ast.UnaryOp(ast.Not(), node.operand)))
+            return [_set_field(node, "operand", ast.UnaryOp(ast.Not(), node.operand))]
         case ast.UnaryOp(op=ast.USub() | ast.Invert()):
-            found.append(_set(node, "op", ast.UAdd()))
+            return [_set_field(node, "op", ast.UAdd())]
         case ast.Constant():
-            found += [_set(node, "value", other) for other in _other_constants(node.value)]
+            constants = _list_other_constants(node.value)
+            return [_set_field(node, "value", constant) for constant in constants]
         case ast.Dict():
-            found += [_drop_entry(node, i) for i in range(len(node.keys))]
+            return [_drop_entry(node, i) for i in range(len(node.keys))]
         case ast.Call():
-            found += _changes_of_call(node)
+            return _list_call_changes(node)
         case ast.If() | ast.IfExp():
-            found.append(_set(node, "test", ast.UnaryOp(ast.Not(), node.test)))
+            return [_set_field(node, "test", ast.UnaryOp(ast.Not(), node.test))]
         case _:
-            pass
-    if block is not None and _removable(node):
-        found.append(
-            _put(block, next(i for i, inner in enumerate(block) if inner is node), ast.Pass())
-        )
-    return found
+            return []
 
 
-def _changes_of_call(node: ast.Call) -> list[Change]:
-    swapped = [_swap_values(node.keywords, i) for i in range(len(node.keywords) - 1)]
-    if isinstance(node.func, ast.Name) and node.func.id in TWINS:
-        return [_set(node.func, "id", TWINS[node.func.id]), *swapped]
-    return [_swap(node.args, i) for i in range(len(node.args) - 1)] + swapped
+def _is_removable(node: ast.AST) -> bool:
+    if isinstance(node, ast.AnnAssign) and node.value is None:
+        return False  # a declaration of a type has no effect
+    return isinstance(node, REMOVABLE_STATEMENTS)
 
 
-def _other_constants(value: object) -> list[object]:
+def _list_comparison_changes(node: ast.Compare) -> list[Change]:
+    """Return the changes of a comparison: each of its operators becomes another one."""
+    changes: list[Change] = []
+    for i, operator in enumerate(node.ops):
+        for replacement in COMPARISONS[type(operator)]:
+            changes.append(_replace_item(node.ops, i, replacement()))
+    return changes
+
+
+def _list_call_changes(node: ast.Call) -> list[Change]:
+    """Return the changes of a call: another function, or two neighboring arguments in the other order."""
+    keyword_swaps = [_swap_keyword_values(node.keywords, i) for i in range(len(node.keywords) - 1)]
+    if isinstance(node.func, ast.Name) and node.func.id in OPPOSITE_FUNCTIONS:
+        opposite = OPPOSITE_FUNCTIONS[node.func.id]
+        return [_set_field(node.func, "id", opposite), *keyword_swaps]
+    argument_swaps = [_swap_items(node.args, i) for i in range(len(node.args) - 1)]
+    return argument_swaps + keyword_swaps
+
+
+def _list_other_constants(value: object) -> list[object]:
+    """Return the constants that replace a constant. Texts for people are not replaced."""
     match value:
         case bool():
             return [not value]
         case int() | float():
             return [value + 1, value - 1]
-        case str() if (
-            value.isidentifier()
-        ):  # a word that the program goes by, not a text for people
+        case str() if value.isidentifier():  # a name that the program compares or looks up
             return [value + "_"]
         case _:
             return []
 
 
-def _set(node: ast.AST, name: str, value: object) -> Change:
+# --- changes that are applied later, when they are called ----------------------------------------------------------
+
+
+def _set_field(node: ast.AST, name: str, value: object) -> Change:
     return lambda: setattr(node, name, value)
 
 
-def _put(values: list[Any], at: int, value: object) -> Change:
-    return lambda: values.__setitem__(at, value)
+def _replace_item(items: list[Any], index: int, item: object) -> Change:
+    return lambda: items.__setitem__(index, item)
 
 
-def _drop(values: list[Any], at: int) -> Change:
-    return lambda: values.pop(at)
+def _drop_item(items: list[Any], index: int) -> Change:
+    return lambda: items.pop(index)
 
 
-def _drop_entry(node: ast.Dict, at: int) -> Change:
-    return lambda: (node.keys.pop(at), node.values.pop(at))
+def _drop_entry(node: ast.Dict, index: int) -> Change:
+    return lambda: (node.keys.pop(index), node.values.pop(index))
 
 
-def _swap(values: list[Any], at: int) -> Change:
-    return lambda: values.__setitem__(slice(at, at + 2), [values[at + 1], values[at]])
+def _swap_items(items: list[Any], index: int) -> Change:
+    """Return a change that swaps an item with the next one."""
+    swapped = [items[index + 1], items[index]]
+    return lambda: items.__setitem__(slice(index, index + 2), swapped)
 
 
-def _swap_values(keywords: list[ast.keyword], at: int) -> Change:
-    def change() -> None:
-        keywords[at].value, keywords[at + 1].value = keywords[at + 1].value, keywords[at].value
+def _swap_keyword_values(keywords: list[ast.keyword], index: int) -> Change:
+    """Return a change that swaps the values of a keyword argument and the next one."""
+    first = keywords[index]
+    second = keywords[index + 1]
 
-    return change
+    def swap() -> None:
+        first.value, second.value = second.value, first.value
+
+    return swap

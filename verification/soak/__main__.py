@@ -138,10 +138,10 @@ class SoakOperator:
             if not any(name in words for name in event.names):
                 line.violations.append(f"no cause names one of {', '.join(event.names)}: {words}")
         if event.follows == "stop" and not line.detected:
-            line.violations.append(f"it had to stop, and went on: {watch.in_words()}")
+            line.violations.append(f"it had to stop, and went on: {watch.describe_status()}")
         self._recover()
         watch.blind = set()
-        line.became = watch.in_words()
+        line.became = watch.describe_status()
         line.recovered_s = round(
             (time.monotonic_ns() - began_ns) * 1e-9 - event.lasts_s - SETTLE_S, 3
         )
@@ -153,7 +153,9 @@ class SoakOperator:
         last = ""
         while True:
             if time.monotonic() > give_up:
-                raise TrialError(f"not back within {RECOVERY_S:g} s: {watch.in_words()}; {last}")
+                raise TrialError(
+                    f"not back within {RECOVERY_S:g} s: {watch.describe_status()}; {last}"
+                )
             self._spend(0.1)
             status = watch.status
             if status is None or status.waiting_for or not self._fresh():
@@ -164,7 +166,7 @@ class SoakOperator:
             elif status.lifecycle in ("fault", "estop"):
                 last = self._ask(keys.LIFECYCLE, LifecycleRequest(action="reset")).reason
             elif status.ready_to_arm:
-                hash_ = watch.description().config_hash
+                hash_ = watch.get_description().config_hash
                 arm = LifecycleRequest(
                     action="arm", robot=status.robot, backend=status.backend, config_hash=hash_
                 )
@@ -181,7 +183,7 @@ class SoakOperator:
         deadline = time.monotonic() + MOVING_S
         while time.monotonic() < deadline:
             self._spend(0.05)
-            if watch.state() != "armed":
+            if watch.get_lifecycle() != "armed":
                 return False
             if watch.sequences - before >= MOVING:
                 return True
@@ -227,8 +229,8 @@ def soak(out: Path, minutes: float, seed: int, backend: str) -> SoakResult:
         log_path.open("wb") as log,
     ):
         watch, health = JudgingObserver(session), ProcessHealth(out)
-        watch.until(lambda: watch.state() == "armed", "armed", START_S)
-        joints = len(watch.description().joints)
+        watch.wait_until(lambda: watch.get_lifecycle() == "armed", "armed", START_S)
+        joints = len(watch.get_description().joints)
         SoakOperator(watch, health, found, log).go(EventDrawer(seed, joints), 60 * minutes)
         if run.process.poll() is not None:
             found.violations.append(f"the run has ended by itself: {run.printed()[-500:]}")

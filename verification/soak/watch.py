@@ -92,7 +92,7 @@ class JudgingObserver(Observer):
             self._before = None
             return
         if self._robot is None:
-            self._robot = self.description()
+            self._robot = self.get_description()
         robot, measured = self._robot, self.joints.get(now.tick)
         follows = before is not None and before.tick == now.tick - 1
         for i, (joint, mode, target) in enumerate(

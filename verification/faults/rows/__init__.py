@@ -1,1 +1,1 @@
-"""How each row of the fault table is measured."""
+"""Measures each row of the fault table. The modules are grouped by the part that fails."""

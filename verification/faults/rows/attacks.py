@@ -1,4 +1,4 @@
-"""Somebody attacks the network: an emergency stop comes through all the same, and a second run arms nothing."""
+"""Measures attacks on the network: an emergency stop must still arrive, and a second run must not arm the robot."""
 
 import subprocess
 import sys
@@ -6,163 +6,210 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from functools import partial
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, JointMode, LifecycleRequest
 from verification.attack.means import datagrams
 from verification.attack.means.floods import end, flood, half_open
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import ProcessRobot, recovered, robot
+from verification.faults.robot import ProcessRobot, recover_robot, start_robot
 from verification.faults.row import InjectionTrial, MeasurementRequest
 
-HALF_OPEN, IDLE, READERS, QUERIES, SAMPLES = 300, 1000, 300, 10_000, 10_000
-ANSWER_S = 10.0
-TRIES = 20  # to find the robot armed under a flood before it is stopped
-STANDING = {"controller": "hold", "rate_hz": 50}
+# Sizes of the floods.
+HALF_OPEN_CONNECTIONS = 300
+IDLE_SESSIONS = 1000
+IDLE_PROCESSES = 4
+LEASE_QUERIES = 10_000
+LEASE_PROCESSES = 2
+GARBAGE_SAMPLES = 10_000
+LEAVING_READERS = 300
+
+CONFIRMATION_TIMEOUT_S = 10.0  # of an emergency stop
+ARMING_TIMEOUT_S = 60.0  # under a flood
+MAX_ARMING_ATTEMPTS = 20  # until the host itself reports that it is armed
+RATE_HZ = 50
+STATIONARY_ROBOT = {"controller": "hold", "rate_hz": RATE_HZ}
+OBSERVED_S = 0.1  # before a trial, so that the newest state of the robot is known
+SECOND_RUN_TIMEOUT_S = 60.0
 
 Flood = Callable[[ProcessRobot], AbstractContextManager[object]]
+"""Floods the network of a robot as long as the returned context lives."""
 
 
-def _flooding(kind: str, amount: int, process_count: int) -> Flood:
-    return lambda started_robot: flood(
-        started_robot.folder, kind, started_robot.endpoint, amount, process_count
-    )
+# --- an emergency stop under a flood -------------------------------------------------------------------------------
+
+
+def _make_process_flood(kind: str, amount: int, process_count: int) -> Flood:
+    """Return a flood by processes of `verification.attack.means.flooder`. amount: of each process."""
+
+    def start_flood(robot: ProcessRobot) -> AbstractContextManager[object]:
+        return flood(robot.folder, kind, robot.endpoint, amount, process_count)
+
+    return start_flood
 
 
 FLOODS: dict[str, Flood] = {
-    "half_open": lambda started_robot: half_open(started_robot.endpoint, HALF_OPEN),
-    "idle": _flooding("idle", IDLE // 4, 4),
-    "lease": _flooding("lease", QUERIES, 2),
-    "garbage": _flooding("garbage", SAMPLES, 1),
-    "datagrams": lambda started_robot: datagrams.flood(started_robot.endpoint),
+    "half_open": lambda robot: half_open(robot.endpoint, HALF_OPEN_CONNECTIONS),
+    "idle": _make_process_flood("idle", IDLE_SESSIONS // IDLE_PROCESSES, IDLE_PROCESSES),
+    "lease": _make_process_flood("lease", LEASE_QUERIES, LEASE_PROCESSES),
+    "garbage": _make_process_flood("garbage", GARBAGE_SAMPLES, 1),
+    "datagrams": lambda robot: datagrams.flood(robot.endpoint),
 }
 
 
-def stopped_under(name: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """The value: from the request of the stop to the setpoints of the stop, by the host's private channel."""
-    with robot(request, **STANDING) as (started_robot, observer), FLOODS[name](started_robot):
+def measure_stop_under_flood(
+    flood_name: str, request: MeasurementRequest
+) -> Iterator[InjectionTrial]:
+    """Request an emergency stop while the network is flooded.
+
+    Args:
+        flood_name: Key of FLOODS.
+        request: Measurement to make.
+
+    Yields:
+        Trials whose value is the time from the request to the setpoints of the stop, in ms.
+    """
+    with (
+        start_robot(request, **STATIONARY_ROBOT) as (robot, observer),
+        FLOODS[flood_name](robot),
+    ):
         for number in range(request.trials):
-            yield _stopped(request, started_robot, observer, by_datagram=number % 2 == 1)
-    _explain(request)
+            _wait_until_armed(request, robot, observer)
+            yield _run_stop_trial(robot, observer, by_datagram=number % 2 == 1)
+    _add_stop_note(request)
 
 
-def stopped_while_readers_leave(request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """The same, with many readers of everything that leave together just before."""
-    with robot(request, **STANDING) as (started_robot, observer):
+def measure_stop_while_readers_leave(request: MeasurementRequest) -> Iterator[InjectionTrial]:
+    """Request an emergency stop just after many readers of every key have left at the same time.
+
+    Yields:
+        Trials whose value is the time from the request to the setpoints of the stop, in ms.
+    """
+    with start_robot(request, **STATIONARY_ROBOT) as (robot, observer):
         for number in range(request.trials):
-            with flood(started_robot.folder, "readers", started_robot.endpoint, READERS) as (
-                readers,
-            ):
-                yield _stopped(
-                    request,
-                    started_robot,
-                    observer,
-                    by_datagram=number % 2 == 1,
-                    before=partial(end, readers),
-                )
-    _explain(request)
+            with flood(robot.folder, "readers", robot.endpoint, LEAVING_READERS) as (readers,):
+                _wait_until_armed(request, robot, observer)
+                end(readers)
+                yield _run_stop_trial(robot, observer, by_datagram=number % 2 == 1)
+    _add_stop_note(request)
 
 
-def _explain(request: MeasurementRequest) -> None:
-    request.note(
+def _add_stop_note(request: MeasurementRequest) -> None:
+    request.add_note(
         "requested in turn by a query on a session that was there before, and by a datagram; 50 Hz, controller `hold`; "
         "reported over the host's private channel, and a period (20 ms) added, in which the setpoints go out"
     )
 
 
-def _stopped(
-    request: MeasurementRequest,
-    started_robot: ProcessRobot,
-    observer: Observer,
-    *,
-    by_datagram: bool,
-    before: Callable[[], object] | None = None,
+def _wait_until_armed(request: MeasurementRequest, robot: ProcessRobot, observer: Observer) -> None:
+    """Arm the robot, and repeat this until the host reports that it is armed over its private channel.
+
+    Raises:
+        TrialError: The robot was not armed after MAX_ARMING_ATTEMPTS.
+    """
+    for _ in range(MAX_ARMING_ATTEMPTS):
+        if observer.get_lifecycle() != "armed":
+            observer.arm(ARMING_TIMEOUT_S)
+        observer.listen_for(OBSERVED_S + robot.random.random() / RATE_HZ)
+        if robot.host_watch.get_lifecycle() == "armed":
+            return
+        request.count_retries()
+    raise TrialError(f"the robot was not armed under the flood: {observer.describe_status()}")
+
+
+def _run_stop_trial(
+    robot: ProcessRobot, observer: Observer, *, by_datagram: bool
 ) -> InjectionTrial:
-    for _ in range(TRIES):
-        if observer.state() != "armed":
-            observer.arm(60.0)
-        observer.watch(0.1 + started_robot.random.random() * 0.02)
-        if started_robot.host.lifecycle() == "armed":
-            break
-        request.retry()
-    else:
-        raise TrialError(f"the robot was not seen armed under the flood: {observer.in_words()}")
-    if before is not None:
-        before()
-    requested_ns = time.monotonic_ns()
-    answers: list[object] = []
+    """Request an emergency stop once, and wait until the host reports it over its private channel.
 
-    def ask() -> None:
+    Args:
+        robot: An armed robot.
+        observer: Its observer.
+        by_datagram: Request the stop by a datagram, instead of by a query.
+    """
+    confirmations: list[bool] = []
+
+    def request_stop() -> None:
         if by_datagram:
-            answers.append(
-                datagrams.ask(started_robot.endpoint, datagrams.stop("operator"), ANSWER_S)
-            )
+            datagram = datagrams.stop("operator")
+            answer = datagrams.ask(robot.endpoint, datagram, CONFIRMATION_TIMEOUT_S)
+            confirmations.append(answer is not None)
         else:
-            answers.append(observer.ask(keys.ESTOP, EstopRequest(requester="operator")).ok)
+            answer = observer.send_request(keys.ESTOP, EstopRequest(requester="operator"))
+            confirmations.append(answer.ok)
 
-    asking = threading.Thread(target=ask, daemon=True)
-    asking.start()
-    stop = started_robot.host.wait_for_status(
-        lambda status: status.lifecycle != "armed", requested_ns, "a stop"
+    request_ns = time.monotonic_ns()
+    requesting = threading.Thread(target=request_stop, daemon=True)
+    requesting.start()
+    stop = robot.host_watch.wait_for_status(
+        lambda status: status.lifecycle != "armed", request_ns, "a stop"
     )
-    started_robot.host.wait_for_status(
-        lambda status: status.lifecycle == "estop", requested_ns, "the emergency stop"
+    robot.host_watch.wait_for_status(
+        lambda status: status.lifecycle == "estop", request_ns, "the emergency stop"
     )
-    asking.join(ANSWER_S)
-    period_ns = observer.description().period_ns
-    failure = "" if answers and answers[0] else "the stop was not confirmed to who asked for it"
-    return recovered(observer, (stop.at_ns - requested_ns + period_ns) / 1e6, failure)
+    requesting.join(CONFIRMATION_TIMEOUT_S)
+    failures: list[str] = []
+    if True not in confirmations:
+        failures.append("the client that requested the stop got no confirmation")
+    # The setpoints of the stop are sent at most one period after the status.
+    period_ns = observer.get_description().period_ns
+    delay_ms = (stop.at_ns - request_ns + period_ns) / 1e6
+    return recover_robot(observer, delay_ms, failures)
 
 
 # --- a second run --------------------------------------------------------------------------------------------------
 
 
-def second_run(request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """A person disarmed the robot; a second `snakesim run` starts on its network. The value: setpoints that move."""
-    command = [
-        sys.executable,
-        "-m",
-        "snakesim_operator",
-        "run",
-        "triplet",
-        "--clock-mode",
-        "realtime",
-        "--duration",
-        "1",
-    ]
-    with robot(request) as (started_robot, observer):
+def measure_second_run(request: MeasurementRequest) -> Iterator[InjectionTrial]:
+    """Start a second `snakesim run` on the network of a robot that an operator has disarmed.
+
+    Yields:
+        Trials whose value is the number of setpoints that were not passive.
+    """
+    with start_robot(request) as (robot, observer):
         for number in range(request.trials):
-            if observer.state() != "armed":
-                observer.arm()
-            observer.ask(keys.LIFECYCLE, LifecycleRequest(action="disarm", requester="bench"))
-            observer.until(lambda: observer.state() == "disarmed", "disarmed")
-            observer.watch(0.1)
-            observer.forget()
-            where = ["--router" if number % 2 else "--endpoint", started_robot.endpoint]
-            typed, output = (
-                [*command, *where, "--out", str(started_robot.folder / f"second{number}")],
-                subprocess.PIPE,
-            )
-            second = subprocess.run(
-                typed, stdout=output, stderr=subprocess.STDOUT, text=True, check=False, timeout=60
-            )
-            observer.listen()
-            failures: list[str] = []
-            if (
-                second.returncode not in (1, 2)
-                or started_robot.config.robot.name not in second.stdout
-            ):
-                failures.append(
-                    f"the second run ended with {second.returncode}: {second.stdout[-300:]}"
-                )
-            moving = sum(
-                any(mode is not JointMode.PASSIVE for mode in h.message.mode)
-                for h in observer.applied
-            )
-            if observer.state() != "disarmed":
-                failures.append(f"the robot is {observer.in_words()}")
-            yield InjectionTrial(value=float(moving), failure="; ".join(failures))
-        request.note(
+            yield _run_second_run_trial(robot, observer, number)
+        request.add_note(
             "in turn on the robot's network (`--router`) and at its endpoint (`--endpoint`)"
         )
+
+
+def _run_second_run_trial(robot: ProcessRobot, observer: Observer, number: int) -> InjectionTrial:
+    """Start a second run once. number: of the trial, decides how the second run finds the network."""
+    if observer.get_lifecycle() != "armed":
+        observer.arm()
+    observer.send_request(keys.LIFECYCLE, LifecycleRequest(action="disarm", requester="bench"))
+    observer.wait_until(lambda: observer.get_lifecycle() == "disarmed", "disarmed")
+    observer.listen_for(OBSERVED_S)
+    observer.forget()
+    second_run = _start_second_run(robot, number)
+    observer.listen()
+    failures: list[str] = []
+    is_refused = second_run.returncode in (1, 2)
+    if not is_refused or robot.config.robot.name not in second_run.stdout:
+        failures.append(
+            f"the second run ended with {second_run.returncode}: {second_run.stdout[-300:]}"
+        )
+    if observer.get_lifecycle() != "disarmed":
+        failures.append(f"the robot is {observer.describe_status()}")
+    active_count = sum(
+        set(received.message.mode) != {JointMode.PASSIVE} for received in observer.applied
+    )
+    return InjectionTrial(value=float(active_count), failure="; ".join(failures))
+
+
+def _start_second_run(robot: ProcessRobot, number: int) -> subprocess.CompletedProcess[str]:
+    """Run `snakesim run triplet` on the network of a robot, and wait until it ends."""
+    network_option = "--router" if number % 2 else "--endpoint"
+    command = [sys.executable, "-m", "snakesim_operator", "run", "triplet"]
+    command += ["--clock-mode", "realtime", "--duration", "1"]
+    command += [network_option, robot.endpoint]
+    command += ["--out", str(robot.folder / f"second{number}")]
+    return subprocess.run(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+        timeout=SECOND_RUN_TIMEOUT_S,
+    )

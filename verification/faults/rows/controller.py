@@ -1,131 +1,185 @@
-"""The controller's process is killed, frozen, or busy with something else; the host restarts."""
+"""Measures a controller whose process is killed, frozen or busy, and a host that restarts while the robot moves."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from signal import SIGCONT, SIGKILL, SIGSTOP
 
 import msgspec
 
 from snakesim_hal.wire.messages import JointMode
+from verification.faults.command_forger import send_payload
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import START_LIMIT_S, ProcessRobot, recovered, robot
+from verification.faults.robot import START_TIMEOUT_S, ProcessRobot, recover_robot, start_robot
 from verification.faults.row import InjectionTrial, MeasurementRequest
-from verification.faults.stranger import send_raw
 
-HANG_S = 0.5
-REPLAYED = 10
-REFUSED_S = 1.5  # until the status must have counted them
-UNDER_WAY_S = 0.1  # until what a dead host has sent has come
-LATCHED_S = 0.15  # how long a fault must be seen to stay, with a controller that commands again
+HANG_DURATION_S = 0.5
+RECORDED_S = 0.1  # in which commands are recorded before the host is killed
+REPLAYED_COMMANDS = 10
+REJECTION_TIMEOUT_S = 1.5  # until the status has counted the rejected commands
+TRANSPORT_TIME_S = 0.1  # until everything that a killed host had sent has arrived
+LATCHED_S = 0.15  # in which a fault must remain although the controller sends commands again
 
-Fail = Callable[[ProcessRobot, Observer], int]
-Mend = Callable[[ProcessRobot], object]
+InjectFault = Callable[[ProcessRobot, Observer], int]
+"""Makes the controller fail, and returns the time just before, by the monotonic clock in ns."""
+
+EndFault = Callable[[ProcessRobot], object]
+"""Makes the controller work again."""
 
 
-def _trial(
-    started_robot: ProcessRobot, observer: Observer, fail: Fail, mend: Mend
+# --- the controller fails ------------------------------------------------------------------------------------------
+
+
+def _measure_failing_controller(
+    inject_fault: InjectFault, end_fault: EndFault, request: MeasurementRequest
+) -> Iterator[InjectionTrial]:
+    """Make the controller fail while the robot moves.
+
+    Yields:
+        Trials whose value is the time from the failure to the status that reports the fault, in ms.
+    """
+    with start_robot(request) as (robot, observer):
+        for _ in range(request.trials):
+            robot.set_in_motion(observer)
+            yield _run_controller_trial(robot, observer, inject_fault, end_fault)
+
+
+def _run_controller_trial(
+    robot: ProcessRobot, observer: Observer, inject_fault: InjectFault, end_fault: EndFault
 ) -> InjectionTrial:
-    started_robot.set_in_motion(observer)
-    failed_ns = fail(started_robot, observer)
-    # From the host itself: a controller that fills a processor also delays what the network brings.
-    stopped = started_robot.host.wait_for_status(
-        lambda status: status.lifecycle == "fault", failed_ns, "a fault because of the lease"
+    failure_ns = inject_fault(robot, observer)
+    # A controller that uses all of a processor also delays messages on the network, but not the private channel.
+    stop = robot.host_watch.wait_for_status(
+        lambda status: status.lifecycle == "fault", failure_ns, "a fault because of the lease"
     )
-    value = (stopped.at_ns - failed_ns) / 1e6
-    observer.safe_after_ms(failed_ns)
-    status = observer.first_fault(failed_ns)
+    delay_ms = (stop.at_ns - failure_ns) / 1e6
+    observer.measure_stop_delay_ms(failure_ns)
+    status = observer.wait_for_fault(failure_ns)
     failures: list[str] = []
     if not any(fault.what == "lease_expired" for fault in status.faults):
         failures.append(f"not because of the lease: {status.reason}")
     if status.lease_holder is not None:
         failures.append(f"the lease is still {status.lease_holder}'s")
-    mend(started_robot)
-    observer.until(
+
+    end_fault(robot)
+    observer.wait_until(
         lambda: observer.status is not None and observer.status.lease_holder == "control",
         "control is back",
     )
     observer.forget()
-    observer.watch(LATCHED_S)
-    if observer.state() != "fault" or any(h.message.sequence is not None for h in observer.applied):
-        failures.append(f"not latched: {observer.in_words()}")
-    trial = recovered(observer, value, "; ".join(failures))
-    return msgspec.structs.replace(
-        trial, late_ms=started_robot.host.measure_extra_delay_ms(stopped)
-    )
+    observer.listen_for(LATCHED_S)
+    if observer.get_lifecycle() != "fault" or observer.has_applied_commands():
+        failures.append(f"not latched: {observer.describe_status()}")
+    trial = recover_robot(observer, delay_ms, failures)
+    late_ms = robot.host_watch.measure_extra_delay_ms(stop)
+    return msgspec.structs.replace(trial, late_ms=late_ms)
 
 
-def _failing(fail: Fail, mend: Mend, request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """fail: when it began, by the monotonic clock; mend: before the operator resets."""
-    with robot(request) as (started_robot, observer):
-        for _ in range(request.trials):
-            yield _trial(started_robot, observer, fail, mend)
+def _kill_controller(robot: ProcessRobot, _observer: Observer) -> int:
+    return robot.send_signal("control", SIGKILL)
 
 
-def _hang(_made: ProcessRobot, observer: Observer) -> int:
-    """Its interpreter is busy, by the injector."""
-    now_ns = time.monotonic_ns()
-    observer.inject("control", "hang", "control", for_s=HANG_S)
-    return now_ns
+def _restart_controller(robot: ProcessRobot) -> None:
+    robot.start_process("control")
 
 
-killed = partial(
-    _failing,
-    lambda started_robot, _: started_robot.signal("control", SIGKILL),
-    lambda started_robot: started_robot.start("control"),
+def _freeze_controller(robot: ProcessRobot, _observer: Observer) -> int:
+    return robot.send_signal("control", SIGSTOP)
+
+
+def _resume_controller(robot: ProcessRobot) -> None:
+    robot.send_signal("control", SIGCONT)
+
+
+def _hang_controller(_robot: ProcessRobot, observer: Observer) -> int:
+    """Keep the controller's interpreter busy for HANG_DURATION_S."""
+    request_ns = time.monotonic_ns()
+    observer.inject_fault("control", "hang", "control", for_s=HANG_DURATION_S)
+    return request_ns
+
+
+def _wait_for_nothing(_robot: ProcessRobot) -> None:
+    """Do nothing: the controller stops hanging on its own."""
+
+
+measure_killed_controller = partial(
+    _measure_failing_controller, _kill_controller, _restart_controller
 )
-frozen = partial(
-    _failing,
-    lambda started_robot, _: started_robot.signal("control", SIGSTOP),
-    lambda started_robot: started_robot.signal("control", SIGCONT),
+measure_frozen_controller = partial(
+    _measure_failing_controller, _freeze_controller, _resume_controller
 )
-suspended = partial(_failing, _hang, lambda _: None)
+measure_hanging_controller = partial(
+    _measure_failing_controller, _hang_controller, _wait_for_nothing
+)
 
 
-def host_restarts(request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """The host is killed while moving and started again; what was streamed before is sent to the new one.
+# --- the host restarts ---------------------------------------------------------------------------------------------
 
-    The value: setpoints of the new host that were not passive, before an operator armed it.
+
+def measure_host_restart(request: MeasurementRequest) -> Iterator[InjectionTrial]:
+    """Kill the host while the robot moves, start a new one, and send it commands that the old one received.
+
+    Yields:
+        Trials whose value is the number of setpoints of the new host that were not passive before an operator armed it.
     """
-    with robot(request) as (started_robot, observer):
+    with start_robot(request) as (robot, observer):
         for _ in range(request.trials):
-            started_robot.set_in_motion(observer)
-            observer.watch(0.1)
-            streamed = [arrival.payload for arrival in observer.commands][-REPLAYED:]
-            epoch = observer.status.lease_epoch if observer.status else 0
-            started_robot.signal("host", SIGKILL)
-            observer.watch(UNDER_WAY_S)
-            observer.forget()
-            started_robot.start("host")
-            observer.until(lambda: observer.statuses, "a status of the new host", START_LIMIT_S)
-            observer.until(lambda: observer.applied, "the new host's setpoints")
-            failures = _objections(observer, streamed)
-            if observer.status is None or 0 < observer.status.lease_epoch <= epoch:
-                failures.append(
-                    f"the lease's epoch did not grow from {epoch}: {observer.in_words()}"
-                )
-            moved = sum(set(h.message.mode) != {JointMode.PASSIVE} for h in observer.applied)
-            yield recovered(observer, float(moved), "; ".join(failures))
-        request.note(f"in each trial {REPLAYED} commands of before were sent to the new host")
+            robot.set_in_motion(observer)
+            yield _run_restart_trial(robot, observer)
+        request.add_note(
+            f"in each trial {REPLAYED_COMMANDS} commands for the old host were sent to the new host"
+        )
 
 
-def _objections(observer: Observer, streamed: list[bytes]) -> list[str]:
-    """What is not as it must be with a new host that is sent what its predecessor was."""
+def _run_restart_trial(robot: ProcessRobot, observer: Observer) -> InjectionTrial:
+    observer.listen_for(RECORDED_S)
+    old_payloads = [arrival.payload for arrival in observer.commands][-REPLAYED_COMMANDS:]
+    old_epoch = observer.status.lease_epoch if observer.status else 0
+    robot.send_signal("host", SIGKILL)
+    observer.listen_for(TRANSPORT_TIME_S)
+    observer.forget()
+    robot.start_process("host")
+    observer.wait_until(lambda: observer.statuses, "a status of the new host", START_TIMEOUT_S)
+    observer.wait_until(lambda: observer.applied, "the new host's setpoints")
+    failures = _send_old_commands(observer, old_payloads)
+    if observer.status is None or 0 < observer.status.lease_epoch <= old_epoch:
+        failures.append(
+            f"the lease's epoch did not grow from {old_epoch}: {observer.describe_status()}"
+        )
+    active_count = sum(
+        set(received.message.mode) != {JointMode.PASSIVE} for received in observer.applied
+    )
+    return recover_robot(observer, float(active_count), failures)
 
-    def refused() -> int:
-        return 0 if observer.status is None else sum(observer.status.commands_rejected.values())
 
-    before = refused()
-    for payload in streamed:
-        send_raw(observer.session, payload)
+def _send_old_commands(observer: Observer, payloads: Sequence[bytes]) -> list[str]:
+    """Send commands for the old host, and check that the new host rejects them and stays disarmed.
+
+    Returns:
+        A description of each violation.
+    """
+    rejected_before = _count_rejected_commands(observer)
+    for payload in payloads:
+        send_payload(observer.session, payload)
+
+    def count_new() -> int:
+        return _count_rejected_commands(observer) - rejected_before
+
     failures: list[str] = []
     try:
-        observer.until(
-            lambda: refused() >= before + len(streamed), "old commands refused", REFUSED_S
+        observer.wait_until(
+            lambda: count_new() >= len(payloads), "old commands rejected", REJECTION_TIMEOUT_S
         )
     except TrialError:
-        failures.append(f"{refused() - before} of {len(streamed)} old commands were refused")
-    observer.watch(LATCHED_S)
-    if {h.message.lifecycle for h in observer.statuses} != {"disarmed"}:
-        failures.append(f"did not boot disarmed, and stay so: {observer.in_words()}")
+        failures.append(f"{count_new()} of {len(payloads)} old commands were rejected")
+    observer.listen_for(LATCHED_S)
+    if {received.message.lifecycle for received in observer.statuses} != {"disarmed"}:
+        failures.append(f"did not start and stay disarmed: {observer.describe_status()}")
     return failures
+
+
+def _count_rejected_commands(observer: Observer) -> int:
+    """Return how many commands the host has rejected, by its newest status."""
+    if observer.status is None:
+        return 0
+    return sum(observer.status.commands_rejected.values())

@@ -1,6 +1,7 @@
-"""Drives of every type: their host is frozen, and what goes wrong with one of them or with their bus.
+"""Measures drives of every type: their host is frozen, a drive fails, or their bus fails.
 
-At 50 Hz, which emulated drives of every type keep on a busy computer. Times within a host are measured in its periods.
+The robot runs at 50 Hz, which emulated drives of every type achieve on a busy computer. Times within a host are counted
+in its control periods.
 """
 
 import contextlib
@@ -9,9 +10,9 @@ import random
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.scenario import RunConfig, write_config
@@ -20,174 +21,213 @@ from snakesim_operator.run import children
 from snakesim_testing.harness.wait import wait_until
 from verification.faults.drives_process import READY
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import START_LIMIT_S, ProcessRobot, configuration, recovered, robot
+from verification.faults.robot import (
+    START_TIMEOUT_S,
+    ProcessRobot,
+    make_config,
+    recover_robot,
+    start_robot,
+)
 from verification.faults.row import InjectionTrial, MeasurementRequest
 from verification.faults.rows import modules
 
 RATE_HZ = 50.0
 PERIOD_MS = 1000.0 / RATE_HZ
 FROZEN_S = 1.0
-WATCHED_S = 1.0  # for drives that are enabled again
-# A watchdog, the period that a setpoint may be old, and a busy computer.
-OFF_MS = 100.0 + 3 * PERIOD_MS
-COOLS_IN_S = 2.0  # time constant of the windings, so that a trial need not wait for minutes
+OBSERVED_S = 1.0  # in which no drive may be enabled again
+WATCHDOG_MS = 100.0  # of every drive
+# A setpoint may be one period old at the signal. A busy computer delays the drives by up to two more.
+MAX_OFF_DELAY_MS = WATCHDOG_MS + 3 * PERIOD_MS
+WINDING_TIME_CONSTANT_S = 2.0  # so that an overheated winding cools down within a trial
 MAX_RETRIES = 10  # of one trial
-BUS = "udp_multicast:239.74.163.9"
-POSE = "127.0.0.1:7450"
-SERVOS = "servos"
-BUSES: dict[str, dict[str, Any]] = {
-    "can": {"backend__channels": [BUS]},
-    "odrive": {"backend__channels": [BUS]},
-    "moteus": {"backend__channels": [BUS]},
-    "cia402": {"backend__channels": [BUS]},
-    "dynamixel": {"backend__ports": [SERVOS]},
-    "mixed": {"backends__odrive__channels": [BUS], "backends__dynamixel__ports": [SERVOS]},
+
+CAN_CHANNEL = "udp_multicast:239.74.163.9"
+MOCAP_ADDRESS = "127.0.0.1:7450"
+SERVO_PORT = "servos"  # link to a pseudo terminal, in the working directory
+
+# Overrides that connect the host of each backend to the buses of the separate drives.
+BUS_OVERRIDES: dict[str, dict[str, Any]] = {
+    "can": {"backend__channels": [CAN_CHANNEL]},
+    "odrive": {"backend__channels": [CAN_CHANNEL]},
+    "moteus": {"backend__channels": [CAN_CHANNEL]},
+    "cia402": {"backend__channels": [CAN_CHANNEL]},
+    "dynamixel": {"backend__ports": [SERVO_PORT]},
+    "mixed": {
+        "backends__odrive__channels": [CAN_CHANNEL],
+        "backends__dynamixel__ports": [SERVO_PORT],
+    },
 }
-WATCHDOGS = ("drive_fault", "module_watchdog")
+WATCHDOG_FAULTS = ("drive_fault", "module_watchdog")
 
 
-def robot_of(backend: str, **dotted: Any) -> RunConfig:
-    """The triplet with drives of one type, or of several."""
-    changes: dict[str, Any] = {}
+def _make_drive_config(backend: str, **overrides: Any) -> RunConfig:
+    """Return the configuration of a robot with drives of one type, or of several (`mixed`)."""
     match backend:
         case "mixed":
-            changes["robot"] = "planar13_mixed"
-        case "feetech":  # These servos have no torque mode.
-            changes["controller"] = "lateral_undulation"
+            overrides["robot"] = "planar13_mixed"
+        case "feetech":  # these servos have no torque mode
+            overrides["controller"] = "lateral_undulation"
         case _:
             pass
-    return configuration(backend, rate_hz=RATE_HZ, **changes, **dotted)
-
-
-# --- the host's process is frozen ------------------------------------------------------------------------------
-
-
-class DrivesOutside:
-    """Emulated drives in a process of their own."""
-
-    def __init__(self, folder: Path, config: RunConfig, log: Any) -> None:
-        self._notes = folder / "drives.notes"
-        self._words: list[bytes] = []
-
-        def keep(words: bytes) -> None:
-            self._words.append(words)
-            log.write(words)
-
-        write_config(config, folder / "drives.json")
-        module = [
-            "verification.faults.drives_process",
-            str(folder / "drives.json"),
-            str(self._notes),
-            "--pose",
-            POSE,
-        ]
-        self._child = children.start_child("drives", module, keep)
-        wait_until(lambda: READY in self.output(), "the drives", START_LIMIT_S)
-
-    def output(self) -> str:
-        """What the process printed."""
-        if (ending := self._child.describe_exit()) is not None:
-            raise TrialError(ending)
-        return b"".join(self._words).decode(errors="replace")
-
-    def changes(self) -> list[tuple[int, list[bool]]]:
-        """When which drives were enabled, oldest first; by the monotonic clock."""
-        lines = self._notes.read_text().splitlines(keepends=True)
-        return [tuple(json.loads(line)) for line in lines if line.endswith("\n")]
-
-    def enabled(self) -> list[bool]:
-        """Which are now."""
-        return self.changes()[-1][1]
-
-    def close(self) -> None:
-        """End it."""
-        children.stop_children([self._child])
-
-
-def host_frozen(request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """SIGSTOP for the host, for 1 s. The value: drives that are enabled at any time before the reset."""
-    _use_loopback()
-    config = robot_of(request.backend, backend__pose_listen=POSE, **BUSES[request.backend])
-    slowest_ms = 0.0
-    with (
-        contextlib.chdir(request.folder),
-        (request.folder / "drives.log").open("ab", buffering=0) as log,
-        contextlib.closing(DrivesOutside(request.folder, config, log)) as drives,
-        robot(request, validate_and_complete_config(config)) as (
-            started_robot,
-            observer,
-        ),  # once the servos' port is there
-    ):
-        for _ in range(request.trials):
-            _set_in_motion(request, started_robot, observer, lambda: all(drives.enabled()))
-            trial, off_ms = _frozen(started_robot, observer, drives)
-            slowest_ms = max(slowest_ms, off_ms)
-            yield trial
-    request.note(
-        f"the real host process at {RATE_HZ:g} Hz, drives in a process of their own on {_buses_in_words(request)}; "
-        f"from the signal until every drive was off: at most {slowest_ms:.0f} ms"
-    )
+    return make_config(backend, rate_hz=RATE_HZ, **overrides)
 
 
 def _set_in_motion(
     request: MeasurementRequest,
-    started_robot: ProcessRobot,
+    robot: ProcessRobot,
     observer: Observer,
     is_ready: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Repeat a trial if the robot stops by itself: a bus of emulated drives is late on a busy computer."""
+    """Set the robot in motion, and try again if it stops by itself or is not ready.
+
+    A bus of emulated drives can be late on a busy computer.
+
+    Raises:
+        TrialError: The robot stopped by itself MAX_RETRIES times.
+    """
     for _ in range(MAX_RETRIES):
         with contextlib.suppress(TrialError):
-            started_robot.set_in_motion(observer)
+            robot.set_in_motion(observer)
             if is_ready():
                 return
-        request.retry()
+        request.count_retries()
     raise TrialError(f"this machine is too busy: the robot stopped by itself {MAX_RETRIES} times")
 
 
-def _frozen(
-    started_robot: ProcessRobot, observer: Observer, drives: DrivesOutside
-) -> tuple[InjectionTrial, float]:
-    """Return a trial, and how long after the signal the last drive was off."""
-    stopped_ns = started_robot.signal("host", signal.SIGSTOP)
-    try:
-        time.sleep(FROZEN_S)
-        changes = [change for change in drives.changes() if change[0] > stopped_ns]
-    finally:
-        resumed_ns = started_robot.signal("host", signal.SIGCONT)
-    off_ms = (changes[-1][0] - stopped_ns) / 1e6 if changes else 0.0
-    failures: list[str] = []
-    if not changes or any(changes[-1][1]):
-        failures.append(f"still enabled after {FROZEN_S:g} s: {changes}")
-    elif off_ms > OFF_MS:
-        failures.append(f"off only after {off_ms:.0f} ms")
-    observer.first_fault(resumed_ns)
-    observer.watch(WATCHED_S)
-    if observer.state() != "fault":
-        failures.append(f"not latched: {observer.in_words()}")
-    failures += _unnamed(observer)
-    again = [enabled for at_ns, enabled in drives.changes() if at_ns > resumed_ns]
-    value = float(sum(map(any, zip(*again, strict=True)))) if again else 0.0
-    return recovered(observer, value, "; ".join(failures)), off_ms
+# --- the host is frozen --------------------------------------------------------------------------------------------
 
 
-def _unnamed(observer: Observer) -> list[str]:
-    """The joints whose watchdog's stop was not reported."""
-    assert observer.status is not None
-    named = {fault.joint for fault in observer.status.faults if fault.what in WATCHDOGS}
-    missing = [joint.name for joint in observer.description().joints if joint.name not in named]
-    return [f"not reported: {', '.join(missing)}"] if missing else []
+class SeparateDrives:
+    """Emulated drives in a separate process, which records when each of them is enabled and disabled."""
+
+    def __init__(self, folder: Path, config: RunConfig, log: BinaryIO) -> None:
+        """Start the process, and wait until its buses are open.
+
+        Args:
+            folder: Folder for the configuration and the record of the process.
+            config: Configuration of the run.
+            log: Open file for the output of the process.
+        """
+        self._record_path = folder / "drives.record"
+        self._output: list[bytes] = []
+
+        def on_output(output: bytes) -> None:
+            self._output.append(output)
+            log.write(output)
+
+        config_path = folder / "drives.json"
+        write_config(config, config_path)
+        command = ["verification.faults.drives_process", str(config_path), str(self._record_path)]
+        command += ["--pose", MOCAP_ADDRESS]
+        self._child = children.start_child("drives", command, on_output)
+        wait_until(lambda: READY in self._read_output(), "the drives", START_TIMEOUT_S)
+
+    def _read_output(self) -> str:
+        """Return everything that the process printed. Raise TrialError if it has ended."""
+        ending = self._child.describe_exit()
+        if ending is not None:
+            raise TrialError(ending)
+        return b"".join(self._output).decode(errors="replace")
+
+    def read_changes(self) -> list[tuple[int, list[bool]]]:
+        """Return every recorded change, oldest first.
+
+        Returns:
+            The time of each change by the monotonic clock in ns, and for each joint whether its drive is enabled.
+        """
+        lines = self._record_path.read_text().splitlines(keepends=True)
+        return [tuple(json.loads(line)) for line in lines if line.endswith("\n")]
+
+    def are_all_enabled(self) -> bool:
+        """Return whether every drive is enabled now."""
+        _, enabled = self.read_changes()[-1]
+        return all(enabled)
+
+    def close(self) -> None:
+        """Stop the process of the drives."""
+        children.stop_children([self._child])
 
 
-def _buses_in_words(request: MeasurementRequest) -> str:
-    buses = [name for values in BUSES[request.backend].values() for name in values]
-    return " and ".join(
-        "a pseudo terminal" if name == SERVOS else "UDP multicast" for name in buses
+def measure_frozen_host(request: MeasurementRequest) -> Iterator[InjectionTrial]:
+    """Freeze the host for FROZEN_S while the robot moves. The drives run in a separate process.
+
+    Yields:
+        Trials whose value is the number of drives that were enabled again before the reset.
+    """
+    _keep_multicast_on_loopback()
+    config = _make_drive_config(
+        request.backend, backend__pose_listen=MOCAP_ADDRESS, **BUS_OVERRIDES[request.backend]
+    )
+    max_off_delay_ms = 0.0
+    with (
+        contextlib.chdir(request.folder),
+        (request.folder / "drives.log").open("ab", buffering=0) as log,
+        contextlib.closing(SeparateDrives(request.folder, config, log)) as drives,
+        # The port of the servos must exist before the configuration is completed.
+        start_robot(request, validate_and_complete_config(config)) as (robot, observer),
+    ):
+        for _ in range(request.trials):
+            _set_in_motion(request, robot, observer, drives.are_all_enabled)
+            trial, off_delay_ms = _run_frozen_host_trial(robot, observer, drives)
+            max_off_delay_ms = max(max_off_delay_ms, off_delay_ms)
+            yield trial
+    request.add_note(
+        f"the real host process at {RATE_HZ:g} Hz, drives in a process of their own on "
+        f"{_describe_buses(request.backend)}; "
+        f"from the signal until every drive was off: at most {max_off_delay_ms:.0f} ms"
     )
 
 
-def _use_loopback() -> None:
-    """Let multicast stay in this network namespace, in which nothing else is."""
+def _run_frozen_host_trial(
+    robot: ProcessRobot, observer: Observer, drives: SeparateDrives
+) -> tuple[InjectionTrial, float]:
+    """Freeze the host once. Return the trial, and the time from the signal to the last drive that was off, in ms."""
+    freeze_ns = robot.send_signal("host", signal.SIGSTOP)
+    try:
+        time.sleep(FROZEN_S)
+        changes = [change for change in drives.read_changes() if change[0] > freeze_ns]
+    finally:
+        resume_ns = robot.send_signal("host", signal.SIGCONT)
+    off_delay_ms = (changes[-1][0] - freeze_ns) / 1e6 if changes else 0.0
+    failures: list[str] = []
+    if not changes or any(changes[-1][1]):
+        failures.append(f"still enabled after {FROZEN_S:g} s: {changes}")
+    elif off_delay_ms > MAX_OFF_DELAY_MS:
+        failures.append(f"off only after {off_delay_ms:.0f} ms")
+    observer.wait_for_fault(resume_ns)
+    observer.listen_for(OBSERVED_S)
+    if observer.get_lifecycle() != "fault":
+        failures.append(f"not latched: {observer.describe_status()}")
+    unreported = _list_unreported_joints(observer)
+    if unreported:
+        failures.append(f"not reported: {', '.join(unreported)}")
+    enabled_again = _count_enabled_drives(drives, resume_ns)
+    return recover_robot(observer, float(enabled_again), failures), off_delay_ms
+
+
+def _list_unreported_joints(observer: Observer) -> list[str]:
+    """Return the joints for which the status reports no stop by a watchdog."""
+    assert observer.status is not None
+    reported = {fault.joint for fault in observer.status.faults if fault.what in WATCHDOG_FAULTS}
+    joint_names = [joint.name for joint in observer.get_description().joints]
+    return [name for name in joint_names if name not in reported]
+
+
+def _count_enabled_drives(drives: SeparateDrives, since_ns: int) -> int:
+    """Return how many drives were enabled at any time after a time."""
+    states = [enabled for at_ns, enabled in drives.read_changes() if at_ns > since_ns]
+    return sum(any(drive_states) for drive_states in zip(*states, strict=True))
+
+
+def _describe_buses(backend: str) -> str:
+    names = [name for values in BUS_OVERRIDES[backend].values() for name in values]
+    return " and ".join(
+        "a pseudo terminal" if name == SERVO_PORT else "UDP multicast" for name in names
+    )
+
+
+def _keep_multicast_on_loopback() -> None:
+    """Route multicast over the loopback interface of this network namespace, which has no other interface."""
     for command in (
         "link set lo up",
         "link set lo multicast on",
@@ -196,28 +236,34 @@ def _use_loopback() -> None:
         subprocess.run(["ip", *command.split()], check=True, capture_output=True, timeout=10)
 
 
-# --- a drive, or its bus ---------------------------------------------------------------------------------------
+# --- a drive or its bus fails --------------------------------------------------------------------------------------
 
 
-def at_host(
-    kind: str, expected: dict[str, Sequence[str]], request: MeasurementRequest
+def measure_injected_fault(
+    kind: str, fault_names: Mapping[str, Sequence[str]], request: MeasurementRequest
 ) -> Iterator[InjectionTrial]:
-    """Inject a fault of joint_N or bus_1 into the host whose process emulates the drives.
+    """Inject a fault into the host, whose process also emulates the drives.
 
-    expected: names that the driver of each type gives it. The value: from its beginning to the stop mode.
+    Args:
+        kind: Kind of the fault. It concerns a random joint, or the first bus.
+        fault_names: Names that the driver may report, by backend, or by `others`.
+        request: Measurement to make.
+
+    Yields:
+        Trials whose value is the time from the beginning of the fault to the stop mode, in ms.
     """
     rng = random.Random(9)
-    config = robot_of(request.backend, robot__heat__time_constant_s=COOLS_IN_S)
-    what = expected.get(request.backend, expected["others"])
-    with robot(request, validate_and_complete_config(config)) as (
-        started_robot,
-        observer,
-    ):  # as `snakesim run` does
-        joints = len(observer.description().joints)
+    overrides = {"robot__heat__time_constant_s": WINDING_TIME_CONSTANT_S}
+    config = validate_and_complete_config(_make_drive_config(request.backend, **overrides))
+    expected_names = fault_names.get(request.backend, fault_names["others"])
+    with start_robot(request, config) as (robot, observer):
+        joint_count = len(observer.get_description().joints)
         for _ in range(request.trials):
-            _set_in_motion(request, started_robot, observer)
-            target = "bus_1" if kind in modules.BUS_KINDS else f"joint_{rng.randrange(joints) + 1}"
-            yield modules.injected(observer, FaultInjection(kind, target), what, PERIOD_MS)
-    request.note(
+            _set_in_motion(request, robot, observer)
+            is_bus_fault = kind in modules.BUS_KINDS
+            target = "bus_1" if is_bus_fault else f"joint_{rng.randrange(joint_count) + 1}"
+            injection = FaultInjection(kind, target)
+            yield modules.run_injection_trial(observer, injection, expected_names, PERIOD_MS)
+    request.add_note(
         f"the real host process at {RATE_HZ:g} Hz, drives emulated in it; counted in its periods"
     )

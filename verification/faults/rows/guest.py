@@ -1,7 +1,8 @@
-"""What needs a machine of its own: modules on a kernel's CAN bus outlive the host, and the wall clock is set.
+"""Measures joint modules whose host ends or is silent: their watchdogs must stop them.
 
-The modules are emulators in a process that lives through all trials, at 25 Hz; the listener has the kernel's time of
-every frame. Host and control are the product's own processes.
+The host is killed or frozen in a virtual machine, which has a CAN bus of the kernel. The modules on this bus continue
+without the host: they are emulated in a process that runs during all trials, at 25 Hz. A listener records every frame
+with the kernel's time. Host and control are the product's own processes.
 """
 
 import contextlib
@@ -16,14 +17,12 @@ from functools import partial
 from pathlib import Path
 
 from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opcode, parse_node
-from snakesim_hal.model.scenario import KeyOverride, load_scenario
 from snakesim_hal.network.session import ConnectionSettings, open_session
-from snakesim_hal.programs import host_program as host_process
+from snakesim_hal.programs import host_program
 from snakesim_testing.can.listened_bus import (
     JOINTS,
     NODES,
     RATE_HZ,
-    SCENARIO,
     ReceivedFrame,
     RobotOnBus,
     bench,
@@ -32,115 +31,147 @@ from snakesim_testing.can.listened_bus import (
     stop_commands,
 )
 from snakesim_testing.can.module_rig import BOOTED, MS, QUIET, ModuleFirmware, armed, setpoint
-from snakesim_testing.hal.small_robots import write_scenario_files
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import START_LIMIT_S, ProcessRobot, robot
 from verification.faults.row import InjectionTrial, MeasurementRequest
 
 CHANNEL = "vcan0"
-ARM_LIMIT_S = 120.0
-LIVE_S = 0.3
-LEFT_S = 0.8
+ARMING_TIMEOUT_S = 120.0
+MOVING_S = 0.3  # from arming to the injection
+# After the signal. Includes the heartbeats after the stop, from which the time of the modules is known.
+OBSERVED_S = 0.8
 MAX_RETRIES = 10  # of each trial, on average
-LOOK_S = 0.4
-WATCHDOG_MS = 100.0
-STEP_S = 3600.0
-AFTER_STEP_S = 1.0
-ATTEMPTS = 3
+POLL_PERIOD_S = 0.4  # long, because an emulated machine needs its time for the modules and the host
+
+# A single module.
+MODULE_PERIOD_US = 10 * MS
+POLL_PERIOD_US = MS / 10
+MAX_SILENCE_US = 1000 * MS  # a module that is still armed then has no watchdog
 
 
-def host_gone(number: signal.Signals, request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """SIGKILL or SIGSTOP for the host. The value: from the last setpoint to the fault, in the module's own time."""
-    rng, by_kernel_ms, done = random.Random(7), list[float](), 0
+# --- the host ends, with modules on the kernel's bus ---------------------------------------------------------------
+
+
+def _measure_ended_host(
+    number: signal.Signals, request: MeasurementRequest
+) -> Iterator[InjectionTrial]:
+    """Kill or freeze the host while the modules are armed. Each trial has a new host.
+
+    Yields:
+        Trials whose value is the time from the last setpoint to the fault of the module, in ms of the module's time.
+    """
+    rng = random.Random(7)
+    fault_delays_ms: list[float] = []  # of the last module in each trial, by the kernel's clock
+    trial_count = 0
     with bench(request.folder, CHANNEL) as robot:
         robot.modules()
         robot.control()
-        while done < request.trials:
-            trial: InjectionTrial | None = None
-            try:
-                with _armed_host(request, robot) as pid:
-                    robot.listener.forget()
-                    time.sleep(LIVE_S + rng.random() / RATE_HZ)
-                    trial = _left_alone(robot, pid, number, by_kernel_ms)
-            except TrialError as error:  # it could not be armed: with a new host, perhaps
-                print(f"    made again: {error}", flush=True)
+        while trial_count < request.trials:
+            trial = _run_ended_host_trial(request, robot, number, rng, fault_delays_ms)
             if trial is not None:
-                done += 1
+                trial_count += 1
                 yield trial
                 continue
-            request.retry()
+            request.count_retries()
             if request.retried > MAX_RETRIES * request.trials:
                 raise TrialError(
                     f"this machine is too busy: the robot stopped by itself {request.retried} times"
                 )
-    request.note(
+    request.add_note(
         f"the real host process and control, {JOINTS} modules in a process of their own, at {RATE_HZ:g} Hz on "
         f"{CHANNEL}; from the signal to the last module's fault by the kernel's clock: at most "
-        f"{max(by_kernel_ms, default=0):.0f} ms. Each trial begins with a new host that is armed by an operator"
+        f"{max(fault_delays_ms, default=0):.0f} ms. Each trial begins with a new host that is armed by an operator"
     )
 
 
-host_killed, host_frozen = (
-    partial(host_gone, number) for number in (signal.SIGKILL, signal.SIGSTOP)
-)
+measure_killed_host = partial(_measure_ended_host, signal.SIGKILL)
+measure_frozen_host = partial(_measure_ended_host, signal.SIGSTOP)
 
 
-def _left_alone(
-    robot: RobotOnBus, pid: int, number: signal.Signals, by_kernel_ms: list[float]
+def _run_ended_host_trial(
+    request: MeasurementRequest,
+    robot: RobotOnBus,
+    number: signal.Signals,
+    rng: random.Random,
+    fault_delays_ms: list[float],
 ) -> InjectionTrial | None:
-    """None: the robot had stopped already when the signal came."""
-    listener, fault = robot.listener, {ModuleState.FAULT}
-    now_ns = time.time_ns()
-    os.kill(pid, number)
-    # Also for the heartbeats after it, from which the modules' own time is known.
-    time.sleep(LEFT_S)
-    received = listener.listen()
-    if not _went_well_until(received, now_ns):
+    """Start and arm a host, and send it a signal. Return None if the trial must be repeated with a new host."""
+    try:
+        with _start_armed_host(request, robot) as host_pid:
+            robot.listener.forget()
+            time.sleep(MOVING_S + rng.random() / RATE_HZ)
+            signal_ns = time.time_ns()
+            os.kill(host_pid, number)
+            time.sleep(OBSERVED_S)
+            return _judge_ended_host_trial(robot, signal_ns, fault_delays_ms)
+    except TrialError as error:
+        print(f"    repeated: {error}", flush=True)
         return None
-    stopped = first_in(received, fault, now_ns)
-    if len(stopped) < JOINTS:
+
+
+def _judge_ended_host_trial(
+    robot: RobotOnBus, signal_ns: int, fault_delays_ms: list[float]
+) -> InjectionTrial | None:
+    """Return the trial from the frames on the bus, or None if the robot had stopped before the signal.
+
+    Args:
+        robot: Robot with a listener on its bus.
+        signal_ns: When the host got the signal, by the kernel's clock.
+        fault_delays_ms: Gets the time from the signal to the last module's fault, by the kernel's clock.
+    """
+    frames = robot.listener.listen()
+    if not _was_moving(frames, signal_ns):
+        return None
+    faults = first_in(frames, {ModuleState.FAULT}, signal_ns)
+    if len(faults) < JOINTS:
+        states = robot.listener.states()
         return InjectionTrial(
-            value=None,
-            failure=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}",
+            value=None, failure=f"not all in fault {OBSERVED_S:g} s after the signal: {states}"
         )
-    by_kernel_ms.append(max(h.at_ns for h in stopped.values()) / 1e6 - now_ns / 1e6)
-    failures: list[str] = []
-    causes = {h.decode()["last_stop"] for h in stopped.values() if h.opcode == Opcode.HEARTBEAT}
-    if causes - {LastStop.WATCHDOG}:
-        failures.append(f"stopped by {causes}")
-    own_ms: list[float] = []
-    for node in NODES:
-        points = [
-            h.at_ns
-            for h in received
-            if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node
-        ]
-        own_ms.append(passed_for_module_ms(received, node, max(points), stopped[node].at_ns))
-    return InjectionTrial(value=max(own_ms), failure="; ".join(failures), recovered=True)
-
-
-def _went_well_until(received: Sequence[ReceivedFrame], now_ns: int) -> bool:
-    """Return whether every module had a setpoint within the last three periods, and none had a stop command."""
-    recent_ns = now_ns - round(3e9 / RATE_HZ)
-    driven = {
-        parse_node(h.frame.id)
-        for h in received
-        if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns
+    fault_delays_ms.append((max(frame.at_ns for frame in faults.values()) - signal_ns) / 1e6)
+    causes = {
+        frame.decode()["last_stop"] for frame in faults.values() if frame.opcode == Opcode.HEARTBEAT
     }
-    return driven == set(NODES) and not stop_commands([h for h in received if h.at_ns > recent_ns])
+    other_causes = causes - {LastStop.WATCHDOG}
+    delays_ms = [_measure_module_delay_ms(frames, node, faults[node]) for node in NODES]
+    return InjectionTrial(
+        value=max(delays_ms),
+        failure=f"stopped by {causes}" if other_causes else "",
+        recovered=True,
+    )
+
+
+def _measure_module_delay_ms(
+    frames: Sequence[ReceivedFrame], node: int, fault: ReceivedFrame
+) -> float:
+    """Return the time from the last setpoint of a module to its fault, in ms of the module's own time."""
+    setpoint_times_ns = [frame.at_ns for frame in frames if _is_setpoint(frame, node)]
+    return passed_for_module_ms(frames, node, max(setpoint_times_ns), fault.at_ns)
+
+
+def _was_moving(frames: Sequence[ReceivedFrame], at_ns: int) -> bool:
+    """Return whether every module got a setpoint in the last three periods before a time, and none a stop command."""
+    recent_ns = at_ns - round(3e9 / RATE_HZ)
+    recent = [frame for frame in frames if frame.at_ns > recent_ns]
+    has_setpoints = all(any(_is_setpoint(frame, node) for frame in recent) for node in NODES)
+    return has_setpoints and not stop_commands(recent)
+
+
+def _is_setpoint(frame: ReceivedFrame, node: int) -> bool:
+    return frame.opcode == Opcode.SET_POINT and parse_node(frame.frame.id) == node
 
 
 @contextlib.contextmanager
-def _armed_host(request: MeasurementRequest, robot: RobotOnBus) -> Iterator[int]:
-    """A host in a process of its own, once it has armed every module."""
-    processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload([__name__])
-    process = processes.Process(target=_become_host, args=(robot.host_arguments, robot.folder))
+def _start_armed_host(request: MeasurementRequest, robot: RobotOnBus) -> Iterator[int]:
+    """Start a host in a new process, arm every module, and yield the process id of the host."""
+    # A new process is forked from one that has imported everything, which takes long on an emulated machine.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    process = context.Process(target=_run_host, args=(robot.host_arguments, robot.folder))
     process.start()
     try:
-        link = ConnectionSettings(robot.endpoint, robot.config.robot.name)
-        with open_session(link, connect_timeout_s=ARM_LIMIT_S) as session:
-            _arm(request, robot, Observer(session))
+        settings = ConnectionSettings(robot.endpoint, robot.config.robot.name)
+        with open_session(settings, connect_timeout_s=ARMING_TIMEOUT_S) as session:
+            _arm_modules(request, robot, Observer(session))
             assert process.pid is not None
             yield process.pid
     finally:
@@ -148,93 +179,59 @@ def _armed_host(request: MeasurementRequest, robot: RobotOnBus) -> Iterator[int]
         process.join()
 
 
-def _arm(request: MeasurementRequest, robot: RobotOnBus, observer: Observer) -> None:
-    """Until every module says that it is armed. Looks rarely: this machine is slow, and modules and host need it."""
-    deadline = time.monotonic() + ARM_LIMIT_S
+def _arm_modules(request: MeasurementRequest, robot: RobotOnBus, observer: Observer) -> None:
+    """Arm the robot until every module reports that it is armed.
+
+    Raises:
+        TrialError: The modules were not armed within ARMING_TIMEOUT_S.
+    """
+    deadline_s = time.monotonic() + ARMING_TIMEOUT_S
     while robot.listener.states() != [ModuleState.ARMED] * JOINTS:
-        if time.monotonic() > deadline:
-            log = robot.read_log("host")[-300:]
-            raise TrialError(f"not armed within {ARM_LIMIT_S:g} s: {observer.in_words()}; {log}")
-        if observer.state() != "armed":
-            observer.arm(ARM_LIMIT_S)
+        if time.monotonic() > deadline_s:
+            log_end = robot.read_log("host")[-300:]
+            raise TrialError(
+                f"not armed within {ARMING_TIMEOUT_S:g} s: {observer.describe_status()}; {log_end}"
+            )
+        if observer.get_lifecycle() != "armed":
+            observer.arm(ARMING_TIMEOUT_S)
         robot.listener.forget()
-        observer.watch(LOOK_S)
-    request.retry(observer.stumbles)
+        observer.listen_for(POLL_PERIOD_S)
+    request.count_retries(observer.failed_armings)
 
 
-def _become_host(arguments: Sequence[str], folder: Path) -> None:
-    """In a new process, forked from one that has imported everything: an emulated machine takes long for that."""
+def _run_host(arguments: Sequence[str], folder: Path) -> None:
+    """Run the host in this process, with its output in a log."""
     os.environ["XDG_STATE_HOME"] = str(folder)
-    output = os.open(folder / "host.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.dup2(output, 1)
-    os.dup2(output, 2)
-    sys.exit(host_process.main([*arguments, "--parent", str(os.getppid())]))
+    log = os.open(folder / "host.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    sys.exit(host_program.main([*arguments, "--parent", str(os.getppid())]))
 
 
-def watchdog(request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """A module whose host is silent from some instant on. The value: until it is passive, in its own exact time."""
+# --- the host sends nothing, with the firmware of one module -------------------------------------------------------
+
+
+def measure_silent_host(request: MeasurementRequest) -> Iterator[InjectionTrial]:
+    """Stop sending setpoints to the firmware of an armed module, after a random number of periods.
+
+    Yields:
+        Trials whose value is the time from the last setpoint to the fault, in ms of the module's own time.
+    """
     rng = random.Random(8)
     for _ in range(request.trials):
         module: ModuleFirmware = armed()
         now_us = BOOTED
         for count in range(rng.randrange(5, 40)):
-            now_us += 10 * MS
+            now_us += MODULE_PERIOD_US
             module.handle_sync(count, QUIET)
             module.poll(now_us)
             module.receive_setpoint(setpoint(count), now_us)
         assert module.state == ModuleState.ARMED, module.state
-        last_us = now_us
-        while module.state == ModuleState.ARMED and now_us - last_us < 1000 * MS:
-            now_us += MS / 10
+        last_setpoint_us = now_us
+        while module.state == ModuleState.ARMED and now_us - last_setpoint_us < MAX_SILENCE_US:
+            now_us += POLL_PERIOD_US
             module.poll(now_us)
-        failure = "" if module.state == ModuleState.FAULT else f"it is {module.state.name}"
-        yield InjectionTrial(value=(now_us - last_us) / MS, failure=failure)
-
-
-def clock_step(request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """An hour ahead, then an hour back, while a robot moves at 25 Hz. The value: faults and stops."""
-    scenario = write_scenario_files(
-        request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', "")
-    )
-    settings = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
-    config = load_scenario(
-        scenario, [KeyOverride(key, value, "the fault table") for key, value in settings.items()]
-    ).config
-    with robot(request, config) as (started_robot, observer):
-        for number in range(request.trials):
-            trial = InjectionTrial(value=None)
-            for _ in range(ATTEMPTS):
-                trial = _stepped(started_robot, observer, STEP_S if number % 2 == 0 else -STEP_S)
-                if trial.value == 0:
-                    break
-                request.retry()
-                _step_clock(STEP_S if number % 2 else -STEP_S)
-                observer.arm(START_LIMIT_S)
-            yield trial
-        if request.trials % 2:
-            _step_clock(-STEP_S)
-    request.note(
-        f"{JOINTS} joints at {RATE_HZ:g} Hz, holding; the clock goes {STEP_S:g} s ahead and back by turns. A step that "
-        f"met a stop, as an emulated machine brings about by itself, was tried again, at most {ATTEMPTS} times"
-    )
-
-
-def _stepped(started_robot: ProcessRobot, observer: Observer, by_s: float) -> InjectionTrial:
-    while observer.state() != "armed":
-        observer.arm(START_LIMIT_S)
-    observer.watch(LIVE_S + started_robot.random.random() / RATE_HZ)
-    observer.forget()
-    _step_clock(by_s)
-    observer.watch(AFTER_STEP_S)
-    faults = len(observer.status.faults) if observer.status is not None else 1
-    stops = sum(h.message.sequence is None for h in observer.applied)
-    failure = "" if observer.state() == "armed" else f"stopped: {observer.in_words()}"
-    if len(observer.applied) < AFTER_STEP_S * RATE_HZ / 2:
-        failure = (
-            failure or f"only {len(observer.applied)} setpoints received of in {AFTER_STEP_S:g} s"
-        )
-    return InjectionTrial(value=float(faults + stops), failure=failure)
-
-
-def _step_clock(by_s: float) -> None:
-    time.clock_settime(time.CLOCK_REALTIME, time.clock_gettime(time.CLOCK_REALTIME) + by_s)
+        failure = ""
+        if module.state != ModuleState.FAULT:
+            failure = f"the state of the module is {module.state.name}"
+        yield InjectionTrial(value=(now_us - last_setpoint_us) / MS, failure=failure)

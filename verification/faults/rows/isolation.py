@@ -1,4 +1,4 @@
-"""A joint that fails in a robot that may lose one: it alone is let go, until a person takes it back."""
+"""Measures a joint that fails in a robot that may isolate one joint: only this joint is disabled, until a reset."""
 
 import random
 import time
@@ -8,67 +8,86 @@ from typing import Any
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import AppliedCommand, JointMode, LifecycleRequest
 from verification.faults.observer import Observer, ReceivedMessage, TrialError
-from verification.faults.robot import recovered, robot
+from verification.faults.robot import recover_robot, start_robot
 from verification.faults.row import InjectionTrial, MeasurementRequest
 
 FAULT_DURATION_S = 0.3
-MORE_S = 0.1  # that the others are watched for, when the joint is sound again
-MAY_LOSE_ONE: dict[str, Any] = {"robot__safety__max_isolated_joints": 1}
+OBSERVED_S = 0.1  # after the end of the fault, in which the other joints must continue
+TIMEOUT_S = 3.0  # for the isolation, and for its end
+ONE_ISOLATED_JOINT: dict[str, Any] = {"robot__safety__max_isolated_joints": 1}
 
 
-def set_aside(kind: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """The value: from the request to the injector to the first setpoints that leave the joint passive."""
+def measure_isolated_joint(kind: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
+    """Let a random joint fail while the robot moves.
+
+    Args:
+        kind: Kind of the fault.
+        request: Measurement to make.
+
+    Yields:
+        Trials whose value is the time from the request to the first setpoints in which the joint is passive, in ms.
+    """
     rng = random.Random(7)
-    with robot(request, **MAY_LOSE_ONE) as (started_robot, observer):
-        names = [joint.name for joint in observer.description().joints]
+    with start_robot(request, **ONE_ISOLATED_JOINT) as (robot, observer):
+        joint_names = [joint.name for joint in observer.get_description().joints]
         for _ in range(request.trials):
-            started_robot.set_in_motion(observer)
-            joint = rng.randrange(len(names))
-            requested_ns = time.monotonic_ns()
-            observer.inject("hal", kind, names[joint], for_s=FAULT_DURATION_S)
-            value = (_let_go(observer, joint, requested_ns).at_ns - requested_ns) / 1e6
-            observer.watch(FAULT_DURATION_S + MORE_S)
-            failures = _objections(observer, names[joint], requested_ns)
-            _take_back(observer)
-            yield recovered(observer, value, "; ".join(failures))
+            robot.set_in_motion(observer)
+            joint = rng.randrange(len(joint_names))
+            request_ns = time.monotonic_ns()
+            observer.inject_fault("hal", kind, joint_names[joint], for_s=FAULT_DURATION_S)
+            isolation = _wait_for_passive_joint(observer, joint, request_ns)
+            delay_ms = (isolation.at_ns - request_ns) / 1e6
+            observer.listen_for(FAULT_DURATION_S + OBSERVED_S)
+            failures = _check_isolation(observer, joint_names[joint], request_ns)
+            _end_isolation(observer)
+            yield recover_robot(observer, delay_ms, failures)
 
 
-def _let_go(observer: Observer, joint_index: int, since_ns: int) -> ReceivedMessage[AppliedCommand]:
-    """The first setpoints without the joint; by the controller, not by the host alone."""
+def _wait_for_passive_joint(
+    observer: Observer, joint: int, since_ns: int
+) -> ReceivedMessage[AppliedCommand]:
+    """Return the first setpoints after a time that answer a controller's command and leave a joint passive."""
 
-    def found() -> list[ReceivedMessage[AppliedCommand]]:
-        passive = (
-            h
-            for h in observer.applied
-            if h.at_ns >= since_ns and h.message.mode[joint_index] is JointMode.PASSIVE
-        )
-        return [received for received in passive if received.message.sequence is not None]
+    def find_passive() -> ReceivedMessage[AppliedCommand] | None:
+        for received in observer.applied:
+            applied = received.message
+            is_passive = applied.mode[joint] is JointMode.PASSIVE
+            if received.at_ns >= since_ns and is_passive and applied.sequence is not None:
+                return received
+        return None
 
-    return observer.until(found, "the joint is let go", 3.0)[0]
+    return observer.wait_until(find_passive, "the joint is disabled", TIMEOUT_S)
 
 
-def _objections(observer: Observer, name: str, since_ns: int) -> list[str]:
+def _check_isolation(observer: Observer, joint_name: str, since_ns: int) -> list[str]:
+    """Check that only this joint is isolated and named, and that the others did not stop.
+
+    Returns:
+        A description of each violation.
+    """
     status = observer.status
     if status is None:
         raise TrialError("no status")
     failures: list[str] = []
     if status.lifecycle != "armed":
-        failures.append(f"the robot stopped: {observer.in_words()}")
-    if status.isolated != [name]:
-        failures.append(f"{status.isolated} are set aside, not {name}")
-    if [fault.joint for fault in status.faults] != [name]:
-        failures.append(f"{name} was not named alone: {[fault.cause for fault in status.faults]}")
-    if (first := observer.first_safe(since_ns)) is not None:
-        failures.append(f"the host stopped all joints at tick {first.message.tick}")
+        failures.append(f"the robot stopped: {observer.describe_status()}")
+    if status.isolated != [joint_name]:
+        failures.append(f"{status.isolated} are isolated, not {joint_name}")
+    if [fault.joint for fault in status.faults] != [joint_name]:
+        causes = [fault.cause for fault in status.faults]
+        failures.append(f"{joint_name} is not the only named joint: {causes}")
+    stop = observer.find_stop_setpoints(since_ns)
+    if stop is not None:
+        failures.append(f"the host stopped all joints at tick {stop.message.tick}")
     return failures
 
 
-def _take_back(observer: Observer) -> None:
-    """Disarm, and reset: then the joint counts again."""
+def _end_isolation(observer: Observer) -> None:
+    """Disarm and reset the robot, which ends the isolation of its joints."""
     for action in ("disarm", "reset"):
-        observer.ask(keys.LIFECYCLE, LifecycleRequest(action=action))
-    observer.until(
+        observer.send_request(keys.LIFECYCLE, LifecycleRequest(action=action))
+    observer.wait_until(
         lambda: observer.status is not None and not observer.status.isolated,
-        "the joint is taken back",
-        3.0,
+        "the isolation has ended",
+        TIMEOUT_S,
     )

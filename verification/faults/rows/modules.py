@@ -1,7 +1,8 @@
-"""Joint modules and buses that fail, through the product's own injector, in a robot with all its processes.
+"""Measures joint modules and buses that fail, and sensors of joints that fail.
 
-Those of CAN alone are measured in periods of robot time, from the host's ticks: a machine that is late by some
-milliseconds does not count, one that misses a period does. What sensors of any backend can do is measured from outside.
+The product's own injector causes the faults, in a robot with all its processes. Faults of the backend `can` alone are
+measured in control periods of the host: a delay of some milliseconds does not count, a missed period does. Faults of
+sensors of any backend are measured by the observer.
 """
 
 import random
@@ -11,144 +12,207 @@ from collections.abc import Iterator, Sequence
 
 from snakesim_can_backend.protocol.definitions import CommandAction
 from snakesim_hal.model.fault_kinds import FaultInjection, validate_and_complete_injection
-from snakesim_hal.wire.messages import Answer, RobotStatus
+from snakesim_hal.wire.messages import Answer, Fault
 from verification.faults import bus_log
 from verification.faults.observer import Observer, TrialError
-from verification.faults.robot import START_LIMIT_S, ProcessRobot, configuration, recovered, robot
+from verification.faults.robot import (
+    START_TIMEOUT_S,
+    ProcessRobot,
+    make_config,
+    recover_robot,
+    start_robot,
+)
 from verification.faults.row import InjectionTrial, MeasurementRequest
 
 PERIOD_MS = 10.0
 FAULT_DURATION_S = 0.3
-REST_S = 0.4  # until all motors must be off
-OFF_NM = 0.1  # what noise makes of none
-# Of a bus that takes no frame any more: modules stop by themselves.
-CUT_OFF = "cut", "bus_off", "full"
-BUS_KINDS = (*CUT_OFF, "error_passive", "overflow")
+BRAKING_S = 0.4  # after which all motors must be off
+MAX_OFF_TORQUE_NM = 0.1  # measured at a motor that is off, because of noise
+DISCONNECTING_KINDS = ("cut", "bus_off", "full")  # no frame reaches a module: it stops by itself
+BUS_KINDS = (*DISCONNECTING_KINDS, "error_passive", "overflow")
 BUS_LOG = "bus.log"
 ROBOT_TIME_PATTERN = re.compile(r"at ([0-9.]+) s of robot time")
 
 
-def at_host(kind: str, what: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """Inject a fault of joint_N or bus_1 on CAN into the host. what: the name that the driver gives it.
+# --- a joint module or a bus fails ---------------------------------------------------------------------------------
 
-    The value: from its beginning, which is just before a Sync, to the stop mode, which goes out where the setpoints
-    of that period would have; for a module from its last good answer, a period earlier.
+
+def measure_injected_fault(
+    kind: str, fault_name: str, request: MeasurementRequest
+) -> Iterator[InjectionTrial]:
+    """Inject a fault of a random joint module or of the first CAN bus.
+
+    Args:
+        kind: Kind of the fault.
+        fault_name: Name that the driver must report.
+        request: Measurement to make.
+
+    Yields:
+        Trials whose value is the time until the stop mode in ms, see `run_injection_trial`.
     """
-    rng, log = random.Random(5), request.folder / BUS_LOG
-    with robot(request, backend__log=str(log)) as (started_robot, observer):
+    rng = random.Random(5)
+    log_path = request.folder / BUS_LOG
+    with start_robot(request, backend__log=str(log_path)) as (robot, observer):
         for _ in range(request.trials):
-            started_robot.set_in_motion(observer)
-            number = rng.randrange(len(observer.description().joints)) + 1
-            injection = FaultInjection(kind, "bus_1" if kind in BUS_KINDS else f"joint_{number}")
-            yield injected(observer, injection, [what], PERIOD_MS)
-    stops = bus_log.commands(bus_log.read(log), CommandAction.STOP)
-    if kind not in CUT_OFF and stops < request.trials:
-        raise TrialError(f"{stops} Stops on the bus in {request.trials} trials")
-    request.note("the real host process, in real time; counted in its periods")
+            robot.set_in_motion(observer)
+            number = rng.randrange(len(observer.get_description().joints)) + 1
+            target = "bus_1" if kind in BUS_KINDS else f"joint_{number}"
+            injection = FaultInjection(kind, target)
+            yield run_injection_trial(observer, injection, [fault_name], PERIOD_MS)
+    stop_count = bus_log.count_commands(bus_log.read_frames(log_path), CommandAction.STOP)
+    if kind not in DISCONNECTING_KINDS and stop_count < request.trials:
+        raise TrialError(f"{stop_count} Stops on the bus in {request.trials} trials")
+    request.add_note("the real host process, in real time; counted in its periods")
 
 
-def injected(
-    observer: Observer, injection: FaultInjection, what: Sequence[str], period_ms: float
+def run_injection_trial(
+    observer: Observer, injection: FaultInjection, fault_names: Sequence[str], period_ms: float
 ) -> InjectionTrial:
-    """Inject a fault once, and return the trial. what: names that the driver may give it; period_ms: of the host."""
-    injection, requested_ns = validate_and_complete_injection(injection), time.monotonic_ns()
-    answer = observer.inject("hal", injection.kind, injection.target, for_s=FAULT_DURATION_S)
-    begun = _begun_tick(answer, period_ms)
-    status = observer.first_fault(requested_ns)
-    found = min(
-        (fault for fault in status.faults if fault.tick >= begun),
-        key=lambda fault: fault.tick,
-        default=None,
-    )
-    if found is None:
-        return InjectionTrial(
-            value=None, failure=f"nothing found after tick {begun}: {status.faults}"
-        )
-    observer.watch(REST_S)
-    failures = _objections(observer, injection, what, requested_ns)
-    if injection.target_type == "joint" and found.joint != injection.target:
-        failures.append(f"{found.joint} was named, not {injection.target}: {found.cause}")
-    observer.watch(FAULT_DURATION_S)
-    periods = found.tick - begun + (2 if injection.target_type == "joint" else 1)
-    return recovered(observer, period_ms * periods, "; ".join(failures))
+    """Inject a fault once while the robot moves.
+
+    The measured time begins just before the Sync of the first tick with the fault. For a joint it begins one period
+    earlier, with the last good answer. It ends with the period whose setpoints are those of the stop mode.
+
+    Args:
+        observer: Observer of the robot.
+        injection: Fault to inject.
+        fault_names: Names that the driver may report.
+        period_ms: Control period of the host.
+
+    Returns:
+        The trial. Its value is the measured time in ms.
+    """
+    injection = validate_and_complete_injection(injection)
+    request_ns = time.monotonic_ns()
+    answer = observer.inject_fault("hal", injection.kind, injection.target, for_s=FAULT_DURATION_S)
+    first_tick = _read_first_tick(answer, period_ms)
+    status = observer.wait_for_fault(request_ns)
+    new_faults = [fault for fault in status.faults if fault.tick >= first_tick]
+    if not new_faults:
+        failure = f"nothing found after tick {first_tick}: {status.faults}"
+        return InjectionTrial(value=None, failure=failure)
+    fault = min(new_faults, key=lambda fault: fault.tick)
+    observer.listen_for(BRAKING_S)
+    failures = [
+        *_check_reported_names(observer, fault_names, request_ns),
+        *_check_stopped(observer, injection),
+        *_check_reported_joint(fault, injection),
+    ]
+    observer.listen_for(FAULT_DURATION_S)
+    period_count = fault.tick - first_tick + 1
+    if injection.target_type == "joint":
+        period_count += 1
+    return recover_robot(observer, period_ms * period_count, failures)
 
 
-def _begun_tick(answer: Answer, period_ms: float) -> int:
-    """Return the first tick that a fault concerns: it begins before the Sync."""
+def _read_first_tick(answer: Answer, period_ms: float) -> int:
+    """Return the first tick with the fault, from the answer of the injector. The fault begins before its Sync."""
     match = ROBOT_TIME_PATTERN.search(answer.reason)
     if match is None:
         raise TrialError(f"the injector does not report the time: {answer.reason}")
     return round(float(match[1]) * 1000 / period_ms)
 
 
-def _objections(
-    observer: Observer, injection: FaultInjection, what: Sequence[str], requested_ns: int
+def _check_reported_names(
+    observer: Observer, fault_names: Sequence[str], since_ns: int
 ) -> list[str]:
-    """Return every condition that is not met after the stop mode."""
+    """Return a violation if no status since a time reports a fault by one of these names."""
+    reported_names = {
+        fault.what
+        for received in observer.statuses
+        if received.at_ns >= since_ns
+        for fault in received.message.faults
+    }
+    if not reported_names.isdisjoint(fault_names):
+        return []
+    return [f"found as {sorted(reported_names)}, not {' or '.join(fault_names)}"]
+
+
+def _check_stopped(observer: Observer, injection: FaultInjection) -> list[str]:
+    """Return a violation if the fault is not latched, and one if the motor of another joint still has torque."""
     failures: list[str] = []
-    reported: list[RobotStatus] = [
-        received.message for received in observer.statuses if received.at_ns >= requested_ns
+    if observer.get_lifecycle() != "fault":
+        failures.append(f"not latched: {observer.describe_status()}")
+    failed_joint = injection.target_index if injection.target_type == "joint" else None
+    state = observer.joints[max(observer.joints)]
+    torques_nm = [
+        abs(torque_nm)
+        for i, (torque_nm, is_valid) in enumerate(zip(state.torque_nm, state.valid, strict=True))
+        if is_valid and i != failed_joint
     ]
-    words = {fault.what for status in reported for fault in status.faults}
-    if words.isdisjoint(what):
-        failures.append(f"found as {sorted(words)}, not {' or '.join(what)}")
-    if observer.state() != "fault":
-        failures.append(f"not latched: {observer.in_words()}")
-    joints = observer.joints[max(observer.joints)]
-    aside = {injection.target_index} if injection.target_type == "joint" else set[int]()
-    torques = [
-        abs(torque)
-        for i, (torque, valid) in enumerate(zip(joints.torque_nm, joints.valid, strict=True))
-        if valid and i not in aside
-    ]
-    if max(torques, default=0.0) > OFF_NM:
-        failures.append(f"a motor still gives {max(torques):.2f} N·m after {REST_S:g} s")
+    max_torque_nm = max(torques_nm, default=0.0)
+    if max_torque_nm > MAX_OFF_TORQUE_NM:
+        failures.append(f"a motor still gives {max_torque_nm:.2f} N·m after {BRAKING_S:g} s")
     return failures
 
 
-def twice_at_start(request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """Open a bus on which two modules have one node id. The value: modules that the host enabled all the same."""
-    joints = configuration("can").robot.chain.modules
+def _check_reported_joint(fault: Fault, injection: FaultInjection) -> list[str]:
+    """Return a violation if a fault of a joint names another joint."""
+    if injection.target_type != "joint" or fault.joint == injection.target:
+        return []
+    return [f"{fault.joint} was named, not {injection.target}: {fault.cause}"]
+
+
+# --- two modules have the same node id -----------------------------------------------------------------------------
+
+
+def measure_duplicate_at_start(request: MeasurementRequest) -> Iterator[InjectionTrial]:
+    """Start the host with a bus on which two modules have the same node id. The host must refuse to start.
+
+    Yields:
+        Trials whose value is the number of frames with which the host enabled a module.
+    """
+    joint_count = make_config("can").robot.chain.modules
     for number in range(request.trials):
-        joint, folder = f"joint_{number % joints + 1}", request.folder / str(number)
+        joint = f"joint_{number % joint_count + 1}"
+        folder = request.folder / str(number)
         folder.mkdir()
-        log = folder / BUS_LOG
-        config = configuration(
-            "can", backend__log=str(log), backend__faults=[f"duplicate:{joint}@0"]
+        log_path = folder / BUS_LOG
+        config = make_config(
+            "can", backend__log=str(log_path), backend__faults=[f"duplicate:{joint}@0"]
         )
-        with ProcessRobot(folder, config) as started_robot:
-            host = started_robot.start("host")
-            host.process.wait(START_LIMIT_S)
-            words = "\n".join(host.output.last_lines())
-        failure = "" if joint in words and "2 times" in words else f"in other words: {words}"
-        frames = bus_log.read(log)
+        with ProcessRobot(folder, config) as robot:
+            host = robot.start_process("host")
+            host.process.wait(START_TIMEOUT_S)
+            output = "\n".join(host.output.last_lines())
+        is_explained = joint in output and "2 times" in output
+        frames = bus_log.read_frames(log_path)
+        enabling_count = bus_log.count_commands(frames, CommandAction.ARM)
+        enabling_count += bus_log.count_setpoints(frames)
         yield InjectionTrial(
-            value=float(bus_log.commands(frames, CommandAction.ARM) + bus_log.setpoints(frames)),
-            failure=failure,
+            value=float(enabling_count),
+            failure="" if is_explained else f"the host gives another reason: {output}",
         )
-    request.note(
+    request.add_note(
         "the real host process, which reports why it refuses; enabled is what its bus log shows"
     )
 
 
-def through_robot(kind: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
-    """Let a joint's sensor fail while the robot moves.
+# --- a sensor of a joint fails -------------------------------------------------------------------------------------
 
-    The value: from the request to the injector to the first safe setpoints that were received.
+
+def measure_failing_sensor(kind: str, request: MeasurementRequest) -> Iterator[InjectionTrial]:
+    """Let the sensor of a random joint fail while the robot moves, with any backend.
+
+    Args:
+        kind: Kind of the fault.
+        request: Measurement to make.
+
+    Yields:
+        Trials whose value is the time from the request to the injector to the setpoints of the stop mode, in ms.
     """
     rng = random.Random(6)
-    with robot(request) as (started_robot, observer):
+    with start_robot(request) as (robot, observer):
         for _ in range(request.trials):
-            started_robot.set_in_motion(observer)
-            joint = f"joint_{rng.randrange(len(observer.description().joints)) + 1}"
-            requested_ns = time.monotonic_ns()
-            observer.inject("hal", kind, joint, for_s=FAULT_DURATION_S)
-            value = observer.safe_after_ms(requested_ns)
-            status = observer.first_fault(requested_ns)
+            robot.set_in_motion(observer)
+            joint = f"joint_{rng.randrange(len(observer.get_description().joints)) + 1}"
+            request_ns = time.monotonic_ns()
+            observer.inject_fault("hal", kind, joint, for_s=FAULT_DURATION_S)
+            delay_ms = observer.measure_stop_delay_ms(request_ns)
+            status = observer.wait_for_fault(request_ns)
             failures: list[str] = []
             if not any(joint in fault.cause or fault.joint == joint for fault in status.faults):
-                failures.append(
-                    f"{joint} was not named: {[fault.cause for fault in status.faults]}"
-                )
-            observer.watch(FAULT_DURATION_S)
-            yield recovered(observer, value, "; ".join(failures))
+                causes = [fault.cause for fault in status.faults]
+                failures.append(f"{joint} was not named: {causes}")
+            observer.listen_for(FAULT_DURATION_S)
+            yield recover_robot(observer, delay_ms, failures)

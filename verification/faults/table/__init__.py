@@ -1,4 +1,4 @@
-"""The fault table: every row, in the order of the page. The rows of one kind of fault are in one module."""
+"""Declares every row of the fault table, in the order of the page. Each module declares related faults."""
 
 from verification.faults.row import FaultHeading, FaultRow
 from verification.faults.table import commands, drives, inputs_and_time, network, processes

@@ -1,8 +1,8 @@
-"""Commands of a second controller, and commands that are late, replayed or malformed."""
+"""Rows about commands of a second controller, and commands that are late, replayed or malformed."""
 
 from verification.faults.row import FaultHeading, FaultRow
-from verification.faults.rows import commands
-from verification.faults.table.row_kinds import FRAMES_THROUGH, both
+from verification.faults.rows import commands, two_writers
+from verification.faults.table.row_kinds import FRAMES_THROUGH, apply_to_sim_and_can
 
 TWO_CONTROLLERS = FaultHeading(
     fault="two controllers",
@@ -17,7 +17,7 @@ TWO_CONTROLLERS = FaultHeading(
             deadline="at once: with the call",
             limit=0.0,
             unit="frames from the second",
-            measures={"both": commands.interleaved},
+            measures={"both": two_writers.measure_interleaved_writers},
         ),
         FaultRow(
             name="second_controller",
@@ -26,7 +26,7 @@ TWO_CONTROLLERS = FaultHeading(
             deadline="at once: none applied",
             limit=0.0,
             unit="frames from the second",
-            measures=both(commands.second_controller),
+            measures=apply_to_sim_and_can(commands.measure_second_controller),
         ),
     ),
 )
@@ -43,7 +43,7 @@ COMMANDS_OUT_OF_TIME = FaultHeading(
             deadline="one message: none applied",
             limit=0.0,
             unit=FRAMES_THROUGH,
-            measures=both(commands.out_of_time),
+            measures=apply_to_sim_and_can(commands.measure_out_of_time),
         ),
     ),
 )
@@ -61,7 +61,7 @@ INVALID_COMMANDS = FaultHeading(
             deadline="one message: none applied",
             limit=0.0,
             unit=FRAMES_THROUGH,
-            measures=both(commands.wrong_in_itself),
+            measures=apply_to_sim_and_can(commands.measure_invalid_content),
         ),
     ),
 )

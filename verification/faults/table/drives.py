@@ -1,15 +1,16 @@
-"""Faults of joint modules, of drives, and of buses."""
+"""Rows about joint modules, drives and buses."""
 
 from verification.faults.row import DRIVE_TYPES, FaultHeading, FaultRow
 from verification.faults.rows import drives, modules
 from verification.faults.table.row_kinds import (
+    MAX_FLOOD_MS,
     NO_BUS,
     NO_WATCHDOG,
-    bus_row,
-    drive_row,
-    isolated_row,
-    joint_row,
-    sensor_row,
+    make_bus_row,
+    make_drive_row,
+    make_isolated_row,
+    make_joint_row,
+    make_sensor_row,
 )
 
 DRIVE_FAILS = FaultHeading(
@@ -24,43 +25,50 @@ DRIVE_FAILS = FaultHeading(
             name="drive_host_frozen",
             fault="host: SIGSTOP for 1 s, then SIGCONT",
             expected="every drive off by its own watchdog; each stop a fault that names its joint; none enabled again",
-            deadline=f"off {drives.OFF_MS:.0f} ms after the signal; enabled again: none before reset and arming",
+            deadline=f"off {drives.MAX_OFF_DELAY_MS:.0f} ms after the signal; "
+            "enabled again: none before reset and arming",
             limit=0.0,
             unit="drives enabled again",
-            measures={**dict.fromkeys(DRIVE_TYPES, drives.host_frozen), "feetech": NO_WATCHDOG},
+            measures={
+                **dict.fromkeys(DRIVE_TYPES, drives.measure_frozen_host),
+                "feetech": NO_WATCHDOG,
+            },
             environment="namespaces",
         ),
-        drive_row(
+        make_drive_row(
             "drive_silent",
             "a drive is silent",
-            "mute",
-            4,
-            "three questions without an answer",
-            {"others": ["drive_silent"], "can": ["module_silent"]},
+            kind="mute",
+            limit_periods=4,
+            reason="three questions without an answer",
+            fault_names={"others": ["drive_silent"], "can": ["module_silent"]},
         ),
-        drive_row(
+        make_drive_row(
             "drive_restarted",
             "a drive restarts",
-            "reboot",
-            4,
-            "it is silent meanwhile",
-            {"others": ["drive_silent", "drive_not_armed"], "can": ["module_restarted"]},
+            kind="reboot",
+            limit_periods=4,
+            reason="it is silent meanwhile",
+            fault_names={
+                "others": ["drive_silent", "drive_not_armed"],
+                "can": ["module_restarted"],
+            },
         ),
-        drive_row(
+        make_drive_row(
             "drive_overheated",
             "a drive's winding is too hot",
-            "overheat",
-            8,
-            "drives report errors ten times a second, or one of them a period is asked",
-            {"others": ["drive_fault"], "can": ["module_overheat"]},
+            kind="overheat",
+            limit_periods=8,
+            reason="drives report errors ten times a second, or the host reads one of them in each period",
+            fault_names={"others": ["drive_fault"], "can": ["module_overheat"]},
         ),
-        drive_row(
+        make_drive_row(
             "drive_bus_lost",
             "the bus is cut for 0.3 s",
-            "cut",
-            3,
-            "as for every bus",
-            {"others": ["interface_down"], "can": ["interface_down"]},
+            kind="cut",
+            limit_periods=3,
+            reason="as for every bus",
+            fault_names={"others": ["interface_down"], "can": ["interface_down"]},
         ),
     ),
 )
@@ -70,21 +78,23 @@ JOINT_MODULE_FAILS = FaultHeading(
     expected="the fault names the joint, and all joints stop",
     deadline="50 ms; restart: one frame",
     rows=(
-        joint_row("joint_silent", "mute", "module_silent"),
-        joint_row("joint_frozen", "freeze", "module_frozen"),
-        joint_row("joint_restarted", "reboot", "module_restarted"),
-        joint_row("joint_wrong_counter", "counter", "wrong_counter"),
-        joint_row("joint_bad_checksum", "checksum", "bad_checksum"),
-        sensor_row("robot_joint_silent", "a joint is silent, by a whole robot", "mute"),
-        sensor_row(
-            "robot_joint_frozen", "a joint repeats its last value, by a whole robot", "freeze"
+        make_joint_row("joint_silent", kind="mute", fault_name="module_silent"),
+        make_joint_row("joint_frozen", kind="freeze", fault_name="module_frozen"),
+        make_joint_row("joint_restarted", kind="reboot", fault_name="module_restarted"),
+        make_joint_row("joint_wrong_counter", kind="counter", fault_name="wrong_counter"),
+        make_joint_row("joint_bad_checksum", kind="checksum", fault_name="bad_checksum"),
+        make_sensor_row("robot_joint_silent", "a joint is silent, by a whole robot", kind="mute"),
+        make_sensor_row(
+            "robot_joint_frozen", "a joint repeats its last value, by a whole robot", kind="freeze"
         ),
-        sensor_row(
+        make_sensor_row(
             "robot_joint_wrong",
             "a joint's angle is suddenly off by 0.5 rad, by a whole robot",
-            "wrong",
+            kind="wrong",
         ),
-        sensor_row("robot_joint_nan", "a joint's angle is no number, by a whole robot", "nan"),
+        make_sensor_row(
+            "robot_joint_nan", "a joint's angle is no number, by a whole robot", kind="nan"
+        ),
     ),
 )
 
@@ -93,10 +103,12 @@ JOINT_IS_ISOLATED = FaultHeading(
     expected="that joint is disabled, and the others continue",
     deadline="50 ms",
     rows=(
-        isolated_row("isolated_silent", "a joint is silent", "mute"),
-        isolated_row("isolated_frozen", "a joint repeats its last value", "freeze"),
-        isolated_row("isolated_wrong", "a joint's angle is suddenly off by 0.5 rad", "wrong"),
-        isolated_row("isolated_nan", "a joint's angle is no number", "nan"),
+        make_isolated_row("isolated_silent", "a joint is silent", kind="mute"),
+        make_isolated_row("isolated_frozen", "a joint repeats its last value", kind="freeze"),
+        make_isolated_row(
+            "isolated_wrong", "a joint's angle is suddenly off by 0.5 rad", kind="wrong"
+        ),
+        make_isolated_row("isolated_nan", "a joint's angle is no number", kind="nan"),
     ),
 )
 
@@ -106,18 +118,40 @@ BUS_FAILS = FaultHeading(
     expected="the robot stops with a fault, and recovers only to disarmed. A duplicate id is refused at arming",
     deadline="2-3 T; flood 100 ms",
     rows=(
-        bus_row("bus_off", "the controller leaves the bus", "bus_off", "bus_off"),
-        bus_row("bus_error_passive", "more than 127 errors", "error_passive", "error_passive"),
-        bus_row("bus_queue_full", "the transmit queue stays full", "full", "bus_stuck"),
-        bus_row("bus_interface_down", "the interface goes down", "cut", "interface_down"),
-        bus_row("bus_receive_overflow", "received frames get lost", "overflow", "receive_overflow"),
-        bus_row("bus_babbling", "a node floods the bus", "babble", "module_babbling", 100.0),
-        bus_row(
+        make_bus_row(
+            "bus_off", "the controller leaves the bus", kind="bus_off", fault_name="bus_off"
+        ),
+        make_bus_row(
+            "bus_error_passive",
+            "more than 127 errors",
+            kind="error_passive",
+            fault_name="error_passive",
+        ),
+        make_bus_row(
+            "bus_queue_full", "the transmit queue stays full", kind="full", fault_name="bus_stuck"
+        ),
+        make_bus_row(
+            "bus_interface_down", "the interface goes down", kind="cut", fault_name="interface_down"
+        ),
+        make_bus_row(
+            "bus_receive_overflow",
+            "received frames get lost",
+            kind="overflow",
+            fault_name="receive_overflow",
+        ),
+        make_bus_row(
+            "bus_babbling",
+            "a node floods the bus",
+            kind="babble",
+            fault_name="module_babbling",
+            limit_ms=MAX_FLOOD_MS,
+        ),
+        make_bus_row(
             "bus_duplicate",
             "a second node with the same id appears",
-            "duplicate",
-            "duplicate_node",
-            100.0,
+            kind="duplicate",
+            fault_name="duplicate_node",
+            limit_ms=MAX_FLOOD_MS,
         ),
         FaultRow(
             name="bus_duplicate_at_start",
@@ -126,7 +160,7 @@ BUS_FAILS = FaultHeading(
             deadline="before anything is enabled",
             limit=0.0,
             unit="modules enabled",
-            measures={"sim": NO_BUS, "can": modules.twice_at_start},
+            measures={"sim": NO_BUS, "can": modules.measure_duplicate_at_start},
         ),
     ),
 )

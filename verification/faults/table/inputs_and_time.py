@@ -1,9 +1,14 @@
-"""Streams that stop, clocks that step, and a simulator that is slow or diverges."""
+"""Rows about streams that stop, a wall clock that steps, and a simulator that is slow or diverges."""
 
 from snakesim_hal.wire import keys
 from verification.faults.row import FaultHeading, FaultRow
-from verification.faults.rows import guest, simulator, streams
-from verification.faults.table.row_kinds import LEASE_MS, PERIOD_MS, both, stream_row
+from verification.faults.rows import simulator, streams, wall_clock
+from verification.faults.table.row_kinds import (
+    LEASE_MS,
+    PERIOD_MS,
+    apply_to_sim_and_can,
+    make_stream_row,
+)
 
 STREAM_STOPS = FaultHeading(
     fault="a stream that control needs stops: from a sensor, from guidance or from navigation",
@@ -19,12 +24,12 @@ STREAM_STOPS = FaultHeading(
             "host",
             limit=30.0 + LEASE_MS + 3 * PERIOD_MS,
             unit="ms",
-            measures=both(streams.no_joints),
+            measures=apply_to_sim_and_can(streams.measure_lost_joint_states),
         ),
-        stream_row("stream_pose", keys.POSE, 240.0),
-        stream_row("stream_contacts", keys.CONTACTS, 240.0),
-        stream_row("stream_world", keys.WORLD, 220.0),
-        stream_row("stream_trajectory", keys.TRAJECTORY, 840.0),
+        make_stream_row("stream_pose", keys.POSE, max_age_ms=240.0),
+        make_stream_row("stream_contacts", keys.CONTACTS, max_age_ms=240.0),
+        make_stream_row("stream_world", keys.WORLD, max_age_ms=220.0),
+        make_stream_row("stream_trajectory", keys.TRAJECTORY, max_age_ms=840.0),
     ),
 )
 
@@ -40,7 +45,7 @@ WALL_CLOCK_STEPS = FaultHeading(
             deadline="-",
             limit=0.0,
             unit="faults and stops",
-            measures=both(guest.clock_step),
+            measures=apply_to_sim_and_can(wall_clock.measure_clock_step),
             environment="guest",
         ),
     ),
@@ -58,7 +63,7 @@ SLOW_SIMULATOR = FaultHeading(
             deadline="-",
             limit=0.0,
             unit="stops and faults",
-            measures=both(simulator.slow),
+            measures=apply_to_sim_and_can(simulator.measure_slow_simulator),
         ),
     ),
 )
@@ -76,7 +81,7 @@ SIMULATION_DIVERGES = FaultHeading(
             limit=1.0,
             unit="steps",
             measures={
-                "sim": simulator.diverges,
+                "sim": simulator.measure_divergence,
                 "can": "modules on a bus are no simulation that could diverge",
             },
         ),

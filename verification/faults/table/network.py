@@ -1,13 +1,13 @@
-"""Faults of the network: a cut, slow consumers, and emergency stops under an attack."""
+"""Rows about the network: a cut, slow consumers, and emergency stops under an attack."""
 
 from verification.faults.row import FaultHeading
 from verification.faults.rows import attacks, consumers, network
 from verification.faults.table.row_kinds import (
     STOP_MS,
-    consumer_row,
-    flood_row,
-    lease_row,
-    stop_row,
+    make_consumer_row,
+    make_flood_row,
+    make_lease_row,
+    make_stop_row,
 )
 
 NETWORK_CUT = FaultHeading(
@@ -15,10 +15,10 @@ NETWORK_CUT = FaultHeading(
     expected="the host stops the robot",
     deadline="lease",
     rows=(
-        lease_row(
+        make_lease_row(
             "network_cut",
             "link down between host and services",
-            network.network_cut,
+            network.measure_cut_network,
             environment="namespaces",
         ),
     ),
@@ -29,18 +29,20 @@ SLOW_CONSUMER = FaultHeading(
     expected="only that subscriber is affected. No control cycle is missed",
     deadline="-",
     rows=(
-        consumer_row(
+        make_consumer_row(
             "consumer_sleeps",
             "a consumer's callback sleeps for 0.5 s at every sample",
-            consumers.sleeps,
+            consumers.measure_sleeping_consumer,
         ),
-        consumer_row(
-            "consumer_disk_full", "a consumer writes to a disk that is full", consumers.disk_full
+        make_consumer_row(
+            "consumer_disk_full",
+            "a consumer writes to a disk that is full",
+            consumers.measure_consumer_with_full_disk,
         ),
-        consumer_row(
+        make_consumer_row(
             "consumer_frozen",
             "four readers of everything are frozen (SIGSTOP)",
-            consumers.frozen_readers,
+            consumers.measure_frozen_readers,
         ),
     ),
 )
@@ -50,19 +52,21 @@ STOP_UNDER_ATTACK = FaultHeading(
     expected="the robot stops at once, regardless of the traffic",
     deadline=f"{STOP_MS:.0f} ms",
     rows=(
-        flood_row("stop_half_open", "300 half-open connections", "half_open"),
-        flood_row("stop_idle", "1000 sessions that do nothing, or as many as get in", "idle"),
-        flood_row("stop_lease_flood", "lease queries, as many as two processes can", "lease"),
-        flood_row("stop_sample_flood", "10,000 samples of noise a second on every key", "garbage"),
-        flood_row(
+        make_flood_row("stop_half_open", "300 half-open connections", "half_open"),
+        make_flood_row("stop_idle", "1000 sessions that do nothing, or as many as get in", "idle"),
+        make_flood_row("stop_lease_flood", "lease queries, as many as two processes can", "lease"),
+        make_flood_row(
+            "stop_sample_flood", "10,000 samples of noise a second on every key", "garbage"
+        ),
+        make_flood_row(
             "stop_datagram_flood",
             "wrong datagrams at the stop port, as many as a thread can",
             "datagrams",
         ),
-        stop_row(
+        make_stop_row(
             "stop_readers_leave",
             "300 readers of everything leave at once",
-            attacks.stopped_while_readers_leave,
+            attacks.measure_stop_while_readers_leave,
         ),
     ),
 )

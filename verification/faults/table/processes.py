@@ -1,4 +1,4 @@
-"""Faults of processes: the controller, the HAL host, the router, and a second run."""
+"""Rows about processes: the controller, the HAL host, the router, and a second run."""
 
 from verification.faults.row import FaultHeading, FaultRow
 from verification.faults.rows import attacks, controller, guest, network
@@ -6,9 +6,10 @@ from verification.faults.table.row_kinds import (
     GUEST_WATCHDOG_MS,
     PERIOD_MS,
     ROUTER_KILLS,
-    both,
-    lease_row,
-    watchdog_row,
+    WATCHDOG_MS,
+    apply_to_sim_and_can,
+    make_lease_row,
+    make_watchdog_row,
 )
 
 CONTROLLER_STOPS = FaultHeading(
@@ -16,12 +17,16 @@ CONTROLLER_STOPS = FaultHeading(
     expected="the robot stops, the lease becomes free, and the fault is latched",
     deadline="lease",
     rows=(
-        lease_row("controller_killed", "control: SIGKILL", controller.killed),
-        lease_row("controller_frozen", "control: SIGSTOP", controller.frozen),
-        lease_row(
+        make_lease_row(
+            "controller_killed", "control: SIGKILL", controller.measure_killed_controller
+        ),
+        make_lease_row(
+            "controller_frozen", "control: SIGSTOP", controller.measure_frozen_controller
+        ),
+        make_lease_row(
             "controller_hung",
             "control: interpreter busy, by the injector (which takes the request at the controller's next tick)",
-            controller.suspended,
+            controller.measure_hanging_controller,
             more_ms=PERIOD_MS,
         ),
     ),
@@ -32,11 +37,26 @@ HOST_STOPS = FaultHeading(
     expected="the watchdog of each joint module stops it",
     deadline="100 ms",
     rows=(
-        watchdog_row(
-            "host_silent", "the host sends nothing any more, at one module", guest.watchdog, 100.0
+        make_watchdog_row(
+            "host_silent",
+            "the host sends nothing any more, at one module",
+            guest.measure_silent_host,
+            limit_ms=WATCHDOG_MS,
         ),
-        watchdog_row("host_killed", "host: SIGKILL", guest.host_killed, GUEST_WATCHDOG_MS, "guest"),
-        watchdog_row("host_frozen", "host: SIGSTOP", guest.host_frozen, GUEST_WATCHDOG_MS, "guest"),
+        make_watchdog_row(
+            "host_killed",
+            "host: SIGKILL",
+            guest.measure_killed_host,
+            limit_ms=GUEST_WATCHDOG_MS,
+            environment="guest",
+        ),
+        make_watchdog_row(
+            "host_frozen",
+            "host: SIGSTOP",
+            guest.measure_frozen_host,
+            limit_ms=GUEST_WATCHDOG_MS,
+            environment="guest",
+        ),
     ),
 )
 
@@ -46,10 +66,10 @@ ROUTER_RESTARTS = FaultHeading(
     "again",
     deadline="lease; 5 s to reconnect",
     rows=(
-        lease_row(
+        make_lease_row(
             "router_restarts",
             "router: SIGKILL, 0.4 s later a new one",
-            network.router_restarts,
+            network.measure_router_restart,
             min_trials=ROUTER_KILLS,
         ),
     ),
@@ -67,7 +87,7 @@ SECOND_RUN = FaultHeading(
             deadline="-",
             limit=0.0,
             unit="setpoints not passive",
-            measures=both(attacks.second_run),
+            measures=apply_to_sim_and_can(attacks.measure_second_run),
         ),
     ),
 )
@@ -84,7 +104,7 @@ HOST_RESTARTS = FaultHeading(
             deadline="before the first setpoints: none but passive ones until armed",
             limit=0.0,
             unit="setpoints not passive",
-            measures=both(controller.host_restarts),
+            measures=apply_to_sim_and_can(controller.measure_host_restart),
         ),
     ),
 )
