@@ -10,8 +10,12 @@ from functools import partial
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, JointMode, LifecycleRequest
-from verification.attack.means import datagrams
-from verification.attack.means.floods import end, flood, half_open
+from verification.attack.tools.floods import kill_process, open_silent_connections, run_flooders
+from verification.attack.tools.stop_datagrams import (
+    flood_stop_port,
+    make_stop_datagram,
+    send_until_answered,
+)
 from verification.faults.observer import Observer, TrialError
 from verification.faults.robot import ProcessRobot, recovered, robot
 from verification.faults.row import InjectionTrial, MeasurementRequest
@@ -25,17 +29,17 @@ Flood = Callable[[ProcessRobot], AbstractContextManager[object]]
 
 
 def _flooding(kind: str, amount: int, process_count: int) -> Flood:
-    return lambda started_robot: flood(
+    return lambda started_robot: run_flooders(
         started_robot.folder, kind, started_robot.endpoint, amount, process_count
     )
 
 
 FLOODS: dict[str, Flood] = {
-    "half_open": lambda started_robot: half_open(started_robot.endpoint, HALF_OPEN),
+    "half_open": lambda started_robot: open_silent_connections(started_robot.endpoint, HALF_OPEN),
     "idle": _flooding("idle", IDLE // 4, 4),
     "lease": _flooding("lease", QUERIES, 2),
     "garbage": _flooding("garbage", SAMPLES, 1),
-    "datagrams": lambda started_robot: datagrams.flood(started_robot.endpoint),
+    "datagrams": lambda started_robot: flood_stop_port(started_robot.endpoint),
 }
 
 
@@ -51,7 +55,7 @@ def stopped_while_readers_leave(request: MeasurementRequest) -> Iterator[Injecti
     """The same, with many readers of everything that leave together just before."""
     with robot(request, **STANDING) as (started_robot, observer):
         for number in range(request.trials):
-            with flood(started_robot.folder, "readers", started_robot.endpoint, READERS) as (
+            with run_flooders(started_robot.folder, "readers", started_robot.endpoint, READERS) as (
                 readers,
             ):
                 yield _stopped(
@@ -59,7 +63,7 @@ def stopped_while_readers_leave(request: MeasurementRequest) -> Iterator[Injecti
                     started_robot,
                     observer,
                     by_datagram=number % 2 == 1,
-                    before=partial(end, readers),
+                    before=partial(kill_process, readers),
                 )
     _explain(request)
 
@@ -96,7 +100,9 @@ def _stopped(
     def ask() -> None:
         if by_datagram:
             answers.append(
-                datagrams.ask(started_robot.endpoint, datagrams.stop("operator"), ANSWER_S)
+                send_until_answered(
+                    started_robot.endpoint, make_stop_datagram("operator"), ANSWER_S
+                )
             )
         else:
             answers.append(observer.ask(keys.ESTOP, EstopRequest(requester="operator")).ok)

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from snakesim_testing.harness.wait import wait_until
-from verification.attack.means.floods import flood
+from verification.attack.tools.floods import run_flooders
 from verification.faults.consumer import STUCK
 from verification.faults.observer import Observer
 from verification.faults.robot import robot
@@ -64,7 +64,7 @@ def frozen_readers(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     ):
         before, with_them = [_missed(observer, FROZEN_WINDOW_S) for _ in range(5)], list[int]()
         for reader in stack.enter_context(
-            flood(request.folder, "everything", started_robot.endpoint, 0, FROZEN)
+            run_flooders(request.folder, "everything", started_robot.endpoint, 0, FROZEN)
         ):
             stack.callback(reader.send_signal, signal.SIGCONT)
             reader.send_signal(signal.SIGSTOP)
