@@ -27,7 +27,7 @@ class Operator(NetworkClient):
 
     def read_lifecycle(self) -> str:
         """Return the lifecycle state in the newest message of status or clock."""
-        newest = [samples[-1] for key in STATE_KEYS if (samples := self.list_samples(key))]
+        newest = [sample for key in STATE_KEYS for sample in self.list_samples(key)[-1:]]
         if not newest:
             return self.read_status()["lifecycle"]
         return max(newest, key=lambda sample: sample.received_s).message["lifecycle"]

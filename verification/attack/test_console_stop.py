@@ -5,8 +5,6 @@ serves the pages.
 """
 
 import http.client
-import os
-import signal
 import socket
 import threading
 import time
@@ -37,6 +35,7 @@ from verification.attack.console import (
 from verification.attack.effort import RecordProperty, choose_effort
 from verification.attack.robot import AttackedRobot
 from verification.attack.tools.floods import hold_half_sent_requests
+from verification.attack.tools.processes import freeze_process
 
 FLOOD_DURATION_S = float(choose_effort(2, 20))
 MAX_FLOODED_STOP_S = 5.0  # the promised limit during a flood; a stop takes about 0.02 s
@@ -186,16 +185,6 @@ def open_kept_connection(console_address: str) -> Iterator[Callable[[str], HttpA
             return answer.status, answer.read().decode()
 
         yield send_request
-
-
-@contextmanager
-def freeze_process(process_id: int) -> Iterator[None]:
-    """Stop a process for as long as the context is open."""
-    os.kill(process_id, signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        os.kill(process_id, signal.SIGCONT)
 
 
 def test_c10_second_stop_works_while_the_page_server_is_frozen(

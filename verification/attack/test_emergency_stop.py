@@ -18,17 +18,17 @@ from verification.attack.effort import FULL_EFFORT, RecordProperty, choose_effor
 from verification.attack.robot import AttackedRobot
 from verification.attack.robot_operator import HostTickTimes
 from verification.attack.terminal_output import find_control_characters
-from verification.attack.tools import stop_datagrams
-from verification.attack.tools.floods import (
-    kill_process,
-    open_silent_connections,
-    run_flooders,
+from verification.attack.tools.floods import open_silent_connections, run_flooders
+from verification.attack.tools.processes import kill_process
+from verification.attack.tools.stop_datagrams import (
+    flood_stop_port,
+    make_stop_datagram,
+    open_false_stop_port,
+    send_until_answered,
 )
-from verification.attack.tools.stop_datagrams import make_stop_datagram, send_until_answered
 
-MAX_COMMAND_STOP_S = (
-    5.0  # from the start of `snakesim estop` to the stop; Python itself takes part of it
-)
+# From the start of `snakesim estop` to the stop. Starting Python takes part of this time.
+MAX_COMMAND_STOP_S = 5.0
 MAX_REQUEST_STOP_S = 0.5  # from a query or a datagram to the stop
 MAX_HOST_PAUSE_S = 1.0  # for which clients that come and go may keep the host from running
 FLOOD_DURATION_S = float(choose_effort(1, 5))  # before the stop is requested
@@ -186,7 +186,7 @@ def test_a4_flood_of_wrong_datagrams_blocks_no_right_one(
     robot: AttackedRobot, record_property: RecordProperty
 ) -> None:
     health = robot.record_health()
-    with stop_datagrams.flood_stop_port(robot.endpoint) as sent_count:
+    with flood_stop_port(robot.endpoint) as sent_count:
         time.sleep(float(choose_effort(2, 10)))
         reason = robot.operator.read_reason()
         assert not reason.startswith("emergency stop"), reason
@@ -228,7 +228,7 @@ def test_a4_false_answer_by_datagram_does_not_confirm_a_stop(
     robot: AttackedRobot, knows_nonce: bool
 ) -> None:
     endpoint = find_free_endpoint()
-    with stop_datagrams.open_false_stop_port(endpoint, knows_nonce=knows_nonce):
+    with open_false_stop_port(endpoint, knows_nonce=knows_nonce):
         command = run_snakesim(robot.run.home, "estop", "--endpoint", endpoint)
     assert command.code == 1, command.printed
     assert "planar13: stopped\n" not in command.printed, command.printed

@@ -4,12 +4,11 @@ No tool believes the first of several answers, or an answer that the state of th
 """
 
 import contextlib
-import os
-import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 import zenoh
@@ -21,7 +20,8 @@ from verification.attack.command import HOLD_POSE_FOR_AN_HOUR, run_snakesim, sta
 from verification.attack.effort import FULL_EFFORT, choose_effort
 from verification.attack.robot import AttackedRobot, connect_operator
 from verification.attack.robot_operator import Operator
-from verification.attack.tools import stop_datagrams
+from verification.attack.tools.processes import freeze_process
+from verification.attack.tools.stop_datagrams import open_false_stop_port
 
 REPETITIONS = range(choose_effort(1, 5))
 
@@ -37,7 +37,8 @@ ESTOP_ANSWER = make_answer("estop", "emergency stop by root; reset it to continu
 ARM_ANSWER = make_answer("armed", "armed, commanded by control")
 
 
-class ImpostorTrial(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class ImpostorTrial:
     """A tool that an impostor tries to deceive."""
 
     arguments: tuple[str, ...]  # of the `snakesim` command
@@ -49,12 +50,32 @@ class ImpostorTrial(NamedTuple):
 
 TRIALS = {
     "disarm": ImpostorTrial(
-        ("robot", "disarm"), "hal/lifecycle", "armed", DISARM_ANSWER, "disarmed"
+        arguments=("robot", "disarm"),
+        key="hal/lifecycle",
+        state_before="armed",
+        false_answer=DISARM_ANSWER,
+        state_after="disarmed",
     ),
-    "reset": ImpostorTrial(("robot", "reset"), "hal/lifecycle", "estop", RESET_ANSWER, "disarmed"),
-    "estop": ImpostorTrial(("estop",), "hal/estop", "armed", ESTOP_ANSWER, "estop"),
+    "reset": ImpostorTrial(
+        arguments=("robot", "reset"),
+        key="hal/lifecycle",
+        state_before="estop",
+        false_answer=RESET_ANSWER,
+        state_after="disarmed",
+    ),
+    "estop": ImpostorTrial(
+        arguments=("estop",),
+        key="hal/estop",
+        state_before="armed",
+        false_answer=ESTOP_ANSWER,
+        state_after="estop",
+    ),
     "arm": ImpostorTrial(
-        ("robot", "arm", "planar13", "sim"), "hal/lifecycle", "disarmed", ARM_ANSWER, "armed"
+        arguments=("robot", "arm", "planar13", "sim"),
+        key="hal/lifecycle",
+        state_before="disarmed",
+        false_answer=ARM_ANSWER,
+        state_after="armed",
     ),
 }
 
@@ -69,15 +90,9 @@ def impersonate(
         yield impostor
 
 
-@contextmanager
-def freeze_host(robot: AttackedRobot) -> Iterator[None]:
+def freeze_host(robot: AttackedRobot) -> AbstractContextManager[None]:
     """Stop the process of the HAL host for as long as the context is open."""
-    process_id = robot.run.part("host")
-    os.kill(process_id, signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        os.kill(process_id, signal.SIGCONT)
+    return freeze_process(robot.run.part("host"))
 
 
 def bring_into_state(operator: Operator, lifecycle: str) -> None:
@@ -171,7 +186,7 @@ def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(
         if attack.startswith("impostor"):
             attacks.enter_context(impersonate(robot, "hal/estop", ESTOP_ANSWER))
         else:
-            attacks.enter_context(stop_datagrams.open_false_stop_port(endpoint))
+            attacks.enter_context(open_false_stop_port(endpoint))
         if "frozen_host" in attack:
             attacks.enter_context(freeze_host(robot))
         command = run_snakesim(tmp_path / "elsewhere", "estop", *router_option)

@@ -28,7 +28,7 @@ SUBSCRIBER_DELAY_S = 1.0  # until the robot's host knows all subscribers
 # Key, payload and encoding of one query.
 Query = tuple[str, bytes, str]
 # Takes endpoint and amount, floods without end, and yields the lines to print.
-Flood = Callable[[str, int], Iterator[str]]
+Flooder = Callable[[str, int], Iterator[str]]
 
 
 class _RateLimiter:
@@ -177,7 +177,7 @@ def subscribe_everything(endpoint: str, _amount: int) -> Iterator[str]:
         yield f"{subscriber} receives"
 
 
-KINDS: dict[str, Flood] = {
+KINDS: dict[str, Flooder] = {
     "idle": occupy_sessions,
     "lease": request_leases,
     "noise": query_with_random_bytes,

@@ -59,12 +59,6 @@ def run_flooders(
         yield processes
 
 
-def kill_process(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process at once; its sessions, subscribers and connections end with it."""
-    process.kill()
-    process.wait()
-
-
 @contextmanager
 def hold_half_sent_requests(console_address: str, count: int, process_count: int) -> Iterator[None]:
     """Keep half-sent HTTP requests open at a console.

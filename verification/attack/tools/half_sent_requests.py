@@ -66,7 +66,9 @@ class HalfSentRequests:
 
 def main() -> None:
     """Keep half-sent requests open until standard input is closed."""
-    host, port, count = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    host = sys.argv[1]
+    port = int(sys.argv[2])
+    count = int(sys.argv[3])
     _raise_file_limit()
     threading.Thread(target=_exit_with_standard_input, daemon=True).start()
     requests = HalfSentRequests(host, port)

@@ -10,7 +10,8 @@ from functools import partial
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, JointMode, LifecycleRequest
-from verification.attack.tools.floods import kill_process, open_silent_connections, run_flooders
+from verification.attack.tools.floods import open_silent_connections, run_flooders
+from verification.attack.tools.processes import kill_process
 from verification.attack.tools.stop_datagrams import (
     flood_stop_port,
     make_stop_datagram,
