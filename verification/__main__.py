@@ -51,7 +51,7 @@ PARTS = {
             "verification/test_docstring_names.py",
             "verification/soak/test_judgement.py",
             "verification/faults/test_fault_table.py",
-            "verification/attack/test_stranger.py",
+            "verification/attack/test_attack_suite.py",
             "verification/fuzz",
         ),
     ),

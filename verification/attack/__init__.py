@@ -1,9 +1,12 @@
-"""A stranger on the robot's network: what he tries, and what must not come of it.
+"""Attacks of an unauthorized client on a running robot, and what each of them must not achieve.
 
-He has `schemas/`, a Zenoh client, MessagePack and sockets, and nothing of ours: `test_stranger.py` holds that no file
-here imports a `snakesim_` package. What he is up against is the `snakesim` command in processes of its own; only
-`data/` is the robot's side. The numbers in the tests' names are those of docs/concepts/open-network.md.
+The client has a Zenoh session, MessagePack, sockets and the folder `schemas/`. It imports no code of SnakeSIM, which
+`test_attack_suite.py` checks. The attacked robot is a `snakesim run` in its own processes. Only `robot_side/` contains
+code that runs in these processes.
 
-    make attack                    all of it: more repetitions, longer floods, more connections
-    pytest verification/attack     each attack once
+The identifiers in the test names (`a4`, `c8`) number the attacks. docs/concepts/open-network.md lists what a client can
+do, with the test of each row.
+
+    make attack                    every attack, with more repetitions, longer floods and more connections
+    pytest verification/attack     every attack once
 """

@@ -1,55 +1,79 @@
-"""The `snakesim` command as anybody runs it, with a home of its own."""
+"""Runs the `snakesim` command as a user does, with a home folder of its own.
+
+Each command gets its own folders for state and runtime files, so that it finds no other run of this computer.
+"""
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
 from snakesim_testing.harness import command
-from snakesim_testing.harness.command import CompletedRun
-from snakesim_testing.harness.command import RunningCommand as Run
+from snakesim_testing.harness.command import CompletedRun, RunningCommand
 
-LIMIT_S = 60.0
-# 50 Hz has the longest lease, 100 ms: a busy machine may well forget a process for 50 ms.
-HOLDING = ("triplet", "--controller", "hold", "--clock-mode", "realtime", "--set", "rate_hz=50")
-STANDING = (*HOLDING, "--duration", "3600", "--stay")
-
-
-def _machine(home: Path) -> dict[str, str]:
-    """On which nothing of ours has run yet."""
-    folders = {name: home / name.lower() for name in ("XDG_STATE_HOME", "XDG_RUNTIME_DIR")}
-    for folder in folders.values():
-        folder.mkdir(parents=True, exist_ok=True)
-    return {"HOME": str(home), **{name: str(folder) for name, folder in folders.items()}}
+COMMAND_TIMEOUT_S = 60.0
+# Arguments of `snakesim run` for a robot that holds its pose. 50 Hz gives the longest lease (100 ms), because a busy
+# machine may not schedule a process for 50 ms.
+HOLD_POSE = ("triplet", "--controller", "hold", "--clock-mode", "realtime", "--set", "rate_hz=50")
+# The same for a run that lasts longer than any test, and continues after a stop.
+HOLD_POSE_FOR_AN_HOUR = (*HOLD_POSE, "--duration", "3600", "--stay")
 
 
-def snakesim(
-    home: Path, *arguments: str, limit_s: float = LIMIT_S, inside: Sequence[str] = ()
-) -> CompletedRun:
-    """Run a command to its end. inside: a prefix that runs it somewhere else."""
+def run_snakesim(home: Path, *arguments: str, command_prefix: Sequence[str] = ()) -> CompletedRun:
+    """Run a command of `snakesim` until it ends.
+
+    Args:
+        home: Home folder of the command, in which it runs.
+        *arguments: Arguments of the command.
+        command_prefix: Command line that runs it elsewhere, such as in a network namespace.
+
+    Returns:
+        Its exit code and output.
+    """
     return command.snakesim(
-        *arguments, cwd=home, timeout_s=limit_s, extra_env=_machine(home), command_prefix=inside
+        *arguments,
+        cwd=home,
+        timeout_s=COMMAND_TIMEOUT_S,
+        extra_env=_make_user_environment(home),
+        command_prefix=command_prefix,
     )
 
 
-def running(
+def start_run(
     home: Path,
     *arguments: str,
     name: str = "run",
     endpoint: str | None = "free",
-    inside: Sequence[str] = (),
-) -> AbstractContextManager[Run]:
-    """A run in the background, as `snakesim_testing.harness.command.running` has it."""
+    command_prefix: Sequence[str] = (),
+) -> AbstractContextManager[RunningCommand]:
+    """Start `snakesim run` in the background; the context ends all of its processes.
+
+    Args:
+        home: Home folder of the command.
+        *arguments: Arguments of `snakesim run`.
+        name: Name of the folder below home into which the run writes.
+        endpoint: Endpoint of its network; "free" for an unused port, None to let the run choose.
+        command_prefix: Command line that runs it elsewhere, such as in a network namespace.
+    """
     return command.running_snakesim(
-        home / name, *arguments, endpoint=endpoint, extra_env=_machine(home), command_prefix=inside
+        home / name,
+        *arguments,
+        endpoint=endpoint,
+        extra_env=_make_user_environment(home),
+        command_prefix=command_prefix,
     )
 
 
-def steering(text: str) -> list[str]:
-    """What of it a terminal obeys or turns around, but for new lines."""
-    return [char for char in text if not char.isprintable() and char != "\n"]
+def _make_user_environment(home: Path) -> dict[str, str]:
+    """Return the variables of a user who has not used SnakeSIM yet, and create the folders that they name."""
+    environment = {"HOME": str(home)}
+    for variable in ("XDG_STATE_HOME", "XDG_RUNTIME_DIR"):
+        folder = home / variable.lower()
+        folder.mkdir(parents=True, exist_ok=True)
+        environment[variable] = str(folder)
+    return environment
 
 
-def address(endpoint: str) -> tuple[str, int]:
-    """Host and port of an endpoint."""
+def parse_endpoint(endpoint: str) -> tuple[str, int]:
+    """Return host and port of an endpoint such as `tcp/127.0.0.1:7447`."""
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
     return host, int(port)

@@ -1,4 +1,4 @@
-"""The robot that is attacked: a run of the `snakesim` command, and an honest operator on its network."""
+"""The robot that is attacked: a `snakesim run` and an operator on its network."""
 
 import contextlib
 import time
@@ -9,117 +9,148 @@ from pathlib import Path
 
 import zenoh
 
+from snakesim_testing.harness.command import RunningCommand
 from snakesim_testing.harness.wait import wait_until
-from verification.attack.command import STANDING, Run, running
-from verification.attack.stranger import NetworkStranger
+from verification.attack.command import HOLD_POSE_FOR_AN_HOUR, start_run
+from verification.attack.robot_operator import ROBOT_KEYS, STATE_KEYS, Operator
 
-BACK_S = 20.0  # until a robot that was attacked is replaced
+RECOVERY_TIMEOUT_S = 20.0  # a robot that does not recover in this time is replaced
+CONNECT_TIMEOUT_S = 0.5  # of one attempt to connect
 
 
 @dataclass(frozen=True)
 class RunHealth:
-    """Of a run's processes at one moment."""
+    """The processes and logs of a run at one moment."""
 
-    parts: dict[str, int]
-    written: dict[Path, int]
+    process_ids: dict[str, int]  # by name of the part
+    log_sizes: dict[Path, int]  # in bytes, by file
 
 
 @dataclass(frozen=True)
 class AttackedRobot:
-    """A run, and somebody who may reset and arm it."""
+    """A run, and an operator who can reset and arm it."""
 
-    run: Run
-    operator: NetworkStranger
+    run: RunningCommand
+    operator: Operator
 
     @property
     def endpoint(self) -> str:
-        """Where its network meets."""
+        """The endpoint of its network."""
         return self.run.endpoint
 
-    def health(self) -> RunHealth:
-        """Its processes, and how much they have written down."""
-        return RunHealth(
-            self.run.parts(), {path: path.stat().st_size for path in self.run.out.glob("*.log")}
-        )
+    def record_health(self) -> RunHealth:
+        """Return which processes run now, and how long their logs are."""
+        log_sizes = {log: log.stat().st_size for log in self.run.out.glob("*.log")}
+        return RunHealth(self.run.parts(), log_sizes)
 
-    def unharmed(self, before: RunHealth, what: str = "") -> None:
-        """Fail unless all its processes are those of before, and none has complained since."""
-        complaints = [
-            f"{path.stem}: {news[-300:]}"
-            for path in sorted(self.run.out.glob("*.log"))
-            if "Traceback"
-            in (news := path.read_text(errors="replace")[before.written.get(path, 0) :])
-        ]
-        assert not complaints, f"{what}: {'; '.join(complaints)}"
-        assert self.run.parts() == before.parts, f"{what}: {self.run.printed()[-1000:]}"
+    def assert_unharmed(self, health_before: RunHealth, attack: str = "") -> None:
+        """Fail if a process of the run was replaced, or has logged an exception.
 
-    def stays(self, lifecycle: str, seconds: float) -> None:
-        """Fail unless it says nothing else for so long."""
-        began = time.monotonic()
-        time.sleep(seconds)
-        seen = {
-            heard.message["lifecycle"]
-            for key in ("hal/clock", "hal/status")
-            for heard in self.operator.heard(key)
-            if heard.at_s > began
+        Args:
+            health_before: Health of the run before the attack.
+            attack: Description of the attack, for the failure.
+        """
+        tracebacks: list[str] = []
+        for log in sorted(self.run.out.glob("*.log")):
+            text = log.read_text(errors="replace")
+            new_text = text[health_before.log_sizes.get(log, 0) :]
+            if "Traceback" in new_text:
+                tracebacks.append(f"{log.stem}: {new_text[-300:]}")
+        assert not tracebacks, f"{attack}: {'; '.join(tracebacks)}"
+        printed = self.run.printed()[-1000:]
+        assert self.run.parts() == health_before.process_ids, f"{attack}: {printed}"
+
+    def assert_stays(self, lifecycle: str, duration_s: float) -> None:
+        """Fail unless status and clock show this lifecycle state, and no other, for a time from now on."""
+        start_s = time.monotonic()
+        time.sleep(duration_s)
+        lifecycles = {
+            sample.message["lifecycle"]
+            for key in STATE_KEYS
+            for sample in self.operator.list_samples(key)
+            if sample.received_s > start_s
         }
-        assert seen == {lifecycle}, f"{seen}: {self.operator.status()['reason']}"
+        assert lifecycles == {lifecycle}, f"{lifecycles}: {self.operator.read_reason()}"
 
 
-def joined(run: Run) -> NetworkStranger:
-    """Somebody on a run's network, as soon as there is one."""
+def connect_operator(run: RunningCommand) -> Operator:
+    """Return an operator on the network of a run, as soon as the network exists."""
 
-    def join() -> NetworkStranger | bool:
+    def try_to_connect() -> Operator | bool:
         with contextlib.suppress(zenoh.ZError):
-            return NetworkStranger(run.endpoint, timeout_s=0.5)
+            return Operator(run.endpoint, timeout_s=CONNECT_TIMEOUT_S)
+        # Waiting is also over if the run has ended.
         return run.process.poll() is not None
 
-    found = wait_until(join, f"a network at {run.endpoint}")
-    assert isinstance(found, NetworkStranger), run.describe_ending()
-    found.receive("hal/status", "hal/clock", "hal/applied", "hal/description")
-    return found
+    operator = wait_until(try_to_connect, f"a network at {run.endpoint}")
+    assert isinstance(operator, Operator), run.describe_ending()
+    operator.subscribe(*ROBOT_KEYS)
+    return operator
 
 
 @contextmanager
-def standing(
-    home: Path, *arguments: str, name: str = "run", inside: Sequence[str] = ()
+def start_armed_robot(
+    home: Path, *arguments: str, command_prefix: Sequence[str] = ()
 ) -> Iterator[AttackedRobot]:
-    """A robot of its own, armed. inside: a prefix that runs it somewhere else."""
+    """Start a run and arm its robot; the context ends the run.
+
+    Args:
+        home: Home folder of the run.
+        *arguments: Arguments of `snakesim run`; by default a robot that holds its pose for an hour.
+        command_prefix: Command line that runs it elsewhere, such as with a limit of open files.
+    """
+    arguments = arguments or HOLD_POSE_FOR_AN_HOUR
     with (
-        running(home, *(arguments or STANDING), name=name, inside=inside) as run,
-        joined(run) as operator,
+        start_run(home, *arguments, command_prefix=command_prefix) as run,
+        connect_operator(run) as operator,
     ):
-        operator.recover()
+        operator.recover_robot()
         yield AttackedRobot(run, operator)
 
 
-class Victim:
-    """One robot for many attacks: brought back after each, and replaced when it does not come back."""
+class SharedRobot:
+    """One robot for many tests: it recovers after each attack, and is replaced if it does not.
 
-    def __init__(self, home: Path, *more: str, inside: Sequence[str] = ()) -> None:
-        """more: arguments of the run, beside those of a robot that stands still; inside: a prefix of its command."""
-        self._home, self._arguments, self._stack = home, (*STANDING, *more), ExitStack()
-        self._inside = inside
+    Starting a run takes seconds, so tests that leave the robot alive share it.
+    """
+
+    def __init__(
+        self, home: Path, *extra_arguments: str, command_prefix: Sequence[str] = ()
+    ) -> None:
+        """Describe the robot, which starts when a test needs it.
+
+        Args:
+            home: Folder for the home folders of its runs.
+            *extra_arguments: Arguments of `snakesim run`, besides those of a robot that holds its pose.
+            command_prefix: Command line that runs it elsewhere.
+        """
+        self._home = home
+        self._arguments = (*HOLD_POSE_FOR_AN_HOUR, *extra_arguments)
+        self._command_prefix = command_prefix
+        self._robot_context = ExitStack()
         self._robot: AttackedRobot | None = None
-        self._number = 0
+        self._run_number = 0
 
-    def armed(self) -> AttackedRobot:
-        """It, armed and following its controller."""
+    def make_armed(self) -> AttackedRobot:
+        """Return the robot, armed and following its controller."""
         if self._robot is not None:
             with contextlib.suppress(AssertionError):
-                self._robot.operator.recover(BACK_S)
-                self._robot.operator.forget()
+                self._robot.operator.recover_robot(RECOVERY_TIMEOUT_S)
+                self._robot.operator.discard_streams()
                 return self._robot
         self.close()
-        self._number += 1
-        home = self._home / str(self._number)
-        home.mkdir()
-        self._robot = self._stack.enter_context(
-            standing(home, *self._arguments, inside=self._inside)
-        )
+        self._robot = self._start_robot()
         return self._robot
 
     def close(self) -> None:
-        """End it."""
+        """End the run."""
         self._robot = None
-        self._stack.close()
+        self._robot_context.close()
+
+    def _start_robot(self) -> AttackedRobot:
+        """Start another run in a new home folder."""
+        self._run_number += 1
+        home = self._home / str(self._run_number)
+        home.mkdir()
+        robot = start_armed_robot(home, *self._arguments, command_prefix=self._command_prefix)
+        return self._robot_context.enter_context(robot)

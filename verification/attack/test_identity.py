@@ -1,10 +1,12 @@
-"""A2: somebody answers in the robot's place. Tools must not believe the first answer, nor an answer alone."""
+"""A2: an impostor answers in the name of the robot.
+
+No tool believes the first of several answers, or an answer that the state of the robot does not confirm.
+"""
 
 import contextlib
-import os
-import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,141 +14,189 @@ import pytest
 import zenoh
 
 from snakesim_testing.harness.endpoint import find_free_endpoint
-from verification.attack.command import STANDING, running, snakesim
-from verification.attack.effort import FULL, effort
-from verification.attack.means import datagrams
-from verification.attack.robot import AttackedRobot, joined
-from verification.attack.stranger import NetworkStranger, settings
+from snakesim_testing.harness.wait import wait_until
+from verification.attack.client import NetworkClient, make_zenoh_config
+from verification.attack.command import HOLD_POSE_FOR_AN_HOUR, run_snakesim, start_run
+from verification.attack.effort import FULL_EFFORT, choose_effort
+from verification.attack.robot import AttackedRobot, connect_operator
+from verification.attack.robot_operator import Operator
+from verification.attack.tools.processes import freeze_process
+from verification.attack.tools.stop_datagrams import open_false_stop_port
 
-TIMES = range(effort(1, 5))
+REPETITIONS = range(choose_effort(1, 5))
 
 
-def lie(lifecycle: str, reason: str) -> dict[str, Any]:
+def make_answer(lifecycle: str, reason: str) -> dict[str, Any]:
+    """Return the answer with which a robot confirms a request."""
     return {"ok": True, "reason": reason, "refusal": None, "epoch": 0, "lifecycle": lifecycle}
 
 
-@contextmanager
-def impostor(robot: AttackedRobot, key: str, answer: dict[str, Any]) -> Iterator[NetworkStranger]:
-    with NetworkStranger(robot.endpoint) as stranger:
-        stranger.pretend(key, answer)
-        yield stranger
+DISARM_ANSWER = make_answer("disarmed", "disarmed on request")
+RESET_ANSWER = make_answer("disarmed", "reset; arm to move again")
+ESTOP_ANSWER = make_answer("estop", "emergency stop by root; reset it to continue")
+ARM_ANSWER = make_answer("armed", "armed, commanded by control")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImpostorTrial:
+    """A tool that an impostor tries to deceive."""
+
+    arguments: tuple[str, ...]  # of the `snakesim` command
+    key: str  # of the request
+    state_before: str
+    false_answer: dict[str, Any]
+    state_after: str  # that the robot itself must reach
+
+
+TRIALS = {
+    "disarm": ImpostorTrial(
+        arguments=("robot", "disarm"),
+        key="hal/lifecycle",
+        state_before="armed",
+        false_answer=DISARM_ANSWER,
+        state_after="disarmed",
+    ),
+    "reset": ImpostorTrial(
+        arguments=("robot", "reset"),
+        key="hal/lifecycle",
+        state_before="estop",
+        false_answer=RESET_ANSWER,
+        state_after="disarmed",
+    ),
+    "estop": ImpostorTrial(
+        arguments=("estop",),
+        key="hal/estop",
+        state_before="armed",
+        false_answer=ESTOP_ANSWER,
+        state_after="estop",
+    ),
+    "arm": ImpostorTrial(
+        arguments=("robot", "arm", "planar13", "sim"),
+        key="hal/lifecycle",
+        state_before="disarmed",
+        false_answer=ARM_ANSWER,
+        state_after="armed",
+    ),
+}
 
 
 @contextmanager
-def frozen_host(robot: AttackedRobot) -> Iterator[None]:
-    pid = robot.run.part("host")
-    os.kill(pid, signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        os.kill(pid, signal.SIGCONT)
+def impersonate(
+    robot: AttackedRobot, key: str, false_answer: dict[str, Any]
+) -> Iterator[NetworkClient]:
+    """Answer all requests on a key in the name of the robot."""
+    with NetworkClient(robot.endpoint) as impostor:
+        impostor.answer_queries(key, false_answer)
+        yield impostor
 
 
-@pytest.mark.parametrize("_time", TIMES)
-@pytest.mark.parametrize(
-    ("tool", "before", "lies", "after"),
-    [
-        ("disarm", "armed", lie("disarmed", "disarmed on request"), "disarmed"),
-        ("reset", "estop", lie("disarmed", "reset; arm to move again"), "disarmed"),
-        ("estop", "armed", lie("estop", "emergency stop by root; reset it to continue"), "estop"),
-        ("arm", "disarmed", lie("armed", "armed, commanded by control"), "armed"),
-    ],
-    ids=["disarm", "reset", "estop", "arm"],
-)
+def freeze_host(robot: AttackedRobot) -> AbstractContextManager[None]:
+    """Stop the process of the HAL host for as long as the context is open."""
+    return freeze_process(robot.run.part("host"))
+
+
+def bring_into_state(operator: Operator, lifecycle: str) -> None:
+    """Bring an armed robot into a lifecycle state."""
+    if lifecycle == "estop":
+        operator.request_emergency_stop()
+    elif lifecycle == "disarmed":
+        operator.disarm_robot()
+    operator.wait_for_lifecycle(lifecycle)
+
+
+@pytest.mark.parametrize("_repetition", REPETITIONS)
+@pytest.mark.parametrize("tool", TRIALS)
 def test_a2_a_second_answer_is_an_impostor(
-    routed: AttackedRobot, tool: str, before: str, lies: dict[str, Any], after: str, _time: int
+    robot_with_router: AttackedRobot, tool: str, _repetition: int
 ) -> None:
-    operator = routed.operator
-    if before == "estop":
-        operator.ask("hal/estop", {"requester": "operator"})
-    elif before == "disarmed":
-        operator.stand_by()
-    operator.until(lambda: operator.lifecycle() == before, before)
-    arguments = {"arm": ["robot", "arm", "planar13", "sim"], "estop": ["estop"]}.get(
-        tool, ["robot", tool]
-    )
-    with impostor(routed, "hal/estop" if tool == "estop" else "hal/lifecycle", lies):
-        ended = routed.run.run_tool(*arguments)
-    # Confirmed past the network, by the stop port of a run of this user.
-    if tool == "estop" and ended.code == 0:
-        assert operator.next("hal/clock")["lifecycle"] == "estop", ended.printed
+    operator = robot_with_router.operator
+    trial = TRIALS[tool]
+    bring_into_state(operator, trial.state_before)
+    with impersonate(robot_with_router, trial.key, trial.false_answer):
+        command = robot_with_router.run.run_tool(*trial.arguments)
+    # The stop port of a run of this user, which is not part of the network, may confirm a stop.
+    if tool == "estop" and command.code == 0:
+        assert operator.wait_for_next("hal/clock")["lifecycle"] == "estop", command.printed
         return
-    assert ended.code == 1, (
-        f"exit code {ended.code} with the robot in {operator.lifecycle()}: {ended.printed}"
+    state = operator.read_lifecycle()
+    assert command.code == 1, (
+        f"exit code {command.code} with the robot in {state}: {command.printed}"
     )
-    assert "impostor" in ended.printed, ended.printed
-    if tool != "arm":  # whoever sees an impostor may well refuse to arm
-        # Not armed in any case: a busy machine may have stopped it before it was asked.
-        operator.until(
-            lambda: operator.lifecycle() in (after, "fault"),
-            f"{after}, as the robot was asked, too",
-            3.0,
-        )
+    assert "impostor" in command.printed, command.printed
+    if tool == "arm":
+        return  # the tool may refuse to arm because of the impostor
+    # The real robot received the request, too. A busy machine may have stopped it before (fault).
+    allowed_states = (trial.state_after, "fault")
+    wait_until(lambda: operator.read_lifecycle() in allowed_states, trial.state_after, 3.0)
 
 
 def test_a2_forged_answer_and_status_do_not_confirm_a_disarm(robot: AttackedRobot) -> None:
     operator = robot.operator
-    answer = lie("disarmed", "disarmed on request")
-    with impostor(robot, "hal/lifecycle", answer) as stranger:
-        forged = {**operator.status(), "lifecycle": "disarmed", "reason": "disarmed on request"}
-        stranger.latch("hal/status", forged)
-        ended = robot.run.run_tool("robot", "disarm")
-    assert ended.code == 1 and "impostor" in ended.printed, (
-        f"the robot is {operator.lifecycle()}: {ended.printed}"
-    )
+    forged_status = {
+        **operator.read_status(),
+        "lifecycle": "disarmed",
+        "reason": DISARM_ANSWER["reason"],
+    }
+    with impersonate(robot, "hal/lifecycle", DISARM_ANSWER) as impostor:
+        impostor.publish_latched("hal/status", forged_status)
+        command = robot.run.run_tool("robot", "disarm")
+    state = operator.read_lifecycle()
+    assert command.code == 1, f"the robot is {state}: {command.printed}"
+    assert "impostor" in command.printed, f"the robot is {state}: {command.printed}"
 
 
-@pytest.mark.parametrize("_time", TIMES)
-@pytest.mark.parametrize(
-    ("tool", "key", "lies", "word"),
-    [
-        (
-            "estop",
-            "hal/estop",
-            lie("estop", "emergency stop by root; reset it to continue"),
-            "planar13: stopped",
-        ),
-        *[("disarm", "hal/lifecycle", lie("disarmed", "disarmed on request"), "planar13: disarmed")]
-        * FULL,
-    ],
-    ids=["estop", "disarm"][: 1 + FULL],
-)
+@pytest.mark.parametrize("_repetition", REPETITIONS)
+@pytest.mark.parametrize("tool", ["estop", "disarm"] if FULL_EFFORT else ["estop"])
 def test_a2_frozen_host_is_not_stopped_by_another_answer(
-    routed: AttackedRobot, tool: str, key: str, lies: dict[str, Any], word: str, _time: int
+    robot_with_router: AttackedRobot, tool: str, _repetition: int
 ) -> None:
-    with impostor(routed, key, lies), frozen_host(routed):
-        ended = routed.run.run_tool(*(["estop"] if tool == "estop" else ["robot", tool]))
-    assert ended.code == 1 and word not in ended.printed, f"exit code {ended.code}: {ended.printed}"
-
-
-@pytest.mark.parametrize(
-    "how", ["false_stop_port_and_frozen_host", *["impostor", "impostor_and_frozen_host"] * FULL]
-)
-def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(tmp_path: Path, how: str) -> None:
-    """The command is typed on another computer: all that it knows is the router's address, where anybody may answer."""
-    endpoint = find_free_endpoint()
-    answer = lie("estop", "emergency stop by root; reset it to continue")
+    success = {"estop": "planar13: stopped", "disarm": "planar13: disarmed"}[tool]
+    trial = TRIALS[tool]
     with (
-        zenoh.open(settings("", "router", listen=endpoint)),
-        running(tmp_path / "robot", *STANDING, "--router", endpoint, endpoint=endpoint) as run,
-        joined(run) as operator,
-        contextlib.ExitStack() as lies,
+        impersonate(robot_with_router, trial.key, trial.false_answer),
+        freeze_host(robot_with_router),
     ):
-        operator.recover()
+        command = robot_with_router.run.run_tool(*trial.arguments)
+    assert command.code == 1, f"exit code {command.code}: {command.printed}"
+    assert success not in command.printed, command.printed
+
+
+ROUTER_ATTACKS = ["false_stop_port_and_frozen_host"]
+if FULL_EFFORT:
+    ROUTER_ATTACKS += ["impostor", "impostor_and_frozen_host"]
+
+
+@pytest.mark.parametrize("attack", ROUTER_ATTACKS)
+def test_a2_stop_through_lab_router_is_confirmed_by_robot_alone(
+    tmp_path: Path, attack: str
+) -> None:
+    """Another computer stops the robot. It knows only the address of the router, where any client may answer."""
+    endpoint = find_free_endpoint()
+    router_option = ("--router", endpoint)
+    with (
+        zenoh.open(make_zenoh_config("", "router", listen=endpoint)),
+        start_run(
+            tmp_path / "robot", *HOLD_POSE_FOR_AN_HOUR, *router_option, endpoint=endpoint
+        ) as run,
+        connect_operator(run) as operator,
+        contextlib.ExitStack() as attacks,
+    ):
+        operator.recover_robot()
         robot = AttackedRobot(run, operator)
-        if how.startswith("impostor"):
-            lies.enter_context(impostor(robot, "hal/estop", answer))
+        if attack.startswith("impostor"):
+            attacks.enter_context(impersonate(robot, "hal/estop", ESTOP_ANSWER))
         else:
-            lies.enter_context(datagrams.false_port(endpoint))
-        if "frozen_host" in how:
-            lies.enter_context(frozen_host(robot))
-        ended = snakesim(tmp_path / "elsewhere", "estop", "--router", endpoint)
-        assert ended.code == 1 and "planar13: stopped" not in ended.printed, ended.printed
+            attacks.enter_context(open_false_stop_port(endpoint))
+        if "frozen_host" in attack:
+            attacks.enter_context(freeze_host(robot))
+        command = run_snakesim(tmp_path / "elsewhere", "estop", *router_option)
+        assert command.code == 1, command.printed
+        assert "planar13: stopped" not in command.printed, command.printed
 
 
-def test_a2_a_frozen_host_gives_no_answer(routed: AttackedRobot) -> None:
-    with frozen_host(routed):
-        ended = routed.run.run_tool("estop")
-    assert (
-        ended.code == 1 and "planar13" in ended.printed and "planar13: stopped" not in ended.printed
-    ), ended.printed
+def test_a2_a_frozen_host_gives_no_answer(robot_with_router: AttackedRobot) -> None:
+    with freeze_host(robot_with_router):
+        command = robot_with_router.run.run_tool("estop")
+    assert command.code == 1, command.printed
+    assert "planar13" in command.printed, command.printed
+    assert "planar13: stopped" not in command.printed, command.printed

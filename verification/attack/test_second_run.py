@@ -1,4 +1,8 @@
-"""A1, A14: a second run beside a robot that is not its own; and tools that must find every robot of a machine."""
+"""A1 and A14: several runs and robots on one computer or network.
+
+A second run never arms the robot of another run. An emergency stop without arguments stops every robot of the computer
+and reports each result.
+"""
 
 import os
 import signal
@@ -8,123 +12,152 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from snakesim_testing.harness.command import CompletedRun, RunningCommand
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from verification.attack.command import HOLDING, STANDING, Run, running, snakesim
-from verification.attack.effort import effort
-from verification.attack.machine import lifecycles, machine_of_its_own
-from verification.attack.robot import AttackedRobot, joined
-from verification.attack.stranger import NetworkStranger, settings
+from verification.attack.client import NetworkClient, make_zenoh_config
+from verification.attack.command import (
+    HOLD_POSE,
+    HOLD_POSE_FOR_AN_HOUR,
+    run_snakesim,
+    start_run,
+)
+from verification.attack.effort import choose_effort
+from verification.attack.network_namespace import create_network_namespace, read_lifecycle
+from verification.attack.robot import AttackedRobot, connect_operator
+from verification.attack.robot_operator import Operator
 
-SHORT = (*HOLDING, "--duration", "1")
-TIMES = range(effort(1, 4))
+SHORT_RUN = (*HOLD_POSE, "--duration", "1")
+REPETITIONS = range(choose_effort(1, 4))
 
 
-def stays_disarmed(operator: NetworkStranger, home: Path, *network: str) -> None:
-    """A second run starts on the network of a disarmed robot; it must refuse, and the robot must stay as it is."""
-    armings = operator.next("hal/clock")["arm_session"]
-    operator.forget()
+def assert_second_run_refuses(operator: Operator, home: Path, *network_options: str) -> None:
+    """Fail unless a second run on the network of a disarmed robot refuses to start and arms nothing.
+
+    Args:
+        operator: Operator of the disarmed robot.
+        home: Home folder of the second run.
+        *network_options: Options with which the second run finds the network.
+    """
+    arm_session = operator.wait_for_next("hal/clock")["arm_session"]
+    operator.discard_streams()
     out = str(home / "second")
-    second = snakesim(home, "run", *SHORT, "--backend", "sim", "--out", out, *network)
-    seen = {heard.message["lifecycle"] for heard in operator.heard("hal/clock")}
-    assert "armed" not in seen and operator.next("hal/clock")["arm_session"] == armings, (
-        second.printed
+    second_run = run_snakesim(
+        home, "run", *SHORT_RUN, "--backend", "sim", "--out", out, *network_options
     )
-    assert second.code in (1, 2), second.printed
-    assert "planar13" in second.printed, f"the live robot is not named: {second.printed}"
-    assert "Traceback" not in second.printed
+    lifecycles = {clock["lifecycle"] for clock in operator.list_messages("hal/clock")}
+    assert "armed" not in lifecycles, second_run.printed
+    assert operator.wait_for_next("hal/clock")["arm_session"] == arm_session, second_run.printed
+    assert second_run.code in (1, 2), second_run.printed
+    assert "planar13" in second_run.printed, (
+        f"the second run does not name the live robot: {second_run.printed}"
+    )
+    assert "Traceback" not in second_run.printed
 
 
-@pytest.mark.parametrize("_time", TIMES)
+@pytest.mark.parametrize("_repetition", REPETITIONS)
 def test_a1_second_run_on_a_router_does_not_arm_robot(
-    routed: AttackedRobot, tmp_path: Path, _time: int
+    robot_with_router: AttackedRobot, tmp_path: Path, _repetition: int
 ) -> None:
-    routed.operator.stand_by()
-    stays_disarmed(routed.operator, tmp_path, "--router", routed.endpoint)
+    robot_with_router.operator.disarm_robot()
+    router_option = ("--router", robot_with_router.endpoint)
+    assert_second_run_refuses(robot_with_router.operator, tmp_path, *router_option)
 
 
 def test_a1_second_run_at_same_endpoint_does_not_arm_robot(
     robot: AttackedRobot, tmp_path: Path
 ) -> None:
-    robot.operator.stand_by()
-    stays_disarmed(robot.operator, tmp_path, "--endpoint", robot.endpoint)
+    robot.operator.disarm_robot()
+    assert_second_run_refuses(robot.operator, tmp_path, "--endpoint", robot.endpoint)
 
 
 @pytest.mark.slow
 def test_a1_second_run_at_router_endpoint_does_not_arm_robot(tmp_path: Path) -> None:
-    """Nobody holds the router's UDP port, so only that somebody listens there can tell the second run."""
+    """No process uses the UDP port of the router. The second run notices only that its TCP port is in use."""
     endpoint = find_free_endpoint()
     with (
-        zenoh.open(settings("", "router", listen=endpoint)),
-        running(tmp_path, *STANDING, "--router", endpoint, endpoint=endpoint) as first,
-        joined(first) as operator,
+        zenoh.open(make_zenoh_config("", "router", listen=endpoint)),
+        start_run(
+            tmp_path, *HOLD_POSE_FOR_AN_HOUR, "--router", endpoint, endpoint=endpoint
+        ) as first_run,
+        connect_operator(first_run) as operator,
     ):
-        operator.recover()
-        operator.stand_by()
-        stays_disarmed(operator, tmp_path / "elsewhere", "--endpoint", endpoint)
-        operator.recover()
+        operator.recover_robot()
+        operator.disarm_robot()
+        assert_second_run_refuses(operator, tmp_path / "elsewhere", "--endpoint", endpoint)
+        operator.recover_robot()
 
 
 def test_a1_phantom_robot_only_keeps_a_run_from_starting(
-    routed: AttackedRobot, tmp_path: Path
+    robot_with_router: AttackedRobot, tmp_path: Path
 ) -> None:
-    operator = routed.operator
-    with NetworkStranger(routed.endpoint, "mamba") as stranger:
-        stranger.seem_alive("alive/hal")
-        stranger.latch("hal/status", {**operator.status(), "robot": "mamba"})
-        stranger.latch("hal/description", {**operator.newest("hal/description"), "robot": "mamba"})
-        second = snakesim(
-            *(tmp_path, "run", *SHORT, "--set", 'robot="mamba"', "--router", routed.endpoint),
-            *("--out", str(tmp_path / "second")),
-        )
-    assert second.code in (1, 2) and "mamba" in second.printed, second.printed
-    operator.recover()
+    operator = robot_with_router.operator
+    endpoint = robot_with_router.endpoint
+    status = {**operator.read_status(), "robot": "mamba"}
+    description = {**operator.read_newest("hal/description"), "robot": "mamba"}
+    mamba_run = (*SHORT_RUN, "--set", 'robot="mamba"', "--router", endpoint)
+    with NetworkClient(endpoint, "mamba") as attacker:
+        attacker.declare_token("alive/hal")
+        attacker.publish_latched("hal/status", status)
+        attacker.publish_latched("hal/description", description)
+        second_run = run_snakesim(tmp_path, "run", *mamba_run, "--out", str(tmp_path / "second"))
+    assert second_run.code in (1, 2), second_run.printed
+    assert "mamba" in second_run.printed, second_run.printed
+    operator.recover_robot()
 
 
-@pytest.mark.parametrize("_time", TIMES)
-def test_a1_two_runs_started_together_have_a_network_each(tmp_path: Path, _time: int) -> None:
+@pytest.mark.parametrize("_repetition", REPETITIONS)
+def test_a1_two_runs_started_together_have_a_network_each(tmp_path: Path, _repetition: int) -> None:
     with (
-        machine_of_its_own() as machine,
-        running(tmp_path, *SHORT, name="one", endpoint=None, inside=machine) as one,
-        running(tmp_path, *SHORT, name="two", endpoint=None, inside=machine) as two,
+        create_network_namespace() as namespace,
+        start_run(tmp_path, *SHORT_RUN, name="one", endpoint=None, command_prefix=namespace) as one,
+        start_run(tmp_path, *SHORT_RUN, name="two", endpoint=None, command_prefix=namespace) as two,
     ):
-        codes = one.end(), two.end()
+        codes = (one.end(), two.end())
         assert codes == (0, 0), one.printed() + two.printed()
-        assert one.endpoint != two.endpoint, f"both met at {one.endpoint}"
+        assert one.endpoint != two.endpoint, f"both runs use {one.endpoint}"
 
 
 @pytest.mark.slow
 def test_a14_stop_without_arguments_names_every_robot_and_its_result(tmp_path: Path) -> None:
     with (
-        machine_of_its_own() as machine,
-        running(tmp_path, *STANDING, name="one", endpoint=None, inside=machine) as one,
-        running(tmp_path, *STANDING, name="two", endpoint=None, inside=machine) as two,
+        create_network_namespace() as namespace,
+        start_run(
+            tmp_path, *HOLD_POSE_FOR_AN_HOUR, name="one", endpoint=None, command_prefix=namespace
+        ) as one,
+        start_run(
+            tmp_path, *HOLD_POSE_FOR_AN_HOUR, name="two", endpoint=None, command_prefix=namespace
+        ) as two,
     ):
-        is_armed(machine, one)
-        is_armed(machine, two)
-        frozen = two.part("host")
-        os.kill(frozen, signal.SIGSTOP)
-        stopped = snakesim(tmp_path, "estop", inside=machine)
-        assert lifecycles(machine, one.endpoint) == ["estop"], stopped.printed
-        assert stopped.code == 1 and named(one, stopped.printed) and named(two, stopped.printed), (
-            stopped.printed
-        )
-        os.kill(frozen, signal.SIGCONT)
-        stopped = snakesim(tmp_path, "estop", inside=machine)
-        assert [lifecycles(machine, run.endpoint) for run in (one, two)] == [
-            ["estop"],
-            ["estop"],
-        ], stopped.printed
-        assert stopped.code == 0 and stopped.printed.count("stopped") == 2, stopped.printed
-        assert named(one, stopped.printed) and named(two, stopped.printed), stopped.printed
-        status = snakesim(tmp_path, "status", inside=machine)
+        for run in (one, two):
+            wait_until_armed(namespace, run)
+        frozen_host = two.part("host")
+        os.kill(frozen_host, signal.SIGSTOP)
+        first_stop = run_snakesim(tmp_path, "estop", command_prefix=namespace)
+        assert read_lifecycle(namespace, one.endpoint) == "estop", first_stop.printed
+        assert first_stop.code == 1, first_stop.printed
+        assert_runs_are_named(first_stop, one, two)
+
+        os.kill(frozen_host, signal.SIGCONT)
+        second_stop = run_snakesim(tmp_path, "estop", command_prefix=namespace)
+        lifecycles = [read_lifecycle(namespace, run.endpoint) for run in (one, two)]
+        assert lifecycles == ["estop", "estop"], second_stop.printed
+        assert second_stop.code == 0, second_stop.printed
+        assert second_stop.printed.count("stopped") == 2, second_stop.printed
+        assert_runs_are_named(second_stop, one, two)
+        status = run_snakesim(tmp_path, "status", command_prefix=namespace)
         assert status.printed.count("planar13: estop") == 2, status.printed
 
 
-def named(run: Run, said: str) -> bool:
-    """Both robots have one name: what tells them apart is where they are."""
-    return run.endpoint.rpartition(":")[2] in said or str(run.out) in said
+def wait_until_armed(namespace: Sequence[str], run: RunningCommand) -> None:
+    """Wait until the robot of a run in a network namespace is armed."""
+    wait_until(
+        lambda: read_lifecycle(namespace, run.endpoint) == "armed", f"armed robot of {run.out.name}"
+    )
 
 
-def is_armed(inside: Sequence[str], run: Run) -> None:
-    wait_until(lambda: lifecycles(inside, run.endpoint) == ["armed"], f"{run.out.name} armed")
+def assert_runs_are_named(command: CompletedRun, *runs: RunningCommand) -> None:
+    """Fail unless a command printed port or folder of each run. The robots have the same name."""
+    for run in runs:
+        port = run.endpoint.rpartition(":")[2]
+        assert port in command.printed or str(run.out) in command.printed, command.printed

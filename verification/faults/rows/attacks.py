@@ -9,8 +9,12 @@ from contextlib import AbstractContextManager
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, JointMode, LifecycleRequest
-from verification.attack.means import datagrams
-from verification.attack.means.floods import end, flood, half_open
+from verification.attack.tools.floods import kill_process, open_silent_connections, run_flooders
+from verification.attack.tools.stop_datagrams import (
+    flood_stop_port,
+    make_stop_datagram,
+    send_until_answered,
+)
 from verification.faults.observer import Observer, TrialError
 from verification.faults.robot import ProcessRobot, recover_robot, start_robot
 from verification.faults.row import InjectionTrial, MeasurementRequest
@@ -40,20 +44,20 @@ Flood = Callable[[ProcessRobot], AbstractContextManager[object]]
 
 
 def _make_process_flood(kind: str, amount: int, process_count: int) -> Flood:
-    """Return a flood by processes of `verification.attack.means.flooder`. amount: of each process."""
+    """Return a flood by processes of `verification.attack.tools.flooder`. amount: of each process."""
 
     def start_flood(robot: ProcessRobot) -> AbstractContextManager[object]:
-        return flood(robot.folder, kind, robot.endpoint, amount, process_count)
+        return run_flooders(robot.folder, kind, robot.endpoint, amount, process_count)
 
     return start_flood
 
 
 FLOODS: dict[str, Flood] = {
-    "half_open": lambda robot: half_open(robot.endpoint, HALF_OPEN_CONNECTIONS),
+    "half_open": lambda robot: open_silent_connections(robot.endpoint, HALF_OPEN_CONNECTIONS),
     "idle": _make_process_flood("idle", IDLE_SESSIONS // IDLE_PROCESSES, IDLE_PROCESSES),
     "lease": _make_process_flood("lease", LEASE_QUERIES, LEASE_PROCESSES),
     "garbage": _make_process_flood("garbage", GARBAGE_SAMPLES, 1),
-    "datagrams": lambda robot: datagrams.flood(robot.endpoint),
+    "datagrams": lambda robot: flood_stop_port(robot.endpoint),
 }
 
 
@@ -87,9 +91,11 @@ def measure_stop_while_readers_leave(request: MeasurementRequest) -> Iterator[In
     """
     with start_robot(request, **STATIONARY_ROBOT) as (robot, observer):
         for number in range(request.trials):
-            with flood(robot.folder, "readers", robot.endpoint, LEAVING_READERS) as (readers,):
+            with run_flooders(robot.folder, "readers", robot.endpoint, LEAVING_READERS) as (
+                readers,
+            ):
                 _wait_until_armed(request, robot, observer)
-                end(readers)
+                kill_process(readers)
                 yield _run_stop_trial(robot, observer, by_datagram=number % 2 == 1)
     _add_stop_note(request)
 
@@ -131,8 +137,8 @@ def _run_stop_trial(
 
     def request_stop() -> None:
         if by_datagram:
-            datagram = datagrams.stop("operator")
-            answer = datagrams.ask(robot.endpoint, datagram, CONFIRMATION_TIMEOUT_S)
+            datagram = make_stop_datagram("operator")
+            answer = send_until_answered(robot.endpoint, datagram, CONFIRMATION_TIMEOUT_S)
             confirmations.append(answer is not None)
         else:
             answer = observer.send_request(keys.ESTOP, EstopRequest(requester="operator"))

@@ -14,7 +14,7 @@ from functools import partial
 import msgspec
 
 from snakesim_testing.harness.wait import wait_until
-from verification.attack.means.floods import flood
+from verification.attack.tools.floods import run_flooders
 from verification.faults.observer import Observer
 from verification.faults.robot import ProcessRobot, start_robot
 from verification.faults.row import InjectionTrial, MeasurementRequest
@@ -78,7 +78,7 @@ def measure_frozen_readers(request: MeasurementRequest) -> Iterator[InjectionTri
             _count_missed_cycles(observer, FROZEN_WINDOW_S) for _ in range(WINDOWS_WITHOUT_READERS)
         ]
         readers = stack.enter_context(
-            flood(request.folder, "everything", robot.endpoint, 0, FROZEN_READERS)
+            run_flooders(request.folder, "everything", robot.endpoint, 0, FROZEN_READERS)
         )
         for reader in readers:
             stack.callback(reader.send_signal, signal.SIGCONT)
