@@ -9,7 +9,8 @@ from contextlib import AbstractContextManager
 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import EstopRequest, JointMode, LifecycleRequest
-from verification.attack.tools.floods import kill_process, open_silent_connections, run_flooders
+from verification.attack.tools.floods import open_silent_connections, run_flooders
+from verification.attack.tools.processes import kill_process
 from verification.attack.tools.stop_datagrams import (
     flood_stop_port,
     make_stop_datagram,
