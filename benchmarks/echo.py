@@ -13,7 +13,9 @@ import zenoh
 from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_testing.harness.endpoint import find_free_endpoint
 
-REQUEST, REPLY = "bench/request", "bench/reply"
+# Keys of the echo.
+REQUEST = "bench/request"
+REPLY = "bench/reply"
 BLOCK = zenoh.CongestionControl.BLOCK
 CONNECT_TIMEOUT_MS = 10000
 START_TIMEOUT_S = 20.0  # for the other process to import Zenoh and to connect

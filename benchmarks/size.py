@@ -2,7 +2,7 @@
 
 from importlib.metadata import distribution
 
-from verification.installation.distributions import required
+from verification.installation.distributions import find_required_distributions
 
 BYTES_A_MB = 1e6
 
@@ -14,7 +14,7 @@ def measure_install_mb(extra: str = "") -> dict[str, float]:
         extra: an optional extra such as `sim`; empty for a plain installation.
     """
     sizes_mb: dict[str, float] = {}
-    for name in required(extra):
+    for name in find_required_distributions(extra):
         paths = [file.locate() for file in distribution(name).files or ()]
         size_bytes = sum(path.stat().st_size for path in paths if path.is_file())  # pyright: ignore
         sizes_mb[name] = size_bytes / BYTES_A_MB

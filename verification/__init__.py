@@ -1,14 +1,16 @@
-"""The campaign: what takes hours or a quiet machine. `make verify` runs it nightly and before a release.
+"""The campaign: tests that take hours or need a quiet machine. `make verify` runs them nightly and before a release.
 
-`attack`        an unauthorized client on the robot's network, in full
-`faults`        the fault table: every fault, measured
-`fuzz`          damaged payloads into every decoder, and over the network
-`soak`          long runs with random faults; random kills
-`links`         bad links between machines; needs root
+`attack`        attacks of an unauthorized client on the robot's network
+`faults`        measures the reaction to every fault, and writes the fault table
+`fuzz`          sends damaged payloads into every decoder, and over the network
+`soak`          long runs with random faults, and processes that are killed at random
+`links`         bad network links between machines; needs root
 `mutation`      changes to the safety core that a unit test must detect
-`computers`     the digests under the code of other processors
-`installation`  wheels, extras, and packages that are left out
-`documents`     every command that the documentation prints
+`computers`     digests of runs with the instructions of other processors
+`installation`  wheels, extras, and installations without some packages
+`documents`     runs every command that the documentation prints
+`sysid`         compares the system identification with `mujoco.sysid`
+`ground`        measures robots on other grounds: slopes, fluids, wheels
 """
 
 import snakesim_testing.isolation  # noqa: F401 - first: it fixes the arithmetic before NumPy is imported

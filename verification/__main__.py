@@ -1,6 +1,8 @@
-"""`python -m verification [PART ...] [--minutes N]`: run the campaign part by part, and print what became of each.
+"""Run the campaign part by part: `python -m verification [PART ...] [--minutes N]`.
 
-A part that fails does not stop the others. `--list` names the parts and about how long each takes on two cores.
+The campaign contains the tests that take long or need a quiet machine. A part that fails does not stop the others. The
+last lines count the parts that passed, and name those that failed. `--list` prints the parts and how many minutes each
+takes on two cores.
 """
 
 import argparse
@@ -20,12 +22,12 @@ PYTEST = ("pytest", "-q", "--timeout", "1800")
 
 @dataclass(frozen=True)
 class CampaignPart:
-    """One part of the campaign: Python's arguments behind `-m`, or a script of the repository."""
+    """One part of the campaign: a Python module, or a script of the repository, with its arguments."""
 
     description: str
-    minutes: float  # on two cores; what `--minutes` counts with
-    command: tuple[str, ...]
-    script: bool = False
+    minutes: float  # on two cores; `--minutes` adds these numbers up
+    command: tuple[str, ...]  # name and arguments
+    is_script: bool = False  # otherwise a module
 
 
 PARTS = {
@@ -40,10 +42,12 @@ PARTS = {
         ("verification.fuzz", "--payloads", "100000"),
     ),
     "sanitizers": CampaignPart(
-        "physics tests with a C library that checks itself", 6, ("verification.sanitize",)
+        "physics tests with C libraries that check their memory accesses",
+        6,
+        ("verification.sanitize",),
     ),
     "contracts": CampaignPart(
-        "tools of the campaign, and the rules of who may import whom",
+        "tests of the campaign's own tools, import rules, names in docstrings",
         1,
         (
             *PYTEST,
@@ -66,15 +70,15 @@ PARTS = {
         (*PYTEST, "tests", "--ignore", "tests/system/can", "-n", "3", "-m", "slow and not quiet"),
     ),
     "trials": CampaignPart(
-        "all random trials, of which each change makes a tenth",
+        "all random trials; with each change, a tenth of them runs",
         4,
         (*PYTEST, "tests/unit", "-n", "2", "-m", "(hypothesis or trials) and not (slow or quiet)"),
     ),
     "can": CampaignPart(
-        "all CAN tests and the contract on a kernel's bus",
+        "all CAN tests, and the contract on virtual CAN interfaces of the kernel",
         7,
         (*WITH_VCAN, *PYTEST, "tests/system/can", "tests/contract", "-m", ""),
-        script=True,
+        is_script=True,
     ),
     "documents": CampaignPart(
         "every command that the documentation prints",
@@ -85,17 +89,17 @@ PARTS = {
         "wheels, extras and left-out packages", 5, (*PYTEST, "verification/installation", "-m", "")
     ),
     "computers": CampaignPart(
-        "the digests under the code of other processors",
+        "digests of runs with the instructions of other processors",
         4,
         (*PYTEST, "verification/computers", "-m", ""),
     ),
     "aarch64": CampaignPart(
-        "the wheel for ARM, on an emulated processor (needs qemu-user-static)",
+        "the wheel for ARM on an emulated processor (needs qemu-user-static)",
         4,
         ("verification.computers.aarch64",),
     ),
     "commissioning": CampaignPart(
-        "hidden faults of joints",
+        "hidden faults of joints, and system identification",
         3,
         (
             *PYTEST,
@@ -138,57 +142,59 @@ PARTS = {
 
 
 def main() -> int:
-    """Run the parts that are asked for; return 1 if one of them failed."""
+    """Run the requested parts. Return 1 if one of them failed, otherwise 0."""
     parser = argparse.ArgumentParser(prog="python -m verification", description=__doc__)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)} (all)")
-    parser.add_argument("--minutes", type=float, help="run the first parts that fit into this time")
-    parser.add_argument("--list", action="store_true", help="name the parts, and run none")
-    asked = parser.parse_args()
-    if unknown := set(asked.parts) - PARTS.keys():
-        parser.error(f"no part called {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
-    chosen = _fitting(
-        [name for name in PARTS if not asked.parts or name in asked.parts], asked.minutes
+    parser.add_argument(
+        "parts", nargs="*", metavar="PART", help=f"parts to run: {', '.join(PARTS)} (all)"
     )
-    if asked.list:
-        for name in chosen:
+    parser.add_argument("--minutes", type=float, help="run the first parts that fit into this time")
+    parser.add_argument("--list", action="store_true", help="print the parts, and run none")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.parts) - PARTS.keys():
+        parser.error(f"no part called {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
+    requested = [name for name in PARTS if not arguments.parts or name in arguments.parts]
+    selected = _select_parts_within(requested, arguments.minutes)
+    if arguments.list:
+        for name in selected:
             print(f"{name:<14}{PARTS[name].minutes:>4g} min  {PARTS[name].description}")
         return 0
-    failed = [name for name in chosen if not _run(name)]
-    print(f"verification: {len(chosen) - len(failed)} of {len(chosen)} parts passed", flush=True)
+    failed = [name for name in selected if not _run_part(name)]
+    passed_count = len(selected) - len(failed)
+    print(f"verification: {passed_count} of {len(selected)} parts passed", flush=True)
     for name in failed:
         print(f"  failed: {name} (python -m verification {name})")
     return 1 if failed else 0
 
 
-def _fitting(names: list[str], minutes: float | None) -> list[str]:
-    """Return the first of the parts that fit into the time together."""
+def _select_parts_within(names: list[str], minutes: float | None) -> list[str]:
+    """Return the first parts that together take no longer than some minutes. None stands for no limit."""
     if minutes is None:
         return names
-    chosen: list[str] = []
+    selected: list[str] = []
+    remaining_minutes = minutes
     for name in names:
-        minutes -= PARTS[name].minutes
-        if minutes < 0:
+        remaining_minutes -= PARTS[name].minutes
+        if remaining_minutes < 0:
             break
-        chosen.append(name)
-    return chosen
+        selected.append(name)
+    return selected
 
 
-def _run(name: str) -> bool:
-    """Run one part; whether it passed."""
+def _run_part(name: str) -> bool:
+    """Run one part, and return whether it passed."""
     part = PARTS[name]
     print(f"== {name}: {part.description}", flush=True)
-    began_s = time.monotonic()
-    words = part.command if part.script else ("-m", *part.command)
-    code = subprocess.run(
-        make_python_command(*words),
+    start_s = time.monotonic()
+    python_arguments = part.command if part.is_script else ("-m", *part.command)
+    completed = subprocess.run(
+        make_python_command(*python_arguments),
         cwd=ROOT,
         env={"SNAKESIM_HYPOTHESIS": "full", **make_child_environment()},
         check=False,
-    ).returncode
-    print(
-        f"== {name}: exit code {code} after {(time.monotonic() - began_s) / 60:.1f} min", flush=True
     )
-    return code == 0
+    duration_min = (time.monotonic() - start_s) / 60
+    print(f"== {name}: exit code {completed.returncode} after {duration_min:.1f} min", flush=True)
+    return completed.returncode == 0
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Every test runs with a state folder of its own and tries the same examples each time."""
+"""Gives every test a separate state folder, and makes Hypothesis try the same examples each time."""
 
 import snakesim_testing.isolation  # noqa: F401 - first: it fixes the arithmetic before NumPy is imported
 from snakesim_testing.hypothesis_profiles import load_profile

@@ -1,8 +1,8 @@
-"""Runs the tests of physics and planner with C libraries that check themselves: `python -m verification.sanitize`.
+"""Run the tests of physics and planner with sanitized C libraries: `python -m verification.sanitize`.
 
-The address sanitizer ends the program at a read or write outside of what belongs to it. The sanitizer of undefined
-behavior ends it at an integer that overflows or a pointer that is not aligned. MuJoCo's arrays lie in one block of
-memory, so a step from one of them into the next is not detected here.
+The address sanitizer ends the program at a read or write outside of allocated memory. The sanitizer of undefined
+behavior ends it at an integer overflow or at a pointer that is not aligned. MuJoCo's arrays lie in one block of
+memory, so an access beyond the end of one array into the next is not detected.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from snakesim_native.load import SWITCH_VARIABLE
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "build" / "sanitized"
-# MuJoCo's headers would replace functions by others that only a MuJoCo with sanitizers has, if they saw this macro.
+# With this macro, MuJoCo's headers would use functions that only a MuJoCo with sanitizers has.
 SANITIZERS = (
     "-fsanitize=address,undefined",
     "-fno-sanitize-recover=all",
@@ -34,9 +34,15 @@ LIBRARIES_TO_PRELOAD = ("libasan.so", "libubsan.so")
 
 
 def main() -> int:
-    """Compile, and run the tests. Returns the exit code of pytest, or 1 without a compiler that has sanitizers."""
-    parser = argparse.ArgumentParser(description="Run the physics tests with sanitizers.")
-    parser.add_argument("tests", nargs="*", default=TESTS, help="files or folders of tests")
+    """Compile the libraries, and run the tests.
+
+    Returns:
+        The exit code of pytest, or 1 if no compiler has sanitizers.
+    """
+    parser = argparse.ArgumentParser(prog="python -m verification.sanitize", description=__doc__)
+    parser.add_argument(
+        "tests", nargs="*", default=TESTS, help="files or folders of tests (physics and planner)"
+    )
     arguments = parser.parse_args()
     try:
         for library in LIBRARIES:
@@ -46,8 +52,8 @@ def main() -> int:
         return 1
     environment = {
         SWITCH_VARIABLE: str(FOLDER),
-        "LD_PRELOAD": " ".join(find_sanitizers()),
-        "ASAN_OPTIONS": "detect_leaks=0",  # Python frees little at its end
+        "LD_PRELOAD": " ".join(find_sanitizer_libraries()),
+        "ASAN_OPTIONS": "detect_leaks=0",  # Python does not free all memory when it ends
     }
     command = [
         sys.executable,
@@ -63,14 +69,14 @@ def main() -> int:
     return subprocess.call(command, cwd=ROOT, env=make_child_environment(environment))
 
 
-def find_sanitizers() -> list[str]:
-    """Return the sanitizers' own libraries, which must be loaded before everything else."""
+def find_sanitizer_libraries() -> list[str]:
+    """Return the paths of the sanitizers' own libraries, which must be loaded before all others."""
     compiler = list_compilers()[0]
-    files: list[str] = []
+    paths: list[str] = []
     for name in LIBRARIES_TO_PRELOAD:
-        printed = subprocess.check_output([*compiler, f"-print-file-name={name}"], text=True)
-        files.append(printed.strip())
-    return files
+        path = subprocess.check_output([*compiler, f"-print-file-name={name}"], text=True)
+        paths.append(path.strip())
+    return paths
 
 
 if __name__ == "__main__":

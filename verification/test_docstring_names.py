@@ -1,4 +1,4 @@
-"""What docstrings name exists, also after a renaming: members of our classes, and constants."""
+"""Tests that the members of classes and the constants which docstrings name exist, also after a renaming."""
 
 import ast
 import re
@@ -18,18 +18,21 @@ EXTERNAL_CONSTANTS = {
     "PIPE_BUF",
     "XDG_STATE_HOME",
 }
-PLACEHOLDERS = {"C_N", "C_L", "RUN_A", "RUN_B"}  # of equations and command lines
+PLACEHOLDERS = {"C_N", "C_L", "RUN_A", "RUN_B"}  # in equations and command lines
 
 
 @pytest.fixture(scope="module")
 def trees() -> dict[str, ast.Module]:
-    """The syntax tree of every shipped file, by its path."""
+    """Return the syntax tree of every shipped file, by its path."""
     paths = sorted(REPOSITORY.glob("snakesim*/**/*.py"))
     return {str(path.relative_to(REPOSITORY)): ast.parse(path.read_text()) for path in paths}
 
 
-def members_by_class(trees: dict[str, ast.Module]) -> dict[str, set[str]]:
-    """Return what the bodies and methods of all classes of a name define; bases of ours count, too."""
+def find_members_by_class(trees: dict[str, ast.Module]) -> dict[str, set[str]]:
+    """Return the names that each class defines in its body, its methods, and its base classes in this repository.
+
+    Classes with the same name count as one.
+    """
     members: dict[str, set[str]] = defaultdict(set)
     bases: dict[str, set[str]] = defaultdict(set)
     for tree in trees.values():
@@ -47,26 +50,26 @@ def members_by_class(trees: dict[str, ast.Module]) -> dict[str, set[str]]:
                         members[node.name].add(name)
                     case _:
                         pass
-    for _ in range(3):  # no hierarchy of ours is deeper
+    for _ in range(3):  # the deepest class hierarchy has three levels
         for name, parents in bases.items():
             for parent in parents:
                 members[name] |= members.get(parent, set())
     return members
 
 
-def docstrings(tree: ast.Module) -> list[str]:
+def find_docstrings(tree: ast.Module) -> list[str]:
     """Return all docstrings of a file."""
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    found = [ast.get_docstring(node) for node in ast.walk(tree) if isinstance(node, documented)]
-    return [text for text in found if text]
+    texts = [ast.get_docstring(node) for node in ast.walk(tree) if isinstance(node, documented)]
+    return [text for text in texts if text]
 
 
 def test_members_that_docstrings_name_exist(trees: dict[str, ast.Module]) -> None:
-    members = members_by_class(trees)
+    members = find_members_by_class(trees)
     checked = 0
     missing: list[str] = []
     for path, tree in trees.items():
-        for text in docstrings(tree):
+        for text in find_docstrings(tree):
             for owner, name in MEMBER.findall(text):
                 if owner not in members:
                     continue
@@ -77,7 +80,7 @@ def test_members_that_docstrings_name_exist(trees: dict[str, ast.Module]) -> Non
     assert not missing
 
 
-def names_in_code() -> set[str]:
+def find_capitalized_names() -> set[str]:
     """Return every capitalized name in code, strings and comments of the product, without docstrings."""
     names: set[str] = set()
     for folder in ("snakesim*", "schemas", "deploy"):
@@ -92,11 +95,11 @@ def names_in_code() -> set[str]:
 
 
 def test_constants_that_docstrings_name_exist(trees: dict[str, ast.Module]) -> None:
-    known = names_in_code() | EXTERNAL_CONSTANTS | PLACEHOLDERS
+    known = find_capitalized_names() | EXTERNAL_CONSTANTS | PLACEHOLDERS
     named = [
         (path, name)
         for path, tree in trees.items()
-        for text in docstrings(tree)
+        for text in find_docstrings(tree)
         for name in CONSTANT.findall(text)
     ]
     assert len(named) > 50

@@ -1,4 +1,4 @@
-"""The import contracts in pyproject.toml: a wrong import that is planted breaks the contract that forbids it."""
+"""Test that the import contracts in pyproject.toml detect wrong imports, by adding some to a copy of the packages."""
 
 import re
 import shutil
@@ -15,7 +15,7 @@ HAL = "Subpackages of the HAL"
 OPERATOR = "Subpackages of the operator package"
 CAN = "Subpackages of the CAN backend"
 PURE = "What keeps a robot safe is pure"
-WRONG = [  # (folder, import, contract that it breaks)
+WRONG_IMPORTS = [  # (folder, imported module, contract that the import breaks)
     ("snakesim_gnc", "mujoco", "Only the simulator runs MuJoCo"),
     ("snakesim_gnc", "snakesim_sim_backend.model.build", NEIGHBORS),
     ("snakesim_hal/host", "snakesim_gnc.guidance.service", NEIGHBORS),
@@ -44,26 +44,26 @@ WRONG = [  # (folder, import, contract that it breaks)
 @pytest.mark.skipif(
     not LINTER.is_file(), reason="import-linter is not installed in this environment"
 )
-def test_a_wrong_import_is_found_at_every_level(tmp_path: Path) -> None:
+def test_wrong_import_breaks_its_contract_at_every_level(tmp_path: Path) -> None:
     shutil.copy(REPOSITORY / "pyproject.toml", tmp_path)
     for package in REPOSITORY.glob("snakesim*/"):
         shutil.copytree(
             package, tmp_path / package.name, ignore=shutil.ignore_patterns("__pycache__")
         )
-    for folder, _, _ in WRONG:
-        wrong = sorted({module for place, module, _ in WRONG if place == folder})
-        lines = "".join(f"import {module}\n" for module in wrong)
-        (tmp_path / folder / "planted.py").write_text(f'"""Breaks rules."""\n\n{lines}')
-    (tmp_path / "snakesim_hal" / "in_no_room.py").write_text('"""Where does this belong?"""\n')
+    for folder, _, _ in WRONG_IMPORTS:
+        modules = sorted({module for place, module, _ in WRONG_IMPORTS if place == folder})
+        imports = "".join(f"import {module}\n" for module in modules)
+        (tmp_path / folder / "planted.py").write_text(f'"""Breaks rules."""\n\n{imports}')
+    (tmp_path / "snakesim_hal" / "in_no_layer.py").write_text('"""Belongs to no layer."""\n')
     command = [str(LINTER), "--config", "pyproject.toml", "--no-cache"]
-    said = subprocess.run(
+    report = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     ).stdout
-    for folder, module, contract in WRONG:
-        broken = next(row for row in said.splitlines() if row.startswith(contract))
+    for folder, module, contract in WRONG_IMPORTS:
+        broken = next(row for row in report.splitlines() if row.startswith(contract))
         assert broken.endswith("BROKEN"), broken
         planted = f"{folder.replace('/', '.')}.planted"
         assert re.search(
-            rf"{re.escape(planted)} -> {re.escape(module)}\b|{re.escape(planted)}.*{module}", said
-        ), said
-    assert "in_no_room" in said
+            rf"{re.escape(planted)} -> {re.escape(module)}\b|{re.escape(planted)}.*{module}", report
+        ), report
+    assert "in_no_layer" in report

@@ -1,4 +1,4 @@
-"""The comparison with `mujoco.sysid`: what it does without that package, and one robot with it."""
+"""Tests of the comparison with `mujoco.sysid`: its tables, its results on one robot, and a missing package."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ from verification.sysid.comparison import (
     compare_robot,
     read_results,
 )
-from verification.sysid.estimates import PARAMETERS, Estimate, Identified
+from verification.sysid.estimates import PARAMETERS, Estimate, IdentificationResult
 from verification.sysid.rollout_fit import has_mujoco_sysid
 from verification.sysid.tables import (
     is_any_joint,
@@ -35,23 +35,27 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.skipif(has_mujoco_sysid(), reason="mujoco.sysid is installed")
 def test_missing_packages_are_named_with_the_way_out() -> None:
     command = [sys.executable, "-m", "verification.sysid", "--robots", "1"]
-    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert ended.returncode == BAD_INPUT
-    assert 'pip install "mujoco-core[sysid]"' in ended.stderr
-    assert not ended.stdout
+    completed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert completed.returncode == BAD_INPUT
+    assert 'pip install "mujoco-core[sysid]"' in completed.stderr
+    assert not completed.stdout
 
 
-def make_identified(errors: dict[int, float | None], *, suspect: int | None) -> Identified:
-    """Return one value of each joint, with this relative error; its interval is 5 % to either side."""
+def make_identified(
+    errors: dict[int, float | None], *, suspect: int | None
+) -> IdentificationResult:
+    """Return a result with one estimate a joint, given by its relative error. Its interval is 5 % to either side."""
     estimates = [
         Estimate(joint, "friction_nm", None if error is None else 2.0 * (1 + error), 0.1, 2.0)
         for joint, error in errors.items()
     ]
-    return Identified(estimates, 1.0, warns=suspect is not None, suspect=suspect, noise_ratio=1.0)
+    return IdentificationResult(
+        estimates, 1.0, warns=suspect is not None, suspect=suspect, noise_ratio=1.0
+    )
 
 
 def make_robot_with_backlash() -> RobotComparison:
-    """Return a robot whose joint 1 has backlash: named, unknown, and noticed at another joint."""
+    """Return a robot with backlash in joint 1: one method names it, one does not notice, one names another joint."""
     return RobotComparison(
         7,
         1,
@@ -64,7 +68,7 @@ def make_robot_with_backlash() -> RobotComparison:
 
 
 def find_cells(lines: list[str], first_cell: str) -> list[str]:
-    """Return the other cells of the row that begins with a cell."""
+    """Return the cells of a row after its first one."""
     (row,) = [line for line in lines if line.startswith(f"| {first_cell} |")]
     return [cell.strip() for cell in row.split("|")[2:-1]]
 
@@ -72,7 +76,8 @@ def find_cells(lines: list[str], first_cell: str) -> list[str]:
 def test_tables_count_errors_intervals_and_warnings() -> None:
     robots = [make_robot_with_backlash()]
     errors = list(make_error_table(robots, is_intact))
-    ours, theirs = ["0", "2.00 %", "2.0 %"], ["1.00 %", "1.0 %"]
+    ours = ["0", "2.00 %", "2.0 %"]
+    theirs = ["1.00 %", "1.0 %"]
     assert find_cells(errors, "`friction_nm`") == ["1", *ours, *theirs, "1 of 1"]
     intervals = list(make_interval_table(robots, is_loose))
     assert find_cells(intervals, "`friction_nm`") == ["-", "-", "0 of 1 (0 to 79 %)", "5.0 %"]
@@ -91,7 +96,7 @@ def test_results_survive_in_a_file(tmp_path: Path) -> None:
     assert read_results(path) == []
     robot = make_robot_with_backlash()
     endless = Estimate(0, "latency_s", 0.01, float("inf"), 0.02)
-    other = RobotComparison(8, None, {THEIRS: Identified([endless], 2.0, warns=False)})
+    other = RobotComparison(8, None, {THEIRS: IdentificationResult([endless], 2.0, warns=False)})
     append_result(path, robot)
     append_result(path, other)
     assert read_results(path) == [robot, other]
@@ -101,11 +106,11 @@ def test_results_survive_in_a_file(tmp_path: Path) -> None:
 @pytest.mark.skipif(not has_mujoco_sysid(), reason="mujoco.sysid is not installed")
 def test_all_methods_find_the_parameters_of_a_robot() -> None:
     robot = compare_robot(3000, (), backlash=False)
-    for found in robot.by_method.values():
-        errors = [one.error for one in found.estimates if one.error is not None]
+    for result in robot.by_method.values():
+        errors = [estimate.error for estimate in result.estimates if estimate.error is not None]
         assert len(errors) == 3 * len(PARAMETERS)
         assert max(errors) < 0.3
-        assert not found.warns
+        assert not result.warns
     lines = list(make_report([robot]))
     assert sum(line.startswith("| `") for line in lines) == 2 * len(PARAMETERS)
 
@@ -114,7 +119,7 @@ def test_all_methods_find_the_parameters_of_a_robot() -> None:
 @pytest.mark.skipif(not has_mujoco_sysid(), reason="mujoco.sysid is not installed")
 def test_all_methods_notice_backlash_and_imus_show_the_joint() -> None:
     robot = compare_robot(3000, (), backlash=True)
-    assert all(found.warns for found in robot.by_method.values())
+    assert all(result.warns for result in robot.by_method.values())
     ours = robot.by_method[OURS]
     assert ours.suspect == robot.loose
-    assert not any(one.misleads for one in ours.estimates)
+    assert not any(estimate.misleads for estimate in ours.estimates)

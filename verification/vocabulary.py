@@ -1,7 +1,7 @@
 """Count the words that this project no longer uses: `python -m verification.vocabulary`.
 
-Each word has a standard replacement. Identifiers and prose of the product and its documentation are counted, tests
-are not; the changelog keeps its words.
+Each word has a standard replacement. The command counts identifiers and prose of the product and its documentation. It
+counts neither tests nor the changelog.
 """
 
 import re
@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[1]
-REJECTED_WORDS = "docs/style/reject.toml"  # lists these words for the check of the prose
+NOT_COUNTED = ("CHANGELOG.md", "docs/style/reject.toml")  # the latter lists rejected words
 REPLACEMENTS: dict[str, str] = {
     r"twins?": "emulator, emulated drive",
     r"set[-_]points?": "setpoint",
@@ -39,26 +39,31 @@ REPLACEMENTS: dict[str, str] = {
 }
 
 
-def count(pattern: str, *paths: str) -> int:
-    """Return how often a word stands in tracked files, as a whole word or as a part of an identifier."""
+def count_word(pattern: str, *paths: str) -> int:
+    """Return how often a word occurs in tracked files, as a whole word or as a part of an identifier.
+
+    Args:
+        pattern: Regular expression of the word.
+        paths: Files and folders, as `git ls-files` takes them.
+    """
     word = rf"(?<![A-Za-z])({pattern})(?![A-Za-z])"
     listed = subprocess.run(
         ["git", "ls-files", *paths], cwd=REPOSITORY, capture_output=True, text=True, check=True
     )
     total = 0
     for name in listed.stdout.splitlines():
-        is_ours = "/vendor/" not in name and name not in ("CHANGELOG.md", REJECTED_WORDS)
-        if is_ours and name.endswith((".py", ".md", ".toml", ".html", ".js")):
+        is_counted = "/vendor/" not in name and name not in NOT_COUNTED
+        if is_counted and name.endswith((".py", ".md", ".toml", ".html", ".js")):
             total += len(re.findall(word, (REPOSITORY / name).read_text()))
     return total
 
 
 def main() -> None:
-    """Print one line a word: its count in code, its count in the documentation, and its replacement."""
+    """Print a line for each word with its count in code, its count in the documentation, and its replacement."""
     print(f"{'word':60} {'code':>6} {'docs':>6}  write instead")
     for pattern, replacement in REPLACEMENTS.items():
-        code = count(pattern, "snakesim*", "schemas", "deploy", "benchmarks")
-        docs = count(pattern, "docs", "README.md")
+        code = count_word(pattern, "snakesim*", "schemas", "deploy", "benchmarks")
+        docs = count_word(pattern, "docs", "README.md")
         print(f"{pattern:60} {code:6} {docs:6}  {replacement}")
 
 

@@ -1,4 +1,4 @@
-"""Ways from a robot to its controller, through the routers of a lab. Each machine is a network namespace."""
+"""Ways from a robot to its controller through the routers of a lab, whose machines are network namespaces."""
 
 import json
 import subprocess
@@ -15,20 +15,20 @@ QUIET = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
 
 @dataclass
 class ConnectionWay:
-    """How host and controller reach each other, and two raw sessions on the same machines."""
+    """A way between host and controller, and the session files of two raw Zenoh sessions on the same machines."""
 
     name: str
     robot: NamespaceMachine
     workstation: NamespaceMachine
-    host: list[str]  # arguments
-    service: list[str]
+    host: list[str]  # arguments of the host program
+    service: list[str]  # arguments of a service program
     robot_file: Path
     workstation_file: Path
     routers: list[tuple[NamespaceMachine, Path]] = field(default_factory=list)
 
 
 class CabledMachines:
-    """The machines, cabled, and files for each way."""
+    """Four machines and the cables between them, with session files for each way."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.folder = folder
@@ -41,13 +41,13 @@ class CabledMachines:
         connect_by_cable(self.second, self.workstation, "desk2", "10.78.4")
         connect_by_cable(self.robot, self.workstation, "direct", "10.78.5")
 
-    def ways(self) -> list[ConnectionWay]:
-        """All of them."""
+    def list_ways(self) -> list[ConnectionWay]:
+        """Return all ways between robot and workstation, the direct one first."""
         two = [
-            (self.first, self._file("first", "router", listen=["tcp/0.0.0.0:7447"])),
+            (self.first, self._write_session_file("first", "router", listen=["tcp/0.0.0.0:7447"])),
             (
                 self.second,
-                self._file(
+                self._write_session_file(
                     "second", "router", listen=["tcp/0.0.0.0:7447"], connect=["tcp/10.78.3.1:7447"]
                 ),
             ),
@@ -55,38 +55,48 @@ class CabledMachines:
         tls = [
             (
                 self.first,
-                self._file(
+                self._write_session_file(
                     "tls-router", "router", listen=["tls/0.0.0.0:7447"], tls=self._certificates()
                 ),
             )
         ]
         return [
-            self._direct(),
-            self._by("one router", two[:1], "tcp/10.78.1.1:7447", "tcp/10.78.2.1:7447"),
-            self._by(
+            self._make_direct_way(),
+            self._make_way_by_routers(
+                "one router", two[:1], "tcp/10.78.1.1:7447", "tcp/10.78.2.1:7447"
+            ),
+            self._make_way_by_routers(
                 "one router, mTLS",
                 tls,
                 "tls/10.78.1.1:7447",
                 "tls/10.78.2.1:7447",
                 self._certificates(),
             ),
-            self._by("two routers", two, "tcp/10.78.1.1:7447", "tcp/10.78.4.1:7447"),
+            self._make_way_by_routers(
+                "two routers", two, "tcp/10.78.1.1:7447", "tcp/10.78.4.1:7447"
+            ),
         ]
 
-    def one_router(self) -> ConnectionWay:
-        """Host and controller at one router."""
-        return self.ways()[1]
+    def find_way_by_one_router(self) -> ConnectionWay:
+        """Return the way on which host and controller connect to the same router."""
+        return self.list_ways()[1]
 
-    def _direct(self) -> ConnectionWay:
+    def _make_direct_way(self) -> ConnectionWay:
         endpoint = "tcp/10.78.5.1:7447"
-        own = self._file("direct-robot", "router", listen=[endpoint])
-        other = self._file("direct-desk", "client", connect=[endpoint])
+        robot_file = self._write_session_file("direct-robot", "router", listen=[endpoint])
+        workstation_file = self._write_session_file("direct-desk", "client", connect=[endpoint])
         host = ["--endpoint", endpoint, "--insecure"]
         return ConnectionWay(
-            "direct", self.robot, self.workstation, host, ["--endpoint", endpoint], own, other
+            "direct",
+            self.robot,
+            self.workstation,
+            host=host,
+            service=["--endpoint", endpoint],
+            robot_file=robot_file,
+            workstation_file=workstation_file,
         )
 
-    def _by(
+    def _make_way_by_routers(
         self,
         name: str,
         routers: list[tuple[NamespaceMachine, Path]],
@@ -95,12 +105,22 @@ class CabledMachines:
         tls: dict[str, Any] | None = None,
     ) -> ConnectionWay:
         stem = name.replace(" ", "-").replace(",", "")
-        own = self._file(f"{stem}-robot", "client", connect=[robot], tls=tls)
-        other = self._file(f"{stem}-desk", "client", connect=[desk], tls=tls)
-        host, service = ["--session", str(own)], ["--session", str(other)]
-        return ConnectionWay(name, self.robot, self.workstation, host, service, own, other, routers)
+        robot_file = self._write_session_file(f"{stem}-robot", "client", connect=[robot], tls=tls)
+        workstation_file = self._write_session_file(
+            f"{stem}-desk", "client", connect=[desk], tls=tls
+        )
+        return ConnectionWay(
+            name,
+            self.robot,
+            self.workstation,
+            host=["--session", str(robot_file)],
+            service=["--session", str(workstation_file)],
+            robot_file=robot_file,
+            workstation_file=workstation_file,
+            routers=routers,
+        )
 
-    def _file(
+    def _write_session_file(
         self, stem: str, mode: str, *, tls: dict[str, Any] | None = None, **ends: list[str]
     ) -> Path:
         path = self.folder / f"{stem}.json5"
@@ -114,11 +134,14 @@ class CabledMachines:
         return path
 
     def _certificates(self) -> dict[str, Any]:
-        """One authority, and one certificate for all: what a handshake and a record cost does not depend on it."""
+        """Create a certificate authority, and one certificate that all processes use.
+
+        The cost of a handshake or a record does not depend on whose certificate it is.
+        """
         authority, key, leaf = (self.folder / name for name in ("ca.pem", "key.pem", "leaf.pem"))
         if not leaf.is_file():
             names = "subjectAltName=IP:10.78.1.1,IP:10.78.2.1"
-            made = [
+            key_options = [
                 "-newkey",
                 "ec",
                 "-pkeyopt",
@@ -127,7 +150,7 @@ class CabledMachines:
                 "-days",
                 "2",
             ]
-            own = [
+            authority_options = [
                 "-x509",
                 "-subj",
                 "/CN=lab",
@@ -136,7 +159,11 @@ class CabledMachines:
                 "-out",
                 authority,
             ]
-            subprocess.run(["openssl", "req", *made, *own], check=True, capture_output=True)
+            subprocess.run(
+                ["openssl", "req", *key_options, *authority_options],
+                check=True,
+                capture_output=True,
+            )
             signed = [
                 "-x509",
                 "-CA",
@@ -156,7 +183,9 @@ class CabledMachines:
                 "-out",
                 leaf,
             ]
-            subprocess.run(["openssl", "req", *made, *signed], check=True, capture_output=True)
+            subprocess.run(
+                ["openssl", "req", *key_options, *signed], check=True, capture_output=True
+            )
         return {
             "root_ca_certificate": str(authority),
             "enable_mtls": True,

@@ -31,7 +31,9 @@ DORA = Path("build/peers")
 ROS_PYTHON = "/usr/bin/python3"
 ROS_PACKAGES = ("python3-rospy", "python3-rosmaster", "python3-sensor-msgs")
 WHOLE = "SnakeSIM, with guidance and navigation beside it"
-RATE_HZ, ROUNDS, REPEATS = 100, 500, 3
+RATE_HZ = 100
+ROUNDS = 500
+REPEATS = 3
 PRIORITY = ("chrt", "--fifo", "19")  # as our own processes have it, where the system allows it
 ISOLATED = ("unshare", "--net", "--pid", "--fork", "--kill-child", "--mount-proc")
 START_LIMIT_S = 60
@@ -128,9 +130,12 @@ def _table(
     state_bytes: int,
     command_bytes: int,
 ) -> list[str]:
-    def row(name: str, found: list[Percentiles]) -> str:
-        p50, p99 = (statistics.median(values) for values in zip(*found, strict=True))
-        ratio = statistics.median(own[0] / other[0] for own, other in zip(ours, found, strict=True))
+    def row(name: str, latencies: list[Percentiles]) -> str:
+        p50, p99 = (statistics.median(values) for values in zip(*latencies, strict=True))
+        ratio = statistics.median(
+            our_p50 / other_p50
+            for (our_p50, _), (other_p50, _) in zip(ours, latencies, strict=True)
+        )
         return f"| {name} | {p50:.0f} | {p99:.0f} | {ratio:.2f} |"
 
     return [
@@ -144,7 +149,7 @@ def _table(
         "| loop | p50, µs | p99, µs | ours / this, p50 |",
         "|---|---|---|---|",
         row("SnakeSIM, host and control with all safety", ours),
-        *(row(name, found) for name, found in theirs.items()),
+        *(row(name, latencies) for name, latencies in theirs.items()),
     ]
 
 
@@ -198,7 +203,8 @@ def _zenoh(state: bytes, command: bytes, prefix: tuple[str, ...]) -> list[float]
 
 
 def _dora(loop: str, prefix: tuple[str, ...]) -> list[float]:
-    python, node = (DORA / "bin/python").absolute(), HERE / "dora_node.py"
+    python = (DORA / "bin/python").absolute()
+    node = HERE / "dora_node.py"
 
     def part(role: str, gives: str, takes: str) -> str:
         command = [*prefix, str(python), str(node), role]

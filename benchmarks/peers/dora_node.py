@@ -6,14 +6,14 @@ import pyarrow as pa
 from dora import Node
 
 sys.path.insert(0, __file__.rpartition("/")[0])
-from loop import measure, sizes, tell
+from loop import measure_round_trips_us, read_loop_parameters, write_times
 
-state_bytes, command_bytes, rounds, period_s = sizes()
+state_bytes, command_bytes, rounds, period_s = read_loop_parameters()
 node = Node()
 
 
 def receive_event() -> bool:
-    """Waits for one input; False when the dataflow ends."""
+    """Wait for one input. Return False if the dataflow ends instead."""
     while True:
         event = node.next()
         if event is None or event["type"] == "STOP":
@@ -34,4 +34,4 @@ else:
         node.send_output("state", pa.array(state, type=pa.uint8()))
         receive_event()
 
-    tell(measure(exchange, rounds, period_s))
+    write_times(measure_round_trips_us(exchange, rounds, period_s))

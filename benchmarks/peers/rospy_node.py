@@ -7,10 +7,10 @@ import rospy
 from sensor_msgs.msg import JointState
 
 sys.path.insert(0, __file__.rpartition("/")[0])
-from loop import measure, sizes, tell
+from loop import measure_round_trips_us, read_loop_parameters, write_times
 
 JOINTS = 13
-_, _, rounds, period_s = sizes()
+_, _, rounds, period_s = read_loop_parameters()
 role = sys.argv[1]
 rospy.init_node(role, disable_signals=True)
 
@@ -44,4 +44,4 @@ else:
     while not (state.get_num_connections() and not came.is_set()):
         rospy.sleep(0.05)
     rospy.sleep(1.0)
-    tell(measure(exchange, rounds, period_s))
+    write_times(measure_round_trips_us(exchange, rounds, period_s))

@@ -1,48 +1,51 @@
 """Writes cpio archives (format "newc"), which the Linux kernel unpacks as its first file system."""
 
-FILE, FOLDER = 0o100000, 0o040000
+FILE_TYPE = 0o100000  # bits of the mode that mark a file
+FOLDER_TYPE = 0o040000
 HEADER_FIELDS = 13
-END = "TRAILER!!!"
+END_NAME = "TRAILER!!!"
 
 
-def folder(path: str) -> bytes:
-    """An entry for a folder that only root may write."""
-    return _entry(path, FOLDER | 0o755, b"")
+def make_folder_entry(path: str) -> bytes:
+    """Return the entry of a folder that only root may write."""
+    return _make_entry(path, FOLDER_TYPE | 0o755, b"")
 
 
-def file(path: str, content: bytes, permissions: int = 0o644) -> bytes:
-    """An entry for a file; the folder that it lies in must come before it."""
-    return _entry(path, FILE | permissions, content)
+def make_file_entry(path: str, content: bytes, permissions: int = 0o644) -> bytes:
+    """Return the entry of a file. The entry of its folder must come before it."""
+    return _make_entry(path, FILE_TYPE | permissions, content)
 
 
-def end() -> bytes:
-    """The entry that ends an archive. The kernel takes several archives in a row, the later file winning."""
-    return _entry(END, 0, b"")
+def make_end_entry() -> bytes:
+    """Return the entry that ends an archive.
+
+    The kernel unpacks several archives in a row. A file of a later archive replaces one of an earlier archive.
+    """
+    return _make_entry(END_NAME, 0, b"")
 
 
-def _entry(path: str, mode: int, content: bytes) -> bytes:
+def _make_entry(path: str, mode: int, content: bytes) -> bytes:
     name = path.encode() + b"\0"
-    inode = uid = gid = mtime = device = checksum = 0
     fields = (
-        inode,
+        0,  # inode
         mode,
-        uid,
-        gid,
-        1,
-        mtime,
+        0,  # user
+        0,  # group
+        1,  # links
+        0,  # modification time
         len(content),
-        device,
-        device,
-        device,
-        device,
+        0,  # device, major
+        0,  # device, minor
+        0,  # device that a special file stands for, major
+        0,  # device that a special file stands for, minor
         len(name),
-        checksum,
+        0,  # checksum
     )
     assert len(fields) == HEADER_FIELDS
     header = b"070701" + b"".join(b"%08X" % field for field in fields)
-    return _aligned(_aligned(header + name) + content)
+    return _pad(_pad(header + name) + content)
 
 
-def _aligned(text: bytes) -> bytes:
-    """Fill up to a multiple of four; every part before it is already aligned."""
-    return text + b"\0" * (-len(text) % 4)
+def _pad(content: bytes) -> bytes:
+    """Pad bytes with zeros to a multiple of four bytes."""
+    return content + b"\0" * (-len(content) % 4)

@@ -1,8 +1,8 @@
-"""Boots a guest, runs one command in it, and passes on the output of the command.
+"""Boots a virtual machine (the guest), runs one command in it, and prints the output of the command.
 
-The guest's root is the host's file system, read-only; what the guest writes stays in its memory, except in the
-folders that it may write. It keeps what it has read: a file that the host changes meanwhile may be seen or not.
-The guest reaches no network; through a forwarded port the host reaches the guest.
+The guest's root is the file system of the host, read-only. Files that the guest writes stay in its memory, except in
+folders that are shared writable. The guest caches files: it may miss a change that the host makes while it runs. The
+guest reaches no network. The host reaches the guest through forwarded ports.
 """
 
 import ctypes
@@ -29,26 +29,27 @@ from deploy.vm.kernel import (
     INPUT_MODULES,
     NETWORK_MODULES,
     Kernel,
-    load_order,
+    order_modules,
 )
-from deploy.vm.packages import need_tool
+from deploy.vm.packages import require_tool
 
 SCRIPTS = Path(__file__).parent
-PORTS = ("out", "err", "control", "console")
-CONSOLE_TAIL = 4000
-DRAIN_LIMIT_S = 10.0
-CONTROLLERS = ("can0", "can1")
-BITRATE = 1_000_000
-CONTROLLER_QUEUE = 1000
+PORTS = ("out", "err", "control", "console")  # serial ports between guest and host
+CONSOLE_TAIL_BYTES = 4000
+DRAIN_TIMEOUT_S = 10.0
+OUTPUT_DESCRIPTORS = {"out": 1, "err": 2}
+CONTROLLERS = ("can0", "can1")  # emulated CAN controllers
+BITRATE = 1_000_000  # bit/s
+CONTROLLER_QUEUE_LENGTH = 1000  # frames
 
-# Nobody attacks a test's guest, so what guards against it is left out: that halves the cost of a system call.
-# On a busy host the emulated timer ticks too late for the check of it at boot, which then panics: no_timer_check.
+# mitigations=off and nokaslr: a test's guest needs no defense against attacks, and system calls take half the time.
+# no_timer_check: on a busy host, the emulated timer is late, and the kernel would panic at its check during the boot.
 KERNEL_OPTIONS = "console=ttyS0 quiet loglevel=3 panic=-1 no_timer_check mitigations=off nokaslr cryptomgr.notests"
 EMULATION = ("-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max")
 VIRTUALIZATION = ("-accel", "kvm", "-cpu", "host")
 
-# These name places of the host that the guest does not have.
-NOT_FOR_THE_GUEST = {
+# These variables name sockets and sessions of the host, which the guest does not have.
+HOST_ONLY_VARIABLES = {
     "XDG_RUNTIME_DIR",
     "DBUS_SESSION_BUS_ADDRESS",
     "DISPLAY",
@@ -56,79 +57,90 @@ NOT_FOR_THE_GUEST = {
     "SSH_AUTH_SOCK",
     "_",
 }
-KILL_WITH_PARENT = 1  # PR_SET_PDEATHSIG
+PR_SET_PDEATHSIG = 1  # from <linux/prctl.h>
 LIBC = ctypes.CDLL(None)  # loaded here, because a forked child must not load anything before `exec`
 
 
 class GuestError(RuntimeError):
-    """The guest did not boot, or it went away before the command ended."""
+    """Raised if the guest did not boot, or ended before the command did."""
 
 
 @dataclass(frozen=True)
-class Request:
-    """What shall run in the guest, and what it shall find there."""
+class GuestRequest:
+    """A command for the guest, and what the guest offers to it."""
 
     command: Sequence[str]
     folder: Path
-    writable: Sequence[Path] = ()
-    channels: Sequence[str] = ("vcan0",)
-    controllers: bool = False
-    forward: Sequence[tuple[int, int]] = ()
+    writable: Sequence[Path] = ()  # folders of the host that the guest may write
+    channels: Sequence[str] = ("vcan0",)  # virtual CAN interfaces
+    controllers: bool = False  # whether there are two emulated CAN controllers
+    forward: Sequence[tuple[int, int]] = ()  # (port of the host, port of the guest)
     cpus: int = 2
     memory: str = "2G"
-    verbose: bool = False
+    verbose: bool = False  # whether to print the messages of the guest's kernel
 
 
-def interface_script(request: Request) -> str:
-    """What session.sh runs, up to the first line that fails, to bring the requested interfaces up."""
+def make_interface_script(request: GuestRequest) -> str:
+    """Return the script that sets up the requested interfaces. session.sh runs it until a line fails."""
     lines: list[str] = []
     for name in map(shlex.quote, request.channels):
         lines += [f"ip link add {name} type vcan", f"ip link set {name} up"]
-    for name in CONTROLLERS if request.controllers else ():
-        # restart-ms is for tests of the driver; what a robot should have stands in deploy/can/README.md.
-        lines.append(f"ip link set {name} type can bitrate {BITRATE} restart-ms 100")
-        lines.append(f"ip link set {name} txqueuelen {CONTROLLER_QUEUE} up")
+    if request.controllers:
+        for name in CONTROLLERS:
+            # restart-ms is for tests of the driver; deploy/can/README.md has the values for a robot.
+            lines.append(f"ip link set {name} type can bitrate {BITRATE} restart-ms 100")
+            lines.append(f"ip link set {name} txqueuelen {CONTROLLER_QUEUE_LENGTH} up")
     if request.forward:
         lines += ["ip address add 10.0.2.15/24 dev eth0", "ip link set eth0 up"]
     return "".join(f"{line}\n" for line in lines)
 
 
-def command_script(request: Request, environment: Mapping[str, str]) -> str:
-    """What the guest's shell runs: the host's environment and folder, then the command."""
-    variables = {name: text for name, text in environment.items() if name not in NOT_FOR_THE_GUEST}
-    # /tmp shows the host's files; a clean folder is safe from programs that clean up there.
+def make_command_script(request: GuestRequest, environment: Mapping[str, str]) -> str:
+    """Return the script that runs the command with the environment and in the folder of the host."""
+    variables = {
+        name: value for name, value in environment.items() if name not in HOST_ONLY_VARIABLES
+    }
+    # /tmp contains the files of the host. An own folder keeps programs from removing them.
     variables |= {"SNAKESIM_VCAN": "guest", "TMPDIR": "/run/snakesim/tmp"}
     exports = (
-        f"export {name}={shlex.quote(text)}\n"
-        for name, text in variables.items()
+        f"export {name}={shlex.quote(value)}\n"
+        for name, value in variables.items()
         if re.fullmatch(r"[A-Za-z_]\w*", name)
     )
     return f"{''.join(exports)}cd {shlex.quote(str(request.folder))} || exit 1\nexec {shlex.join(request.command)}\n"
 
 
-def first_files(request: Request, environment: Mapping[str, str]) -> bytes:
-    """The part of the guest's first file system that belongs to this run."""
+def make_run_archive(request: GuestRequest, environment: Mapping[str, str]) -> bytes:
+    """Return the part of the guest's first file system that belongs to this run, as a cpio archive."""
     shares = "".join(f"{path}\n" for path in request.writable)
     return b"".join(
         (
-            cpio.folder("run.d"),
-            cpio.file("init", (SCRIPTS / "init.sh").read_bytes(), 0o755),
-            cpio.file("run.d/session.sh", (SCRIPTS / "session.sh").read_bytes()),
-            cpio.file("run.d/interfaces.sh", interface_script(request).encode()),
-            cpio.file(
+            cpio.make_folder_entry("run.d"),
+            cpio.make_file_entry("init", (SCRIPTS / "init.sh").read_bytes(), 0o755),
+            cpio.make_file_entry("run.d/session.sh", (SCRIPTS / "session.sh").read_bytes()),
+            cpio.make_file_entry("run.d/interfaces.sh", make_interface_script(request).encode()),
+            cpio.make_file_entry(
                 "run.d/command.sh",
-                command_script(request, environment).encode("utf-8", "surrogateescape"),
+                make_command_script(request, environment).encode("utf-8", "surrogateescape"),
             ),
-            cpio.file("run.d/shares", shares.encode("utf-8", "surrogateescape")),
-            cpio.end(),
+            cpio.make_file_entry("run.d/shares", shares.encode("utf-8", "surrogateescape")),
+            cpio.make_end_entry(),
         )
     )
 
 
-def qemu_arguments(
-    request: Request, kernel: Kernel, kvm: bool, initramfs: str, ports: Mapping[str, int]
+def make_qemu_command(
+    request: GuestRequest, kernel: Kernel, kvm: bool, initramfs: str, ports: Mapping[str, int]
 ) -> list[str]:
-    """QEMU's command line. `ports`: the number of an open socket for each of PORTS."""
+    """Return the command line of QEMU.
+
+    Args:
+        request: The command and the guest that it needs.
+        kernel: The kernel to boot.
+        kvm: Whether to use KVM; otherwise QEMU emulates the processor.
+        initramfs: Path of the guest's first file system.
+        ports: File descriptor of an open socket for each of PORTS.
+    """
     modules = [*BOOT_MODULES, *CAN_MODULES, *INPUT_MODULES]
     shares = ["-fsdev", "local,id=root,path=/,security_model=none,readonly=on,multidevs=remap"]
     shares += ["-device", "virtio-9p-pci,fsdev=root,mount_tag=root"]
@@ -139,19 +151,19 @@ def qemu_arguments(
             f"local,id=share{number},path={escaped},security_model=none,multidevs=remap",
         ]
         shares += ["-device", f"virtio-9p-pci,fsdev=share{number},mount_tag=share{number}"]
-    talk = ["-device", "virtio-serial-pci"]
-    for name, number in ports.items():
-        talk += ["-chardev", f"socket,id={name},fd={number}"]
-        talk += (
-            ["-serial", "chardev:console"]
-            if name == "console"
-            else ["-device", f"virtserialport,chardev={name},name={name}"]
-        )
+    serial_ports = ["-device", "virtio-serial-pci"]
+    for name, descriptor in ports.items():
+        serial_ports += ["-chardev", f"socket,id={name},fd={descriptor}"]
+        if name == "console":
+            serial_ports += ["-serial", "chardev:console"]
+        else:
+            serial_ports += ["-device", f"virtserialport,chardev={name},name={name}"]
     network = []
     if request.forward:
         modules += NETWORK_MODULES
         rules = "".join(
-            f",hostfwd=tcp:127.0.0.1:{outer}-:{inner}" for outer, inner in request.forward
+            f",hostfwd=tcp:127.0.0.1:{host_port}-:{guest_port}"
+            for host_port, guest_port in request.forward
         )
         network = [
             "-netdev",
@@ -167,102 +179,114 @@ def qemu_arguments(
             "can-bus,id=canbus0",
             *("-device", "kvaser_pci,canbus=canbus0") * len(CONTROLLERS),
         ]
-    options = f"{KERNEL_OPTIONS} snakesim_modules={','.join(load_order(modules, kernel))}"
+    options = f"{KERNEL_OPTIONS} snakesim_modules={','.join(order_modules(modules, kernel))}"
     return [
-        need_tool("qemu-system-x86_64"),
+        require_tool("qemu-system-x86_64"),
         *("-nodefaults", "-no-user-config", "-no-reboot", "-display", "none", "-machine", "q35"),
         *(VIRTUALIZATION if kvm else EMULATION),
         *("-smp", str(request.cpus), "-m", request.memory),
         *("-kernel", str(kernel.image), "-initrd", initramfs, "-append", options),
         *shares,
-        *talk,
+        *serial_ports,
         *network,
         *controllers,
     ]
 
 
 class Guest:
-    """One running guest, until it is closed."""
+    """A running guest. `close` ends it."""
 
-    def __init__(self, request: Request, kernel: Kernel, kvm: bool) -> None:
+    def __init__(self, request: GuestRequest, kernel: Kernel, kvm: bool) -> None:
+        """Start the guest. It boots in the background.
+
+        Args:
+            request: The command and the guest that it needs.
+            kernel: The kernel to boot.
+            kvm: Whether to use KVM; otherwise QEMU emulates the processor.
+        """
         self._request = request
-        self._console = b""
-        self._control = b""
-        self._passed = {"out": 0, "err": 0}
+        self._console_tail = b""  # last output of the guest's kernel
+        self._control_rest = b""  # begin of a line that has not arrived completely
+        self._printed_bytes = {"out": 0, "err": 0}
         self._ready = False
-        self._ended: tuple[int, dict[str, int]] | None = None
-        self._signals = 0
-        self._held = ExitStack()
-        self._selector = self._held.enter_context(selectors.DefaultSelector())
-        with ExitStack() as handed_over:
-            ours, theirs = {}, {}
+        self._result: tuple[int, dict[str, int]] | None = None  # exit code, length of its outputs
+        self._signal_count = 0
+        self._resources = ExitStack()
+        self._selector = self._resources.enter_context(selectors.DefaultSelector())
+        with ExitStack() as inherited:
+            host_ends: dict[str, socket.socket] = {}
+            guest_descriptors: dict[str, int] = {}
             for name in PORTS:
-                our_end, their_end = socket.socketpair()
-                ours[name] = self._held.enter_context(our_end)
-                theirs[name] = handed_over.enter_context(their_end).fileno()
-                self._selector.register(our_end, selectors.EVENT_READ, name)
-            self._control_port = ours["control"]
-            initramfs = os.memfd_create("initramfs")  # the environment in it is private
-            handed_over.callback(os.close, initramfs)
+                host_end, guest_end = socket.socketpair()
+                host_ends[name] = self._resources.enter_context(host_end)
+                guest_descriptors[name] = inherited.enter_context(guest_end).fileno()
+                self._selector.register(host_end, selectors.EVENT_READ, name)
+            self._control_port = host_ends["control"]
+            # A file in memory, because it contains the environment, which other users must not read.
+            initramfs = os.memfd_create("initramfs")
+            inherited.callback(os.close, initramfs)
             with os.fdopen(os.dup(initramfs), "wb") as file:
-                file.write(kernel.initramfs.read_bytes() + first_files(request, os.environ))
+                file.write(kernel.initramfs.read_bytes() + make_run_archive(request, os.environ))
             self._process = subprocess.Popen(
-                qemu_arguments(request, kernel, kvm, f"/proc/self/fd/{initramfs}", theirs),
+                make_qemu_command(
+                    request, kernel, kvm, f"/proc/self/fd/{initramfs}", guest_descriptors
+                ),
                 stdin=subprocess.DEVNULL,
-                stdout=theirs["console"],
-                stderr=theirs["console"],
-                pass_fds=(initramfs, *theirs.values()),
-                start_new_session=True,  # Ctrl-C goes to us, and from us to the command
-                preexec_fn=_dying_with(os.getpid()),
+                stdout=guest_descriptors["console"],
+                stderr=guest_descriptors["console"],
+                pass_fds=(initramfs, *guest_descriptors.values()),
+                start_new_session=True,  # this process gets Ctrl-C, and forwards it to the command
+                preexec_fn=_make_child_setup(os.getpid()),
             )
 
     def close(self) -> None:
-        """End it."""
+        """End the guest at once."""
         self._process.kill()
         self._process.wait()
-        self._held.close()
+        self._resources.close()
 
-    def wait_until_ready(self, limit_s: float) -> None:
-        """Return as soon as the command starts.
+    def wait_until_ready(self, timeout_s: float) -> None:
+        """Wait until the command starts.
 
         Raises:
-            GuestError: after `limit_s`, or when the guest gives up.
+            GuestError: The guest did not boot in time, or it ended.
         """
-        deadline = time.monotonic() + limit_s
+        deadline_s = time.monotonic() + timeout_s
         while not self._ready:
-            if time.monotonic() > deadline:
+            if time.monotonic() > deadline_s:
                 raise GuestError(
-                    f"the guest did not boot within {limit_s:.0f} s{self._last_words()}"
+                    f"the guest did not boot within {timeout_s:.0f} s{self._describe_console()}"
                 )
-            self._pass_on(timeout_s=0.5)
+            self._handle_output(timeout_s=0.5)
 
     def run(self) -> int:
-        """Pass the output on until the command has ended; its exit code."""
+        """Print the output of the command until it has ended, and return its exit code.
+
+        Signals that end a program are forwarded to the command.
+        """
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._forward_signal)
-        while self._ended is None:
-            self._pass_on(timeout_s=None)
-        code, promised = self._ended
-        deadline = time.monotonic() + DRAIN_LIMIT_S
-        while (
-            any(self._passed[name] < promised[name] for name in promised)
-            and time.monotonic() < deadline
-        ):
-            self._pass_on(timeout_s=0.5)
+        while self._result is None:
+            self._handle_output(timeout_s=None)
+        code, output_bytes = self._result
+        deadline_s = time.monotonic() + DRAIN_TIMEOUT_S
+        while not self._has_printed(output_bytes) and time.monotonic() < deadline_s:
+            self._handle_output(timeout_s=0.5)
         return code
 
+    def _has_printed(self, output_bytes: Mapping[str, int]) -> bool:
+        """Return whether at least this many bytes of each output are printed."""
+        return all(self._printed_bytes[name] >= count for name, count in output_bytes.items())
+
     def _forward_signal(self, number: int, _frame: FrameType | None) -> None:
-        self._signals += 1
-        if self._signals > 1:
-            raise KeyboardInterrupt  # a second request ends the command at once
+        """Forward the first signal to the command. The second one ends the guest."""
+        self._signal_count += 1
+        if self._signal_count > 1:
+            raise KeyboardInterrupt
         self._control_port.sendall(signal.Signals(number).name.removeprefix("SIG").encode() + b"\n")
 
-    def _pass_on(self, timeout_s: float | None) -> None:
-        """Handle what has arrived from the guest."""
-        handlers: dict[str, Callable[[bytes], None]] = {
-            "control": self._obey,
-            "console": self._note,
-        }
+    def _handle_output(self, timeout_s: float | None) -> None:
+        """Read the ports of the guest, and process what has arrived."""
         for key, _ in self._selector.select(timeout_s):
             port = key.fileobj
             assert isinstance(port, socket.socket)
@@ -270,53 +294,69 @@ class Guest:
             with suppress(ConnectionResetError):
                 content = port.recv(65536)
             if content:
-                handlers.get(key.data, lambda text, name=key.data: self._print(name, text))(content)
+                self._process_content(key.data, content)
             elif key.data == "control":
-                raise GuestError(f"the guest went away{self._last_words()}")
+                raise GuestError(f"the guest has ended{self._describe_console()}")
             else:
                 self._selector.unregister(port)
 
-    def _obey(self, content: bytes) -> None:
-        *lines, self._control = (self._control + content).split(b"\n")
+    def _process_content(self, port: str, content: bytes) -> None:
+        """Process what has arrived on a port of the guest."""
+        match port:
+            case "control":
+                self._process_control(content)
+            case "console":
+                self._process_console(content)
+            case _:
+                self._print_output(port, content)
+
+    def _process_control(self, content: bytes) -> None:
+        """Process the lines of session.sh: `ready`, and `exit` with the code and the length of both outputs."""
+        *lines, self._control_rest = (self._control_rest + content).split(b"\n")
         for line in lines:
             match line.decode().split():
                 case ["ready"]:
                     self._ready = True
                 case ["exit", code, out, err]:
-                    self._ended = int(code), {"out": int(out), "err": int(err)}
+                    self._result = int(code), {"out": int(out), "err": int(err)}
                 case _:
                     raise GuestError(f"the guest printed {line!r}")
 
-    def _note(self, content: bytes) -> None:
-        self._console = (self._console + content)[-CONSOLE_TAIL:]
+    def _process_console(self, content: bytes) -> None:
+        """Keep the last messages of the guest's kernel, and print them if requested."""
+        self._console_tail = (self._console_tail + content)[-CONSOLE_TAIL_BYTES:]
         if self._request.verbose:
             _write(sys.stderr.fileno(), content.replace(b"\r", b""))
 
-    def _print(self, name: str, content: bytes) -> None:
-        _write({"out": 1, "err": 2}[name], content)
-        self._passed[name] += len(content)
+    def _print_output(self, name: str, content: bytes) -> None:
+        """Print output of the command."""
+        _write(OUTPUT_DESCRIPTORS[name], content)
+        self._printed_bytes[name] += len(content)
 
-    def _last_words(self) -> str:
-        output = self._console.replace(b"\r", b"").decode(errors="replace").strip()
+    def _describe_console(self) -> str:
+        """Return the last messages of the guest's kernel, as the end of an error message."""
+        output = self._console_tail.replace(b"\r", b"").decode(errors="replace").strip()
         return f". It printed:\n{output}" if output else "; it printed nothing"
 
 
 def _write(descriptor: int, content: bytes) -> None:
+    """Write all of a content to a file descriptor."""
     while content:
-        content = content[os.write(descriptor, content) :]
+        written_bytes = os.write(descriptor, content)
+        content = content[written_bytes:]
 
 
-def die_with_parent() -> None:
-    """Have the kernel kill this process when its parent dies, however it dies. A machine costs a whole core."""
-    LIBC.prctl(KILL_WITH_PARENT, signal.SIGKILL, 0, 0, 0)
+def set_parent_death_signal() -> None:
+    """Make the kernel kill this process when its parent ends, even by SIGKILL. A guest occupies a whole core."""
+    LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
 
-def _dying_with(parent: int) -> Callable[[], None]:
-    """For the child to run before QEMU: the kernel kills it when `parent` dies, even of SIGKILL."""
+def _make_child_setup(parent_pid: int) -> Callable[[], None]:
+    """Return a function that a child calls before it becomes QEMU, so that it ends with its parent."""
 
     def before_exec() -> None:
-        die_with_parent()
-        if os.getppid() != parent:
+        set_parent_death_signal()
+        if os.getppid() != parent_pid:  # the parent has ended before the call above
             os._exit(1)
 
     return before_exec

@@ -1,4 +1,4 @@
-"""Gets what the VM needs from the distribution: tools are installed, everything else only downloaded and unpacked."""
+"""Installs tools for the virtual machine with apt, and downloads and unpacks other packages without installing them."""
 
 import os
 import re
@@ -7,83 +7,106 @@ import subprocess
 import sys
 from pathlib import Path
 
-TOOLS = {"qemu-system-x86_64": "qemu-system-x86", "ip": "iproute2"}
-# Debian's and Ubuntu's; the cloud images have no CAN.
-KERNEL_PACKAGES = "linux-image-amd64", "linux-image-generic"
-APT_LIMIT_S = 900
+PACKAGES_BY_TOOL = {"qemu-system-x86_64": "qemu-system-x86", "ip": "iproute2"}
+# The kernel packages of Debian and Ubuntu. Their kernels for the cloud have no CAN.
+KERNEL_PACKAGES = ("linux-image-amd64", "linux-image-generic")
+APT_TIMEOUT_S = 900
+MAX_MESSAGE_CHARACTERS = 2000
 
 
 class PreparationError(RuntimeError):
-    """Something that the guest needs is missing; the message explains what to do."""
+    """Raised if something that the guest needs is missing. The message explains what to do."""
 
 
 def find_tool(name: str) -> str | None:
-    """The tool's path, searched also in the folders that a user's PATH leaves out."""
+    """Return the path of a tool, or None. Folders that the PATH of a user often leaves out are searched, too."""
     return shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin:/usr/bin:/bin")
 
 
-def need_tool(name: str) -> str:
-    """The tool's path; installed first if it is missing and we are root."""
-    if found := find_tool(name):
-        return found
-    install = ["apt-get", "install", "--yes", "--no-install-recommends", TOOLS.get(name, name)]
+def require_tool(name: str) -> str:
+    """Return the path of a tool. If it is missing, install it as root.
+
+    Raises:
+        PreparationError: The tool is missing, and cannot be installed.
+    """
+    if path := find_tool(name):
+        return path
+    install = [
+        "apt-get",
+        "install",
+        "--yes",
+        "--no-install-recommends",
+        PACKAGES_BY_TOOL.get(name, name),
+    ]
     if os.geteuid() != 0:
         raise PreparationError(
             f"{name} is missing. Run: sudo apt-get update && sudo {' '.join(install)}"
         )
     print(f"with_vcan: installing {install[-1]}", file=sys.stderr)
-    if _apt(install).returncode:
+    if _run_apt(install).returncode:
         update_lists()
-        _must(_apt(install))
-    if found := find_tool(name):
-        return found
-    raise PreparationError(f"{install[-1]} is installed and still there is no {name} on the PATH")
+        _check_success(_run_apt(install))
+    if path := find_tool(name):
+        return path
+    raise PreparationError(f"{install[-1]} is installed, but {name} is not on the PATH")
 
 
 def update_lists() -> None:
-    """`apt-get update`, for which one must be root."""
+    """Update the package lists, as root.
+
+    Raises:
+        PreparationError: The user is not root, or the update fails.
+    """
     if os.geteuid() != 0:
         raise PreparationError("the package lists are missing or too old. Run: sudo apt-get update")
-    _must(_apt(["apt-get", "update"]))
+    _check_success(_run_apt(["apt-get", "update"]))
 
 
-def kernel_version() -> str:
-    """The version of the distribution's current kernel, as its package is named."""
-    for update in (False, True):
-        if update:
+def find_kernel_version() -> str:
+    """Return the version of the distribution's current kernel, as in the names of its packages.
+
+    Raises:
+        PreparationError: The distribution has no such package, even after an update of the package lists.
+    """
+    for update_first in (False, True):
+        if update_first:
             update_lists()
         for package in KERNEL_PACKAGES:
-            listed = _apt(["apt-cache", "depends", package]).stdout
-            if found := re.search(r"Depends: linux-image-(\d\S*)", listed):
-                return found[1]
+            dependencies = _run_apt(["apt-cache", "depends", package]).stdout
+            match = re.search(r"Depends: linux-image-(\d\S*)", dependencies)
+            if match is not None:
+                return match[1]
     raise PreparationError(
-        f"apt knows none of {', '.join(KERNEL_PACKAGES)}: only Debian and Ubuntu on x86-64 will do"
+        f"apt has no package {' or '.join(KERNEL_PACKAGES)}: the guest needs Debian or Ubuntu on x86-64"
     )
 
 
-def kernel_packages(version: str) -> list[str]:
-    """The packages that together hold the image and the modules (Ubuntu splits them)."""
+def list_kernel_packages(version: str) -> list[str]:
+    """Return the packages that contain image and modules of a kernel. Ubuntu has several of them."""
     names = (f"linux-{part}-{version}" for part in ("image", "modules", "modules-extra"))
-    return [name for name in names if _apt(["apt-cache", "show", name]).returncode == 0]
+    return [name for name in names if _run_apt(["apt-cache", "show", name]).returncode == 0]
 
 
-def unpack(package: str, into: Path) -> None:
-    """Download a package and lay its files out below `into`; nothing is installed."""
+def unpack_package(package: str, into: Path) -> None:
+    """Download a package, and unpack its files below `into`. The package is not installed."""
     downloads = into.parent / "downloads"
     downloads.mkdir(exist_ok=True)
-    # As root apt drops to a user of its own, who may not write here.
+    # If root calls apt, it downloads as another user, who may not write here.
     options = ["-o", "APT::Sandbox::User=root"] if os.geteuid() == 0 else []
     download = ["apt-get", *options, "download", package]
-    if _apt(download, downloads).returncode:
+    if _run_apt(download, downloads).returncode:
         update_lists()
-        _must(_apt(download, downloads))
+        _check_success(_run_apt(download, downloads))
     for archive in downloads.glob(f"{package}_*.deb"):
-        _must(_apt(["dpkg-deb", "--extract", str(archive), str(into)]))
+        _check_success(_run_apt(["dpkg-deb", "--extract", str(archive), str(into)]))
 
 
-def _apt(command: list[str], folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+def _run_apt(command: list[str], folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a program of apt or dpkg without input, and return its result."""
     if not shutil.which(command[0]):
-        raise PreparationError(f"{command[0]} is missing: only Debian and Ubuntu on x86-64 will do")
+        raise PreparationError(
+            f"{command[0]} is missing: the guest needs Debian or Ubuntu on x86-64"
+        )
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive", "LC_ALL": "C"}
     return subprocess.run(
         command,
@@ -92,11 +115,13 @@ def _apt(command: list[str], folder: Path | None = None) -> subprocess.Completed
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=APT_LIMIT_S,
+        timeout=APT_TIMEOUT_S,
         check=False,
     )
 
 
-def _must(done: subprocess.CompletedProcess[str]) -> None:
-    if done.returncode:
-        raise PreparationError(f"`{' '.join(done.args)}` failed:\n{done.stderr.strip()[-2000:]}")
+def _check_success(completed: subprocess.CompletedProcess[str]) -> None:
+    """Raise PreparationError with the last messages of a program if it failed."""
+    if completed.returncode:
+        messages = completed.stderr.strip()[-MAX_MESSAGE_CHARACTERS:]
+        raise PreparationError(f"`{' '.join(completed.args)}` failed:\n{messages}")

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Runs a command where virtual CAN interfaces are up: here, or in a small virtual machine.
+"""Runs a command with virtual CAN interfaces, on this kernel or in a small virtual machine.
 
     python deploy/vm/with_vcan.py -- .venv/bin/python -m pytest tests/system/can
 
-A kernel with CAN gets a network namespace of its own, in which nothing of the host is touched. Where the kernel has no
-CAN, the command runs in a guest that has the host's files: this checkout may be written, any other change stays in the
-guest. SNAKESIM_VCAN is set to it: native or guest. Needs Debian or Ubuntu on x86-64 for the guest.
+If this kernel has CAN, the command runs in a separate network namespace. Otherwise it runs in a virtual machine, the
+guest. The guest has the files of the host. It may write this checkout; other changes stay in the guest. The variable
+SNAKESIM_VCAN is set to `native` or `guest`. The guest needs Debian or Ubuntu on x86-64.
 
-Why not virtme-ng: 1.42 boots the same kernel without KVM, but wants its modules and kmod installed on the host. It does
-not load Debian's virtio_console, so output and exit code of the command were lost ("cannot find script I/O ports"), and
-a command that took 45 s here, mostly imports, took 177 s there.
+virtme-ng 1.42 is not used. It boots the same kernel without KVM, but needs its modules and kmod on the host. It does
+not load Debian's virtio_console, so output and exit code of the command were lost ("cannot find script I/O ports"). A
+command that took 45 s here, mostly imports, took 177 s there.
 """
 
 import argparse
@@ -24,43 +24,62 @@ from contextlib import closing
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))  # so that `deploy.vm` means the same here and in the tests
+sys.path.insert(0, str(ROOT))  # so that `deploy.vm` is the same package here and in the tests
 
-from deploy.vm.kernel import Kernel, cache_folder, ready_kernel  # noqa: E402
-from deploy.vm.machine import Guest, GuestError, Request, die_with_parent  # noqa: E402
-from deploy.vm.packages import PreparationError, find_tool, need_tool  # noqa: E402
+from deploy.vm.kernel import Kernel, find_cache_folder, prepare_kernel  # noqa: E402
+from deploy.vm.machine import Guest, GuestError, GuestRequest, set_parent_death_signal  # noqa: E402
+from deploy.vm.packages import PreparationError, find_tool, require_tool  # noqa: E402
 
-BOOT_LIMIT_S = {True: 30.0, False: 120.0}  # with KVM, without
-PROBE_LIMIT_S = 20.0
-ATTEMPTS = 2
-INTERRUPTED, BROKEN_PIPE, CANNOT = 130, 141, 125
+BOOT_TIMEOUT_WITH_KVM_S = 30.0
+BOOT_TIMEOUT_WITHOUT_KVM_S = 120.0
+KVM_TEST_TIMEOUT_S = 20.0
+MAX_PORT = 65535
+MAX_ATTEMPTS = 2
+
+# Exit codes, as shells and env(1) have them.
+CANNOT_START = 125
+INTERRUPTED = 130
+BROKEN_PIPE = 141
 
 
 def main() -> int:
-    """Choose the place and run the command there; its exit code, or 125 when it could not be started."""
-    arguments = _parsed()
-    die_with_parent()
+    """Run the command on this kernel or in a guest, and return its exit code.
+
+    Returns:
+        The exit code of the command, or CANNOT_START if it could not be started.
+    """
+    arguments = _parse_arguments()
+    set_parent_death_signal()
     try:
-        need_tool("ip")
-        only_guest = arguments.guest or arguments.controllers or arguments.forward
-        if not only_guest and (prefix := native_prefix(arguments.channels)) is not None:
-            os.environ["SNAKESIM_VCAN"] = "native"
-            os.execvp((*prefix, *arguments.command)[0], [*prefix, *arguments.command])
-        return run_in_guest(arguments)
+        require_tool("ip")
+        needs_guest = arguments.guest or arguments.controllers or arguments.forward
+        prefix = None if needs_guest else make_native_prefix(arguments.channels)
+        if prefix is None:
+            return run_in_guest(arguments)
+        os.environ["SNAKESIM_VCAN"] = "native"
+        command = [*prefix, *arguments.command]
+        os.execvp(command[0], command)
     except (PreparationError, GuestError) as error:
         print(f"with_vcan: {error}", file=sys.stderr)
-        return CANNOT
+        return CANNOT_START
     except FileNotFoundError as error:
-        print(f"with_vcan: there is no {error.filename}", file=sys.stderr)
-        return CANNOT
+        print(f"with_vcan: {error.filename} does not exist", file=sys.stderr)
+        return CANNOT_START
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:
         return BROKEN_PIPE
 
 
-def native_prefix(channels: list[str]) -> list[str] | None:
-    """What to put before the command so that it finds the channels on this kernel; None if that cannot be."""
+def make_native_prefix(channels: list[str]) -> list[str] | None:
+    """Return the command prefix that runs a command with these interfaces on this kernel.
+
+    Args:
+        channels: Names of the interfaces.
+
+    Returns:
+        The prefix, which is empty if the interfaces exist. None if this kernel cannot have them.
+    """
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError:
@@ -68,28 +87,36 @@ def native_prefix(channels: list[str]) -> list[str] | None:
     present = {name for _, name in socket.if_nameindex()}
     if present.issuperset(channels):
         return []
-    enter = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--map-root-user"]
+    enter_namespace = ["unshare", "--net"]
+    if os.geteuid() != 0:
+        enter_namespace.append("--map-root-user")
     ip = shlex.quote(find_tool("ip") or "ip")
-    bring_up = " && ".join(
+    create_interfaces = " && ".join(
         f"{ip} link add {name} type vcan && {ip} link set {name} up"
         for name in map(shlex.quote, channels)
     )
-    prefix = [*enter, "sh", "-c", f'{ip} link set lo up && {bring_up} && exec "$@"', "sh"]
-    tried = subprocess.run(
+    prefix = [
+        *enter_namespace,
+        "sh",
+        "-c",
+        f'{ip} link set lo up && {create_interfaces} && exec "$@"',
+        "sh",
+    ]
+    attempt = subprocess.run(
         [*prefix, "true"], stdin=subprocess.DEVNULL, capture_output=True, check=False
     )
-    return prefix if tried.returncode == 0 else None
+    return prefix if attempt.returncode == 0 else None
 
 
 def run_in_guest(arguments: argparse.Namespace) -> int:
-    """Boot a guest and run the command in it; a boot that fails is tried once more."""
+    """Boot a guest, run the command in it, and return its exit code. A boot that fails is repeated once."""
     if platform.machine() != "x86_64":
         raise PreparationError(
-            f"this kernel has no CAN, and there is no guest for {platform.machine()}, only for x86-64"
+            f"this kernel has no CAN, and a guest needs x86-64, but this is {platform.machine()}"
         )
-    need_tool("qemu-system-x86_64")
-    kernel = ready_kernel()
-    request = Request(
+    require_tool("qemu-system-x86_64")
+    kernel = prepare_kernel()
+    request = GuestRequest(
         command=arguments.command,
         folder=Path.cwd(),
         writable=[ROOT, *(path.resolve(strict=True) for path in arguments.rwdir)],
@@ -100,47 +127,55 @@ def run_in_guest(arguments: argparse.Namespace) -> int:
         memory=arguments.memory,
         verbose=arguments.verbose,
     )
-    kvm = kvm_works(kernel)
-    for attempt in range(1, ATTEMPTS + 1):
+    kvm = check_kvm(kernel)
+    for attempt in range(1, MAX_ATTEMPTS + 1):
         with closing(Guest(request, kernel, kvm)) as guest:
             try:
-                guest.wait_until_ready(BOOT_LIMIT_S[kvm])
+                guest.wait_until_ready(
+                    BOOT_TIMEOUT_WITH_KVM_S if kvm else BOOT_TIMEOUT_WITHOUT_KVM_S
+                )
             except GuestError as error:
-                if attempt == ATTEMPTS:
+                if attempt == MAX_ATTEMPTS:
                     raise
-                print(f"with_vcan: {error}\nwith_vcan: trying once more", file=sys.stderr)
-                kvm = False  # in case that was it
+                print(f"with_vcan: {error}\nwith_vcan: the guest is started again", file=sys.stderr)
+                kvm = False  # KVM may be the reason
                 continue
             return guest.run()
     raise AssertionError("the last attempt returns or raises")
 
 
-def kvm_works(kernel: Kernel) -> bool:
-    """Whether a guest boots with KVM, tried once for each start of the machine: a KVM that is there may hang."""
+def check_kvm(kernel: Kernel) -> bool:
+    """Return whether a guest boots with KVM. A KVM that exists may hang.
+
+    The test runs once for each start of the computer. Its result is kept in the cache.
+    """
     if not os.access("/dev/kvm", os.R_OK | os.W_OK):
         return False
-    answers = cache_folder() / "kvm.json"
-    this_start = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    known = json.loads(answers.read_text()) if answers.exists() else {}
-    if this_start not in known:
+    cache = find_cache_folder() / "kvm.json"
+    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    results = json.loads(cache.read_text()) if cache.exists() else {}
+    if boot_id not in results:
         try:
-            nothing = Request(command=["true"], folder=Path("/"), channels=[])
-            with closing(Guest(nothing, kernel, kvm=True)) as guest:
-                guest.wait_until_ready(PROBE_LIMIT_S)
+            request = GuestRequest(command=["true"], folder=Path("/"), channels=[])
+            with closing(Guest(request, kernel, kvm=True)) as guest:
+                guest.wait_until_ready(KVM_TEST_TIMEOUT_S)
             works = True
         except GuestError:
             works = False
-        known = {this_start: works}
-        answers.write_text(json.dumps(known))
-    return known[this_start]
+        results = {boot_id: works}
+        cache.write_text(json.dumps(results))
+    return results[boot_id]
 
 
-def _parsed() -> argparse.Namespace:
+def _parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--channels", type=names, default=["vcan0"], help="default: vcan0; or vcan0,vcan1,..."
+        "--channels",
+        type=parse_interface_names,
+        default=["vcan0"],
+        help="names of the interfaces, such as vcan0,vcan1 (vcan0)",
     )
     parser.add_argument(
         "--guest", action="store_true", help="use a guest even if this kernel has CAN"
@@ -152,33 +187,38 @@ def _parsed() -> argparse.Namespace:
     guest.add_argument(
         "--controllers",
         action="store_true",
-        help="two emulated controllers, can0 and can1, on one bus",
+        help="emulate two CAN controllers on one bus, can0 and can1",
     )
     guest.add_argument(
-        "--forward", type=ports, action="append", default=[], metavar="HOSTPORT:GUESTPORT"
+        "--forward",
+        type=parse_ports,
+        action="append",
+        default=[],
+        metavar="HOSTPORT:GUESTPORT",
+        help="forward a TCP port of this computer to the guest; may be repeated",
     )
     guest.add_argument(
         "--rwdir",
         type=Path,
         action="append",
         default=[],
-        help="one more folder that may be written",
+        help="folder that the guest may write; may be repeated",
     )
-    guest.add_argument("--cpus", type=int, default=2, help="default: 2")
-    guest.add_argument("--memory", default="2G", help="default: 2G")
+    guest.add_argument("--cpus", type=int, default=2, help="number of processors (2)")
+    guest.add_argument("--memory", default="2G", help="size of the memory (2G)")
     parser.usage = "with_vcan.py [options] -- COMMAND ..."
-    # Divided here, because a command may have a `--` of its own.
+    # The first `--` separates options and command. The command may contain another one.
     words = sys.argv[1:]
-    divided = words.index("--") if "--" in words else len(words)
-    arguments = parser.parse_args(words[:divided])
-    arguments.command = words[divided + 1 :]
+    separator = words.index("--") if "--" in words else len(words)
+    arguments = parser.parse_args(words[:separator])
+    arguments.command = words[separator + 1 :]
     if not arguments.command:
-        parser.error("there is no command; it comes after --")
+        parser.error("the command is missing; it comes after --")
     return arguments
 
 
-def names(text: str) -> list[str]:
-    """Interface names, as in `vcan0,vcan1`."""
+def parse_interface_names(text: str) -> list[str]:
+    """Return the names in a list of interfaces such as `vcan0,vcan1`."""
     names = text.split(",")
     if not all(name.isalnum() and len(name) <= 15 for name in names):
         raise argparse.ArgumentTypeError(
@@ -187,14 +227,16 @@ def names(text: str) -> list[str]:
     return names
 
 
-def ports(text: str) -> tuple[int, int]:
-    """The host's and the guest's port, as in `17447:7447`."""
-    outer, _, inner = text.partition(":")
-    if not (
-        outer.isdigit() and inner.isdigit() and 0 < int(outer) < 65536 and 0 < int(inner) < 65536
-    ):
+def parse_ports(text: str) -> tuple[int, int]:
+    """Return the port of the host and that of the guest in a text such as `17447:7447`."""
+    host_port, _, guest_port = text.partition(":")
+    if not (_is_port(host_port) and _is_port(guest_port)):
         raise argparse.ArgumentTypeError(f"{text!r}: two ports of 1 to 65535, as in 17447:7447")
-    return int(outer), int(inner)
+    return int(host_port), int(guest_port)
+
+
+def _is_port(text: str) -> bool:
+    return text.isdigit() and 0 < int(text) <= MAX_PORT
 
 
 if __name__ == "__main__":

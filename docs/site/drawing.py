@@ -74,7 +74,7 @@ class Drawing:
             self._parts.append(_text(x, y + number * LINE_PX, line, kind, anchor))
 
     def to_svg(self) -> str:
-        """Return the file."""
+        """Return the drawing as the text of an SVG file."""
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self._width} {self._height}" '
             f'width="{self._width}" height="{self._height}" role="img" aria-label="{escape(self._title)}" '

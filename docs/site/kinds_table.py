@@ -1,6 +1,6 @@
-"""The tables of faults on request in docs/how-to/inject-faults.md, from the registry and from the driver types.
+"""Writes the tables of faults on request in docs/how-to/inject-faults.md, from the registry and the driver types.
 
-`python -m docs.site.kinds_table` writes it.
+Run `python -m docs.site.kinds_table` after a change of fault kinds or drivers.
 """
 
 from pathlib import Path
@@ -11,8 +11,10 @@ from snakesim_hal.model.fault_kinds import EXECUTOR_DESCRIPTIONS, FAULT_KINDS, F
 from snakesim_hal.programs.preflight import load_backend_class
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "inject-faults.md"
-BEGIN, END = "<!-- from here: made by `make schemas` -->\n", "<!-- to here -->\n"
-BEGIN_DRIVES = "<!-- drive types, from here: made by `make schemas` -->\n"
+# Lines of the page that enclose its tables.
+FAULTS_BEGIN = "<!-- from here: made by `make schemas` -->\n"
+DRIVES_BEGIN = "<!-- drive types, from here: made by `make schemas` -->\n"
+TABLE_END = "<!-- to here -->\n"
 DRIVE_TYPES = ("odrive", "moteus", "cia402", "dynamixel", "feetech")
 TARGETS = {
     "process": "`host`, `guidance`, `navigation`, `control`, and `router` with `--with-router`, which cannot hang",
@@ -24,36 +26,36 @@ TARGETS = {
 }
 
 
-def with_table() -> str:
-    """The page as it should be."""
-    page = _replace(PAGE.read_text(encoding="utf-8"), BEGIN, table())
-    return _replace(page, BEGIN_DRIVES, drive_table())
+def make_page() -> str:
+    """Return the text of the page with new tables."""
+    page = _replace_table(PAGE.read_text(encoding="utf-8"), FAULTS_BEGIN, make_fault_table())
+    return _replace_table(page, DRIVES_BEGIN, make_drive_table())
 
 
-def _replace(page: str, begin: str, new_table: str) -> str:
+def _replace_table(page: str, begin: str, new_table: str) -> str:
     """Return a page with another table behind the mark that begins it."""
-    head, _, rest = page.partition(begin)
-    return head + begin + new_table + END + rest.partition(END)[2]
+    before, _, rest = page.partition(begin)
+    _, _, after = rest.partition(TABLE_END)
+    return before + begin + new_table + TABLE_END + after
 
 
-def table() -> str:
-    """A row a kind."""
+def make_fault_table() -> str:
+    """Return the table with a row for each kind of fault."""
     rows = ["| target | kind | effect | amount | carried out by |", "|---|---|---|---|---|"]
     for sort, kinds in FAULT_KINDS.items():
-        target = (
-            f"{sort}: {TARGETS[sort]}"
-            if sort in ("process", "key", "joint", "bus")
-            else TARGETS[sort]
-        )
+        has_names = sort in ("process", "key", "joint", "bus")
+        target = f"{sort}: {TARGETS[sort]}" if has_names else TARGETS[sort]
         for name, kind in kinds.items():
-            amount = "" if kind.amount is None else _amount(kind.amount)
-            doers = ", else ".join(EXECUTOR_DESCRIPTIONS[doer] for doer in kind.executors)
-            rows.append(f"| {target} | `{name}` | {kind.description} | {amount} | {doers} |")
-            target = ""
+            amount = "" if kind.amount is None else _describe_amount(kind.amount)
+            executors = ", else ".join(
+                EXECUTOR_DESCRIPTIONS[executor] for executor in kind.executors
+            )
+            rows.append(f"| {target} | `{name}` | {kind.description} | {amount} | {executors} |")
+            target = ""  # only the first row of a target names it
     return "\n".join(rows) + "\n"
 
 
-def drive_table() -> str:
+def make_drive_table() -> str:
     """Return the table of faults that emulated drives and their buses have, with a row for each drive type."""
     rows = ["| `--backend` | in an emulated drive | on its bus | in samples |", "|---|---|---|---|"]
     in_samples = [
@@ -73,10 +75,11 @@ def drive_table() -> str:
     return "\n".join(rows) + "\n"
 
 
-def _amount(amount: FaultAmount) -> str:
+def _describe_amount(amount: FaultAmount) -> str:
+    """Return the meaning of an amount, with its default, minimum and maximum."""
     unit = "" if amount.unit == "1" else f" {amount.unit}"
     return f"{amount.description}, {amount.default:g}{unit} ({amount.min_value:g} to {amount.max_value:g})"
 
 
 if __name__ == "__main__":
-    PAGE.write_text(with_table(), encoding="utf-8")
+    PAGE.write_text(make_page(), encoding="utf-8")

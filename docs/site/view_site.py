@@ -159,30 +159,37 @@ def view(
     """Yield the problems of a page in every view, and put its pictures on the sheets."""
     open_page(tab, page)
     for (width, scheme), sheet in sheets.items():
-        show(tab, width, scheme)
+        set_view(tab, width, scheme)
         for problem in json.loads(tab.value(CHECK) or "[]"):
             yield f"{page} ({width}, {scheme}): {problem}"
         tiles = 1
         if max_tiles > 1:
             page_height = int(tab.value("document.documentElement.scrollHeight"))
             tiles = min(-(-page_height // WIDTHS_PX[width]), max_tiles)
-            show(tab, width, scheme, tiles)
+            set_view(tab, width, scheme, tiles)
         sheet.add(page, tab.picture(), tiles)
     yield from (f"{page}: {error}" for error in tab.errors if "search_index" not in error)
     tab.errors.clear()
 
 
-def show(tab: BrowserTab, width: int, scheme: str, tiles: int = 1) -> None:
-    """Give the window a width and the height of some tiles, and the page a color scheme."""
+def set_view(tab: BrowserTab, width: int, scheme: str, tiles: int = 1) -> None:
+    """Set the width and the height of the window, and the color scheme of the page.
+
+    Args:
+        tab: The page.
+        width: Width of the window, in points.
+        scheme: Color scheme, `light` or `dark`.
+        tiles: Height of the window, in tiles of a contact sheet.
+    """
     tab.size(width, tiles * WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
     attribute = json.dumps("slate" if scheme == "dark" else "default")
-    # As the theme's own button does.
+    # The button of the theme does the same.
     tab.value(f"document.body.setAttribute('data-md-color-scheme', {attribute})")
-    time.sleep(0.2)  # until it is laid out
+    time.sleep(0.2)  # until the browser has laid out the page
 
 
 def open_page(tab: BrowserTab, page: Path) -> None:
-    """Show a page, with the pictures that a reader would have to scroll to."""
+    """Open a page, and load also the pictures that are visible only after scrolling."""
     tab.send("Page.navigate", url=f"file://{COPY / page}")
     deadline = time.monotonic() + LOAD_LIMIT_S
     name = json.dumps(page.name)

@@ -115,4 +115,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # Call the module under its own name: the caller cannot unpickle an instance of `__main__._RaisedError`.
+    from snakesim_operator.run import pinned_process
+
+    sys.exit(pinned_process.main())

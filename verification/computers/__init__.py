@@ -1,1 +1,1 @@
-"""One digest on every computer."""
+"""Tests that a run has the same digest on every kind of processor."""

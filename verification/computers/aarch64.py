@@ -26,29 +26,29 @@ EMULATOR = "qemu-aarch64-static"
 TESTS = ("tests/unit/sim_backend/test_laws.py", "tests/unit/gnc/test_native_growth.py")
 SCENARIO = "peg_row"
 DURATION_S = "0.3"  # of robot time; the emulator is slow
-MAX_COMMAND_S = 1800  # on a slow computer
+COMMAND_TIMEOUT_S = 1800  # long enough for a slow computer
 # A program of the emulated computer cannot be started directly, only through the script.
 SITE_CUSTOMIZATION = f"import sys\nsys.executable = {str(PYTHON_SCRIPT)!r}\n"
 
 
 class MissingToolError(Exception):
-    """Something that this computer lacks; the text explains what to do."""
+    """Raised if this computer has no apt or emulator. The text explains what to do."""
 
 
 def main() -> int:
-    """Prepare the emulated computer, and run the tests and both runs. Returns the exit code."""
+    """Prepare the emulated computer, run the tests and both runs on it, and return the exit code."""
     try:
         download_debian_python()
         install_packages(build_wheel())
     except MissingToolError as error:
         print(f"aarch64: {error}")
         return 2
-    tests = run_emulated(
+    completed = run_emulated(
         "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "addopts=", "-m", "not slow", *TESTS
     )
-    if tests.returncode:
+    if completed.returncode:
         return 1
-    # With a named folder, a library that cannot be loaded is an error.
+    # If the variable names a folder, SnakeSIM fails if it cannot load a library.
     with_library = run_scenario(str(SITE_PACKAGES / "snakesim_native" / "compiled"), "run-c")
     without_library = run_scenario("off", "run-python")
     print(f"{SCENARIO}: digest {with_library} with the C libraries, {without_library} without")
@@ -56,7 +56,7 @@ def main() -> int:
 
 
 def build_wheel() -> Path:
-    """Build the wheels of this repository, as `make wheels` does. Returns the one for ARM."""
+    """Build the wheels of this repository as `make wheels` does, and return the one for ARM."""
     run_on_host(sys.executable, ROOT / "deploy" / "wheels.py")
     (wheel,) = (ROOT / "build" / "wheels").glob("*_aarch64.whl")
     return wheel
@@ -65,14 +65,15 @@ def build_wheel() -> Path:
 def download_debian_python() -> None:
     """Download Debian's Python for arm64 with all that it needs, and unpack it.
 
-    apt gets folders of its own, so the lists and the architecture of this computer stay as they are.
+    apt uses separate folders, so the package lists and the architecture of this computer do not change.
     """
     if shutil.which("apt-get") is None:
         raise MissingToolError("apt-get is missing: this needs Debian")
     if shutil.which(EMULATOR) is None:
         raise MissingToolError(f"{EMULATOR} is missing. Run: sudo apt-get install qemu-user-static")
     shutil.rmtree(BUILD_FOLDER, ignore_errors=True)
-    state, cache = BUILD_FOLDER / "apt" / "state", BUILD_FOLDER / "apt" / "cache"
+    state = BUILD_FOLDER / "apt" / "state"
+    cache = BUILD_FOLDER / "apt" / "cache"
     for folder in (
         state / "lists" / "partial",
         cache / "archives" / "partial",
@@ -165,7 +166,7 @@ def run_scenario(libraries: str, out: str) -> str:
 def run_emulated(
     *arguments: str | Path, extra_env: dict[str, str] | None = None, capture_output: bool = False
 ) -> subprocess.CompletedProcess[str]:
-    """Run the emulated Python with these arguments in its folder, which has only the tests."""
+    """Run the emulated Python in its folder, which contains the tests but no packages of this repository."""
     environment = {
         name: value
         for name, value in os.environ.items()
@@ -177,19 +178,23 @@ def run_emulated(
         env=environment | {"OMP_NUM_THREADS": "1"} | (extra_env or {}),
         capture_output=capture_output,
         text=True,
-        timeout=MAX_COMMAND_S,
+        timeout=COMMAND_TIMEOUT_S,
         check=False,
     )
 
 
 def run_on_host(*command: str | Path) -> None:
-    """Run a program of this computer. Raises CalledProcessError if it fails; its output is shown then."""
-    ended = subprocess.run(
-        command, capture_output=True, text=True, timeout=MAX_COMMAND_S, check=False
+    """Run a program of this computer. If it fails, print its output.
+
+    Raises:
+        CalledProcessError: The program failed.
+    """
+    completed = subprocess.run(
+        command, capture_output=True, text=True, timeout=COMMAND_TIMEOUT_S, check=False
     )
-    if ended.returncode:
-        sys.stderr.write(ended.stdout + ended.stderr)
-    ended.check_returncode()
+    if completed.returncode:
+        sys.stderr.write(completed.stdout + completed.stderr)
+    completed.check_returncode()
 
 
 if __name__ == "__main__":

@@ -1,15 +1,17 @@
-"""One seed, one digest, on any computer: under the code that OpenBLAS and NumPy choose there, and on a slow one.
+"""Tests that a scenario and a seed have the same digest on every computer, whatever its processor and its speed.
 
-The choice of another computer is set from outside, by the libraries' own variables.
+OpenBLAS and NumPy choose other instructions on other processors. Environment variables of these libraries make them
+choose here as they would there.
 """
 
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
+from _pytest.mark.structures import ParameterSet
 
 from snakesim_hal.base import arithmetic
 from snakesim_testing.harness.endpoint import find_free_endpoint
@@ -19,41 +21,47 @@ from snakesim_testing.runs.command import (
     make_environment,
     run_program,
 )
-from verification.golden import GOLDEN, SECONDS
+from verification.golden import DURATION_S, GOLDEN
 
 pytestmark = pytest.mark.e2e
 
-PLAIN = "X86_V3 X86_V4 AVX512_ICL AVX512_SPR"
+ROOT = Path(__file__).parents[2]
+
+ALL_NUMPY_FEATURES = "X86_V3 X86_V4 AVX512_ICL AVX512_SPR"
+# Environment variables that imitate the processor of a computer.
 COMPUTERS: dict[str, dict[str, str]] = {
     "Haswell": {"OPENBLAS_CORETYPE": "Haswell"},
     "SkylakeX": {"OPENBLAS_CORETYPE": "SkylakeX"},
     "Nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
-    "plain NumPy": {"NPY_DISABLE_CPU_FEATURES": PLAIN},
-    "all enabled": {"NPY_ENABLE_CPU_FEATURES": PLAIN},
+    "plain NumPy": {"NPY_DISABLE_CPU_FEATURES": ALL_NUMPY_FEATURES},
+    "all enabled": {"NPY_ENABLE_CPU_FEATURES": ALL_NUMPY_FEATURES},
 }
-OWN = arithmetic.find_differing_parts(arithmetic.measure_arithmetic())
-common = pytest.mark.skipif(
-    not arithmetic.make_common_arithmetic_env() or bool(OWN),
-    reason=f"the digests of this computer are its own: {' and '.join(OWN) or 'without AVX2 and FMA'}",
+DIFFERING_PARTS = arithmetic.find_differing_parts(arithmetic.measure_arithmetic())
+DIFFERENCE = " and ".join(DIFFERING_PARTS) or "without AVX2 and FMA"
+needs_common_arithmetic = pytest.mark.skipif(
+    not arithmetic.make_common_arithmetic_env() or bool(DIFFERING_PARTS),
+    reason=f"this computer computes other digests: {DIFFERENCE}",
 )
-IN_ONE_PROCESS = [
+# Arguments of pytest that select tests of whole runs.
+ONE_PROCESS_TESTS = [
     "tests/system/runs",
     "tests/system/recordings",
     "tests/system/commands",
     "-m",
     "not slow and not e2e",
 ]
-OF_THIS_PROCESS = [
+IN_PROCESS_RECORD_TESTS = [
     "tests/system/recordings/test_recordings.py",
     "tests/system/commands/test_compare.py",
 ]
-IN_REAL_TIME = [
+REAL_TIME_TESTS = [
     "tests/system/runs/test_run.py",
     "tests/system/recordings/test_record.py",
     "-k",
     "not no_slow_computer",
 ]
 
+# A program of a user. It imports NumPy before SnakeSIM could choose the common arithmetic.
 PROGRAM = """
 import sys
 import numpy
@@ -65,161 +73,155 @@ print(result.summary.command_digest, len(result.record.time_s))
 """
 
 
-def on(computer: Mapping[str, str], folder: Path) -> dict[str, str]:
-    """The environment of a user there, who has heard nothing of ours."""
-    ours = make_environment(folder)
-    return {
+def make_user_environment(computer: Mapping[str, str], folder: Path) -> dict[str, str]:
+    """Return the environment of a user on another computer, without the variables that the tests set.
+
+    Args:
+        computer: Variables that imitate the computer.
+        folder: Folder for state.
+    """
+    variables = {
         name: value
-        for name, value in ours.items()
+        for name, value in make_environment(folder).items()
         if name not in arithmetic.make_common_arithmetic_env()
-    } | dict(computer)
+    }
+    return {**variables, **computer}
 
 
-def run(folder: Path, *arguments: str, computer: Mapping[str, str] | None = None) -> CompletedRun:
-    typed = [
-        *SNAKESIM_COMMAND,
-        "run",
-        *arguments,
-        "--duration",
-        str(SECONDS),
-        "--no-record",
-        "--out",
-        "run",
-    ]
-    return run_program(typed, folder, on(computer or {}, folder))
+def run_as_user(
+    command: Sequence[str], folder: Path, computer: Mapping[str, str] | None = None
+) -> CompletedRun:
+    """Run a program in a folder as a user of another computer does. None stands for this computer."""
+    return run_program(command, folder, make_user_environment(computer or {}, folder))
 
 
-def digest_in(ended: CompletedRun) -> str:
-    assert "command digest" in ended.out, ended.out + ended.err
-    return ended.out.partition("command digest")[2].partition("\n")[0].strip()
+def run_scenario(
+    folder: Path, *arguments: str, computer: Mapping[str, str] | None = None
+) -> CompletedRun:
+    """Run `snakesim run` for as long as the golden digests cover, and return the result."""
+    duration = ("--duration", str(DURATION_S))
+    command = [*SNAKESIM_COMMAND, "run", *arguments, *duration, "--no-record", "--out", "run"]
+    return run_as_user(command, folder, computer)
 
 
-@common
+def find_digest(completed: CompletedRun) -> str:
+    """Return the digest that a run has printed, with the remarks behind it."""
+    assert "command digest" in completed.out, completed.printed
+    _, _, rest = completed.out.partition("command digest")
+    digest, _, _ = rest.partition("\n")
+    return digest.strip()
+
+
+def mark_slow(*names: str) -> list[ParameterSet]:
+    """Return test parameters that only the campaign uses."""
+    return [pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
+@needs_common_arithmetic
 @pytest.mark.parametrize("scenario", GOLDEN)
-def test_a_scenario_has_its_digest(tmp_path: Path, scenario: str) -> None:
-    said = "`make golden` writes the digests again, after a change that is meant to change what robots do"
-    assert digest_in(run(tmp_path, scenario, "--in-process")) == GOLDEN[scenario], said
+def test_scenario_has_golden_digest(tmp_path: Path, scenario: str) -> None:
+    digest = find_digest(run_scenario(tmp_path, scenario, "--in-process"))
+    assert digest == GOLDEN[scenario], "after an intended change, run `make golden`"
 
 
-@common
+@needs_common_arithmetic
 @pytest.mark.parametrize(
-    "computer",
-    [
-        "SkylakeX",
-        "plain NumPy",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("Haswell", "Nehalem", "all enabled")),
-    ],
+    "computer", ["SkylakeX", "plain NumPy", *mark_slow("Haswell", "Nehalem", "all enabled")]
 )
-def test_it_is_that_of_every_computer(tmp_path: Path, computer: str) -> None:
-    assert (
-        digest_in(run(tmp_path, "peg_row", "--in-process", computer=COMPUTERS[computer]))
-        == GOLDEN["peg_row"]
-    )
+def test_digest_is_equal_on_other_processors(tmp_path: Path, computer: str) -> None:
+    completed = run_scenario(tmp_path, "peg_row", "--in-process", computer=COMPUTERS[computer])
+    assert find_digest(completed) == GOLDEN["peg_row"]
 
 
-@common
-@pytest.mark.parametrize(
-    "computer", ["SkylakeX", pytest.param("plain NumPy", marks=pytest.mark.slow)]
-)
-def test_and_that_of_five_processes(tmp_path: Path, computer: str) -> None:
-    ended = run(
-        tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer]
-    )
-    # A computer that stands for seconds loses a process, and the run is no whole one.
-    if " is gone: " in ended.out:
-        ended = run(
-            tmp_path, "triplet", "--endpoint", find_free_endpoint(), computer=COMPUTERS[computer]
+@needs_common_arithmetic
+@pytest.mark.parametrize("computer", ["SkylakeX", *mark_slow("plain NumPy")])
+def test_digest_is_equal_in_five_processes(tmp_path: Path, computer: str) -> None:
+    def run_triplet() -> CompletedRun:
+        endpoint = find_free_endpoint()
+        return run_scenario(
+            tmp_path, "triplet", "--endpoint", endpoint, computer=COMPUTERS[computer]
         )
-    assert digest_in(ended) == GOLDEN["triplet"], ended.out + ended.err
+
+    completed = run_triplet()
+    # If the computer stops for seconds, the run loses a process and is not complete.
+    if " is gone: " in completed.out:
+        completed = run_triplet()
+    assert find_digest(completed) == GOLDEN["triplet"], completed.printed
 
 
-@common
-# No processor lacks what these need.
-@pytest.mark.parametrize(
-    "computer",
-    ["Nehalem", *(pytest.param(n, marks=pytest.mark.slow) for n in ("Haswell", "plain NumPy"))],
-)
-def test_and_that_of_a_program_that_imported_numpy_first(tmp_path: Path, computer: str) -> None:
+@needs_common_arithmetic
+# Every processor has the instructions that these need.
+@pytest.mark.parametrize("computer", ["Nehalem", *mark_slow("Haswell", "plain NumPy")])
+def test_digest_is_equal_after_importing_numpy_first(tmp_path: Path, computer: str) -> None:
     (tmp_path / "program.py").write_text(PROGRAM)
-    typed = [sys.executable, "program.py", "peg_row", str(SECONDS)]
-    ended = run_program(typed, tmp_path, on(COMPUTERS[computer], tmp_path))
-    digest, ticks = ended.out.split() or pytest.fail(ended.err)
-    assert digest.startswith(GOLDEN["peg_row"]) and int(ticks) == 100 * SECONDS
+    command = [sys.executable, "program.py", "peg_row", str(DURATION_S)]
+    completed = run_as_user(command, tmp_path, COMPUTERS[computer])
+    digest, tick_count = completed.out.split() or pytest.fail(completed.err)
+    assert digest.startswith(GOLDEN["peg_row"])
+    assert int(tick_count) == 100 * DURATION_S
 
 
-@common
-def test_what_such_a_program_did_wrong_is_raised_there(tmp_path: Path) -> None:
-    wrong = PROGRAM.replace(
+@needs_common_arithmetic
+def test_error_of_program_that_imported_numpy_first_is_raised(tmp_path: Path) -> None:
+    wrong_program = PROGRAM.replace(
         '[parse_set_option(f"duration_s={sys.argv[2]}")]',
         '[parse_set_option("clock_mode=realtime")]',
     )
-    (tmp_path / "program.py").write_text(wrong)
-    ended = run_program(
-        [sys.executable, "program.py", "triplet"], tmp_path, on(COMPUTERS["Nehalem"], tmp_path)
-    )
-    assert (
-        ended.code == 1 and "errors.ConfigError" in ended.err and "must be 'lockstep'" in ended.err
-    )
+    (tmp_path / "program.py").write_text(wrong_program)
+    command = [sys.executable, "program.py", "triplet"]
+    completed = run_as_user(command, tmp_path, COMPUTERS["Nehalem"])
+    assert completed.code == 1
+    assert "errors.ConfigError" in completed.err
+    assert "must be 'lockstep'" in completed.err
 
 
-@common
+@needs_common_arithmetic
 def test_other_c_library_marks_digest_as_local(tmp_path: Path) -> None:
-    """glibc has sines for processors with FMA, and others."""
-    other = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"}
-    typed = [
-        *SNAKESIM_COMMAND,
-        "run",
-        "triplet",
-        "--in-process",
-        "--duration",
-        "0.3",
-        "--out",
-        "run",
-    ]
-    ended = run_program(typed, tmp_path, on(other, tmp_path))
-    own = (
+    """Uses the sine of glibc for processors without FMA, which rounds differently."""
+    other_library = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4"}
+    remark = (
         "its own: NumPy and C library round otherwise than on most computers with NumPy 2.2 to 2.4"
     )
-    assert ended.code == 0 and digest_in(ended).endswith(f", {own}"), ended.out + ended.err
-    told = run_program([*SNAKESIM_COMMAND, "recording", "info", "run"], tmp_path, on({}, tmp_path))
-    assert own in told.out
-    assert run_program([*typed[:-1], "usual"], tmp_path, on({}, tmp_path)).code == 0
-    compared = run_program(
-        [*SNAKESIM_COMMAND, "study", "compare", "run", "usual"], tmp_path, on({}, tmp_path)
+    run_command = [*SNAKESIM_COMMAND, "run", "triplet", "--in-process", "--duration", "0.3"]
+    local = run_as_user([*run_command, "--out", "run"], tmp_path, other_library)
+    assert local.code == 0, local.printed
+    assert find_digest(local).endswith(f", {remark}"), local.printed
+    info = run_as_user([*SNAKESIM_COMMAND, "recording", "info", "run"], tmp_path)
+    assert remark in info.out
+    usual = run_as_user([*run_command, "--out", "usual"], tmp_path)
+    assert usual.code == 0
+    comparison = run_as_user([*SNAKESIM_COMMAND, "study", "compare", "run", "usual"], tmp_path)
+    assert "description.arithmetic.C library" in comparison.out, comparison.printed
+
+
+def run_tests(
+    folder: Path, variables: Mapping[str, str], *selection: str, prefix: Sequence[str] = ()
+) -> None:
+    """Run tests of this repository as a contributor on another computer does, and check that they pass.
+
+    Args:
+        folder: Folder for state.
+        variables: Variables that imitate the computer.
+        selection: Arguments of pytest that select the tests.
+        prefix: Command prefix, such as for a control group.
+    """
+    pytest_command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
+    completed = subprocess.run(
+        [*prefix, *pytest_command, "--timeout", "900", *selection],
+        cwd=ROOT,
+        env=make_user_environment(variables, folder),
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    assert "description.arithmetic.C library" in compared.out, compared.out + compared.err
-
-
-# --- the tests of whole runs, on other computers -------------------------------------------------------------------
-
-
-def suite(folder: Path, env: Mapping[str, str], *chosen: str, before: tuple[str, ...] = ()) -> None:
-    """Run tests as a contributor there does, from this repository."""
-    typed = [
-        *before,
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-p",
-        "no:cacheprovider",
-        "--timeout",
-        "900",
-        *chosen,
-    ]
-    root = Path(__file__).parents[2]
-    done = subprocess.run(
-        typed, cwd=root, env=on(env, folder), capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout[-8000:] + done.stderr[-2000:]
+    assert completed.returncode == 0, completed.stdout[-8000:] + completed.stderr[-2000:]
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("computer", ["Nehalem"])  # the digests of all are compared above
-def test_whole_runs_are_what_they_are_on_every_computer(tmp_path: Path, computer: str) -> None:
-    suite(
+@pytest.mark.parametrize("computer", ["Nehalem"])  # the tests above compare the digests of all
+def test_whole_runs_pass_their_tests_on_other_processor(tmp_path: Path, computer: str) -> None:
+    run_tests(
         tmp_path,
         COMPUTERS[computer],
         "tests/system/runs",
@@ -234,22 +236,22 @@ def test_whole_runs_are_what_they_are_on_every_computer(tmp_path: Path, computer
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("computer", ["Haswell", "Nehalem", "plain NumPy"])
 def test_records_are_equal_after_importing_numpy_first(tmp_path: Path, computer: str) -> None:
-    suite(tmp_path, {**COMPUTERS[computer], "SNAKESIM_UNPINNED": "1"}, *OF_THIS_PROCESS)
+    run_tests(tmp_path, {**COMPUTERS[computer], "SNAKESIM_UNPINNED": "1"}, *IN_PROCESS_RECORD_TESTS)
 
 
 @pytest.fixture
 def half_a_core() -> Iterator[Path]:
-    """A control group whose processes get half of one core, together."""
-    v1, v2 = Path("/sys/fs/cgroup/cpu"), Path("/sys/fs/cgroup")
-    group = (v1 if v1.is_dir() else v2) / f"snakesim-{os.getpid()}"
+    """Return the folder of a control group whose processes together get half of one core."""
+    root = Path("/sys/fs/cgroup")
+    is_version_1 = (root / "cpu").is_dir()
+    group = (root / "cpu" if is_version_1 else root) / f"snakesim-{os.getpid()}"
     try:
         group.mkdir()
-        if v1.is_dir():
-            (group / "cpu.cfs_quota_us").write_text(
-                str(int((group / "cpu.cfs_period_us").read_text()) // 2)
-            )
+        if is_version_1:
+            period_us = int((group / "cpu.cfs_period_us").read_text())
+            (group / "cpu.cfs_quota_us").write_text(str(period_us // 2))
         else:
-            (group / "cpu.max").write_text("50000 100000")
+            (group / "cpu.max").write_text("50000 100000")  # quota and period in us
     except OSError as error:
         pytest.skip(f"needs root, and a control group for processor time: {error}")
     yield group
@@ -259,8 +261,10 @@ def half_a_core() -> Iterator[Path]:
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize(
-    "chosen", [IN_ONE_PROCESS, IN_REAL_TIME], ids=["one process", "in real time"]
+    "selection", [ONE_PROCESS_TESTS, REAL_TIME_TESTS], ids=["one process", "in real time"]
 )
-def test_half_a_core_is_enough(tmp_path: Path, half_a_core: Path, chosen: list[str]) -> None:
-    joining = ("sh", "-c", f'echo $$ > {half_a_core}/cgroup.procs; exec "$@"', "sh")
-    suite(tmp_path, {}, *chosen, before=joining)
+def test_runs_pass_their_tests_on_half_a_core(
+    tmp_path: Path, half_a_core: Path, selection: list[str]
+) -> None:
+    join_group = ("sh", "-c", f'echo $$ > {half_a_core}/cgroup.procs; exec "$@"', "sh")
+    run_tests(tmp_path, {}, *selection, prefix=join_group)

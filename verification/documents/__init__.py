@@ -1,1 +1,1 @@
-"""What the documentation asks its readers to type."""
+"""Tests that run the commands which the documentation prints, and build the documentation site."""

@@ -1,6 +1,7 @@
-"""What tutorials, the guide to evaluations and the README ask a reader to type is typed here, as printed.
+"""Tests that run the commands in the README, the tutorials and the guides exactly as printed.
 
-Of docs/hardware/joint-modules.md only what needs no CAN; `make test-can` runs the rest of it with commands of its own.
+Of docs/hardware/joint-modules.md, only the section that needs no CAN is tested here. `make test-can` runs commands for
+the other sections.
 """
 
 import os
@@ -19,59 +20,89 @@ from snakesim_testing.runs.documents import REPOSITORY, DocumentSection, needs_u
 pytestmark = [pytest.mark.e2e, pytest.mark.timeout(600)]
 
 
-def typed_in(page: str) -> list[DocumentSection]:
-    """The sections of a page in which something is to be typed."""
-    return [section for section in parse_sections(REPOSITORY / page) if section.has_commands]
-
-
-TOUR = (
+GET_STARTED_PAGES = (
     "get-started/first-run",
     "tutorials/explore-runs",
     "tutorials/watch-a-running-robot",
     "tutorials/recover-from-faults",
     "tutorials/write-a-controller",
 )
-TUTORIAL = [section for page in TOUR for section in typed_in(f"docs/{page}.md")]
-EVALUATION = [
-    section
-    for page in ("evaluate-controllers", "write-a-suite", "optimize-parameters")
-    for section in typed_in(f"docs/how-to/{page}.md")
-]
-JOINT_MODULES = REPOSITORY / "docs" / "hardware" / "joint-modules.md"
-# Needs no CAN.
-HIL = [section for section in parse_sections(JOINT_MODULES) if section.title == "1. Anywhere"]
-CONTROLLERS, ROBOTS, SCENES, URDF = (
-    typed_in(f"docs/{page}.md")
-    for page in ("reference/controllers", "how-to/robots", "how-to/scenes", "how-to/urdf")
+EVALUATION_PAGES = (
+    "how-to/evaluate-controllers",
+    "how-to/write-a-suite",
+    "how-to/optimize-parameters",
 )
-PAGES = ("first-controller", "train-a-policy", "your-robot", "your-sensor", "lab-on-your-desk")
-LESSONS = [section for page in PAGES for section in typed_in(f"docs/tutorials/{page}.md")]
-README = typed_in("README.md")
-LIMIT_S = 500.0
+TUTORIAL_PAGES = (
+    "tutorials/first-controller",
+    "tutorials/train-a-policy",
+    "tutorials/your-robot",
+    "tutorials/your-sensor",
+    "tutorials/lab-on-your-desk",
+)
+JOINT_MODULES_PAGE = REPOSITORY / "docs" / "hardware" / "joint-modules.md"
+SECTION_WITHOUT_CAN = "1. Anywhere"
+SCRIPT_TIMEOUT_S = 500.0
+END_TIMEOUT_S = 30.0
 
 
-def named(section: DocumentSection) -> str:
-    """A test's name."""
+def read_sections(page: str) -> list[DocumentSection]:
+    """Return the sections of a Markdown file that contain commands."""
+    return [section for section in parse_sections(REPOSITORY / page) if section.has_commands]
+
+
+def read_doc_sections(*pages: str) -> list[DocumentSection]:
+    """Return the sections of pages in `docs` that contain commands. Pages are named without suffix."""
+    return [section for page in pages for section in read_sections(f"docs/{page}.md")]
+
+
+README = read_sections("README.md")
+GET_STARTED = read_doc_sections(*GET_STARTED_PAGES)
+EVALUATION = read_doc_sections(*EVALUATION_PAGES)
+TUTORIALS = read_doc_sections(*TUTORIAL_PAGES)
+CONTROLLERS = read_doc_sections("reference/controllers")
+ROBOTS = read_doc_sections("how-to/robots")
+SCENES = read_doc_sections("how-to/scenes")
+URDF = read_doc_sections("how-to/urdf")
+HARDWARE_IN_THE_LOOP = [
+    section
+    for section in parse_sections(JOINT_MODULES_PAGE)
+    if section.title == SECTION_WITHOUT_CAN
+]
+
+
+def make_test_id(section: DocumentSection) -> str:
+    """Return the title of a section in lower case, with hyphens between its words."""
     return re.sub(r"\W+", "-", section.title).lower()
 
 
-def apart() -> list[str]:
-    """A network of the script's own, in which the default port is free; nothing where the kernel grants none."""
-    command = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--map-root-user"]
-    granted = shutil.which("unshare") and subprocess.run(
-        [*command, "true"], capture_output=True, check=False
-    )
-    return command if granted and granted.returncode == 0 else []
+def find_isolation_prefix() -> list[str]:
+    """Return the command prefix for a network namespace, in which the default port is free.
+
+    The prefix is empty if the kernel grants no namespace.
+    """
+    prefix = ["unshare", "--net"]
+    if os.geteuid() != 0:
+        prefix.append("--map-root-user")
+    if shutil.which("unshare") is None:
+        return []
+    attempt = subprocess.run([*prefix, "true"], capture_output=True, check=False)
+    return prefix if attempt.returncode == 0 else []
 
 
-def typed(script: str, cwd: Path, prefix: list[str]) -> str:
-    """Run a script; what it says. Nothing that it has started is left."""
+def run_script(script: str, cwd: Path, prefix: list[str]) -> str:
+    """Run a bash script, check that it succeeds, and return its output.
+
+    Args:
+        script: The script.
+        cwd: Folder in which it runs. Its virtual environment comes first on the search path.
+        prefix: Command prefix, such as for a network namespace.
+    """
     (cwd / "typed.sh").write_text(script)
-    path = os.pathsep.join([str(cwd / ".venv" / "bin"), os.environ["PATH"]])
+    search_path = os.pathsep.join([str(cwd / ".venv" / "bin"), os.environ["PATH"]])
     process = subprocess.Popen(
         [*prefix, "bash", "typed.sh"],
         cwd=cwd,
-        env=make_environment(cwd / "state", PATH=path),
+        env=make_environment(cwd / "state", PATH=search_path),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -79,69 +110,84 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
         start_new_session=True,
     )
     try:
-        said, _ = process.communicate(timeout=LIMIT_S)
+        output, _ = process.communicate(timeout=SCRIPT_TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGTERM)
-        said, _ = process.communicate(timeout=30)
-        raise AssertionError(f"not done within {LIMIT_S:.0f} s:\n{said}") from None
-    assert process.returncode == 0, said
-    assert "Traceback" not in said, said
-    return said
+        os.killpg(process.pid, signal.SIGTERM)  # all processes that the script has started
+        output, _ = process.communicate(timeout=END_TIMEOUT_S)
+        raise AssertionError(f"not done within {SCRIPT_TIMEOUT_S:.0f} s:\n{output}") from None
+    assert process.returncode == 0, output
+    assert "Traceback" not in output, output
+    return output
 
 
 @needs_uv
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "section",
-    [*TUTORIAL, *HIL, *EVALUATION, *CONTROLLERS, *ROBOTS, *SCENES, *URDF, *LESSONS],
-    ids=named,
+    [
+        *GET_STARTED,
+        *HARDWARE_IN_THE_LOOP,
+        *EVALUATION,
+        *CONTROLLERS,
+        *ROBOTS,
+        *SCENES,
+        *URDF,
+        *TUTORIALS,
+    ],
+    ids=make_test_id,
 )
-def test_a_section_as_printed(section: DocumentSection, tmp_path: Path) -> None:
+def test_section_commands_succeed_as_printed(section: DocumentSection, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
     documents.clone(folder)
     for name, content in section.files.items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(content, encoding="utf-8")
-    typed(documents.make_bash_script(section), folder, apart())
+    run_script(documents.make_bash_script(section), folder, find_isolation_prefix())
 
 
 @needs_uv
-def test_the_readme_as_printed(tmp_path: Path) -> None:
-    """All blocks of the README, in a fresh clone with an environment of its own from the lock.
+def test_readme_commands_succeed_in_fresh_clone(tmp_path: Path) -> None:
+    """Runs all blocks of the README in a clone with a new environment, made from the lock.
 
-    The tests, of which this is one, are only collected there. Downloads come from uv's cache, as a rule.
+    The clone only collects the tests, because this test is one of them. Downloads come from uv's cache, as a rule.
     """
     origin = tmp_path / "origin"
     git = ["git", "-c", "user.name=x", "-c", "user.email=x@example.org"]
     shutil.copytree(REPOSITORY, origin, ignore=documents.leave_out, symlinks=True)
-    for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "As it is"]):
+    for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "Copy the working tree"]):
         subprocess.run([*git, "-C", str(origin), *arguments], check=True)
     clone = tmp_path / "snakesim"
     subprocess.run([*git, "clone", "-q", str(origin), str(clone)], check=True)
     install, quick_start = README
     for name, content in quick_start.files.items():
         (clone / name).write_text(content, encoding="utf-8")
-    printed = documents.make_bash_script(install)
-    assert "\nmake demo" in printed and "\nmake test" in printed
-    script = printed.replace("\nmake test", "\nmake test-unit WORKERS=0 ARGS='--collect-only -q'")
-    output = typed(script + "\n" + documents.make_bash_script(quick_start), clone, [])
+    install_script = documents.make_bash_script(install)
+    assert "\nmake demo" in install_script and "\nmake test" in install_script
+    install_script = install_script.replace(
+        "\nmake test", "\nmake test-unit WORKERS=0 ARGS='--collect-only -q'"
+    )
+    quick_start_script = documents.make_bash_script(quick_start)
+    output = run_script(f"{install_script}\n{quick_start_script}", clone, [])
     assert "report:" in output and (clone / "runs" / "demo" / "report.html").is_file()
     assert "tests collected" in output
     assert (clone / "first.html").is_file()
 
 
-def test_the_documents_ask_for_something() -> None:
-    assert (
-        len(TUTORIAL) >= 5
-        and len(EVALUATION) >= 6
-        and len(README) >= 1
-        and len(HIL) == 1
-        and len(CONTROLLERS) == len(SCENES) == 1
-    )
-    every = [info for section in [*TUTORIAL, *EVALUATION, *README] for info, _ in section.blocks]
-    assert {info.split()[0] for info in every if info} <= {"sh", "python", "toml", "text"}
+def test_documents_contain_commands_without_dangerous_ones() -> None:
+    assert len(GET_STARTED) >= 5
+    assert len(EVALUATION) >= 6
+    assert len(README) >= 1
+    assert len(HARDWARE_IN_THE_LOOP) == 1
+    assert len(CONTROLLERS) == 2
+    assert len(SCENES) == 1
+    sections = [*GET_STARTED, *EVALUATION, *README]
+    languages = {info.split()[0] for section in sections for info, _ in section.blocks if info}
+    assert languages <= {"sh", "python", "toml", "text"}
     commands = "\n".join(
-        content for section in TUTORIAL for info, content in section.blocks if info.startswith("sh")
+        content
+        for section in GET_STARTED
+        for info, content in section.blocks
+        if info.startswith("sh")
     )
     assert not re.search(
         r"\bpip\b(?! install --python)|pgrep|kill -9|killall|pkill|step:clock", commands

@@ -1,4 +1,4 @@
-"""The documentation as a site: every page is on it, it needs no network, and its search works from a folder."""
+"""Tests of the documentation site: it has every page, needs no network, and its search works from a folder."""
 
 import re
 import subprocess
@@ -12,7 +12,7 @@ from snakesim_testing.runs.documents import REPOSITORY
 SITE = REPOSITORY / "build" / "docs"
 
 
-def test_the_menu_has_every_page() -> None:
+def test_menu_contains_every_page() -> None:
     menu = (REPOSITORY / "docs" / "site" / "mkdocs.yml").read_text()
     pages = [
         page.relative_to(REPOSITORY)
@@ -25,19 +25,21 @@ def test_the_menu_has_every_page() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
-def test_the_site_is_searched_from_a_folder_without_a_network() -> None:
-    """`make docs` fails at a link into nowhere."""
+def test_site_search_works_from_folder_without_network() -> None:
     subprocess.run([sys.executable, "docs/site/build.py"], cwd=REPOSITORY, check=True)
-    loaded = re.compile(r"""<(?:script|link|img|iframe)[^>]*(?:src|href)=["']?(?:https?:)?//""")
-    assert not [page for page in SITE.rglob("*.html") if loaded.search(page.read_text())]
-    # A block taken for a text.
-    assert not [page for page in SITE.rglob("*.html") if "<code>``" in page.read_text()]
+    loads_from_network = re.compile(
+        r"""<(?:script|link|img|iframe)[^>]*(?:src|href)=["']?(?:https?:)?//"""
+    )
+    pages = {page: page.read_text() for page in SITE.rglob("*.html")}
+    assert not [page for page, html in pages.items() if loads_from_network.search(html)]
+    # A code block that was rendered as text contains this element.
+    assert not [page for page, html in pages.items() if "<code>``" in html]
     with open_chromium() as browser:
         tab = browser.open(f"file://{SITE}/docs/concepts/safety.html")
         tab.wait_for("Safety")
         tab.wait_until_loaded()
         tab.value("document.querySelector('input[name=query]').focus()")
         tab.send("Input.insertText", text="leas")
-        tab.press("e", 69, text="e")  # the page looks at what is there when a key comes up
+        tab.press("e", 69, text="e")  # the page starts a search at the release of a key
         tab.wait_for("matching documents")
         assert not tab.errors

@@ -1,6 +1,6 @@
-"""`python -m verification.ground [--write] [--rounds 60]`: compare the laws of the ground, and print the tables.
+"""Compare the laws of the ground with independent computations: `python -m verification.ground [--write]`.
 
-`--write` writes docs/development/ground-laws.md.
+The command prints the tables of all comparisons. `--write` also writes docs/development/ground-laws.md.
 """
 
 import argparse
@@ -139,7 +139,7 @@ time. It computes the forces on each link, and their derivatives for the implici
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the tables, and write the page if asked to. Returns the exit code."""
+    """Print the tables, write the page if requested, and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m verification.ground", description=__doc__)
     parser.add_argument(
         "--write", action="store_true", help="write docs/development/ground-laws.md"

@@ -1,4 +1,4 @@
-"""The CPU time of a physics step with each law of the ground, for a snake that undulates."""
+"""Measures the CPU time of a physics step with each law of the ground, for a snake that undulates."""
 
 import statistics
 import time
@@ -16,7 +16,8 @@ from snakesim_testing.sim.waves import SERVO_NM_PER_RAD, JointWave
 WAVE = JointWave(0.3, 0.7, 4.0)
 STEPS_PER_ROUND = 100
 WARM_UP_STEPS = 100
-STEPS_PER_TARGET = 5
+STEPS_PER_TARGET = 5  # physics steps with the same torques
+DAMPING_NM_S_PER_RAD = 10.0  # of the joints
 
 
 class TimedSnake:
@@ -28,10 +29,10 @@ class TimedSnake:
         self._model = sim.model
         self._data = mujoco.MjData(sim.model)
         self._data.qpos[2] = config.robot.module.radius_m
-        self._count = config.robot.chain.modules
+        self._joint_count = config.robot.chain.modules
         self._physics = PhysicsStepper(sim, self._data)
         self._physics.reset()
-        self._model.dof_damping[FREE_DOFS:] = 10.0
+        self._model.dof_damping[FREE_DOFS:] = DAMPING_NM_S_PER_RAD
         self._step_count = 0
         self._step(WARM_UP_STEPS)
 
@@ -40,24 +41,31 @@ class TimedSnake:
         return self._step(STEPS_PER_ROUND) / STEPS_PER_ROUND * 1e6
 
     def _step(self, step_count: int) -> float:
-        """Make steps. Returns their CPU time in s, without that of the wave."""
-        spent_s = 0.0
-        joints = slice(FREE_QPOS, FREE_QPOS + self._count)
+        """Make some steps, and return their CPU time in s, without that of the wave."""
+        cpu_s = 0.0
+        joints = slice(FREE_QPOS, FREE_QPOS + self._joint_count)
         for _ in range(0, step_count, STEPS_PER_TARGET):
-            wanted = WAVE.at(self._step_count * self._model.opt.timestep, self._count)
-            torques = SERVO_NM_PER_RAD * (wanted - self._data.qpos[joints])
-            self._data.qfrc_applied[FREE_DOFS : FREE_DOFS + self._count] = torques
-            begin_s = time.thread_time()
+            target_rad = WAVE.at(self._step_count * self._model.opt.timestep, self._joint_count)
+            torques = SERVO_NM_PER_RAD * (target_rad - self._data.qpos[joints])
+            self._data.qfrc_applied[FREE_DOFS : FREE_DOFS + self._joint_count] = torques
+            start_s = time.thread_time()
             self._physics.step(STEPS_PER_TARGET)
-            spent_s += time.thread_time() - begin_s
+            cpu_s += time.thread_time() - start_s
             self._step_count += STEPS_PER_TARGET
-        return spent_s
+        return cpu_s
 
 
 def measure_medians_us(
     cases: dict[str, tuple[dict[str, Any], dict[str, Any]]], round_count: int
 ) -> dict[str, dict[LawsVersion, float]]:
-    """Return the median CPU time of a step of each case, by version of the laws; all take turns in every round."""
+    """Return the median CPU time of a step in microseconds, for each case and each version of the laws.
+
+    All cases and versions run in every round, so that a busy machine affects them equally.
+
+    Args:
+        cases: Settings of the robot and of the scene, by the name of the case.
+        round_count: Number of rounds.
+    """
     versions: tuple[LawsVersion, ...] = ("c", "python")
     snakes: dict[tuple[str, LawsVersion], TimedSnake] = {
         (name, version): TimedSnake(robot, scene, version)

@@ -1,6 +1,6 @@
-"""`python -m verification.ground.pictures [SCENARIO ...]`: draw the terrain pictures of the documentation.
+"""Draw the pictures of terrain in the documentation: `python -m verification.ground.pictures [SCENARIO ...]`.
 
-Runs each scenario with its seed, and writes a picture at one time of the run to docs/pictures/terrain-<scenario>.png.
+The command runs each scenario with its seed, and writes a picture of one moment to docs/pictures/terrain-SCENARIO.png.
 """
 
 import argparse
@@ -18,16 +18,16 @@ from snakesim_sim_backend.film import FollowCamera
 
 PICTURES = Path(__file__).parents[2] / "docs" / "pictures"
 WIDTH = 1000  # pixels
-HEIGHT = 460
+HEIGHT = 460  # pixels
 
 
 class Shot(NamedTuple):
-    """When a picture of a run is taken, and from where."""
+    """The time of a picture in a run, and the position of the camera."""
 
     time_s: float
     azimuth_deg: float
     elevation_deg: float
-    distance_per_length: float  # of the camera, in lengths of the robot
+    distance_per_length: float  # of the camera from the robot, in lengths of the robot
 
 
 SHOTS = {
@@ -41,8 +41,8 @@ SHOTS = {
 
 def draw_shot(scenario: str, shot: Shot) -> None:
     """Run a scenario until the time of its shot, and write the picture."""
-    done = simulate(load_scenario(scenario, [parse_set_option(f"duration_s={shot.time_s}")]).config)
-    record = done.record
+    set_option = parse_set_option(f"duration_s={shot.time_s}")
+    record = simulate(load_scenario(scenario, [set_option]).config).record
     row = int(np.flatnonzero(record.has_pose)[-1])
     nodes_w = record.find_body_points_w(row)
     assert nodes_w is not None
@@ -64,7 +64,7 @@ def draw_shot(scenario: str, shot: Shot) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw the pictures of the given scenarios, or of all. Returns the exit code."""
+    """Draw the pictures of the given scenarios, or of all, and return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m verification.ground.pictures", description=__doc__
     )

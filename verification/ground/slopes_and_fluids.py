@@ -1,4 +1,4 @@
-"""The comparisons of slopes and fluids with computations that do not use MuJoCo."""
+"""Compares slopes and fluids with computations that do not use MuJoCo."""
 
 import numpy as np
 
@@ -30,7 +30,7 @@ STEPS_S = (0.002, 0.001, 0.0005)
 
 
 def compare_slopes() -> list[str]:
-    """Return the rows of bodies that glide on slopes, and of their equation of motion."""
+    """Return a table that compares bodies that glide on slopes with their equation of motion."""
     rows = [
         "| Surface | Slope | Simulator, mm | Runge-Kutta, mm | Difference |",
         "|---|---|---|---|---|",
@@ -47,14 +47,12 @@ def compare_slopes() -> list[str]:
             moved = glider.position_w - start
             gravity_w = make_tilted_gravity(slope_rad, towards_rad)
             expected = glide_without_mujoco(velocity_m_s, HU, SLOPE_S, gravity_w=gravity_w)
-            rows.append(
-                f"| {surface} | {name} | {_format_mm(moved)} | {_format_mm(expected)} | {_compare(moved, expected)} |"
-            )
+            rows.append(f"| {surface} | {name} | {_format_comparison(moved, expected)} |")
     return rows
 
 
 def compare_fluid_forces() -> list[str]:
-    """Return the rows of the force of a fluid on a moving body, and of the documented formulas."""
+    """Return a table that compares the force of a fluid on a moving body with the documented formulas."""
     rows = ["| Fluid | Velocity, m/s | Simulator, N | Formulas, N |", "|---|---|---|---|"]
     for fluid, section in FLUIDS.items():
         swimmer = Swimmer(section)
@@ -67,7 +65,7 @@ def compare_fluid_forces() -> list[str]:
 
 
 def compare_fluid_gliding() -> list[str]:
-    """Return the rows of bodies that glide in a fluid, and of their equation of motion."""
+    """Return a table that compares bodies that glide in a fluid with their equation of motion."""
     rows = [
         "| Fluid | Thrown, m/s | Simulator, mm | Runge-Kutta, mm | Difference |",
         "|---|---|---|---|---|",
@@ -77,14 +75,12 @@ def compare_fluid_gliding() -> list[str]:
             swimmer = Swimmer(section)
             expected = swimmer.glide_without_mujoco(np.array(velocity), FLUID_S)[:2]
             moved = swimmer.glide(np.array(velocity), FLUID_S)[:2]
-            rows.append(
-                f"| {fluid} | {name} | {_format_mm(moved)} | {_format_mm(expected)} | {_compare(moved, expected)} |"
-            )
+            rows.append(f"| {fluid} | {name} | {_format_comparison(moved, expected)} |")
     return rows
 
 
 def compare_fluid_waves() -> list[str]:
-    """Return the rows of waves in a fluid, and of their momentum balance."""
+    """Return a table that compares waves in a fluid with their momentum balance."""
     rows = [
         "| Fluid | Wave | Simulator, mm/s | Steps of 0.5 ms, stiffer servos | Momentum balance, mm/s |",
         "|---|---|---|---|---|",
@@ -99,7 +95,7 @@ def compare_fluid_waves() -> list[str]:
 
 
 def compare_fluid_steps() -> list[str]:
-    """Return the rows of a wave in water and its reverse, at several physics steps."""
+    """Return a table of a wave in water and its reverse, at several physics steps."""
     rows = ["| Physics step | Wave, mm/s | Its reverse, mm/s | Sum, mm/s |", "|---|---|---|---|"]
     wave = next(iter(WAVES.values()))
     for step_s in STEPS_S:
@@ -120,6 +116,7 @@ def _format_force(force_n: Floats) -> str:
     return ", ".join(f"{component:+.3f}" for component in (force_n + 0.0).round(6) + 0.0)
 
 
-def _compare(moved: Floats, expected: Floats) -> str:
-    """Return the length of the difference over that of the path."""
-    return f"{100 * np.linalg.norm(moved - expected) / np.linalg.norm(expected):.2f} %"
+def _format_comparison(moved_m: Floats, expected_m: Floats) -> str:
+    """Return three cells: both displacements, and their difference in percent of the length of the path."""
+    difference = np.linalg.norm(moved_m - expected_m) / np.linalg.norm(expected_m)
+    return f"{_format_mm(moved_m)} | {_format_mm(expected_m)} | {100 * difference:.2f} %"

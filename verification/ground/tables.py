@@ -1,4 +1,4 @@
-"""The comparisons of the laws of ground and friction with what does not use them."""
+"""Compares the simulated laws of ground and friction with computations that do not use them."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ NO_FRICTION = DirectionalFriction(0.0, 0.0, 0.0)
 ROLLING = DirectionalFriction(ROLLING_FRICTION, ROLLING_FRICTION, TIRE_FRICTION)
 SKIN = {"skin": {"forward": HU.forward, "backward": HU.backward, "sideways": HU.sideways}}
 ON_WHEELS = {"wheels": WHEELS}
-ON_TURNING_WHEELS = {"wheels": WHEELS | {"separate_limits": True}}
+ON_SEPARATE_LIMITS = {"wheels": WHEELS | {"separate_limits": True}}
 CLOTH = {"friction": FRICTION}
 MUD = {"friction": 0.0, "viscous": {"along_s_per_m": 0.5, "across_s_per_m": 3.0}}
 MUD_S_PER_M = 0.5 + 3.0j
@@ -74,7 +74,7 @@ COST_CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 
 def compare_waves() -> list[str]:
-    """Return the rows of simulated waves and of their momentum balance."""
+    """Return a table that compares simulated waves with their momentum balance."""
     laws: dict[str, tuple[dict[str, Any], dict[str, Any], DirectionalFriction, complex]] = {
         "isotropic": ({}, CLOTH, DirectionalFriction(FRICTION, FRICTION, FRICTION), 0j),
         "scales": (SKIN, CLOTH, HU, 0j),
@@ -91,7 +91,7 @@ def compare_waves() -> list[str]:
 
 
 def compare_gliding() -> list[str]:
-    """Return the rows of bodies that glide to rest, and of their equation of motion."""
+    """Return a table that compares bodies that glide to rest with their equation of motion."""
     rows = [
         "| Surface | Thrown, m/s | Simulator, mm | Runge-Kutta, mm | Difference |",
         "|---|---|---|---|---|",
@@ -106,61 +106,65 @@ def compare_gliding() -> list[str]:
             expected = glide_without_mujoco(np.array(velocity), HU, GLIDING_S)
             difference = np.linalg.norm(moved - expected) / np.linalg.norm(expected)
             rows.append(
-                f"| {surface} | {name} | {_in_mm(moved)} | {_in_mm(expected)} | {100 * difference:.2f} % |"
+                f"| {surface} | {name} | {_format_mm(moved)} | {_format_mm(expected)} | {100 * difference:.2f} % |"
             )
     return rows
 
 
 def compare_drag() -> list[str]:
-    """Return the rows of bodies that are dragged at a constant speed."""
+    """Return a table of the forces on bodies that are dragged at a constant speed, divided by their weight."""
     rows = ["| Surface | Forward | Backward | Sideways |", "|---|---|---|---|"]
     rows.append(f"| coefficients | {HU.forward:.4f} | {HU.backward:.4f} | {HU.sideways:.4f} |")
     for surface in SURFACES:
-        found: list[str] = []
+        cells: list[str] = []
         for direction in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)):
             glider = GlidingSnake(surface, SKIN)
             force_n = glider.drag(DRAG_M_S * np.array(direction), 0.6)
-            found.append(f"{np.linalg.norm(force_n) / (glider.mass_kg * G):.4f}")
-        rows.append(f"| {surface} | {' | '.join(found)} |")
+            cells.append(f"{np.linalg.norm(force_n) / (glider.mass_kg * G):.4f}")
+        rows.append(f"| {surface} | {' | '.join(cells)} |")
     return rows
 
 
 def compare_wheels() -> list[str]:
-    """Return the rows of wheels as bodies, and of wheels as friction."""
+    """Return a table that compares wheels as bodies with wheels as friction."""
     bodies = WheeledSnake()
     glider = GlidingSnake("flat ground", ON_WHEELS)
     rolling_m_s2 = np.linalg.norm(glider.drag(np.array([0.5, 0.0]), 0.4)) / glider.mass_kg
     creep_mm_s = _measure_creep_mm_s(ON_WHEELS)
-    turning = GlidingSnake("flat ground", ON_TURNING_WHEELS)
-    turning_m_s2 = np.linalg.norm(turning.drag(np.array([0.5, 0.0]), 0.4)) / turning.mass_kg
-    turning_creep_mm_s = _measure_creep_mm_s(ON_TURNING_WHEELS)
+    separate_glider = GlidingSnake("flat ground", ON_SEPARATE_LIMITS)
+    separate_m_s2 = (
+        np.linalg.norm(separate_glider.drag(np.array([0.5, 0.0]), 0.4)) / separate_glider.mass_kg
+    )
+    separate_creep_mm_s = _measure_creep_mm_s(ON_SEPARATE_LIMITS)
     rows = [
         "| Quantity | Wheels as bodies | Wheels as friction | The same law in the middle of the links | "
         "`separate_limits` | Balance with separate limits | Separate limits in the middle |",
         "|---|---|---|---|---|---|---|",
         f"| deceleration of a straight snake, m/s² | {bodies.coast(0.5, 0.4):.4f} | {rolling_m_s2:.4f} | "
-        f"{ROLLING_FRICTION * G:.4f} | {turning_m_s2:.4f} | {ROLLING_FRICTION * G:.4f} | {ROLLING_FRICTION * G:.4f} |",
+        f"{ROLLING_FRICTION * G:.4f} | {separate_m_s2:.4f} | {ROLLING_FRICTION * G:.4f} | {ROLLING_FRICTION * G:.4f} |",
         f"| creep sideways under 80 % of what holds, mm/s | {bodies.push_sideways(0.8 * TIRE_FRICTION, 1.0):.3f} | "
-        f"{creep_mm_s:.6f} | 0 | {turning_creep_mm_s:.6f} | 0 | 0 |",
+        f"{creep_mm_s:.6f} | 0 | {separate_creep_mm_s:.6f} | 0 | 0 |",
     ]
     for name, wave in WAVES.items():
         ours = simulate_wave(wave, CLOTH, ON_WHEELS).drift_mm_s
         middle = integrate_momentum_balance(wave, ROLLING, in_the_middle=True).drift_mm_s
-        separate = integrate_momentum_balance(
+        separate_middle = integrate_momentum_balance(
             wave, ROLLING, in_the_middle=True, separate_limits=True
         ).drift_mm_s
-        of_bodies = bodies.swim(wave).drift_mm_s
-        turning_wave = simulate_wave(wave, CLOTH, ON_TURNING_WHEELS).drift_mm_s
-        balance = integrate_momentum_balance(wave, ROLLING, separate_limits=True).drift_mm_s
+        with_bodies = bodies.swim(wave).drift_mm_s
+        ours_separate = simulate_wave(wave, CLOTH, ON_SEPARATE_LIMITS).drift_mm_s
+        separate_balance = integrate_momentum_balance(
+            wave, ROLLING, separate_limits=True
+        ).drift_mm_s
         rows.append(
-            f"| drift of {name}, mm/s | {of_bodies:+.1f} | {ours:+.1f} | {middle:+.1f} | {turning_wave:+.1f} | "
-            f"{balance:+.1f} | {separate:+.1f} |"
+            f"| drift of {name}, mm/s | {with_bodies:+.1f} | {ours:+.1f} | {middle:+.1f} | {ours_separate:+.1f} | "
+            f"{separate_balance:+.1f} | {separate_middle:+.1f} |"
         )
     return rows
 
 
 def _measure_creep_mm_s(wheels: dict[str, Any]) -> float:
-    """Return the speed sideways of a body on wheels under 80 % of what holds it."""
+    """Return the sideways speed of a body on wheels under 80 % of the force that the tires can hold."""
     creep = GlidingSnake("flat ground", wheels)
     creep.push(np.array([0.0, 0.8 * TIRE_FRICTION]))
     creep.go(0.5)
@@ -170,13 +174,13 @@ def _measure_creep_mm_s(wheels: dict[str, Any]) -> float:
 
 
 def measure_cost(round_count: int) -> list[str]:
-    """Return the rows of the CPU time of a physics step."""
+    """Return a table of the CPU time of a physics step with each law."""
     rows = ["| Ground | C version, µs | Python version, µs |", "|---|---|---|"]
     for name, times_us in measure_medians_us(COST_CASES, round_count).items():
         rows.append(f"| {name} | {times_us['c']:.1f} | {times_us['python']:.1f} |")
     return rows
 
 
-def _in_mm(vector_m: Floats) -> str:
+def _format_mm(vector_m: Floats) -> str:
     x, y = (1e3 * vector_m).tolist()
     return f"{x:+.1f}, {y:+.1f}"

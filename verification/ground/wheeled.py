@@ -1,4 +1,4 @@
-"""`planar13` on wheels that are bodies, in plain MuJoCo with its own friction: nothing of SnakeSIM's laws is used."""
+"""Simulates `planar13` on wheels that are bodies, in plain MuJoCo with its own friction, without SnakeSIM's laws."""
 
 import mujoco
 import numpy as np
@@ -17,9 +17,8 @@ WHEEL_RADIUS_M = 0.03
 BEARING_RADIUS_M = 0.003
 BEARING_FRICTION = 0.1
 ROLLING_FRICTION = BEARING_FRICTION * BEARING_RADIUS_M / WHEEL_RADIUS_M
-TRACK_M = 0.03  # of a wheel from the middle of its link
-WHEEL_KG = 1e-3
-FREE_QPOS, FREE_DOFS = 7, 6
+TRACK_M = 0.03  # distance of a wheel from the axis of its link
+WHEEL_MASS_KG = 1e-3
 STEP_S = 0.001
 WHEELS = {
     "radius_m": WHEEL_RADIUS_M,
@@ -30,9 +29,9 @@ WHEELS = {
 
 
 class WheeledSnake:
-    """One pair of wheels in the middle of each link. A wheel is a sphere that turns about its axle only.
+    """A snake with a pair of wheels in the middle of each link. A wheel is a sphere that rotates about its axle only.
 
-    The bearings brake with a constant torque, that of the weight at rest.
+    The bearings brake with a constant torque, which is computed from the weight at rest.
     """
 
     def __init__(self) -> None:
@@ -63,7 +62,7 @@ class WheeledSnake:
                 type=mujoco.mjtGeom.mjGEOM_CAPSULE,
                 size=[robot.module.radius_m, 0, 0],
                 fromto=[0, 0, 0, length_m, 0, 0],
-                mass=mass_kg - 2 * WHEEL_KG,
+                mass=mass_kg - 2 * WHEEL_MASS_KG,
                 contype=0,
                 conaffinity=0,
             )
@@ -77,6 +76,7 @@ class WheeledSnake:
     def _add_wheels(
         self, body: mujoco.MjsBody, link_index: int, length_m: float, mass_kg: float
     ) -> None:
+        """Add a pair of wheels to the body of a link."""
         bearing_nm = BEARING_FRICTION * BEARING_RADIUS_M * G * mass_kg / 2
         for side, name in ((1, "left"), (-1, "right")):
             wheel = body.add_body(
@@ -86,7 +86,7 @@ class WheeledSnake:
             wheel.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 size=[WHEEL_RADIUS_M, 0, 0],
-                mass=WHEEL_KG,
+                mass=WHEEL_MASS_KG,
                 condim=3,
                 friction=[TIRE_FRICTION, 0, 0],
                 solref=[2 * STEP_S, 1.0],
@@ -95,62 +95,66 @@ class WheeledSnake:
             )
 
     def swim(self, wave: JointWave) -> BodyTrack:
-        """Let the joints follow a wave."""
+        """Simulate a snake whose joints follow a wave, and return the track of its body."""
         data = self.data
         mujoco.mj_resetData(self.model, data)
         count = len(self._angles)
         data.qpos[self._angles] = wave.at(0.0, count)
         steps = int(PERIODS * wave.period_s / STEP_S) + 1
-        center, axis = np.empty((steps, 2)), np.empty((steps, 2))
-        tail, head = self.model.body("link_0").id, self.model.body(f"link_{count}").id
+        center_w_m = np.empty((steps, 2))
+        axis_w_m = np.empty((steps, 2))
+        tail = self.model.body("link_0").id
+        head = self.model.body(f"link_{count}").id
         for k in range(steps):
-            after_s = (k + 1) * STEP_S
-            wanted = SERVO_NM_PER_RAD * (wave.at(after_s, count) - data.qpos[self._angles])
-            data.qfrc_applied[self._velocities] = wanted + SERVO_NM_S_PER_RAD * wave.rates_at(
-                after_s, count
-            )
+            end_s = (k + 1) * STEP_S
+            stiffness_nm = SERVO_NM_PER_RAD * (wave.at(end_s, count) - data.qpos[self._angles])
+            # The joints of the model damp their whole velocity, so the rate of the wave is added.
+            damping_nm = SERVO_NM_S_PER_RAD * wave.rates_at(end_s, count)
+            data.qfrc_applied[self._velocities] = stiffness_nm + damping_nm
             mujoco.mj_step(self.model, data)
             head_w = data.xpos[head] + self.lengths_m[-1] * data.xmat[head].reshape(3, 3)[:, 0]
-            center[k] = data.subtree_com[tail, :2]
-            axis[k] = (head_w - data.xpos[tail])[:2]
-        return BodyTrack(center, axis, STEP_S, wave.period_s)
+            center_w_m[k] = data.subtree_com[tail, :2]
+            axis_w_m[k] = (head_w - data.xpos[tail])[:2]
+        return BodyTrack(center_w_m, axis_w_m, STEP_S, wave.period_s)
 
     def coast(self, speed_m_s: float, time_s: float) -> float:
         """Return the mean deceleration of the straight snake that rolls forward, in m/s²."""
         data = self._straighten()
         data.qvel[0] = speed_m_s
-        for wheel in self._wheel_dofs():
+        for wheel in self._find_wheel_dofs():
             data.qvel[wheel] = speed_m_s / WHEEL_RADIUS_M
-        self._go(0.1)
+        self._simulate(0.1)
         before = float(data.qvel[0])
-        self._go(time_s)
+        self._simulate(time_s)
         return (before - float(data.qvel[0])) / time_s
 
     def push_sideways(self, force_per_weight: float, time_s: float) -> float:
         """Return the mean speed of the straight snake under a force to its left, in mm/s."""
         data = self._straighten()
-        self._go(0.2)
+        self._simulate(0.2)
         for i, mass_kg in enumerate(self.masses_kg):
             data.xfrc_applied[self.model.body(f"link_{i}").id, 1] = force_per_weight * G * mass_kg
-        self._go(0.3)
+        self._simulate(0.3)
         before = float(data.qpos[1])
-        self._go(time_s)
+        self._simulate(time_s)
         return (float(data.qpos[1]) - before) / time_s * 1e3
 
     def _straighten(self) -> mujoco.MjData:
-        """Put the snake straight at rest, with stiff joints."""
+        """Reset the snake to a straight body at rest, and return its data."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.xfrc_applied[:] = 0.0
         return self.data
 
-    def _go(self, time_s: float) -> None:
+    def _simulate(self, time_s: float) -> None:
+        """Simulate with stiff joints."""
         for _ in range(round(time_s / STEP_S)):
             self.data.qfrc_applied[self._velocities] = (
                 -SERVO_NM_PER_RAD * self.data.qpos[self._angles]
             )
             mujoco.mj_step(self.model, self.data)
 
-    def _wheel_dofs(self) -> list[int]:
+    def _find_wheel_dofs(self) -> list[int]:
+        """Return the indices of the velocities of all wheels."""
         links = range(len(self.lengths_m))
         return [
             int(self.model.joint(f"{name}_{i}").dofadr[0])

@@ -1,1 +1,1 @@
-"""Installed from wheels, with and without extras."""
+"""Tests of SnakeSIM installed from a wheel, with and without extras, and without some of its packages."""

@@ -1,4 +1,4 @@
-"""Rooms of the operator's tools that nothing imports can be left out, all or one: the rest starts, lists and runs."""
+"""Tests that any feature of `snakesim_operator.features` can be left out, or all: everything else works without it."""
 
 import shutil
 import sys
@@ -16,72 +16,92 @@ from snakesim_testing.runs.documents import REPOSITORY
 pytestmark = pytest.mark.e2e
 
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-COMMANDS: dict[str, list[str]] = {}  # of the rooms that nothing imports, with their nouns
-for _name, _at in PROJECT["entry-points"]["snakesim.commands"].items():
-    if _at.startswith("snakesim_operator."):
-        _module, _, _attribute = _at.partition(":")
-        _registered: Commands = getattr(import_module(_module), _attribute)
-        COMMANDS[_at.split(".")[2]] = [one.name for one in _registered if isinstance(one, Command)]
-IMPORT_ALL = (
-    "import importlib, pkgutil, snakesim_operator as top\n"
-    "for found in pkgutil.walk_packages(top.__path__, 'snakesim_operator.'):\n"
-    "    found.name.endswith('__main__') or importlib.import_module(found.name)\n"
-    "print(top.__file__)\n"
-)
+FEATURES = "snakesim_operator.features."
+SHORT_RUN = ("run", "triplet", "--in-process", "--set", "duration_s=0.2")
+COMMAND_TIMEOUT_S = 100.0
+IMPORT_ALL_MODULES = """\
+import importlib, pkgutil, snakesim_operator
+for module in pkgutil.walk_packages(snakesim_operator.__path__, "snakesim_operator."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+print(snakesim_operator.__file__)
+"""
 
 
-def without(rooms: Sequence[str], folder: Path) -> Path:
-    """A copy of the packages without rooms and their entry points, with metadata that hides the installed ones."""
+def find_commands_by_feature() -> dict[str, list[str]]:
+    """Return the names of the commands that each feature registers, such as "robot arm"."""
+    names_by_feature: dict[str, list[str]] = {}
+    for entry_point in PROJECT["entry-points"]["snakesim.commands"].values():
+        if not entry_point.startswith(FEATURES):
+            continue
+        module, _, attribute = entry_point.partition(":")
+        commands: Commands = getattr(import_module(module), attribute)
+        feature = module.split(".")[2]
+        names_by_feature[feature] = [item.name for item in commands if isinstance(item, Command)]
+    return names_by_feature
+
+
+COMMANDS_BY_FEATURE = find_commands_by_feature()
+
+
+def copy_packages_without(features: Sequence[str], folder: Path) -> None:
+    """Copy all packages except some features, with metadata that replaces that of the installed packages."""
     for package in REPOSITORY.glob("snakesim*"):
         shutil.copytree(
             package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__")
         )
-    for room in rooms:
-        shutil.rmtree(folder / "snakesim_operator" / "features" / room)
-    gone = tuple(f"snakesim_operator.features.{room}." for room in rooms)
+    for feature in features:
+        shutil.rmtree(folder / "snakesim_operator" / "features" / feature)
+    left_out_prefixes = tuple(f"{FEATURES}{feature}." for feature in features)
+    lines: list[str] = []
+    for group, entry_points in PROJECT["entry-points"].items():
+        lines.append(f"[{group}]")
+        for name, target in entry_points.items():
+            if not target.startswith(left_out_prefixes):
+                lines.append(f"{name} = {target}")
     metadata = folder / f"snakesim-{PROJECT['version']}.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text(
         f"Metadata-Version: 2.4\nName: snakesim\nVersion: {PROJECT['version']}\n"
     )
-    lines: list[str] = []
-    for group, entries in PROJECT["entry-points"].items():
-        lines.append(f"[{group}]")
-        lines += [f"{n} = {at}" for n, at in entries.items() if not at.startswith(gone)]
     (metadata / "entry_points.txt").write_text("\n".join(lines) + "\n")
-    return folder
 
 
 @pytest.mark.parametrize(
-    "rooms",
+    "left_out",
     [
-        pytest.param([*COMMANDS], id="all"),
-        *(pytest.param([n], id=n, marks=pytest.mark.slow) for n in COMMANDS),
+        pytest.param([*COMMANDS_BY_FEATURE], id="all"),
+        *(
+            pytest.param([feature], id=feature, marks=pytest.mark.slow)
+            for feature in COMMANDS_BY_FEATURE
+        ),
     ],
 )
-def test_all_else_works_without(rooms: list[str], tmp_path: Path) -> None:
-    library, work = without(rooms, tmp_path / "library"), tmp_path / "work"
+def test_commands_work_without_left_out_features(left_out: list[str], tmp_path: Path) -> None:
+    library = tmp_path / "library"
+    work = tmp_path / "work"
+    copy_packages_without(left_out, library)
     work.mkdir()
 
-    def run(*words: str) -> CompletedRun:
-        return run_program(
-            [sys.executable, *words],
-            work,
-            {**make_environment(work), "PYTHONPATH": str(library)},
-            100.0,
-        )
+    def run_python(*arguments: str) -> CompletedRun:
+        environment = {**make_environment(work), "PYTHONPATH": str(library)}
+        return run_program([sys.executable, *arguments], work, environment, COMMAND_TIMEOUT_S)
 
-    imported = run("-c", IMPORT_ALL)
-    assert imported.code == 0 and str(library) in imported.out, imported.out + imported.err
-    shown = run("-m", "snakesim_operator", "--help")
-    assert shown.code == 0 and not shown.err and " estop " in shown.out, shown.err
-    for room, names in COMMANDS.items():
-        helped = run("-m", "snakesim_operator", *names[0].split(), "--help")
-        assert helped.code == (2 if room in rooms else 0), helped.out + helped.err
-    if "console" in rooms:
-        beside = run("-m", "snakesim_operator", "run", "triplet", "--console")
-        assert beside.code == 2 and "without the console" in beside.err, beside.err
-    ran = run(
-        "-m", "snakesim_operator", "run", "triplet", "--in-process", "--set", "duration_s=0.2"
-    )
-    assert ran.code == 0, ran.out + ran.err
+    def snakesim(*arguments: str) -> CompletedRun:
+        return run_python("-m", "snakesim_operator", *arguments)
+
+    imported = run_python("-c", IMPORT_ALL_MODULES)
+    assert imported.code == 0, imported.printed
+    assert str(library) in imported.out, imported.printed
+    overview = snakesim("--help")
+    assert overview.code == 0 and not overview.err and " estop " in overview.out, overview.err
+    for feature, names in COMMANDS_BY_FEATURE.items():
+        first_command = names[0].split()
+        answer = snakesim(*first_command, "--help")
+        expected_code = 2 if feature in left_out else 0
+        assert answer.code == expected_code, answer.printed
+    if "console" in left_out:
+        answer = snakesim("run", "triplet", "--console")
+        assert answer.code == 2 and "without the console" in answer.err, answer.err
+    completed = snakesim(*SHORT_RUN)
+    assert completed.code == 0, completed.printed

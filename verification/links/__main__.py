@@ -1,171 +1,31 @@
-"""Bad links between a robot and its controller, measured: `python -m verification.links [--write]`; needs root."""
+"""Measure bad links between a robot and its controller: `python -m verification.links [--write] [--trials N]`.
+
+The result is two tables: how long a robot stays armed over links that are bad all the time, and how soon it stops and
+is armed again if a link or a router fails. `--write` writes them to docs/benchmarks/lab-links.md. Needs root.
+"""
 
 import argparse
 import os
 import platform
-import statistics
 import subprocess
-import tempfile
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
-import msgspec
-import numpy as np
-
-from snakesim_hal.run_log.host_record import BLACK_BOX, HOST_RECORD, HostRecord
-from snakesim_operator.results.run_log import RunRecord
-from verification.links.lab import LinkLab, lab
-
-PAGE = Path(__file__).parents[2] / "docs" / "benchmarks" / "lab-links.md"
-ARMED_S = 10.0
-ARM_LIMIT_S = 20.0
-WRITTEN_S = 1.0  # until rows are on disk
-
-
-@dataclass(frozen=True)
-class LinkCondition:
-    """A link that is bad in one way, for as long as the robot is armed."""
-
-    name: str
-    loss: float = 0.0
-    delay_s: float = 0.0
-    jitter_s: float = 0.0
-    rate_hz: int = 100
-
-
-# Each way, so that a round trip takes twice as long, and is lost about twice as often. A lease is longer at 50 Hz.
-CONDITIONS = (
-    LinkCondition("good"),
-    LinkCondition("1 % of packets lost", loss=0.01),
-    LinkCondition("5 % of packets lost", loss=0.05),
-    LinkCondition("5 +- 2.5 ms", delay_s=0.005, jitter_s=0.0025),
-    LinkCondition("10 +- 5 ms", delay_s=0.01, jitter_s=0.005),
-    LinkCondition("20 +- 10 ms", delay_s=0.02, jitter_s=0.01),
-    LinkCondition("20 +- 10 ms, at 50 Hz", delay_s=0.02, jitter_s=0.01, rate_hz=50),
-    LinkCondition("5 % of packets lost, at 50 Hz", loss=0.05, rate_hz=50),
+from verification.links.trials import (
+    CONDITIONS,
+    LONG_CUT,
+    MAX_ARMED_S,
+    ROUTER_KILLED,
+    SHORT_CUT,
+    measure_condition,
+    measure_event,
 )
 
+PAGE = Path(__file__).parents[2] / "docs" / "benchmarks" / "lab-links.md"
+NETEM_TEST = "unshare --net tc qdisc add dev lo root netem delay 1ms"
+TRIALS_RATIO = 4  # rows with long trials have this many times fewer of them
 
-def held(condition: LinkCondition, trial_count: int) -> str:
-    """A line of the table: how long an armed robot keeps going, how fast, and what ends it."""
-    armed_s: list[float] = []
-    ended: list[str] = []
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        lab(Path(folder), f"rate_hz={condition.rate_hz}") as made,
-    ):
-        made.link.set_quality(
-            loss=condition.loss, delay_s=condition.delay_s, jitter_s=condition.jitter_s
-        )
-        for _ in range(trial_count):
-            try:
-                made.arm(ARM_LIMIT_S)
-            except AssertionError:
-                armed_s.append(0.0)
-                ended.append("not armed")
-                continue
-            began = time.monotonic()
-            while (
-                time.monotonic() - began < ARMED_S
-                and (status := made.status)
-                and status.lifecycle == "armed"
-            ):
-                time.sleep(0.001)
-            armed_s.append(time.monotonic() - began)
-            status = made.status
-            if status is not None and status.lifecycle == "fault":
-                ended.append(status.faults[0].what)
-            else:
-                made.disarm()
-        time.sleep(WRITTEN_S)
-        speed, latency = moved(Path(folder))
-    names = ", ".join(f"{name} {ended.count(name)}" for name in dict.fromkeys(ended)) or "-"
-    median_s, min_s = statistics.median(armed_s), min(armed_s)
-    kept = sum(seconds >= ARMED_S for seconds in armed_s)
-    return (
-        f"| {condition.name} | {kept} of {trial_count} | {median_s:.1f} | {min_s:.2f} "
-        f"| {names} | {speed} | {latency} |"
-    )
-
-
-def moved(folder: Path) -> tuple[str, str]:
-    """Speed while armed, and the time from state to command, as text."""
-    if not (folder / BLACK_BOX).is_file():
-        return "-", "-"
-    host = msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=HostRecord)
-    record = RunRecord.load(folder)
-    steps_m = np.hypot(*np.diff(record.position_w_m[:, :2], axis=0).T)
-    steps_s = np.diff(record.time_s)
-    driven = (
-        (steps_s < 0.1) & np.isfinite(steps_m) & (np.abs(record.torque_nm[1:]).max(axis=1) > 0.05)
-    )
-    speed = steps_m[driven].sum() / max(steps_s[driven].sum(), 1e-9)
-    p50, p99 = (host.state_to_command_us[p] for p in ("p50", "p99"))
-    return (
-        f"{speed:.2f}",
-        "-" if p50 is None or p99 is None else f"{p50 / 1000:.1f} / {p99 / 1000:.1f}",
-    )
-
-
-def event(
-    name: str,
-    trial_count: int,
-    break_it: Callable[[LinkLab], None],
-    mend: Callable[[LinkLab], None],
-    broken_s: float,
-) -> str:
-    """A line of the other table: until the robot has stopped, and from the repair until it is armed again."""
-    stopped_ms: list[float] = []
-    again_s: list[float] = []
-    with tempfile.TemporaryDirectory() as folder, lab(Path(folder)) as made:
-        for _ in range(trial_count):
-            made.arm()
-            time.sleep(1.0)
-            assert made.status is not None and made.status.lifecycle == "armed", made.status
-            began = time.monotonic()
-            break_it(made)
-            stopped_ms.append(
-                1000 * made.until(lambda status: status.lifecycle == "fault", "stopped")
-            )
-            time.sleep(max(broken_s - (time.monotonic() - began), 0.0))
-            mend(made)
-            again_s.append(made.arm())
-    stopped = f"{statistics.median(stopped_ms):.0f} / {max(stopped_ms):.0f}"
-    return f"| {name} | {trial_count} | {stopped} | {statistics.median(again_s):.2f} / {max(again_s):.2f} |"
-
-
-def events(trial_count: int) -> list[str]:
-    """What breaks, and is mended."""
-    cut, mend = (lambda made: made.link.make(cut=True)), (lambda made: made.link.make())
-    return [
-        event("link cut for 0.5 s", trial_count, cut, mend, 0.5),
-        event(
-            "link cut for 5 s, and the machine joins again",
-            max(trial_count // 4, 1),
-            cut,
-            mend,
-            5.0,
-        ),
-        event(
-            "router killed, and a new one started",
-            trial_count,
-            LinkLab.kill_router,
-            LinkLab.start_router,
-            0.2,
-        ),
-    ]
-
-
-def has_netem() -> bool:
-    """Whether this kernel has the queueing discipline `netem`."""
-    probe = ["unshare", "--net", "tc", "qdisc", "add", "dev", "lo", "root", "netem", "delay", "1ms"]
-    return subprocess.run(probe, capture_output=True, check=False).returncode == 0
-
-
-HEAD = """\
+LINKS_TEMPLATE = """\
 # Bad links between a robot and its controller
 
 How long does a robot keep moving if the network link to its controller loses or delays packets? How fast does it stop
@@ -206,7 +66,7 @@ of 20 +- 10 ms on one interface corresponds to the round trip of the condition 1
 | Link | Lasted | Armed, median s | Armed, shortest s | Ended by | Driven speed, m/s | State to command, p50 / p99 ms |
 |---|---|---|---|---|---|---|
 """
-EVENTS = """
+EVENTS_SECTION = """
 ## A link or a router that fails and returns
 
 *Stopped after* is the time until the host has stopped the robot. *Armed again after* is the time from the repair until
@@ -218,33 +78,57 @@ the worst value.
 """
 
 
+def has_netem() -> bool:
+    """Return whether this kernel has the queueing discipline `netem`."""
+    return subprocess.run(NETEM_TEST.split(), capture_output=True, check=False).returncode == 0
+
+
+def measure_conditions(trial_count: int) -> list[str]:
+    """Measure all links that are bad all the time, print each row, and return the rows."""
+    rows: list[str] = []
+    for condition in CONDITIONS:
+        row = measure_condition(condition, trial_count)
+        print(row, flush=True)
+        rows.append(row)
+    return rows
+
+
+def measure_events(trial_count: int, long_trial_count: int) -> list[str]:
+    """Measure all failures of links and routers, print each row, and return the rows."""
+    rows: list[str] = []
+    for event in (SHORT_CUT, LONG_CUT, ROUTER_KILLED):
+        row = measure_event(event, long_trial_count if event is LONG_CUT else trial_count)
+        print(row, flush=True)
+        rows.append(row)
+    return rows
+
+
 def main() -> None:
-    """Measure; print, or write the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Run all trials and print their tables, or also write the page."""
+    parser = argparse.ArgumentParser(prog="python -m verification.links", description=__doc__)
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
-    parser.add_argument("--trials", type=int, default=20)
-    wanted = parser.parse_args()
-    head = HEAD.format(
-        trials=wanted.trials,
+    parser.add_argument("--trials", type=int, default=20, help="trials of an event (20)")
+    arguments = parser.parse_args()
+    long_trial_count = max(arguments.trials // TRIALS_RATIO, 1)
+    netem_reason = (
+        "although this kernel has it" if has_netem() else "because this kernel does not have it"
+    )
+    introduction = LINKS_TEMPLATE.format(
+        trials=arguments.trials,
         day=date.today(),
         cpus=os.cpu_count(),
         kernel=platform.release(),
-        armed=ARMED_S,
-        netem="although this kernel has it"
-        if has_netem()
-        else "because this kernel does not have it",
+        armed=MAX_ARMED_S,
+        netem=netem_reason,
         load=f"{os.getloadavg()[1]:.1f}",
     )
-    lines: list[str] = []
-    for condition in CONDITIONS:
-        lines.append(held(condition, max(wanted.trials // 4, 1)))
-        print(lines[-1], flush=True)
-    happened = events(wanted.trials)
-    print("\n".join(happened))
-    if wanted.write:
-        PAGE.write_text(
-            head + "\n".join(lines) + "\n" + EVENTS + "\n".join(happened) + "\n", encoding="utf-8"
-        )
+    condition_rows = measure_conditions(long_trial_count)
+    event_rows = measure_events(arguments.trials, long_trial_count)
+    if arguments.write:
+        condition_table = "\n".join(condition_rows) + "\n"
+        event_table = "\n".join(event_rows) + "\n"
+        page = introduction + condition_table + EVENTS_SECTION + event_table
+        PAGE.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,14 @@
-"""A link between two network namespaces that loses and delays Ethernet frames: for kernels that have no `netem`.
+"""A link between two network namespaces that delays and drops Ethernet frames, for kernels without `netem`.
 
     python -m verification.links.relay PID_A PID_B NAME
 
-makes an interface NAME in the network namespaces of two processes, and carries frames between them. A line of JSON on
-stdin changes it: {"loss": 0.01, "delay_s": 0.02, "jitter_s": 0.01, "cut": false}. Delay and jitter (uniform) are for
-each direction; frames keep their order, as in a queue. It ends with its stdin.
+The process creates an interface NAME in the network namespaces of two processes, and forwards frames between them. It
+prints `ready` when both interfaces exist. A line of JSON on standard input changes the quality of the link:
+
+    {"loss": 0.01, "delay_s": 0.02, "jitter_s": 0.01, "cut": false}
+
+Loss, delay and jitter (uniformly distributed) apply to each direction. A property that a line does not name becomes
+perfect. Frames keep their order, as in a queue. The process ends when its standard input is closed.
 """
 
 import ctypes
@@ -17,16 +21,74 @@ import struct
 import sys
 import time
 from collections import deque
+from dataclasses import dataclass
 
 from snakesim_hal.base.process import HOST_PRIORITY, set_realtime_priority
 
-TUNSETIFF, IFF_TAP, IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
+# Numbers of the Linux kernel, from <linux/if_tun.h> and <linux/sched.h>.
+TUNSETIFF = 0x400454CA
+IFF_TAP = 0x0002
+IFF_NO_PI = 0x1000
 CLONE_NEWNET = 0x40000000
-FRAME_BYTES = 65536
+
+STDIN = 0  # file descriptor
+MAX_READ_BYTES = 65536
+IDLE_WAIT_S = 1.0
 
 
-def interface(pid: str, name: str) -> int:
-    """A TAP interface in the namespace of a process, which this process is in afterwards."""
+@dataclass
+class LinkQuality:
+    """The quality of each direction of the link."""
+
+    loss: float = 0.0  # probability that a frame is dropped
+    delay_s: float = 0.0
+    jitter_s: float = 0.0  # the delay differs by up to this much
+    cut: bool = False  # drops every frame
+
+
+class RelayDirection:
+    """Frames on their way from one interface to the other."""
+
+    def __init__(self, source: int, sink: int) -> None:
+        """Forward frames between two open TAP interfaces, given by their file descriptors."""
+        self.source = source
+        self.sink = sink
+        self._queue: deque[tuple[float, bytes]] = deque()  # (time to send in s, frame)
+
+    def read_frames(self, now_s: float, quality: LinkQuality) -> None:
+        """Read all frames that have arrived, and drop or queue each of them."""
+        while True:
+            try:
+                frame = os.read(self.source, MAX_READ_BYTES)
+            except OSError:  # no frame is left, or the interface is down
+                return
+            if quality.cut or random.random() < quality.loss:
+                continue
+            send_time_s = now_s + quality.delay_s + random.uniform(-1, 1) * quality.jitter_s
+            if self._queue:
+                last_send_time_s, _ = self._queue[-1]
+                send_time_s = max(send_time_s, last_send_time_s)
+            self._queue.append((send_time_s, frame))
+
+    def send_due_frames(self, now_s: float) -> float:
+        """Send the frames whose delay is over, and return the time until the next one is due, in s."""
+        while self._queue and self._queue[0][0] <= now_s:
+            _, frame = self._queue.popleft()
+            try:
+                os.write(self.sink, frame)
+            except OSError:  # the interface is down: the frame is lost, as on a real link
+                continue
+        if not self._queue:
+            return IDLE_WAIT_S
+        next_send_time_s, _ = self._queue[0]
+        return next_send_time_s - now_s
+
+
+def open_tap(pid: str, name: str) -> int:
+    """Create a TAP interface in the network namespace of a process, and return its file descriptor.
+
+    This process stays in that namespace.
+    """
     libc = ctypes.CDLL(None, use_errno=True)
     namespace = os.open(f"/proc/{pid}/ns/net", os.O_RDONLY)
     if libc.setns(namespace, CLONE_NEWNET) != 0:
@@ -37,59 +99,29 @@ def interface(pid: str, name: str) -> int:
     return tap
 
 
-class RelayDirection:
-    """One direction."""
-
-    def __init__(self, source: int, sink: int) -> None:
-        self.source, self.sink = source, sink
-        self.waiting: deque[tuple[float, bytes]] = deque()
-
-    def take(self, now: float, link: dict[str, float]) -> None:
-        """Read what has come; decide its fate."""
-        while True:
-            try:
-                frame = os.read(self.source, FRAME_BYTES)
-            except OSError:  # none left, or the interface is down
-                return
-            if link["cut"] or random.random() < link["loss"]:
-                continue
-            due = now + link["delay_s"] + random.uniform(-1, 1) * link["jitter_s"]
-            if self.waiting:
-                due = max(due, self.waiting[-1][0])
-            self.waiting.append((due, frame))
-
-    def give(self, now: float) -> float:
-        """Pass on what is due. Returns how long the next one has to wait."""
-        while self.waiting and self.waiting[0][0] <= now:
-            try:
-                os.write(self.sink, self.waiting.popleft()[1])
-            except OSError:
-                continue
-        return self.waiting[0][0] - now if self.waiting else 1.0
-
-
 def main() -> None:
-    """Until stdin is closed."""
+    """Forward frames until standard input is closed."""
     pid_a, pid_b, name = sys.argv[1:]
-    a, b = interface(pid_a, name), interface(pid_b, name)
+    tap_a = open_tap(pid_a, name)
+    tap_b = open_tap(pid_b, name)
     set_realtime_priority(HOST_PRIORITY + 1)
-    ways = RelayDirection(a, b), RelayDirection(b, a)
-    link = {"loss": 0.0, "delay_s": 0.0, "jitter_s": 0.0, "cut": False}
-    os.set_blocking(0, False)
+    directions = [RelayDirection(tap_a, tap_b), RelayDirection(tap_b, tap_a)]
+    quality = LinkQuality()
+    os.set_blocking(STDIN, False)
     print("ready", flush=True)
-    wait_s = 1.0
+    wait_s = IDLE_WAIT_S
     while True:
-        ready, _, _ = select.select([0, a, b], [], [], max(wait_s, 0.0))
-        if 0 in ready:
-            order = os.read(0, 65536)
-            if not order:
+        readable, _, _ = select.select([STDIN, tap_a, tap_b], [], [], max(wait_s, 0.0))
+        if STDIN in readable:
+            orders = os.read(STDIN, MAX_READ_BYTES)
+            if not orders:
                 return
-            for line in order.splitlines():
-                link.update(json.loads(line))
-        for way in ways:
-            if way.source in ready:
-                way.take(time.monotonic(), link)
-        wait_s = min(way.give(time.monotonic()) for way in ways)
+            for order in orders.splitlines():
+                quality = LinkQuality(**json.loads(order))
+        for direction in directions:
+            if direction.source in readable:
+                direction.read_frames(time.monotonic(), quality)
+        wait_s = min(direction.send_due_frames(time.monotonic()) for direction in directions)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A robot and its controller on machines of their own: what a broken link or a dead router does. Needs root."""
+"""A robot and its controller on separate machines: what a bad link or a dead router does. Needs root."""
 
 import os
 import re
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from verification.links.lab import LinkLab, lab
+from verification.links.link_lab import LinkLab, start_link_lab
 
 pytestmark = [
     pytest.mark.e2e,
@@ -20,67 +20,73 @@ pytestmark = [
         reason="makes links of TAP interfaces: needs /dev/net/tun",
     ),
 ]
-IMAGES_BYTES = 200_000
-STOP_LIMIT_S = 0.3  # 50 ms of the lease, a period, and a busy computer
+MIN_RECORDING_BYTES = 200_000  # a recording of this size contains images
+MAX_STOP_S = 0.3  # the lease lasts 50 ms; the rest is for a control cycle on a busy computer
+SLOW_LINK = "tc qdisc add dev robot root tbf rate 4mbit burst 16kb latency 50ms"
 
 
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LinkLab]:
-    with lab(tmp_path_factory.mktemp("lab")) as made:
-        yield made
+def link_lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LinkLab]:
+    """Return a lab whose robot is ready to be armed."""
+    with start_link_lab(tmp_path_factory.mktemp("lab")) as started_lab:
+        yield started_lab
 
 
-def armed(made: LinkLab) -> None:
-    """Moving for a moment."""
-    made.arm()
+def arm_and_move(link_lab: LinkLab) -> None:
+    """Arm the robot, and let it move for a moment."""
+    link_lab.arm()
     time.sleep(0.3)
 
 
-def test_cut_link_stops_robot_and_restored_one_allows_arming(robot: LinkLab) -> None:
-    armed(robot)
-    robot.link.set_quality(cut=True)
-    assert robot.until(lambda status: status.lifecycle == "fault", "stopped") < STOP_LIMIT_S
-    time.sleep(3.0)  # longer than the session between router and workstation lives
-    robot.link.set_quality()
-    robot.arm()
+def wait_for_stop(link_lab: LinkLab) -> float:
+    """Wait until the host has stopped the robot, and return the waiting time in s."""
+    return link_lab.wait_until(lambda status: status.lifecycle == "fault", "stopped")
 
 
-def test_dead_router_stops_robot_and_new_one_allows_arming(robot: LinkLab) -> None:
-    """Again and again: a row of the fault table."""
-    armed(robot)
-    robot.kill_router()
-    assert robot.until(lambda status: status.lifecycle == "fault", "stopped") < STOP_LIMIT_S
-    robot.start_router()
-    robot.arm()
+def test_cut_link_stops_robot_and_restored_one_allows_arming(link_lab: LinkLab) -> None:
+    arm_and_move(link_lab)
+    link_lab.link.set_quality(cut=True)
+    assert wait_for_stop(link_lab) < MAX_STOP_S
+    time.sleep(3.0)  # the session between router and workstation ends earlier
+    link_lab.link.set_quality()
+    link_lab.arm()
 
 
-def test_a_link_with_some_delay_keeps_the_robot_armed(robot: LinkLab) -> None:
-    robot.link.set_quality(delay_s=0.005)
+def test_dead_router_stops_robot_and_new_one_allows_arming(link_lab: LinkLab) -> None:
+    arm_and_move(link_lab)
+    link_lab.kill_router()
+    assert wait_for_stop(link_lab) < MAX_STOP_S
+    link_lab.start_router()
+    link_lab.arm()
+
+
+def test_link_with_some_delay_keeps_robot_armed(link_lab: LinkLab) -> None:
+    link_lab.link.set_quality(delay_s=0.005)
     try:
-        armed(robot)
+        arm_and_move(link_lab)
         time.sleep(1.0)
-        assert robot.status is not None and robot.status.lifecycle == "armed"
+        assert link_lab.is_armed()
     finally:
-        robot.link.set_quality()
+        link_lab.link.set_quality()
+
+
+def stays_armed(link_lab: LinkLab) -> bool:
+    """Arm the robot, and return whether it is still armed after 2 s."""
+    link_lab.arm()
+    time.sleep(2.0)
+    return link_lab.is_armed()
 
 
 def test_slow_link_overloaded_by_images_stops_nothing(tmp_path: Path) -> None:
-    with lab(tmp_path, "robot=planar13_camera") as made:
-        made.robot.run(
-            "sh", "-c", "tc qdisc add dev robot root tbf rate 4mbit burst 16kb latency 50ms"
-        )
-        recording = made.record()
-        made.until(
-            lambda _: recording.is_file() and recording.stat().st_size > IMAGES_BYTES,
+    with start_link_lab(tmp_path, "robot=planar13_camera") as link_lab:
+        link_lab.robot.run("sh", "-c", SLOW_LINK)
+        recording = link_lab.start_recorder()
+        link_lab.wait_until(
+            lambda _: recording.is_file() and recording.stat().st_size > MIN_RECORDING_BYTES,
             "images are recorded",
         )
-
-        def stays_armed() -> bool:
-            made.arm()
-            time.sleep(2.0)
-            return made.status is not None and made.status.lifecycle == "armed"
-
-        # A busy computer may stop it once; a link that is too full would each time.
-        assert any(stays_armed() for _ in range(3)), made.status and made.status.reason
-        link = made.robot.run("tc", "-s", "qdisc", "show", "dev", "robot")
-        assert re.search(r"overlimits [1-9]\d{2,}", link), f"it was not full: {link}"
+        # A busy computer may stop the robot once. A link that is too slow would stop it each time.
+        assert any(stays_armed(link_lab) for _ in range(3)), link_lab.host.status
+        statistics = link_lab.robot.run("tc", "-s", "qdisc", "show", "dev", "robot")
+        overloaded = re.search(r"overlimits [1-9]\d{2,}", statistics)
+        assert overloaded, f"the link was not overloaded: {statistics}"

@@ -1,4 +1,4 @@
-"""`python -m verification.sysid`: compares `snakesim robot identify` with `mujoco.sysid`, and prints the tables."""
+"""Compare `snakesim robot identify` with `mujoco.sysid`, and print tables: `python -m verification.sysid`."""
 
 import argparse
 import sys
@@ -16,9 +16,9 @@ from verification.sysid.comparison import (
 from verification.sysid.rollout_fit import has_mujoco_sysid
 from verification.sysid.tables import make_report
 
-HINT = (
-    "python -m verification.sysid: `mujoco.sysid` is not complete here; install its optional packages with "
-    '`pip install "mujoco-core[sysid]"`, or leave this comparison out'
+MISSING_PACKAGES_MESSAGE = (
+    "python -m verification.sysid: `mujoco.sysid` is not complete here. Install its optional packages with "
+    '`pip install "mujoco-core[sysid]"`.'
 )
 BAD_INPUT = 2
 
@@ -27,18 +27,18 @@ def main() -> int:
     """Print the comparison; return 2 if `mujoco.sysid` is not installed."""
     arguments = _parse_arguments()
     if not has_mujoco_sysid():
-        print_stderr(HINT)
+        print_stderr(MISSING_PACKAGES_MESSAGE)
         return BAD_INPUT
-    numbers = range(arguments.first, arguments.first + arguments.robots)
-    known: list[RobotComparison] = read_results(arguments.results) if arguments.results else []
-    robots = {robot.number: robot for robot in known if robot.number in numbers}
-    missing = [number for number in numbers if number not in robots]
+    seeds = range(arguments.first, arguments.first + arguments.robots)
+    saved: list[RobotComparison] = read_results(arguments.results) if arguments.results else []
+    robots = {robot.number: robot for robot in saved if robot.number in seeds}
+    missing = [seed for seed in seeds if seed not in robots]
     for robot in _compare_robots(missing, arguments):
         robots[robot.number] = robot
         if arguments.results:
             append_result(arguments.results, robot)
-        print_stderr(f"robot {robot.number}: {len(robots)} of {len(numbers)}")
-    for line in make_report([robots[number] for number in numbers]):
+        print_stderr(f"robot {robot.number}: {len(robots)} of {len(seeds)}")
+    for line in make_report([robots[seed] for seed in seeds]):
         print_line(line)
     return 0
 
@@ -56,19 +56,24 @@ def _parse_arguments() -> argparse.Namespace:
         help="file that keeps the results; robots that are in it are not identified again",
     )
     parser.add_argument(
-        "--set", action="append", default=[], dest="sets", metavar="PATH=VALUE", help="as of a run"
+        "--set",
+        action="append",
+        default=[],
+        dest="sets",
+        metavar="PATH=VALUE",
+        help="change the scenario, as `snakesim run --set` does",
     )
     return parser.parse_args()
 
 
 def _compare_robots(
-    numbers: Sequence[int], arguments: argparse.Namespace
+    seeds: Sequence[int], arguments: argparse.Namespace
 ) -> Iterator[RobotComparison]:
-    """Yield the result of each robot as soon as it is known."""
+    """Compare the methods on each robot, and yield each result as soon as it is known."""
     with ProcessPoolExecutor(arguments.workers) as pool:
         futures = [
-            pool.submit(compare_robot, number, arguments.sets, backlash=arguments.backlash)
-            for number in numbers
+            pool.submit(compare_robot, seed, arguments.sets, backlash=arguments.backlash)
+            for seed in seeds
         ]
         for future in as_completed(futures):
             yield future.result()

@@ -10,11 +10,11 @@ import msgspec
 
 from verification.commissioning_trials import draw_hidden_robot, record_motion
 from verification.sysid.equations import identify_by_equations
-from verification.sysid.estimates import Identified
+from verification.sysid.estimates import IdentificationResult
 from verification.sysid.rollout_fit import identify_by_rollouts
 
-# Of each robot and its record: mujoco.sysid simulates the record once for each parameter of each joint.
-SIZE = ("robot.chain.modules=3", "duration_s=12")
+# Robots and records are small, because mujoco.sysid simulates the record once for each parameter of each joint.
+SMALL_ROBOT_OPTIONS = ("robot.chain.modules=3", "duration_s=12")
 OURS = "robot identify"
 OURS_WITHOUT_IMUS = "robot identify, without IMUs"
 THEIRS = "mujoco.sysid"
@@ -22,11 +22,11 @@ THEIRS = "mujoco.sysid"
 
 @dataclass(frozen=True)
 class RobotComparison:
-    """What every method has found of one robot."""
+    """The result of every method for one robot."""
 
-    number: int  # which is the seed
+    number: int  # of the robot; also the seed of its hidden parameters
     loose: int | None  # index of the joint with backlash
-    by_method: Mapping[str, Identified]
+    by_method: Mapping[str, IdentificationResult]
 
 
 def compare_robot(number: int, sets: Sequence[str], *, backlash: bool) -> RobotComparison:
@@ -34,10 +34,10 @@ def compare_robot(number: int, sets: Sequence[str], *, backlash: bool) -> RobotC
 
     Args:
         number: Number of the robot, which is its seed.
-        sets: As `--set` of a run.
+        sets: Changes of the scenario, as `snakesim run --set` takes them.
         backlash: Whether one of its joints has backlash.
     """
-    robot = draw_hidden_robot(number, *SIZE, *sets, backlash=backlash)
+    robot = draw_hidden_robot(number, *SMALL_ROBOT_OPTIONS, *sets, backlash=backlash)
     columns, link_rates = record_motion(robot)
     by_method = {
         OURS: identify_by_equations(robot, columns, link_rates),
@@ -54,7 +54,7 @@ def append_result(path: Path, robot: RobotComparison) -> None:
 
 
 def read_results(path: Path) -> list[RobotComparison]:
-    """Return the results in a file; none if there is no such file."""
+    """Return the results in a file, or an empty list if the file does not exist."""
     if not path.exists():
         return []
     return [

@@ -9,40 +9,40 @@ from snakesim_operator.features.commissioning.identification import (
     identify_joints,
 )
 from verification.commissioning_trials import HiddenRobot, find_named_joints
-from verification.sysid.estimates import PARAMETERS, Estimate, Identified, get_truth
+from verification.sysid.estimates import PARAMETERS, Estimate, IdentificationResult, get_truth
 
 
 def identify_by_equations(
     robot: HiddenRobot, columns: Mapping[str, Floats], link_rates: Floats | None
-) -> Identified:
+) -> IdentificationResult:
     """Identify a robot as `snakesim robot identify` does.
 
     Args:
-        robot: The robot.
-        columns: The record.
-        link_rates: What the gyros of the links measured; None for links without IMUs.
+        robot: The robot. Its hidden parameters serve only as the truth in the result.
+        columns: The record of its motion, by signal.
+        link_rates: Rates that the gyros of the links measured; None for links without IMUs.
     """
-    begun_s = time.process_time()
+    start_s = time.process_time()
     joints = identify_joints(robot.config, columns, link_rates)
-    cpu_s = time.process_time() - begun_s
+    cpu_s = time.process_time() - start_s
     estimates = [
         _make_estimate(robot, i, joint, parameter)
         for i, joint in enumerate(joints)
         for parameter in PARAMETERS
     ]
-    named = find_named_joints(joints)
-    return Identified(
+    named_joints = find_named_joints(joints)
+    return IdentificationResult(
         estimates,
         cpu_s,
         warns=any(joint.fails or not joint.complete for joint in joints),  # exit code 1
-        suspect=named[0] if named else None,
+        suspect=named_joints[0] if named_joints else None,
     )
 
 
 def _make_estimate(
     robot: HiddenRobot, joint_index: int, joint: JointIdentification, parameter: str
 ) -> Estimate:
-    """Return a value of a joint; it is unknown if `--write` would not write it into the robot file."""
+    """Return an estimate, without a value if `--write` would not write it into the robot file."""
     truth = get_truth(robot, joint_index, parameter)
     value = None if joint.fails else joint.fields.get(parameter)
     if value is None:

@@ -1,4 +1,4 @@
-"""What one method has identified of one robot, beside the truth."""
+"""The parameters that one method has estimated for one robot, together with their true values."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ PARAMETERS = (
     "damping_nm_s_per_rad",
     "latency_s",
 )
-CLOSE = 0.1  # relative error that counts as close
+MAX_CLOSE_ERROR = 0.1  # relative error up to which a value counts as close
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One identified value of one joint, beside the truth."""
+    """One estimated parameter of one joint, together with its true value."""
 
     joint_index: int
     parameter: str
@@ -31,34 +31,36 @@ class Estimate:
 
     @property
     def error(self) -> float | None:
-        """Relative error; None if the value is unknown."""
-        return None if self.value is None else abs(self.value / self.truth - 1)
+        """Return the relative error, or None if the value is unknown."""
+        if self.value is None:
+            return None
+        return abs(self.value / self.truth - 1)
 
     @property
     def covers(self) -> bool:
-        """Whether the interval covers the truth."""
+        """Return whether the interval covers the true value."""
         return self.value is not None and abs(self.value - self.truth) <= self.half_width
 
     @property
     def is_close(self) -> bool:
-        """Whether the value is known and close to the truth."""
-        return self.error is not None and self.error < CLOSE
+        """Return whether the value is known and close to the true value."""
+        return self.error is not None and self.error < MAX_CLOSE_ERROR
 
     @property
     def misleads(self) -> bool:
-        """Whether the value is not close to the truth, and its interval does not cover the truth either."""
+        """Return whether the value is known and wrong, and its interval does not cover the true value."""
         return self.value is not None and not self.is_close and not self.covers
 
 
 @dataclass(frozen=True)
-class Identified:
-    """What one method has found of one robot."""
+class IdentificationResult:
+    """The estimates of one method for one robot, and whether it noticed that the robot does not fit its model."""
 
     estimates: Sequence[Estimate]
     cpu_s: float
-    warns: bool  # it reports that the robot does not fit its model
+    warns: bool  # whether the method reports that the robot does not fit its model
     suspect: int | None = None  # index of the joint that it names as the reason
-    # Rms of what the fit leaves unexplained, in standard deviations of the noise. None: the method knows no noise.
+    # Rms of the residuals, in standard deviations of the sensor noise; None if the method does not know the noise.
     noise_ratio: float | None = None
 
 
@@ -68,9 +70,8 @@ def get_truth(robot: HiddenRobot, joint_index: int, parameter: str) -> float:
         return robot.latency_s[joint_index]
     joint = robot.config.robot.joint_table[joint_index]
     hidden = getattr(robot.truth[joint.name], parameter, None)
-    truth = getattr(joint.motor, parameter) if hidden is None else hidden
+    true_value = getattr(joint.motor, parameter) if hidden is None else hidden
     if parameter == "armature_kg_m2" and joint_index == robot.loose:
-        truth *= (
-            1 + LINK_SIDE_INERTIA_RATIO
-        )  # the output stage of the gear comes on top of the rotor
-    return truth
+        # The methods measure rotor and output stage of the gear together.
+        true_value *= 1 + LINK_SIDE_INERTIA_RATIO
+    return true_value

@@ -21,24 +21,25 @@ from snakesim_sim_backend.model.build import assemble_model_blueprint
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings
 from verification.commissioning_trials import HiddenRobot
-from verification.sysid.estimates import PARAMETERS, Estimate, Identified, get_truth
+from verification.sysid.estimates import PARAMETERS, Estimate, IdentificationResult, get_truth
 
-START_LATENCY_S = 0.01  # the robot file has none
-MIN_RATIO = 0.2  # of a fitted value to the start value
+START_LATENCY_S = 0.01  # the robot file has no value
+# The fit limits the ratio of each value to its start value.
+MIN_RATIO = 0.2
 MAX_RATIO = 3.0
-SKIPPED_S = 0.5  # of the record, until the start state, which is measured with noise, is forgotten
+SKIPPED_S = 0.5  # after this time, the noise of the measured start state has no effect
 MAX_ITERATIONS = 15
-STEP_TOLERANCE = 1e-4  # of the ratios, at which the fit ends
+STEP_TOLERANCE = 1e-4  # the fit ends when the ratios change less
 TIME_COLUMNS = 1  # of MuJoCo's state, before positions, velocities and activations
 SIGNALS = ("angle_rad", "velocity_rad_s", "torque_nm")
-# `mujoco.sysid` reports the residuals, and judges nothing. Above this rms of them, in standard deviations of the noise,
-# a careful user would not trust the fit. An exact model leaves 1.0; one of six fits had stopped at 1.05.
+# `mujoco.sysid` reports residuals without a verdict. Above this rms, in standard deviations of the noise, a careful
+# user would not trust the fit. With an exact model, the rms is 1.0; one of six fits stopped at 1.05.
 MAX_NOISE_RATIO = 1.1
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """What `mujoco.sysid` has fitted. Values and half-widths are by `make_parameter_name`."""
+    """The values that `mujoco.sysid` has fitted, by the names that `make_parameter_name` returns."""
 
     values: Mapping[str, float]
     half_widths: Mapping[str, float]  # of the 95 % intervals
@@ -46,7 +47,7 @@ class FitResult:
 
 
 def make_spec(config: RunConfig) -> mujoco.MjSpec:
-    """Return the simulator's model of the hanging robot with its motors, without what slows it down only.
+    """Return the simulator's model of the hanging robot with its motors, without parts that only slow it down.
 
     Ground, contacts and sensors have no effect on a robot that hangs.
     """
@@ -77,11 +78,11 @@ class RolloutFit:
         """Prepare the fit.
 
         Args:
-            robot: The robot; its hidden parameters are used for nothing here.
-            columns: The record.
+            robot: The robot. Its hidden parameters are not used here.
+            columns: The record of its motion, by signal.
         """
         self._config = robot.config
-        self._count = len(robot.config.robot.joint_table)
+        self._joint_count = len(robot.config.robot.joint_table)
         self._columns = columns
         self.spec = make_spec(robot.config)
         self.model = self.spec.compile()
@@ -98,14 +99,14 @@ class RolloutFit:
         sensor = robot.config.robot.sensors.joints
         self._noise = np.repeat(
             [sensor.angle_noise_rad, sensor.velocity_noise_rad_s, sensor.torque_noise_nm],
-            self._count,
+            self._joint_count,
         )
 
     def run(self) -> FitResult:
         """Fit all parameters, beginning with those of the robot file."""
         parameters = mujoco_sysid.ParameterDict()
         start_values: dict[str, float] = {}
-        for i in range(self._count):
+        for i in range(self._joint_count):
             for parameter in PARAMETERS:
                 name = make_parameter_name(i, parameter)
                 start_values[name] = get_start_value(self._config, i, parameter)
@@ -127,7 +128,7 @@ class RolloutFit:
         )
         residuals, _, _ = residual(result.x, fitted)
         _, half_widths = mujoco_sysid.calculate_intervals(residuals, result.jac)
-        by_joint = np.concatenate(residuals).reshape(-1, len(SIGNALS), self._count)
+        by_joint = np.concatenate(residuals).reshape(-1, len(SIGNALS), self._joint_count)
         return FitResult(
             values={name: start_values[name] * fitted[name].value[0] for name in start_values},
             half_widths={
@@ -138,11 +139,11 @@ class RolloutFit:
         )
 
     def _make_sequences(self) -> Any:
-        """Return the record as `mujoco.sysid` has it."""
+        """Return the record in the types of `mujoco.sysid`."""
         data = mujoco.MjData(self.model)
         hanging = MujocoPhysicsModel(self._config, PhysicsModelSettings(suspended=True))
         data.qpos[:] = hanging.data.qpos
-        data.qpos[-self._count :] = self._columns["angle_rad"][0]
+        data.qpos[-self._joint_count :] = self._columns["angle_rad"][0]
         control = np.zeros((len(self._control_times_s), self.model.nu))
         return mujoco_sysid.ModelSequences(
             "hanging robot",
@@ -177,7 +178,7 @@ class RolloutFit:
         return spec.compile()
 
     def _roll_out(self, *, control_signal: Any, param_dicts: Any, **others: Any) -> Any:
-        """Simulate the record with each set of parameters, with targets that are late by its latencies."""
+        """Simulate the record with each set of parameters, and delay the targets by its latencies."""
         del control_signal
         controls = [
             mujoco_sysid.TimeSeries(self._control_times_s, self._delay_targets(parameters))
@@ -188,7 +189,7 @@ class RolloutFit:
     def _delay_targets(self, parameters: Any) -> Floats:
         """Return the inputs of the motors, (steps, inputs). Parts of a step are interpolated."""
         control = np.zeros((len(self._control_times_s), self.model.nu))
-        for i in range(self._count):
+        for i in range(self._joint_count):
             latency_s = self._get_value(parameters, i, "latency_s")
             whole_steps, part = divmod(latency_s / self._step_s, 1.0)
             steps = np.arange(len(control)) - int(whole_steps)
@@ -213,13 +214,13 @@ class RolloutFit:
         """Return measured minus simulated signals in standard deviations of their noise, (ticks, signals)."""
         rows = state[self._ticks * self._steps_per_tick - 1]  # after the step that ends at the tick
         speed_end = TIME_COLUMNS + model.nq + model.nv
-        angle_rad = rows[:, TIME_COLUMNS + model.nq - self._count : TIME_COLUMNS + model.nq]
-        velocity_rad_s = rows[:, speed_end - self._count : speed_end]
-        torque_nm = rows[:, speed_end : speed_end + self._count]
-        # A drive computes its torque from its current, by the constant of the file.
+        angle_rad = rows[:, TIME_COLUMNS + model.nq - self._joint_count : TIME_COLUMNS + model.nq]
+        velocity_rad_s = rows[:, speed_end - self._joint_count : speed_end]
+        torque_nm = rows[:, speed_end : speed_end + self._joint_count]
+        # A drive computes its torque from its current with the constant in the robot file.
         constants = [
             parameters[make_parameter_name(i, "torque_constant_nm_per_a")].value[0]
-            for i in range(self._count)
+            for i in range(self._joint_count)
         ]
         predicted = np.column_stack((angle_rad, velocity_rad_s, torque_nm / constants))
         residual = (measured.data - predicted) / self._noise
@@ -231,12 +232,12 @@ def make_parameter_name(joint_index: int, parameter: str) -> str:
     return f"{parameter} of joint {joint_index + 1}"
 
 
-def identify_by_rollouts(robot: HiddenRobot, columns: Mapping[str, Floats]) -> Identified:
-    """Identify a robot with `mujoco.sysid`."""
+def identify_by_rollouts(robot: HiddenRobot, columns: Mapping[str, Floats]) -> IdentificationResult:
+    """Identify a robot with `mujoco.sysid`, from the record of its motion."""
     logging.getLogger("absl").setLevel(logging.ERROR)
-    begun_s = time.process_time()
+    start_s = time.process_time()
     fit = RolloutFit(robot, columns).run()
-    cpu_s = time.process_time() - begun_s
+    cpu_s = time.process_time() - start_s
     estimates: list[Estimate] = []
     for i in range(len(robot.config.robot.joint_table)):
         for parameter in PARAMETERS:
@@ -245,7 +246,7 @@ def identify_by_rollouts(robot: HiddenRobot, columns: Mapping[str, Floats]) -> I
             estimates.append(Estimate(i, parameter, fit.values[name], fit.half_widths[name], truth))
     noise_ratio = float(np.sqrt(np.mean(fit.noise_ratios**2)))
     warns = noise_ratio > MAX_NOISE_RATIO
-    return Identified(
+    return IdentificationResult(
         estimates,
         cpu_s,
         warns=warns,

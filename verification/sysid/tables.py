@@ -5,7 +5,7 @@ from statistics import median
 
 from snakesim_operator.features.evaluate.table import compute_wilson_interval
 from verification.sysid.comparison import OURS, OURS_WITHOUT_IMUS, THEIRS, RobotComparison
-from verification.sysid.estimates import CLOSE, PARAMETERS, Estimate, Identified
+from verification.sysid.estimates import MAX_CLOSE_ERROR, PARAMETERS, Estimate, IdentificationResult
 
 METHODS = (OURS, OURS_WITHOUT_IMUS, THEIRS)
 JointFilter = Callable[[RobotComparison, int], bool]
@@ -53,7 +53,7 @@ def make_error_table(
     for parameter in PARAMETERS:
         ours = _collect_estimates(robots, OURS, accepts, parameter)
         theirs = _collect_estimates(robots, THEIRS, accepts, parameter)
-        unknown = sum(one.value is None for one in ours)
+        unknown = sum(estimate.value is None for estimate in ours)
         yield (
             f"| `{parameter}` | {len(ours)} | {unknown} | {_describe_errors(ours)} "
             f"| {_describe_errors(theirs)} | {_describe_closer(ours, theirs)} |"
@@ -78,39 +78,39 @@ def make_interval_table(
 
 
 def make_verdict_table(robots: Sequence[RobotComparison]) -> Iterator[str]:
-    """Yield the table of the robots of which a method warns, and of the joints that it names."""
+    """Yield the table of how many robots each method warns about, and of the joints that it names."""
     yield "| method | robots | warns | names the joint | names another joint |"
     yield "|---|---|---|---|---|"
     for method in METHODS:
-        found = [(robot, robot.by_method[method]) for robot in robots]
-        warned = sum(identified.warns for _, identified in found)
-        named = sum(identified.suspect is not None for _, identified in found)
+        results = [(robot, robot.by_method[method]) for robot in robots]
+        warned = sum(result.warns for _, result in results)
+        named = sum(result.suspect is not None for _, result in results)
         named_right = sum(
-            identified.suspect is not None and identified.suspect == robot.loose
-            for robot, identified in found
+            result.suspect is not None and result.suspect == robot.loose
+            for robot, result in results
         )
-        yield f"| {method} | {len(found)} | {warned} | {named_right} | {named - named_right} |"
+        yield f"| {method} | {len(results)} | {warned} | {named_right} | {named - named_right} |"
 
 
 def make_value_table(
     robots: Sequence[RobotComparison], groups: Mapping[str, JointFilter]
 ) -> Iterator[str]:
-    """Yield the table of the values that are far off, and of those of them whose intervals do not cover the truth."""
-    yield f"| method | joints | values | more than {_percent(CLOSE, 0)} off | of these, not covered |"
+    """Yield the table of values with a large error, and of those whose interval does not cover the truth either."""
+    yield f"| method | joints | values | more than {_format_percent(MAX_CLOSE_ERROR, 0)} off | of these, not covered |"
     yield "|---|---|---|---|---|"
     for method in METHODS:
         for label, accepts in groups.items():
             estimates = [
-                one
+                estimate
                 for robot in robots
-                for one in robot.by_method[method].estimates
-                if accepts(robot, one.joint_index)
+                for estimate in robot.by_method[method].estimates
+                if accepts(robot, estimate.joint_index)
             ]
-            known = [one for one in estimates if one.value is not None]
+            known = [estimate for estimate in estimates if estimate.value is not None]
             yield (
                 f"| {method} | {label} | {len(known)} of {len(estimates)} "
-                f"| {sum(not one.is_close for one in known)} "
-                f"| {sum(one.misleads for one in known)} |"
+                f"| {sum(not estimate.is_close for estimate in known)} "
+                f"| {sum(estimate.misleads for estimate in known)} |"
             )
 
 
@@ -126,11 +126,11 @@ def describe_costs(robots: Sequence[RobotComparison]) -> Iterator[str]:
     )
 
 
-def _list_noise_ratios(found: Iterator[Identified]) -> Iterator[float]:
-    """Yield the residuals of the fits that have any."""
-    for identified in found:
-        if identified.noise_ratio is not None:
-            yield identified.noise_ratio
+def _list_noise_ratios(results: Iterator[IdentificationResult]) -> Iterator[float]:
+    """Yield the noise ratio of each result that has one."""
+    for result in results:
+        if result.noise_ratio is not None:
+            yield result.noise_ratio
 
 
 def _collect_estimates(
@@ -138,24 +138,24 @@ def _collect_estimates(
 ) -> list[Estimate]:
     """Return the estimates of one parameter by one method, in the order of the joints."""
     return [
-        one
+        estimate
         for robot in robots
-        for one in robot.by_method[method].estimates
-        if one.parameter == parameter and accepts(robot, one.joint_index)
+        for estimate in robot.by_method[method].estimates
+        if estimate.parameter == parameter and accepts(robot, estimate.joint_index)
     ]
 
 
 def _describe_errors(estimates: Sequence[Estimate]) -> str:
-    """Return median and greatest relative error."""
-    errors = [one.error for one in estimates if one.error is not None]
+    """Return the median and the maximum relative error."""
+    errors = [estimate.error for estimate in estimates if estimate.error is not None]
     if not errors:
         return "- | -"
-    return f"{_percent(median(errors), 2)} | {_percent(max(errors), 1)}"
+    return f"{_format_percent(median(errors), 2)} | {_format_percent(max(errors), 1)}"
 
 
 def _describe_closer(ours: Sequence[Estimate], theirs: Sequence[Estimate]) -> str:
     """Return in how many joints `mujoco.sysid` is closer to the truth, of those that both know."""
-    errors = [(one.error, other.error) for one, other in zip(ours, theirs, strict=True)]
+    errors = [(estimate.error, other.error) for estimate, other in zip(ours, theirs, strict=True)]
     known = [(our, their) for our, their in errors if our is not None and their is not None]
     return f"{sum(their < our for our, their in known)} of {len(known)}"
 
@@ -165,16 +165,16 @@ def _describe_intervals(estimates: Sequence[Estimate]) -> str:
 
     Joints count as independent.
     """
-    known = [one for one in estimates if one.value is not None]
+    known = [estimate for estimate in estimates if estimate.value is not None]
     if not known:
         return "- | -"
-    covered = sum(one.covers for one in known)
+    covered = sum(estimate.covers for estimate in known)
     low, high = compute_wilson_interval(covered, len(known))
-    width = median(one.half_width / abs(one.truth) for one in known)
-    interval = f"{100 * low:.0f} to {_percent(high, 0)}"
-    return f"{covered} of {len(known)} ({interval}) | {_percent(width, 1)}"
+    width = median(estimate.half_width / abs(estimate.truth) for estimate in known)
+    interval = f"{100 * low:.0f} to {_format_percent(high, 0)}"
+    return f"{covered} of {len(known)} ({interval}) | {_format_percent(width, 1)}"
 
 
-def _percent(fraction: float, digits: int) -> str:
-    """Return a fraction as the documentation has it."""
+def _format_percent(fraction: float, digits: int) -> str:
+    """Return a fraction in percent, with a space before the sign."""
     return f"{100 * fraction:.{digits}f} %"

@@ -23,7 +23,7 @@ from snakesim_testing.operator.browser import (
     ChromiumBrowser,
     open_chromium,
 )
-from verification.screenshots import recording
+from verification.screenshots import run_recording_console
 
 pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
 
@@ -53,7 +53,7 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
     record = RunRecord.load(tmp_path / "run")
     angle = record.angle_rad[:, 4]
     measured, wanted = "angle_rad.joint_5, rad", "control.reference_rad.joint_5, rad"
-    with recording(str(tmp_path / "run"), 1.0) as address, open_chromium() as browser:
+    with run_recording_console(str(tmp_path / "run"), 1.0) as address, open_chromium() as browser:
         tab = browser.open(f"{address.rstrip('/')}/signals", 800, 900)
         tab.wait_for(" signals")
         tab.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))

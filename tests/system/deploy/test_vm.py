@@ -31,27 +31,27 @@ KERNEL = kernel.Kernel(
     },
     built_in=["virtio_net"],
 )
-REQUEST = machine.Request(
+REQUEST = machine.GuestRequest(
     command=["printf", "%s", "it's"], folder=Path("/a folder"), writable=[Path("/re,po")]
 )
 
 
 def test_every_entry_of_an_archive_is_aligned() -> None:
     for length in range(5):
-        entry = cpio.file("n" * length + "x", b"c" * length)
+        entry = cpio.make_file_entry("n" * length + "x", b"c" * length)
         assert len(entry) % 4 == 0
         # The size, seventh of the eight-digit fields after the magic.
         assert int(entry[54:62], 16) == length
 
 
 def test_vm_modules_are_ordered_by_dependency_without_builtin_ones() -> None:
-    order = kernel.load_order(["can_raw", "virtio_net", "kvaser_pci", "vcan"], KERNEL)
+    order = kernel.order_modules(["can_raw", "virtio_net", "kvaser_pci", "vcan"], KERNEL)
     assert order == ["can", "can_raw", "sja1000", "can_dev", "kvaser_pci", "vcan"]
 
 
 def test_a_kernel_without_the_module_is_named() -> None:
     with raises_error(PreparationError):
-        kernel.load_order(["flexcan"], KERNEL)
+        kernel.order_modules(["flexcan"], KERNEL)
 
 
 @pytest.mark.parametrize(
@@ -63,11 +63,11 @@ def test_a_kernel_without_the_module_is_named() -> None:
     ],
 )
 def test_dependencies_are_read_from_the_module(section: bytes, names: list[str]) -> None:
-    assert kernel.dependencies(b"\x7fELF\0" + section) == names
+    assert kernel.find_dependencies(b"\x7fELF\0" + section) == names
 
 
 def test_module_names_have_no_dash_and_no_ending() -> None:
-    assert kernel.module_name("kernel/net/can/can-raw.ko.xz") == "can_raw"
+    assert kernel.parse_module_name("kernel/net/can/can-raw.ko.xz") == "can_raw"
 
 
 def bz_image(payload: bytes) -> bytes:
@@ -80,19 +80,19 @@ def bz_image(payload: bytes) -> bytes:
 
 def test_the_plain_kernel_is_taken_out_of_its_image() -> None:
     plain = b"\x7fELF" + struct.pack("<III", 4, 8, 18) + b"Xen\0" + bytes(64)
-    assert kernel.plain_kernel(bz_image(lzma.compress(plain) + b"size")) == plain
+    assert kernel.extract_plain_kernel(bz_image(lzma.compress(plain) + b"size")) == plain
 
 
 def test_a_kernel_that_qemu_could_not_start_directly_stays_packed() -> None:
-    assert kernel.plain_kernel(bz_image(lzma.compress(b"\x7fELF" + bytes(64)))) is None
-    assert kernel.plain_kernel(bz_image(b"\x1f\x8b gzip")) is None
+    assert kernel.extract_plain_kernel(bz_image(lzma.compress(b"\x7fELF" + bytes(64)))) is None
+    assert kernel.extract_plain_kernel(bz_image(b"\x1f\x8b gzip")) is None
 
 
 def test_the_command_keeps_its_words_folder_and_environment(tmp_path: Path) -> None:
-    request = machine.Request(
+    request = machine.GuestRequest(
         command=["sh", "-c", 'echo "$0 $GREETING $SNAKESIM_VCAN" > out', "it's"], folder=tmp_path
     )
-    script = machine.command_script(
+    script = machine.make_command_script(
         request, {"GREETING": "two\nlines", "DISPLAY": ":0", "BASH_FUNC_x%%": "() { :; }"}
     )
     subprocess.run(["sh", "-c", script], check=True, timeout=30, env={"PATH": "/usr/bin:/bin"})
@@ -102,20 +102,20 @@ def test_the_command_keeps_its_words_folder_and_environment(tmp_path: Path) -> N
 
 
 def test_interfaces_are_brought_up_as_asked() -> None:
-    request = machine.Request(
+    request = machine.GuestRequest(
         [], Path("/"), channels=["vcan0", "vcan1"], controllers=True, forward=[(17447, 7447)]
     )
-    script = machine.interface_script(request)
+    script = machine.make_interface_script(request)
     assert "ip link add vcan1 type vcan\nip link set vcan1 up\n" in script
     assert "ip link set can1 type can bitrate 1000000" in script
     assert "ip link set eth0 up" in script
-    assert "can1 type can" not in machine.interface_script(REQUEST)
+    assert "can1 type can" not in machine.make_interface_script(REQUEST)
 
 
-def qemu(request: machine.Request, monkeypatch: pytest.MonkeyPatch, kvm: bool = False) -> str:
-    monkeypatch.setattr(machine, "need_tool", str)
+def qemu(request: machine.GuestRequest, monkeypatch: pytest.MonkeyPatch, kvm: bool = False) -> str:
+    monkeypatch.setattr(machine, "require_tool", str)
     ports = {name: number for number, name in enumerate(machine.PORTS, start=10)}
-    return " ".join(machine.qemu_arguments(request, KERNEL, kvm, "/proc/self/fd/9", ports))
+    return " ".join(machine.make_qemu_command(request, KERNEL, kvm, "/proc/self/fd/9", ports))
 
 
 def test_the_host_is_read_only_but_for_the_given_folders(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,12 +130,12 @@ def test_vm_guest_has_network_only_for_forwarded_loopback_ports(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert "-netdev" not in qemu(REQUEST, monkeypatch)
-    line = qemu(machine.Request([], Path("/"), forward=[(17447, 7447)]), monkeypatch)
+    line = qemu(machine.GuestRequest([], Path("/"), forward=[(17447, 7447)]), monkeypatch)
     assert "restrict=on,hostfwd=tcp:127.0.0.1:17447-:7447" in line
 
 
 def test_controllers_share_one_bus(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = qemu(machine.Request([], Path("/"), controllers=True), monkeypatch)
+    line = qemu(machine.GuestRequest([], Path("/"), controllers=True), monkeypatch)
     assert line.count("kvaser_pci,canbus=canbus0") == 2
     assert line.index("sja1000,") < line.index("kvaser_pci ")
     assert "kvaser_pci" not in qemu(REQUEST, monkeypatch)
@@ -144,9 +144,9 @@ def test_controllers_share_one_bus(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("parse", "text"),
     [
-        *((with_vcan.ports, text) for text in ("", "17447", "0:7447", "17447:70000", "a:b")),
+        *((with_vcan.parse_ports, text) for text in ("", "17447", "0:7447", "17447:70000", "a:b")),
         *(
-            (with_vcan.names, text)
+            (with_vcan.parse_interface_names, text)
             for text in ("", "vcan0,", "vcan0;reboot", "a-name-of-more-than-fifteen")
         ),
     ],

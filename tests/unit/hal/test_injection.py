@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from docs.site.kinds_table import PAGE, with_table
+from docs.site.kinds_table import PAGE, make_page
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import (
     FAULT_KINDS,
@@ -141,7 +141,7 @@ def test_help_explains_every_kind() -> None:
 
 
 def test_the_page_has_every_kind() -> None:
-    assert PAGE.read_text(encoding="utf-8") == with_table(), (
+    assert PAGE.read_text(encoding="utf-8") == make_page(), (
         "run `make schemas` and commit what it changes"
     )
 
