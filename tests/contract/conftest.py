@@ -1,4 +1,4 @@
-"""The benches that our own backends have to stand on."""
+"""The benches with which our own backends run the contract suite."""
 
 import os
 from pathlib import Path
@@ -17,8 +17,10 @@ from snakesim_testing.benches.homing_drives import HomingBackend
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
 
-VCAN = "SNAKESIM_VCAN"  # set by deploy/vm/with_vcan.py: the kernel here has vcan0, and it is up
-IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs the other clauses, too
+# deploy/vm/with_vcan.py sets this variable if the kernel has vcan0, and it is up.
+VCAN_VARIABLE = "SNAKESIM_VCAN"
+# Opening a backend takes half a minute in an emulated machine. `-m ""` runs the other clauses, too.
+EMULATED_MACHINE_CLAUSES = (
     "every_joint_is_valid",
     "position_mode",
     "leaving_armed",
@@ -28,34 +30,34 @@ IN_AN_EMULATED_MACHINE = (  # an opening takes half a minute there: `-m ""` runs
 )
 WHISKER = Path(__file__).parents[2] / "examples" / "whisker.py"
 MINIMAL_DRIVER = Path(__file__).parents[2] / "examples" / "minimal_driver.py"
-# Clauses that a camera may concern.
-OF_SENSORS = "sensor", "sample", "contradicts_itself", "listed"
-LOOKS_AHEAD = (
+# Parts of the names of clauses that may depend on a camera.
+SENSOR_CLAUSES = ("sensor", "sample", "contradicts_itself", "listed")
+CAMERA_OVERRIDES = (
     'robot.sensors.depth=[{name="head", width=32, height=24, pitch_rad=0.4}]',
     'robot.sensors.range=[{name="front", beams=9, fov_rad=2.0}]',
     f'robot.sensors.custom=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
-# ODrive has the same kit, Dynamixel no velocity mode.
-AS_ANOTHER = "moteus", "sim-position", "threads"
-# moteus does it otherwise; for buses in threads see tests/system/drives/test_buses.py
-WITHOUT_THE_DRIVER = "test_drives_"
-POSITION_ONLY = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
-HEAD_OF_SERVOS = (
+# Benches whose clauses other benches cover: moteus and ODrive use the same kit, Dynamixel has position mode alone.
+COVERED_BENCHES = ("moteus", "sim-position", "threads")
+# These clauses are special for moteus. tests/system/drives/test_buses.py tests buses in threads.
+DRIVER_FAILURE_CLAUSES = "test_drives_"
+POSITION_ONLY_OVERRIDES = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
+MIXED_OVERRIDES = (
     'robot.drive.driver="odrive"',
     'robot.joints.joint_3.driver="dynamixel"',
     'robot.joints.joint_4.driver="dynamixel"',
 )
-ALL_FAMILIES = (
+ALL_DRIVER_TYPES_OVERRIDES = (
     'robot.drive.driver="odrive"',
     'robot.joints.joint_2.driver="moteus"',
     'robot.joints.joint_3.driver="dynamixel"',
     'robot.joints.joint_4.driver="dynamixel"',
 )
-ON_VCAN = ('backend.channels=["vcan0"]', 'backend.emulators="process"')
+VCAN_OVERRIDES = ('backend.channels=["vcan0"]', 'backend.emulators="process"')
 
 
-class InRealTime(MixedBackend):
-    """Each bus in a thread of its own, where emulated drives in this process would let it be in turn."""
+class RealTimeMixedBackend(MixedBackend):
+    """A mixed robot in real time, with a thread for each bus. Emulated drives usually share one thread."""
 
     @classmethod
     def check(cls, config: RunConfig, settings: Any) -> tuple[ClockMode, ...]:
@@ -63,34 +65,34 @@ class InRealTime(MixedBackend):
         return ("realtime",)
 
 
-IN_REAL_TIME: Any = InRealTime
+REAL_TIME_MIXED_BACKEND: Any = RealTimeMixedBackend
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_snakesim_benches() -> list[Bench]:
-    """Simulator, also with a camera; CAN on a bus inside the process, or on the kernel's with modules as processes."""
-    if os.environ.get(VCAN):  # `make test-can`
-        return [Bench("can-vcan", "can", overrides=ON_VCAN, mute_joint=cut_off)]
+    """Return the benches of all our backends, or that of joint modules on vcan0 for `make test-can`."""
+    if os.environ.get(VCAN_VARIABLE):  # `make test-can`
+        return [Bench("can-vcan", "can", overrides=VCAN_OVERRIDES, mute_joint=mute_module)]
     return [
         Bench("sim", "sim"),
-        Bench("sim-camera", "sim", overrides=LOOKS_AHEAD),
-        Bench("sim-position", "sim", overrides=POSITION_ONLY),
-        Bench("can-virtual", "can", mute_joint=cut_off, make_emulated_drives=ModuleDrives),
+        Bench("sim-camera", "sim", overrides=CAMERA_OVERRIDES),
+        Bench("sim-position", "sim", overrides=POSITION_ONLY_OVERRIDES),
+        Bench("can-virtual", "can", mute_joint=mute_module, make_emulated_drives=ModuleDrives),
         Bench(
             "can-firmware",
             "can",
             overrides=('backend.emulators="firmware"',),
-            mute_joint=cut_off,
+            mute_joint=mute_module,
             make_emulated_drives=FirmwareDrives,
             unavailable_reason=find_reason_against_firmware(),
         ),
-        Bench("odrive", "odrive", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
-        Bench("moteus", "moteus", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
-        Bench("cia402", "cia402", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
+        Bench("odrive", "odrive", mute_joint=mute_drive, make_emulated_drives=DrivesOfAnyType),
+        Bench("moteus", "moteus", mute_joint=mute_drive, make_emulated_drives=DrivesOfAnyType),
+        Bench("cia402", "cia402", mute_joint=mute_drive, make_emulated_drives=DrivesOfAnyType),
         Bench(
-            "dynamixel", "dynamixel", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType
+            "dynamixel", "dynamixel", mute_joint=mute_drive, make_emulated_drives=DrivesOfAnyType
         ),
-        Bench("feetech", "feetech", mute_joint=cut_drive_off, make_emulated_drives=DrivesOfAnyType),
+        Bench("feetech", "feetech", mute_joint=mute_drive, make_emulated_drives=DrivesOfAnyType),
         Bench(
             "minimal-driver",
             f"{MINIMAL_DRIVER}:MinimalBackend",
@@ -103,63 +105,66 @@ def pytest_snakesim_benches() -> list[Bench]:
         Bench(
             "mixed",
             "mixed",
-            overrides=HEAD_OF_SERVOS,
-            mute_joint=cut_drive_off,
+            overrides=MIXED_OVERRIDES,
+            mute_joint=mute_drive,
             make_emulated_drives=DrivesOfAnyType,
         ),
         Bench(
             "threads",
-            IN_REAL_TIME,
-            overrides=ALL_FAMILIES,
-            mute_joint=cut_drive_off,
+            REAL_TIME_MIXED_BACKEND,
+            overrides=ALL_DRIVER_TYPES_OVERRIDES,
+            mute_joint=mute_drive,
             make_emulated_drives=DrivesOfAnyType,
         ),
     ]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Only clauses that depend on what the bench is for: the camera, the bus. All are for `make verify`."""
+    """Mark clauses as slow that do not depend on the purpose of a bench. `make verify` runs all."""
     for item in items:
-        is_special = WITHOUT_THE_DRIVER in item.name and "[moteus" in item.name
-        if any(f"[{bench}" in item.name for bench in AS_ANOTHER) and not is_special:
+        is_needed = DRIVER_FAILURE_CLAUSES in item.name and "[moteus" in item.name
+        if any(f"[{bench}" in item.name for bench in COVERED_BENCHES) and not is_needed:
             item.add_marker(pytest.mark.slow)
-        if "sim-camera" in item.name and not any(words in item.name for words in OF_SENSORS):
+        if "sim-camera" in item.name and not any(
+            name_part in item.name for name_part in SENSOR_CLAUSES
+        ):
             item.add_marker(pytest.mark.slow)
-    if os.environ.get(VCAN) != "guest":
+    if os.environ.get(VCAN_VARIABLE) != "guest":
         return
     for item in items:
         if item.path.name == "test_contract.py" and not any(
-            words in item.name for words in IN_AN_EMULATED_MACHINE
+            name_part in item.name for name_part in EMULATED_MACHINE_CLAUSES
         ):
             item.add_marker(pytest.mark.slow)
 
 
 def find_reason_against_firmware() -> str | None:
-    """Why the reference firmware cannot be compiled here. CI has a compiler, and must run its clauses."""
+    """Return why the reference firmware cannot be compiled here. CI has a compiler, and must run its clauses."""
     if list_compilers() or os.environ.get("CI"):
         return None
     return f"the reference firmware of joint modules is in C, and {NO_COMPILER}"
 
 
-def cut_off(backend: Any, joint: int) -> None:
-    """From now on the driver hears nothing of a joint's module."""
+def mute_module(backend: Any, joint: int) -> None:
+    """Drop all frames from the module of a joint from now on."""
     process_frame = backend.modules.module_reports.process_frame
 
-    def receive(frame: CanFrame) -> None:
+    def pass_other_frames(frame: CanFrame) -> None:
         if parse_node(frame.id) != joint + 1:
             process_frame(frame)
 
-    backend.modules.module_reports.process_frame = receive
+    backend.modules.module_reports.process_frame = pass_other_frames
 
 
-def cut_drive_off(backend: Any, joint: int) -> None:
-    """From now on the driver hears nothing of a joint's drive."""
+def mute_drive(backend: Any, joint: int) -> None:
+    """Drop all responses from the drive of a joint from now on."""
     bus = next(bus for bus in backend._drives.buses if joint in bus.spec.joints)
-    drives, silent = bus.drives, bus.spec.joints.index(joint)
+    drives = bus.drives
+    silent_index = bus.spec.joints.index(joint)
     handle_response = drives.handle_response
 
-    def heard(i: int, said: Any) -> None:
-        if i != silent:
-            handle_response(i, said)
+    def pass_other_responses(index: int, response: Any) -> None:
+        if index != silent_index:
+            handle_response(index, response)
 
-    drives.handle_response = heard
+    drives.handle_response = pass_other_responses

@@ -1,4 +1,4 @@
-"""The contract suite itself: what is good passes, and whatever breaks a clause fails that clause."""
+"""The contract suite passes good backends, and each backend that breaks a clause fails that clause."""
 
 import ast
 import os
@@ -19,12 +19,15 @@ from snakesim_testing.benches.workbench import read_example_from_docs
 ROOT = Path(__file__).parents[2]
 SUITE = ROOT / "snakesim_testing" / "contract"
 PLUGIN = "snakesim_testing.contract.plugin"
-pytestmark = pytest.mark.timeout(900)  # whole suites, perhaps on an emulated machine
-NOTICED = {"failure", "error"}
-BUS = "./snakesim_testing/benches/workbench.py"
+pytestmark = pytest.mark.timeout(
+    900
+)  # these tests run whole suites, perhaps on an emulated machine
+FAILED_OUTCOMES = {"failure", "error"}
+WORKBENCH = "./snakesim_testing/benches/workbench.py"
 
 
-def python(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+def run_python(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run Python without the pytest options of this session."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTEST_ADDOPTS"}
     command = [sys.executable, *arguments]
     return subprocess.run(
@@ -35,13 +38,13 @@ def python(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str
 def run_suite(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run the suite in a process of its own, as a user runs it."""
     plugins = ["-p", "no:cacheprovider", "-p", "snakesim_testing"]
-    return python(
+    return run_python(
         "-m", "pytest", "--pyargs", "snakesim_testing.contract", *plugins, *arguments, cwd=cwd
     )
 
 
-def clauses() -> set[str]:
-    """Names of all contract tests."""
+def list_clauses() -> set[str]:
+    """Return the names of all contract tests."""
     return {
         node.name
         for path in SUITE.glob("test_*.py")
@@ -50,86 +53,103 @@ def clauses() -> set[str]:
     }
 
 
-def test_every_clause_has_a_backend_that_breaks_it() -> None:
+def test_contract_every_clause_has_a_mutant_that_breaks_it() -> None:
     broken = {clause for mutant in MUTANTS for clause in mutant.breaks}
-    assert broken == clauses()
+    assert broken == list_clauses()
 
 
-def find_unnoticed(mutants: Sequence[Mutant], report: Path) -> list[tuple[str, str, set[str]]]:
-    """Run each of these mutants against its clauses, in one process; return what did not fail."""
-    names = " or ".join(mutant.name for mutant in mutants)
-    ran = run_suite(
+def find_unnoticed_mutants(
+    mutants: Sequence[Mutant], report: Path
+) -> list[tuple[str, str, set[str]]]:
+    """Run mutants against their clauses in one process.
+
+    Returns:
+        Mutant, clause and outcomes, for each clause that did not fail.
+    """
+    name_filter = " or ".join(mutant.name for mutant in mutants)
+    completed = run_suite(
         "-p",
         "snakesim_testing.benches.mutants",
         "-k",
-        names,
+        name_filter,
         f"--junitxml={report}",
         "--tb=no",
         "-q",
     )
-    assert report.is_file(), ran.stdout + ran.stderr
-    # (mutant, clause) -> what came of it.
+    assert report.is_file(), completed.stdout + completed.stderr
+    # By mutant and clause.
     outcomes: dict[tuple[str, str], set[str]] = defaultdict(set)
     for case in ElementTree.parse(report).getroot().iter("testcase"):
         clause, _, rest = case.attrib["name"].partition("[")
         children = [child.tag for child in case if child.tag in ("failure", "error", "skipped")]
-        outcomes[rest.rstrip("]").partition("-")[0], clause].add(
-            children[0] if children else "passed"
-        )
-    tried = [
+        mutant_name = rest.rstrip("]").partition("-")[0]
+        outcomes[mutant_name, clause].add(children[0] if children else "passed")
+    expected_failures = [
         (mutant.name, clause, outcomes[mutant.name, clause])
         for mutant in mutants
         for clause in mutant.breaks
     ]
-    return [(name, clause, found) for name, clause, found in tried if not found or found - NOTICED]
+    return [
+        (name, clause, outcome)
+        for name, clause, outcome in expected_failures
+        if not outcome or outcome - FAILED_OUTCOMES
+    ]
 
 
-def test_a_driver_that_breaks_a_clause_fails_it(tmp_path: Path) -> None:
-    assert not find_unnoticed(DRIVER_MUTANTS, tmp_path / "report.xml")
-
-
-@pytest.mark.slow
-def test_a_backend_that_breaks_a_clause_fails_it(tmp_path: Path) -> None:
-    """One test, so that workers side by side do not run the suite several times."""
-    others = [mutant for mutant in MUTANTS if mutant not in DRIVER_MUTANTS]
-    assert not find_unnoticed(others, tmp_path / "report.xml")
+def test_contract_driver_mutants_fail_the_clauses_they_break(tmp_path: Path) -> None:
+    assert not find_unnoticed_mutants(DRIVER_MUTANTS, tmp_path / "report.xml")
 
 
 @pytest.mark.slow
-def test_the_example_of_the_docs_passes_from_anywhere(tmp_path) -> None:
+def test_contract_backend_mutants_fail_the_clauses_they_break(tmp_path: Path) -> None:
+    """Run all mutants in one test, so that parallel workers do not run the suite several times."""
+    backend_mutants = [mutant for mutant in MUTANTS if mutant not in DRIVER_MUTANTS]
+    assert not find_unnoticed_mutants(backend_mutants, tmp_path / "report.xml")
+
+
+@pytest.mark.slow
+def test_contract_example_of_the_docs_passes_in_any_folder(tmp_path) -> None:
     (tmp_path / "workbench.py").write_text(read_example_from_docs())
-    given = [
+    options = [
         "--snakesim-backend",
         "./workbench.py:Workbench",
         "--snakesim-mute",
         "./workbench.py:mute",
     ]
-    ran = run_suite(*given, "--snakesim-table", "table.md", "-q", cwd=tmp_path)
-    assert ran.returncode == 0, ran.stdout
-    assert ran.stdout.count("skipped:") == 3
-    assert "joint_1 is described with every mode" in ran.stdout  # so there is none that it lacks
-    assert "7 clauses, on Workbench: this bench has no emulated drives" in ran.stdout
-    assert "2 clauses, on Workbench: this robot has no power sensor" in ran.stdout
+    completed = run_suite(*options, "--snakesim-table", "table.md", "-q", cwd=tmp_path)
+    assert completed.returncode == 0, completed.stdout
+    assert completed.stdout.count("skipped:") == 3
+    assert "joint_1 is described with every mode" in completed.stdout  # so no mode is missing
+    assert "7 clauses, on Workbench: this bench has no emulated drives" in completed.stdout
+    assert "2 clauses, on Workbench: this robot has no power sensor" in completed.stdout
     rows = [
         line
         for line in (tmp_path / "table.md").read_text().splitlines()
         if line.endswith("| pass |")
     ]
-    assert len(rows) == len(clauses()) - 10
+    assert len(rows) == len(list_clauses()) - 10
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("backend", "said"), [("BusWorkbench", ""), ("RealTimeWorkbench", "not exactly repeatable")]
+    ("backend", "expected_output"),
+    [("BusWorkbench", ""), ("RealTimeWorkbench", "not exactly repeatable")],
 )
-def test_contract_passes_late_coarse_slow_or_realtime_backend(backend: str, said: str) -> None:
-    looks = ("--snakesim-mute", f"{BUS}:mute", "--snakesim-drives", f"{BUS}:WorkbenchDrives")
-    ran = run_suite("--snakesim-backend", f"{BUS}:{backend}", *looks, "-q")
-    assert ran.returncode == 0 and said in ran.stdout, ran.stdout
+def test_contract_passes_late_coarse_slow_or_realtime_backend(
+    backend: str, expected_output: str
+) -> None:
+    options = (
+        "--snakesim-mute",
+        f"{WORKBENCH}:mute",
+        "--snakesim-drives",
+        f"{WORKBENCH}:WorkbenchDrives",
+    )
+    completed = run_suite("--snakesim-backend", f"{WORKBENCH}:{backend}", *options, "-q")
+    assert completed.returncode == 0 and expected_output in completed.stdout, completed.stdout
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("options", "expected_output"),
     [
         pytest.param((), "give --snakesim-backend", marks=pytest.mark.slow),
         pytest.param(
@@ -143,11 +163,11 @@ def test_contract_passes_late_coarse_slow_or_realtime_backend(backend: str, said
         ),
     ],
 )
-def test_a_wrong_call_is_said_once(given, said) -> None:
-    ran = run_suite(*given, "-q")
-    assert ran.returncode != 0
-    assert said in ran.stdout + ran.stderr
-    assert " failed" not in ran.stdout
+def test_contract_wrong_call_is_reported_once(options, expected_output) -> None:
+    completed = run_suite(*options, "-q")
+    assert completed.returncode != 0
+    assert expected_output in completed.stdout + completed.stderr
+    assert " failed" not in completed.stdout
 
 
 def test_contract_project_may_define_options_of_usual_names(tmp_path: Path) -> None:
@@ -158,12 +178,14 @@ def test_contract_project_may_define_options_of_usual_names(tmp_path: Path) -> N
     (tmp_path / "test_it.py").write_text(
         "def test_it(pytestconfig):\n    assert pytestconfig.getoption('--backend') == 'x'\n"
     )
-    ran = python("-m", "pytest", "-q", "-p", "no:cacheprovider", "--backend", "x", cwd=tmp_path)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
+    completed = run_python(
+        "-m", "pytest", "-q", "-p", "no:cacheprovider", "--backend", "x", cwd=tmp_path
+    )
+    assert completed.returncode == 0, completed.stdout + completed.stderr
 
 
-def test_the_plugin_loads_nothing_of_ours_until_it_is_used() -> None:
+def test_contract_plugin_imports_no_other_modules_until_used() -> None:
     code = f"import sys, {PLUGIN}; print([name for name in sys.modules if name.startswith('snakesim_')])"
-    assert python("-c", code).stdout.strip() == str(
+    assert run_python("-c", code).stdout.strip() == str(
         ["snakesim_testing", "snakesim_testing.contract", PLUGIN]
     )

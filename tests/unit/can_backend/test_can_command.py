@@ -1,4 +1,4 @@
-"""`snakesim drive` for joint modules: the sum of a bus, who answers on it, and the spelled-out DBC file."""
+"""`snakesim drive` for joint modules: the load of a bus, a scan of its nodes, and the complete DBC file."""
 
 import re
 import uuid
@@ -24,59 +24,42 @@ from snakesim_testing.can.frames import health, heartbeat
 from snakesim_testing.messages import raises_error
 from snakesim_testing.operator.registered import run_registered
 
-run = partial(run_registered, COMMANDS)
+run_command = partial(run_registered, COMMANDS)
 TRIPLET = load_scenario("triplet").config
 
 # --- load --------------------------------------------------------------------------------------------------
 
 
-def test_load_prints_the_sum(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["drive", "load", "can", "triplet"]) == 0
-    said = capsys.readouterr().out
-    assert "one bus: 13 joints at 100 Hz" in said
-    assert "JointState       1300 frames/s x 135 bits (8 bytes) =  17.6 %" in said
-    assert "together 56.7 %" in said
-    assert "5.24 of 10.00 ms" in said
-    assert "Refused" not in said
+def test_load_command_prints_loads_and_their_sum(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["drive", "load", "can", "triplet"]) == 0
+    output = capsys.readouterr().out
+    assert "one bus: 13 joints at 100 Hz" in output
+    assert "JointState       1300 frames/s x 135 bits (8 bytes) =  17.6 %" in output
+    assert "together 56.7 %" in output
+    assert "5.24 of 10.00 ms" in output
+    assert "Refused" not in output
 
 
-def test_load_says_what_is_refused_and_what_would_fit(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["drive", "load", "can", "triplet", "--set", "rate_hz=300"]) == 1
+def test_load_command_of_overload_suggests_what_fits(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["drive", "load", "can", "triplet", "--set", "rate_hz=300"]) == 1
     assert "Refused. What would fit: rate_hz = " in capsys.readouterr().out
 
 
-def test_load_takes_the_settings_of_the_backend(capsys: pytest.CaptureFixture[str]) -> None:
+def test_load_command_uses_the_settings_of_the_backend(capsys: pytest.CaptureFixture[str]) -> None:
     flags = ["--set", 'backend.channels=["can0", "can1"]', "--set", "backend.contact_rate_hz=0"]
-    assert run(["drive", "load", "can", "triplet", *flags]) == 0
-    said = capsys.readouterr().out
-    assert "can0: 7 joints" in said
-    assert "can1: 6 joints" in said
-    assert "Contact" not in said
+    assert run_command(["drive", "load", "can", "triplet", *flags]) == 0
+    output = capsys.readouterr().out
+    assert "can0: 7 joints" in output
+    assert "can1: 6 joints" in output
+    assert "Contact" not in output
     with raises_error(ConfigError, code="config/out-of-range"):
-        run(["drive", "load", "can", "triplet", "--set", "backend.imu_rate_hz=-1"])
+        run_command(["drive", "load", "can", "triplet", "--set", "backend.imu_rate_hz=-1"])
 
 
-def test_load_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
-    assert (
-        run(
-            [
-                "drive",
-                "load",
-                "can",
-                "triplet",
-                "--joints",
-                "13",
-                "18",
-                "30",
-                "--hz",
-                "50",
-                "100",
-                "200",
-            ]
-        )
-        == 0
-    )
-    heading, *rows, about = capsys.readouterr().out.splitlines()
+def test_load_command_with_several_rates_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+    command = "drive load can triplet --joints 13 18 30 --hz 50 100 200"
+    assert run_command(command.split()) == 0
+    heading, *rows, note = capsys.readouterr().out.splitlines()
     assert heading.split() == ["joints", "50", "Hz", "100", "Hz", "200", "Hz"]
     for row, joints in zip(rows, (13, 18, 30), strict=True):
         cells = [
@@ -85,27 +68,34 @@ def test_load_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
         ]
         assert [word for word in row.split() if "." in word] == cells
         assert row.count("refused") == sum(float(cell) > 80 for cell in cells)
-    assert "80%" in about
+    assert "80%" in note
 
 
-def test_a_table_of_several_buses_is_of_the_fullest(capsys: pytest.CaptureFixture[str]) -> None:
-    two = 'backend.channels=["can0", "can1"]'
-    assert run(["drive", "load", "can", "triplet", "--set", two, "--joints", "13"]) == 0
-    said = capsys.readouterr().out
-    loaded = load_scenario("triplet", [parse_set_option("backend=can"), parse_set_option(two)])
-    assert f"{100 * max(validate_bus_load(loaded.config, load_can_settings(loaded))):.1f} %" in said
-    assert "the fullest of 2 buses" in said
+def test_load_command_table_shows_the_fullest_bus(capsys: pytest.CaptureFixture[str]) -> None:
+    two_channels = 'backend.channels=["can0", "can1"]'
+    assert (
+        run_command(["drive", "load", "can", "triplet", "--set", two_channels, "--joints", "13"])
+        == 0
+    )
+    output = capsys.readouterr().out
+    loaded = load_scenario(
+        "triplet", [parse_set_option("backend=can"), parse_set_option(two_channels)]
+    )
+    assert (
+        f"{100 * max(validate_bus_load(loaded.config, load_can_settings(loaded))):.1f} %" in output
+    )
+    assert "the fullest of 2 buses" in output
 
 
 @pytest.mark.parametrize(
     "flags", [["--joints", "0"], ["--joints", "63"], ["--hz", "19"], ["--hz", "fast"]]
 )
-def test_load_refuses_what_no_robot_is(
+def test_load_command_with_invalid_joints_or_rate_is_refused(
     flags: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit) as caught:
-        run(["drive", "load", "can", "triplet", *flags])
-    assert caught.value.code == 2
+    with pytest.raises(SystemExit) as exit_info:
+        run_command(["drive", "load", "can", "triplet", *flags])
+    assert exit_info.value.code == 2
     assert flags[1] in capsys.readouterr().err
 
 
@@ -113,22 +103,22 @@ def test_load_refuses_what_no_robot_is(
 
 
 @pytest.mark.slow
-def test_the_dbc_file_needs_a_folder(tmp_path: Path) -> None:
+def test_dbc_command_into_a_file_as_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with raises_error(ConfigError, code="file/not-writable", field="all.dbc"):
-        run(["drive", "dbc", "--out", str(tmp_path / "file" / "all.dbc")])
+        run_command(["drive", "dbc", "--out", str(tmp_path / "file" / "all.dbc")])
 
 
 # --- scan --------------------------------------------------------------------------------------------------
 
 
-def identity(node: int, serial: int) -> CanFrame:
+def make_identity(node: int, serial: int) -> CanFrame:
     return load_layouts()[Opcode.IDENTITY].encode(
         node, serial=serial, firmware_major=1, protocol=1, emulated=1
     )
 
 
-def scanned(*frames_on_bus: CanFrame) -> tuple[list[dict[str, str]], list[CanFrame]]:
+def scan_frames(*frames_on_bus: CanFrame) -> tuple[list[dict[str, str]], list[CanFrame]]:
     """Scan a bus on which these frames arrive, and return the rows of the scan and the frames that it sent."""
     channel = f"scan-{uuid.uuid4().hex[:8]}"
     wire = VirtualWire(channel)
@@ -143,7 +133,9 @@ def scanned(*frames_on_bus: CanFrame) -> tuple[list[dict[str, str]], list[CanFra
 
 
 def test_can_scan_lists_modules_by_node_and_serial() -> None:
-    rows, _ = scanned(identity(62, 0xBEEF), identity(3, 0xCAFE), identity(3, 0xF00D))
+    rows, _ = scan_frames(
+        make_identity(62, 0xBEEF), make_identity(3, 0xCAFE), make_identity(3, 0xF00D)
+    )
     assert [(row["node"], row["serial"]) for row in rows] == [
         ("3", "0000CAFE"),
         ("3", "0000F00D"),
@@ -152,14 +144,14 @@ def test_can_scan_lists_modules_by_node_and_serial() -> None:
 
 
 def test_can_scan_sends_only_requests_for_identities() -> None:
-    _, sent_by_scan = scanned(identity(3, 0xCAFE), heartbeat(3, 1.0))
+    _, sent_by_scan = scan_frames(make_identity(3, 0xCAFE), heartbeat(3, 1.0))
     assert sent_by_scan
     assert set(sent_by_scan) == {make_command(CommandAction.IDENTIFY)}
 
 
 def test_can_scan_of_reporting_module_has_all_values_with_units() -> None:
-    (row,), _ = scanned(
-        identity(3, 0xCAFE),
+    (row,), _ = scan_frames(
+        make_identity(3, 0xCAFE),
         heartbeat(3, 12.34, ModuleState.FAULT, fault_leak=1, fault_voltage=1),
         health(3, voltage=23.9, motor_temperature=41, board_temperature=33),
         load_layouts()[Opcode.SHAFT_LOAD].encode(3, torque=-1.25),
@@ -181,8 +173,8 @@ def test_can_scan_of_reporting_module_has_all_values_with_units() -> None:
     }
 
 
-def test_can_scan_of_module_with_heartbeat_alone_has_state_without_health() -> None:
-    (row,), _ = scanned(identity(62, 0xBEEF), heartbeat(62, 1.0))
+def test_can_scan_of_module_with_heartbeat_alone_has_only_state() -> None:
+    (row,), _ = scan_frames(make_identity(62, 0xBEEF), heartbeat(62, 1.0))
     assert row["state"] == "disarmed"
     assert row["faults"] == "none"
     assert row["voltage"] == UNKNOWN
@@ -190,14 +182,14 @@ def test_can_scan_of_module_with_heartbeat_alone_has_state_without_health() -> N
 
 
 def test_can_scan_table_has_heading_and_one_line_per_module() -> None:
-    rows, _ = scanned(identity(3, 0xCAFE), identity(62, 0xBEEF))
+    rows, _ = scan_frames(make_identity(3, 0xCAFE), make_identity(62, 0xBEEF))
     heading, *lines = align_columns(COLUMNS, rows)
     assert heading.split() == list(COLUMNS)
     assert len(lines) == len(rows) == 2
 
 
 def test_can_scan_of_minimal_module_invents_no_values() -> None:
-    rows, _ = scanned(identity(5, 1), identity(0, 2), identity(63, 3))
+    rows, _ = scan_frames(make_identity(5, 1), make_identity(0, 2), make_identity(63, 3))
     assert [row["node"] for row in rows] == ["0", "5", "63"]
     for row in rows:
         assert {
@@ -205,24 +197,26 @@ def test_can_scan_of_minimal_module_invents_no_values() -> None:
         } == {UNKNOWN}
 
 
-def test_scan_of_an_empty_bus_is_a_failure(capsys: pytest.CaptureFixture[str]) -> None:
+def test_can_scan_of_an_empty_bus_fails(capsys: pytest.CaptureFixture[str]) -> None:
     assert (
-        run(["drive", "scan", "can", f"virtual:scan-{uuid.uuid4().hex[:8]}", "--duration", "0.05"])
+        run_command(
+            ["drive", "scan", "can", f"virtual:scan-{uuid.uuid4().hex[:8]}", "--duration", "0.05"]
+        )
         == 1
     )
     assert "no module answers" in capsys.readouterr().out
 
 
-def test_scan_of_an_interface_that_is_not_there() -> None:
+def test_can_scan_of_missing_interface_is_refused() -> None:
     with raises_error(ConfigError, code="bus/not-available"):
-        run(["drive", "scan", "can", "nocan7"])
+        run_command(["drive", "scan", "can", "nocan7"])
 
 
 def test_can_scan_of_foreign_bus_names_it_and_sends_nothing(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     channel = f"scan-{uuid.uuid4().hex[:8]}"
-    theirs = [
+    foreign_messages = [
         can.Message(arbitration_id=0x705, data=b"\x05", is_extended_id=False),
         can.Message(
             arbitration_id=0x061, data=bytes([0, 0, 0, 0, 8, 0, 0, 0]), is_extended_id=False
@@ -232,25 +226,29 @@ def test_can_scan_of_foreign_bus_names_it_and_sends_nothing(
         to_python_can(heartbeat(4, 1.0)),
     ]
     with can.Bus(interface="virtual", channel=channel) as bus:
-        chatter = [bus.send_periodic(message, 0.01) for message in theirs]
-        said_no = run(["drive", "scan", "can", f"virtual:{channel}", "--duration", "0.05"])
-        assert bus.recv(0) is None, "something was sent"
+        periodic_tasks = [bus.send_periodic(message, 0.01) for message in foreign_messages]
+        exit_code = run_command(
+            ["drive", "scan", "can", f"virtual:{channel}", "--duration", "0.05"]
+        )
+        assert bus.recv(0) is None, "the scan sent a frame"
         assert (
-            run(["drive", "scan", "can", f"virtual:{channel}", "--duration", "0.05", "--anyway"])
+            run_command(
+                ["drive", "scan", "can", f"virtual:{channel}", "--duration", "0.05", "--anyway"]
+            )
             == 1
         )
-        heard = [bus.recv(0.5)]
-        for task in chatter:
+        received = [bus.recv(0.5)]
+        for task in periodic_tasks:
             task.stop()
-    assert said_no == 1
-    assert heard[0] is not None
-    said = capsys.readouterr().out
-    for line in (
+    assert exit_code == 1
+    assert received[0] is not None
+    output = capsys.readouterr().out
+    for pattern in (
         r"virtual:\S+: others use this bus, and nothing was sent; .*--anyway",
         r"  0x061  8 B  \d+ frames  as ODrive's heartbeat of node 3\n",
         r"  0x705  1 B  \d+ frames  as CANopen's heartbeat of node 5, operational\n",
         r"  0x7FF  3 B  \d+ frames  unknown\n",
         r"  0x01234567  8 B  \d+ frames  29-bit id\n",
     ):
-        assert re.search(line, said), f"{line} is not in {said}"
-    assert "0x1C4" not in said  # a heartbeat of ours
+        assert re.search(pattern, output), f"{pattern} is not in {output}"
+    assert "0x1C4" not in output  # a heartbeat of a joint module

@@ -1,4 +1,4 @@
-"""What a scenario's [backends.can] section may say, beyond what tests/unit/hal/model/test_files.py has of any file."""
+"""The section [backends.can] of a scenario. tests/unit/hal/model/test_files.py tests what holds for every file."""
 
 from typing import Any
 
@@ -11,12 +11,12 @@ from snakesim_hal.model.files import ConfigTable, decode_table
 from snakesim_testing.messages import raises_error
 
 
-def read(section: dict[str, Any]) -> CanSettings:
+def read_settings(section: dict[str, Any]) -> CanSettings:
     return decode_table(ConfigTable(section, "crawl.toml", {}), CanSettings, "backends.can")
 
 
 @pytest.mark.parametrize(
-    ("section", "where"),
+    ("section", "place"),
     [
         ({}, "here"),
         ({"channels": ["can0"]}, "none"),
@@ -24,8 +24,8 @@ def read(section: dict[str, Any]) -> CanSettings:
         ({"channels": ["can0"], "emulators": "process"}, "process"),
     ],
 )
-def test_can_settings_choose_where_emulators_run(section: dict[str, Any], where: str) -> None:
-    assert read(section).emulators_run == where
+def test_can_settings_choose_where_emulators_run(section: dict[str, Any], place: str) -> None:
+    assert read_settings(section).emulators_run == place
 
 
 @pytest.mark.parametrize(
@@ -45,10 +45,10 @@ def test_can_settings_bad_value_is_named_with_file_and_expectation(key: str, val
         field=("crawl.toml", f"backends.can.{key}"),
         value=value,
     ):
-        read({key: value})
+        read_settings({key: value})
 
 
-def test_the_watchdog_goes_as_far_as_modules_let_it() -> None:
+def test_can_settings_watchdog_has_the_range_of_the_modules() -> None:
     allowed = PARAMETERS[ModuleParameter.WATCHDOG]
     for value in (allowed.low, allowed.high):
-        assert read({"watchdog_s": value}).watchdog_s == value
+        assert read_settings({"watchdog_s": value}).watchdog_s == value

@@ -1,4 +1,4 @@
-"""Every code that is used is explained, every explained code is used, and docs/reference/errors.md is current."""
+"""Every used code is in a registry, every registered code is used, and docs/reference/errors.md is current."""
 
 import ast
 import re
@@ -16,7 +16,7 @@ from snakesim_hal.base.terminal import run_tool
 
 REPOSITORY = Path(__file__).parents[3]
 REGISTRIES = ("error_codes.py", "fault_codes.py")
-MODULE_FAULTS = {  # made of the names of fault bits and states
+MODULE_FAULTS = {  # composed from the names of fault bits and states
     *(f"module_{fault.name.lower()}" for fault in ModuleFault),
     "module_fault",
     "module_emergency",
@@ -24,7 +24,7 @@ MODULE_FAULTS = {  # made of the names of fault bits and states
 
 
 CODE_NODES = (ast.Assign, ast.Call, ast.Constant, ast.FunctionDef, ast.keyword)
-# A file without any of these words holds no code of an error, and no fault; parsing all files takes seconds.
+# A file without any of these words contains no code. Parsing all files takes seconds.
 CODE_WORDS = (
     "code=",
     "code =",
@@ -38,7 +38,7 @@ CODE_WORDS = (
 
 
 def iterate_nodes() -> Iterator[ast.AST]:
-    """Every node of the product's source that may hold a code."""
+    """Yield the nodes of the source of the product that may contain a code."""
     for path in sorted(REPOSITORY.glob("snakesim*/**/*.py")):
         if path.name in REGISTRIES or path.parts[len(REPOSITORY.parts)] == "snakesim_testing":
             continue
@@ -50,15 +50,16 @@ def iterate_nodes() -> Iterator[ast.AST]:
 
 
 def find_texts(node: ast.AST) -> set[str]:
+    """Return all string literals in a node."""
     return {
-        part.value
-        for part in ast.walk(node)
-        if isinstance(part, ast.Constant) and isinstance(part.value, str)
+        child.value
+        for child in ast.walk(node)
+        if isinstance(child, ast.Constant) and isinstance(child.value, str)
     }
 
 
 def find_codes(nodes: list[ast.AST]) -> Iterator[str]:
-    """The texts that `code` is set to: as an argument, as a default of a class, as a constant, or returned."""
+    """Yield the texts of `code`: arguments, defaults of classes, constants, and returned values."""
     for node in nodes:
         match node:
             case (
@@ -78,12 +79,12 @@ def nodes() -> list[ast.AST]:
     return list(iterate_nodes())
 
 
-def test_codes_of_errors_are_those_of_the_registry(nodes: list[ast.AST]) -> None:
+def test_error_codes_in_source_equal_the_registry(nodes: list[ast.AST]) -> None:
     used = {code for code in find_codes(nodes) if re.fullmatch(r"[a-z0-9]+/[a-z-]+", code)}
     assert used == set(ERROR_CODES)
 
 
-def test_faults_are_those_of_the_registry(nodes: list[ast.AST]) -> None:
+def test_fault_codes_in_source_equal_the_registry(nodes: list[ast.AST]) -> None:
     constants = [node.value for node in nodes if isinstance(node, ast.Constant)]
     texts = {value for value in constants if isinstance(value, str)}
     assert set(FAULT_CODES) - texts <= MODULE_FAULTS
@@ -108,7 +109,7 @@ def test_faults_are_those_of_the_registry(nodes: list[ast.AST]) -> None:
     assert used <= set(FAULT_CODES)
 
 
-def test_every_class_has_a_default_that_is_explained() -> None:
+def test_error_classes_have_registered_default_codes() -> None:
     classes = [
         value
         for value in vars(errors).values()
@@ -118,13 +119,13 @@ def test_every_class_has_a_default_that_is_explained() -> None:
     assert all(error_type.code in ERROR_CODES for error_type in classes)
 
 
-def test_entries_are_sentences() -> None:
+def test_registry_entries_are_sentences() -> None:
     for code, entry in [*ERROR_CODES.items(), *FAULT_CODES.items(), *REFUSAL_CODES.items()]:
         texts = (entry.title, entry.cause, entry.remedy)
         assert all(text.endswith(".") and "|" not in text for text in texts), code
 
 
-def test_linked_pages_exist_and_name_the_code() -> None:
+def test_registry_links_pages_that_contain_the_code() -> None:
     docs = PAGE.parents[1]
     linked = {
         code: entry.page
@@ -142,11 +143,11 @@ def test_linked_pages_exist_and_name_the_code() -> None:
     )
 
 
-def test_the_page_is_current() -> None:
+def test_error_page_is_current() -> None:
     assert PAGE.read_text(encoding="utf-8") == make_page(), "run `make schemas`"
 
 
-def test_the_code_ends_the_first_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_error_code_ends_the_first_line_of_a_message(capsys: pytest.CaptureFixture[str]) -> None:
     def fail() -> int:
         raise errors.RefusedError("choose one:", "  a", code="network/several-robots")
 

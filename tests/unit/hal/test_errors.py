@@ -1,4 +1,4 @@
-"""An exception of a plugin is described by the line that its author has written."""
+"""An exception of a plugin is described with the line of the plugin, and not with a line of a library."""
 
 import re
 from pathlib import Path
@@ -12,15 +12,15 @@ from snakesim_hal.base.errors import describe_exception
 PLUGIN = "import numpy as np\n\n\ndef solve():\n    return np.linalg.solve(np.zeros((2, 2)), np.ones(2))\n"
 
 
-def described(folder: Path, package: str) -> str:
-    """What is said of an exception within NumPy, called by `mine.plugin` in this folder."""
+def describe_plugin_error(folder: Path, package: str) -> str:
+    """Return the description of an exception in NumPy, which `mine.plugin` in this folder calls."""
     folder.mkdir()
-    names: dict[str, Any] = {"__name__": "mine.plugin"}
-    exec(compile(PLUGIN, str(folder / "plugin.py"), "exec"), names)
-    with pytest.raises(np.linalg.LinAlgError) as caught:
-        names["solve"]()
-    # Without this test's own line.
-    return describe_exception(caught.value.with_traceback(caught.tb.tb_next), package)
+    namespace: dict[str, Any] = {"__name__": "mine.plugin"}
+    exec(compile(PLUGIN, str(folder / "plugin.py"), "exec"), namespace)
+    with pytest.raises(np.linalg.LinAlgError) as raised:
+        namespace["solve"]()
+    # The traceback begins after the line of this test.
+    return describe_exception(raised.value.with_traceback(raised.tb.tb_next), package)
 
 
 @pytest.mark.parametrize(
@@ -35,5 +35,5 @@ def described(folder: Path, package: str) -> str:
 def test_error_location_is_plugin_line_and_not_of_numpy(
     tmp_path: Path, folder: str, package: str, place: str
 ) -> None:
-    said = described(tmp_path / folder, package)
-    assert re.fullmatch(rf"raised LinAlgError: Singular matrix \({place}\)", said)
+    description = describe_plugin_error(tmp_path / folder, package)
+    assert re.fullmatch(rf"raised LinAlgError: Singular matrix \({place}\)", description)

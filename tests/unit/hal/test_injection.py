@@ -1,4 +1,4 @@
-"""The vocabulary of faults on request: texts, who carries what out, and the order of time."""
+"""Injected faults: their texts, the process that executes each, and their order in time."""
 
 from math import inf
 
@@ -11,6 +11,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import (
     FAULT_KINDS,
     FaultInjection,
+    FaultTransition,
     InjectionPlan,
     describe_fault_kinds,
     parse_injection,
@@ -36,35 +37,38 @@ TARGETS = {
     "simulator": ["simulator"],
     "clock": ["clock"],
 }
-seconds = st.floats(0.0, 1e4).map(lambda s: round(s, 2))
+times_s = st.floats(0.0, 1e4).map(lambda s: round(s, 2))
 
 
 @st.composite
-def injections(draw: st.DrawFn) -> FaultInjection:
-    sort = draw(st.sampled_from(sorted(FAULT_KINDS)))
-    name = draw(st.sampled_from(sorted(FAULT_KINDS[sort])))
-    start_s = draw(seconds)
-    end_s = draw(st.one_of(st.just(inf), seconds.map(lambda s: round(start_s + s + 0.01, 2))))
-    amount = FAULT_KINDS[sort][name].amount
-    drawn = (
+def draw_injection(draw: st.DrawFn) -> FaultInjection:
+    """Draw any valid fault injection."""
+    target_type = draw(st.sampled_from(sorted(FAULT_KINDS)))
+    name = draw(st.sampled_from(sorted(FAULT_KINDS[target_type])))
+    start_s = draw(times_s)
+    end_s = draw(st.one_of(st.just(inf), times_s.map(lambda s: round(start_s + s + 0.01, 2))))
+    amount = FAULT_KINDS[target_type][name].amount
+    drawn_amount = (
         None
         if amount is None
         else draw(st.sampled_from([amount.min_value, amount.default, amount.max_value]))
     )
-    return FaultInjection(name, draw(st.sampled_from(TARGETS[sort])), start_s, end_s, drawn)
+    return FaultInjection(
+        name, draw(st.sampled_from(TARGETS[target_type])), start_s, end_s, drawn_amount
+    )
 
 
-@given(injections())
-def test_texts_go_both_ways(injection: FaultInjection) -> None:
-    there = parse_injection(str(injection))
-    assert str(there) == str(injection)
-    assert there.kind == injection.kind
-    assert there.target == injection.target
-    assert there.executing_part == injection.executing_part
-    assert there.kind_info is FAULT_KINDS[there.target_type][there.kind]
+@given(draw_injection())
+def test_injection_text_is_parsed_and_formatted(injection: FaultInjection) -> None:
+    parsed = parse_injection(str(injection))
+    assert str(parsed) == str(injection)
+    assert parsed.kind == injection.kind
+    assert parsed.target == injection.target
+    assert parsed.executing_part == injection.executing_part
+    assert parsed.kind_info is FAULT_KINDS[parsed.target_type][parsed.kind]
 
 
-def test_an_amount_that_is_left_out_is_the_usual_one() -> None:
+def test_injection_without_amount_has_the_default() -> None:
     assert parse_injection("drop:sensor/joints@1").amount == 1.0
     assert parse_injection("delay:sensor/joints@1").amount == 0.05
     assert parse_injection("mute:joint_2@1").amount is None
@@ -88,11 +92,11 @@ def test_an_amount_that_is_left_out_is_the_usual_one() -> None:
         ("drop:hal/done/navigation@1", "navigation"),
     ],
 )
-def test_everything_has_a_part_that_carries_it_out(text: str, part: str) -> None:
+def test_injection_names_the_part_that_executes_it(text: str, part: str) -> None:
     assert parse_injection(text).executing_part == part
 
 
-def test_what_is_not_there_cannot_go_wrong() -> None:
+def test_injection_into_a_missing_target_is_refused() -> None:
     validate_injection_targets(
         [parse_injection("mute:joint_13@1"), parse_injection("kill:host@1")],
         services=["control"],
@@ -108,31 +112,40 @@ def test_what_is_not_there_cannot_go_wrong() -> None:
         )
 
 
-def test_a_request_is_checked_like_a_text() -> None:
+def test_injection_request_is_checked_like_a_text() -> None:
     assert validate_and_complete_injection(FaultInjection("drop", keys.JOINTS)).amount == 1.0
     with raises_error(ConfigError, code="injection/unknown-fault"):
         validate_and_complete_injection(FaultInjection("mute", "control"), "mute control")
 
 
-@given(st.lists(injections(), max_size=8), st.lists(seconds, max_size=8))
+@given(st.lists(draw_injection(), max_size=8), st.lists(times_s, max_size=8))
 def test_injection_plan_yields_each_change_once_in_time_order(
-    given_: list[FaultInjection], looks: list[float]
+    planned: list[FaultInjection], poll_times_s: list[float]
 ) -> None:
-    plan, seen = InjectionPlan(given_), []
-    for now_s in [*sorted(looks), inf]:
+    plan = InjectionPlan(planned)
+    changes: list[FaultTransition] = []
+    for now_s in [*sorted(poll_times_s), inf]:
         due = plan.pop_due_transitions(now_s)
         assert (
             all(change.time_s <= now_s for change in due) and plan.next_transition_s() > now_s
         ) or now_s == inf
-        seen += due
-    assert [change.time_s for change in seen] == sorted(change.time_s for change in seen)
-    ends = [i for i in given_ if i.end_s != inf and not i.kind_info.is_instantaneous]
-    assert sorted(str(c.injection) for c in seen if c.is_start) == sorted(map(str, given_))
-    assert sorted(str(c.injection) for c in seen if not c.is_start) == sorted(map(str, ends))
+        changes += due
+    assert [change.time_s for change in changes] == sorted(change.time_s for change in changes)
+    ends = [
+        planned_fault
+        for planned_fault in planned
+        if planned_fault.end_s != inf and not planned_fault.kind_info.is_instantaneous
+    ]
+    assert sorted(str(change.injection) for change in changes if change.is_start) == sorted(
+        map(str, planned)
+    )
+    assert sorted(str(change.injection) for change in changes if not change.is_start) == sorted(
+        map(str, ends)
+    )
     assert plan.next_transition_s() == inf
 
 
-def test_help_explains_every_kind() -> None:
+def test_injection_help_explains_every_kind() -> None:
     for kinds in FAULT_KINDS.values():
         for name, kind in kinds.items():
             assert name in summarize_fault_kinds()
@@ -140,19 +153,20 @@ def test_help_explains_every_kind() -> None:
             assert kind.description in describe_fault_kinds()
 
 
-def test_the_page_has_every_kind() -> None:
+def test_injection_page_has_every_kind() -> None:
     assert PAGE.read_text(encoding="utf-8") == make_page(), (
         "run `make schemas` and commit what it changes"
     )
 
 
-# --- of a run ------------------------------------------------------------------------------------------------
+# --- planned faults of a run -----------------------------------------------------------------------------------
 
 
-def test_a_runs_plan_names_the_entry_that_is_wrong() -> None:
-    assert [str(i) for i in parse_planned_faults(make_run_config(faults=["mute:joint_1@1"]))] == [
-        "mute:joint_1@1"
-    ]
+def test_injection_plan_with_invalid_entry_is_refused_by_entry() -> None:
+    assert [
+        str(planned_fault)
+        for planned_fault in parse_planned_faults(make_run_config(faults=["mute:joint_1@1"]))
+    ] == ["mute:joint_1@1"]
     with raises_error(ConfigError, code="injection/unknown-fault", field="crawl"):
         parse_planned_faults(make_run_config(faults=["mute:joint_1@1", "mute"]))
     with raises_error(ConfigError, code="injection/unknown-target", field="faults[0]"):
@@ -162,7 +176,7 @@ def test_a_runs_plan_names_the_entry_that_is_wrong() -> None:
     )
 
 
-def test_a_backend_is_not_asked_for_what_it_cannot_do() -> None:
+def test_injection_that_a_backend_does_not_support_is_refused() -> None:
     backend = {"supported_kinds": ("leak",), "bus_count": 1, "reason": "it is a toy"}
     validate_faults_for_backend(
         make_run_config(faults=["leak:joint_1@1", "mute:joint_1@1", "slow:simulator@1"]), **backend

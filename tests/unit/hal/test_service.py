@@ -1,4 +1,4 @@
-"""The loop around a service: when it says that it is there, and what it waits for."""
+"""The loop of a service publishes what it waits for, and answers ticks when it has all inputs."""
 
 from typing import Any
 
@@ -17,13 +17,14 @@ from snakesim_testing.hal.foreign_samples import CLOCK, ROBOT
 from snakesim_testing.hal.small_robots import make_joint_state, make_run_config
 
 
-class Undemanding(Service):
-    """Answers whether it has joints or not."""
+class UndemandingService(Service):
+    """A service that reads joint states, but does not need them."""
 
     name = "navigation"
 
     def __init__(self, client: Any, config: Any) -> None:
-        self.client, self.joints = client, client.subscribe(keys.JOINTS, JointState)
+        self.client = client
+        self.joints = client.subscribe(keys.JOINTS, JointState)
 
     def configure(self, robot: RobotDescription) -> None: ...
 
@@ -32,27 +33,25 @@ class Undemanding(Service):
         return []
 
 
-def test_service_waits_for_the_joints_before_it_answers_ticks() -> None:
+def test_service_waits_for_joint_states_before_it_answers_ticks() -> None:
     network = LocalNetwork()
     hal = network.create_session()
     hal.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(ROBOT)
-    clocks, felt = (
-        hal.declare_publisher(keys.CLOCK, Clock),
-        hal.declare_publisher(keys.JOINTS, JointState),
-    )
-    done = hal.declare_reader(keys.done_key("navigation"), TickDone)
+    clock_publisher = hal.declare_publisher(keys.CLOCK, Clock)
+    joint_publisher = hal.declare_publisher(keys.JOINTS, JointState)
+    done_reader = hal.declare_reader(keys.done_key("navigation"), TickDone)
     loop = ServiceLoop(
-        Undemanding, make_run_config(clock_mode=CLOCK.clock_mode), network.create_session()
+        UndemandingService, make_run_config(clock_mode=CLOCK.clock_mode), network.create_session()
     )
-    clocks.put(CLOCK)
+    clock_publisher.put(CLOCK)
     loop.connect()
-    entries = hal.declare_latched_reader(keys.PROCESS_ALL, ProcessInfo)
+    process_reader = hal.declare_latched_reader(keys.PROCESS_ALL, ProcessInfo)
     loop.step()
-    assert done.drain() == []
-    assert entries.drain()[-1].waits_for == [keys.JOINTS]
-    felt.put(make_joint_state(ROBOT, 0.1, tick=CLOCK.tick))
-    clocks.put(CLOCK)
+    assert done_reader.drain() == []
+    assert process_reader.drain()[-1].waits_for == [keys.JOINTS]
+    joint_publisher.put(make_joint_state(ROBOT, 0.1, tick=CLOCK.tick))
+    clock_publisher.put(CLOCK)
     loop.step()
-    assert [one.tick for one in done.drain()] == [CLOCK.tick]
-    assert entries.drain()[-1].waits_for == []
+    assert [answer.tick for answer in done_reader.drain()] == [CLOCK.tick]
+    assert process_reader.drain()[-1].waits_for == []
     loop.close()

@@ -1,4 +1,4 @@
-"""What a tool prints: nothing that came from outside steers the terminal, and JSON stays JSON."""
+"""Printed text contains no characters that control the terminal, and JSON remains valid."""
 
 import ast
 import json
@@ -14,13 +14,13 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import escape_invisible, overwrite_line, print_line, report_error
 
 REPOSITORY = Path(__file__).parents[3]
-# Control, format (bidirectional overrides too), surrogates, separators.
-STEERING = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+# Categories of control, format (also bidirectional overrides), surrogate and separator characters.
+CONTROL_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
 
-def test_every_character_that_could_steer_is_shown_as_an_escape() -> None:
+def test_terminal_control_characters_are_printed_as_escapes() -> None:
     for code in range(sys.maxunicode + 1):
-        if unicodedata.category(chr(code)) in STEERING:
+        if unicodedata.category(chr(code)) in CONTROL_CATEGORIES:
             assert escape_invisible(f"a{chr(code)}b").isascii(), hex(code)
     assert (
         escape_invisible("\x1b[2J\x9b31m\r\n\u202eoff")
@@ -32,11 +32,11 @@ def test_every_character_that_could_steer_is_shown_as_an_escape() -> None:
 
 
 @given(st.text())
-def test_a_json_text_that_is_printed_stays_one(text: str) -> None:
+def test_terminal_escaped_json_is_still_valid_json(text: str) -> None:
     value = {text: [text]}
-    shown = escape_invisible(json.dumps(value, ensure_ascii=False))
-    assert json.loads(shown) == value
-    assert "\n" not in shown
+    printed = escape_invisible(json.dumps(value, ensure_ascii=False))
+    assert json.loads(printed) == value
+    assert "\n" not in printed
 
 
 def test_terminal_output_has_no_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,7 +52,7 @@ def test_terminal_output_has_no_control_characters(capsys: pytest.CaptureFixture
 
 
 def test_terminal_streams_are_never_written_directly() -> None:
-    """`make check` refuses `print`; nor does anything write to the streams directly."""
+    """Find writes to the streams. `make check` refuses `print`."""
     for package in REPOSITORY.glob("snakesim*"):
         for path in package.rglob("*.py"):
             text = path.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""A serial port as an adapter has it: its latency, nobody else on it, and unplugged."""
+"""The serial port of an adapter: its latency, exclusive access, and an adapter that is unplugged."""
 
 from pathlib import Path
 
@@ -10,17 +10,18 @@ from snakesim_serial_backend.wire import USB_LATENCY_S, PseudoTerminal, SerialWi
 from snakesim_testing.messages import raises_error
 
 
-def test_the_latency_timer_is_the_adapters(tmp_path: Path) -> None:
-    timer = tmp_path / "sys/class/tty/ttyUSB0/device/latency_timer"
-    timer.parent.mkdir(parents=True)
-    timer.write_text("16\n")
+def test_latency_is_read_from_the_timer_of_the_adapter(tmp_path: Path) -> None:
+    timer_file = tmp_path / "sys/class/tty/ttyUSB0/device/latency_timer"
+    timer_file.parent.mkdir(parents=True)
+    timer_file.write_text("16\n")
     assert latency_s("/dev/ttyUSB0", tmp_path) == 0.016
-    assert latency_s("/dev/ttyACM0", tmp_path) == USB_LATENCY_S, "not said"
+    assert latency_s("/dev/ttyACM0", tmp_path) == USB_LATENCY_S, "the adapter reports no latency"
     assert latency_s("/dev/pts/3", tmp_path) == 0.0
 
 
 def test_serial_port_is_exclusive_and_late_bytes_are_discarded(tmp_path: Path) -> None:
-    pty, log = PseudoTerminal(), tmp_path / "bytes.txt"
+    pty = PseudoTerminal()
+    log = tmp_path / "bytes.txt"
     with log.open("w") as file:
         wire = SerialWire(pty.path, 1_000_000, file)
         with raises_error(BackendError, code="bus/cannot-open"):
@@ -49,7 +50,7 @@ def test_serial_port_is_exclusive_and_late_bytes_are_discarded(tmp_path: Path) -
     pty.close()
 
 
-def test_an_adapter_that_is_pulled_is_said_and_no_exception() -> None:
+def test_serial_port_of_unplugged_adapter_reports_an_error() -> None:
     pty = PseudoTerminal()
     wire = SerialWire(pty.path, 57600)
     pty.close()
@@ -61,7 +62,7 @@ def test_an_adapter_that_is_pulled_is_said_and_no_exception() -> None:
     wire.close()
 
 
-def test_a_port_that_is_not_there_is_named() -> None:
+def test_missing_serial_port_is_refused_by_name() -> None:
     with raises_error(ConfigError, code="bus/not-available", field="/dev/ttyUSB77"):
         SerialWire("/dev/ttyUSB77", 57600)
 
@@ -71,11 +72,11 @@ def test_serial_port_survives_a_pause_of_the_computer(monkeypatch: pytest.Monkey
     wire = SerialWire(pty.path, 1_000_000)
     write = serial.Serial.write
 
-    def pauses(port: serial.Serial, data: bytes) -> None:
+    def write_with_timeout(port: serial.Serial, data: bytes) -> None:
         write(port, data)
         raise serial.SerialTimeoutException("Write timeout")
 
-    monkeypatch.setattr(serial.Serial, "write", pauses)
+    monkeypatch.setattr(serial.Serial, "write", write_with_timeout)
     wire.send(b"hello?")
     assert wire.error() == ""
     monkeypatch.undo()

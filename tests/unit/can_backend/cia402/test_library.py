@@ -1,4 +1,4 @@
-"""Our CANopen against the PyPI library `canopen`: it is a second master of the emulated drives, and a drive of ours."""
+"""The PyPI library `canopen` commands our emulated drives, and our driver commands drives of the library."""
 
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -35,23 +35,24 @@ EDS = str(BUNDLED)
 
 
 class LibraryWire:
-    """Our end of a bus whose other end is a network of the library, in the same thread and without waiting."""
+    """A bus between our code and a network of the library. Frames are delivered immediately, in the same thread."""
 
     channel = "library"
 
     def __init__(self) -> None:
         self.network = LibraryNetwork(self)
-        self.arrived: list[CanFrame] = []
-        self.when_sent: Callable[[CanFrame], None] = lambda _frame: None
-        self.when_arrived: Callable[[], None] = lambda: None
+        self.received_frames: list[CanFrame] = []
+        self.on_sent: Callable[[CanFrame], None] = lambda _frame: None
+        self.on_received: Callable[[], None] = lambda: None
 
     def send(self, frame: CanFrame) -> bool:
         self.network.notify(frame.id, bytearray(frame.data), 0.0)
-        self.when_sent(frame)
+        self.on_sent(frame)
         return True
 
     def receive(self) -> list[CanFrame]:
-        frames, self.arrived = self.arrived, []
+        frames = self.received_frames
+        self.received_frames = []
         return frames
 
     def errors(self) -> list[Any]:
@@ -61,7 +62,7 @@ class LibraryWire:
         return None
 
     def idle(self) -> float | None:
-        return 0.0 if self.arrived else None
+        return 0.0 if self.received_frames else None
 
     def inject(self, kind: str, *, begins: bool) -> None:
         raise NotImplementedError(kind, begins)
@@ -71,7 +72,7 @@ class LibraryWire:
 
 
 class LibraryNetwork(canopen.Network):
-    """A network whose frames are sent to our end."""
+    """A network of the library that delivers its frames to our end of the wire."""
 
     def __init__(self, wire: LibraryWire) -> None:
         super().__init__()
@@ -79,8 +80,8 @@ class LibraryNetwork(canopen.Network):
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         assert not remote
-        self._wire.arrived.append(CanFrame(can_id, bytes(data)))
-        self._wire.when_arrived()
+        self._wire.received_frames.append(CanFrame(can_id, bytes(data)))
+        self._wire.on_received()
 
     def send_periodic(self, can_id: int, data: bytes, period: float, remote: bool = False) -> Any:
         """Send nothing: a heartbeat would need a thread."""
@@ -88,7 +89,7 @@ class LibraryNetwork(canopen.Network):
         return SimpleNamespace(stop=lambda: None, update=lambda _data: None)
 
 
-class Master:
+class LibraryMaster:
     """The library as the master of our emulated drives."""
 
     def __init__(self) -> None:
@@ -98,7 +99,7 @@ class Master:
         self.emulator: Any = Cia402Backend.make_emulator(
             CONFIG, settings, [self.wire], self.clock, None
         )
-        self.wire.when_arrived = self.emulator
+        self.wire.on_received = self.emulator
         self.node: Any = BaseNode402(1, EDS)
         self.wire.network.add_node(self.node)
         self.pass_time(0.02)
@@ -112,74 +113,75 @@ class Master:
         self.emulator()
 
     def enable(self, mode: str) -> None:
+        """Enable the drive in an operation mode."""
         self.node.sdo["Modes of operation"].raw = OperationMode.NAME2CODE[mode]
         self.node.state = "OPERATION ENABLED"
 
 
 @pytest.fixture
-def master() -> Iterator[Master]:
-    one = Master()
-    yield one
-    one.emulator.close()
+def master() -> Iterator[LibraryMaster]:
+    opened = LibraryMaster()
+    yield opened
+    opened.emulator.close()
 
 
-def test_states_and_commands_are_those_of_the_library() -> None:
+def test_states_and_controlwords_equal_those_of_the_library() -> None:
     for name, (_, bits) in State402.SW_MASK.items():
-        ours = decode_statusword(bits)
-        assert ours.value.upper().removesuffix(" ACTIVE") == name.removesuffix(" ACTIVE"), name
-        assert decode_statusword(bits | 0xFF90) == ours, "bits that do not belong to the state"
-    assert {ControlwordCommand(word) for word in State402.CW_CODE_COMMANDS} == set(
+        state = decode_statusword(bits)
+        assert state.value.upper().removesuffix(" ACTIVE") == name.removesuffix(" ACTIVE"), name
+        assert decode_statusword(bits | 0xFF90) == state, "bits that do not belong to the state"
+    assert {ControlwordCommand(controlword) for controlword in State402.CW_CODE_COMMANDS} == set(
         ControlwordCommand
     )
 
 
-def test_abort_codes_and_errors_are_those_of_the_library() -> None:
+def test_abort_codes_and_error_texts_equal_those_of_the_library() -> None:
     assert set(ABORTS) <= set(SdoAbortedError.CODES)
     for code in (0x2310, 0x3210, 0x4210, 0x8130):
-        theirs = EmcyError(code, 0, b"", 0.0).get_desc().lower()
-        assert theirs.split()[0] in describe_error(code) or theirs == "monitoring"
+        library_text = EmcyError(code, 0, b"", 0.0).get_desc().lower()
+        assert library_text.split()[0] in describe_error(code) or library_text == "monitoring"
 
 
 def test_bundled_eds_is_read_equally_by_the_library() -> None:
-    theirs = canopen.import_od(EDS, 5)
-    ours = read_eds(EDS)
-    for (index, sub), described in ours.objects.items():
-        found: Any = theirs[index]
-        variable: Any = found if isinstance(found, ODVariable) else found[sub]
-        assert described.size == SIZES[variable.data_type], variable.name
-        assert described.mappable == variable.pdo_mappable, variable.name
-        assert described.default_value(5) == (variable.default or 0), variable.name
-    device: Any = theirs.device_information
-    assert (ours.vendor, ours.product) == (device.vendor_number, device.product_number)
+    library_objects = canopen.import_od(EDS, 5)
+    our_eds = read_eds(EDS)
+    for (index, sub), our_object in our_eds.objects.items():
+        entry: Any = library_objects[index]
+        variable: Any = entry if isinstance(entry, ODVariable) else entry[sub]
+        assert our_object.size == SIZES[variable.data_type], variable.name
+        assert our_object.mappable == variable.pdo_mappable, variable.name
+        assert our_object.default_value(5) == (variable.default or 0), variable.name
+    device: Any = library_objects.device_information
+    assert (our_eds.vendor, our_eds.product) == (device.vendor_number, device.product_number)
 
 
-def test_every_object_of_the_driver_has_the_type_of_the_eds() -> None:
-    theirs = canopen.import_od(EDS, 5)
+def test_object_entries_of_driver_have_the_types_of_the_eds() -> None:
+    library_objects = canopen.import_od(EDS, 5)
     for entry in vars(objects).values():
         if not isinstance(entry, objects.ObjectEntry):
             continue
-        found: Any = theirs[entry.index]
-        variable: Any = found if isinstance(found, ODVariable) else found[entry.sub]
+        described: Any = library_objects[entry.index]
+        variable: Any = described if isinstance(described, ODVariable) else described[entry.sub]
         assert (variable.data_type in (2, 3, 4)) == entry.format.islower(), entry.name
         assert SIZES[variable.data_type] == entry.size, entry.name
 
 
-def test_library_reads_identity_and_limits_of_an_emulated_drive(master: Master) -> None:
+def test_library_reads_identity_and_limits_of_an_emulated_drive(master: LibraryMaster) -> None:
     sdo = master.node.sdo
     assert sdo[0x1000].raw & 0xFFFF == 402
     assert sdo["Identity object"]["Serial number"].raw == 0x4020_0001
     assert master.node.is_op_mode_supported("CYCLIC SYNCHRONOUS POSITION")
     rated_nm = sdo["Motor rated torque"].raw / 1000
     assert rated_nm * sdo["Max torque"].raw / 1000 == pytest.approx(CONFIG.robot.limits.torque_nm)
-    with pytest.raises(SdoAbortedError) as refused:
+    with pytest.raises(SdoAbortedError) as refusal:
         sdo.download(0x6041, 0, b"\0\0")
-    assert refused.value.code == 0x0601_0002
-    with pytest.raises(SdoAbortedError) as missing:
+    assert refusal.value.code == 0x0601_0002
+    with pytest.raises(SdoAbortedError) as missing_object:
         sdo.upload(0x6099, 1)
-    assert missing.value.code == 0x0602_0000
+    assert missing_object.value.code == 0x0602_0000
 
 
-def test_library_leads_an_emulated_drive_through_its_states(master: Master) -> None:
+def test_library_enables_and_stops_an_emulated_drive(master: LibraryMaster) -> None:
     master.enable("CYCLIC SYNCHRONOUS TORQUE")
     assert master.drive.state == PowerState.ENABLED
     master.node.sdo["Target torque"].raw = 100
@@ -191,7 +193,7 @@ def test_library_leads_an_emulated_drive_through_its_states(master: Master) -> N
     assert master.node.sdo["Torque actual value"].raw == 0
 
 
-def test_library_maps_pdos_and_receives_them_after_sync(master: Master) -> None:
+def test_library_maps_pdos_and_receives_them_after_sync(master: LibraryMaster) -> None:
     node = master.node
     node.nmt.state = "PRE-OPERATIONAL"
     pdo = node.tpdo[1]
@@ -206,13 +208,15 @@ def test_library_maps_pdos_and_receives_them_after_sync(master: Master) -> None:
     received: list[int] = []
     pdo.add_callback(lambda mapping: received.append(mapping["Statusword"].raw))
     master.wire.network.sync.transmit()
-    assert [decode_statusword(word) for word in received] == [PowerState.SWITCH_ON_DISABLED]
-    with pytest.raises(SdoAbortedError) as refused:
+    assert [decode_statusword(statusword) for statusword in received] == [
+        PowerState.SWITCH_ON_DISABLED
+    ]
+    with pytest.raises(SdoAbortedError) as refusal:
         node.sdo[0x1A00][1].raw = 0x6041_0010
-    assert refused.value.code == 0x0800_0022, "a mapping in use"
+    assert refusal.value.code == 0x0800_0022, "a mapping in use"
 
 
-def test_drive_stops_by_itself_without_heartbeats_and_reports_it(master: Master) -> None:
+def test_drive_without_heartbeats_stops_and_reports_an_emergency(master: LibraryMaster) -> None:
     node = master.node
     node.sdo[0x1016][1].raw = 127 << 16 | 100
     node.sdo["Abort connection option code"].raw = 1
@@ -234,13 +238,13 @@ def test_drive_stops_by_itself_without_heartbeats_and_reports_it(master: Master)
 
 
 class LibraryDrives:
-    """Drives of the library, which our driver brings up and drives."""
+    """Drives of the library that our driver configures and commands."""
 
     def __init__(self) -> None:
         self.wire = LibraryWire()
         joints = CONFIG.robot.joint_table
         self.nodes: list[Any] = [canopen.LocalNode(joint.id, EDS) for joint in joints]
-        self.words = [0x0040] * JOINTS
+        self.statuswords = [0x0040] * JOINTS
         for i, node in enumerate(self.nodes):
             self.wire.network.add_node(node)
             node.sdo["Identity object"]["Serial number"].raw = 7 + i
@@ -268,16 +272,17 @@ class LibraryDrives:
                 clock_ns=lambda: 0,
             )
         )
-        self.wire.when_sent = self._answer_sync
+        self.wire.on_sent = self._answer_sync
 
     def _answer_sync(self, frame: CanFrame) -> None:
+        """Send the PDOs of all operational nodes after a SYNC."""
         if frame.id != SYNC_ID:
             return
         for i, node in enumerate(self.nodes):
             if node.nmt.state != "OPERATIONAL":
                 continue
             node.tpdo.read()
-            node.tpdo[1]["Statusword"].raw = self.words[i]
+            node.tpdo[1]["Statusword"].raw = self.statuswords[i]
             node.tpdo[1]["Position actual value"].raw = 1024
             node.tpdo[1]["Torque actual value"].raw = -500
             node.tpdo[2]["Velocity actual value"].raw = 2048
@@ -320,19 +325,19 @@ def test_our_setpoints_are_decoded_by_drives_of_the_library() -> None:
     node = drives.nodes[0]
     node.rpdo.read()
     node.rpdo[1].add_callback(lambda pdo: received.append(tuple(variable.raw for variable in pdo)))
-    everybody = frozenset(range(JOINTS))
+    all_joints = frozenset(range(JOINTS))
     targets = drives.readings.angle_rad * 0 + 3.14159265
     limits = drives.readings.angle_rad * 0 + 2.0
     command = BusCommand(
-        everybody, [JointMode.POSITION] * JOINTS, targets, limits, may_enable=True, emergency=False
+        all_joints, [JointMode.POSITION] * JOINTS, targets, limits, may_enable=True, emergency=False
     )
-    for word in (0x0040, 0x0021, 0x0023, 0x0027):
-        drives.words = [word] * JOINTS
+    for statusword in (0x0040, 0x0021, 0x0023, 0x0027):
+        drives.statuswords = [statusword] * JOINTS
         drives.readings.start_request()
         drives.driver.read()
         drives.driver.send_setpoints(command)
-    controls = [values[0] for values in received]
-    assert controls == [
+    controlwords = [values[0] for values in received]
+    assert controlwords == [
         0x00,
         ControlwordCommand.SWITCH_ON,
         ControlwordCommand.ENABLE_OPERATION,

@@ -1,4 +1,4 @@
-"""Units and limits of drives, which are read at the start and compared with the joint; and EDS files."""
+"""The driver reads units, limits and EDS files of drives at the start, and compares them with the joints."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +28,7 @@ from snakesim_hal.model.joints import Joint
 from snakesim_testing.can.driver_loop import config
 from snakesim_testing.messages import raises_error
 
-FITTING: dict[ObjectEntry, int] = {  # for a joint of 4 N·m, 5 rad/s and 1.5 rad
+FITTING_OBJECTS: dict[ObjectEntry, int] = {  # suits a joint of 4 N·m, 5 rad/s and 1.5 rad
     DEVICE_TYPE: 0x0002_0192,
     SUPPORTED_MODES: 0x380,
     ENCODER_INCREMENTS: 10_000,
@@ -40,34 +40,39 @@ FITTING: dict[ObjectEntry, int] = {  # for a joint of 4 N·m, 5 rad/s and 1.5 ra
 }
 
 
-def joint(**dotted: Any) -> Joint:
+def make_joint(**dotted: Any) -> Joint:
     return config(1, backend="cia402", **dotted).robot.joint_table[0]
 
 
-def objections(
-    changed: dict[ObjectEntry, int], one: Joint | None = None, **settings: Any
+def list_incompatibilities(
+    changed: dict[ObjectEntry, int], checked_joint: Joint | None = None, **settings: Any
 ) -> list[str]:
-    values = FITTING | changed
-    used = Cia402Settings(**settings)
-    scaling = determine_scaling(values, used, one or joint())
+    """Return what does not fit between a drive with changed objects and a joint."""
+    if checked_joint is None:
+        checked_joint = make_joint()
+    values = FITTING_OBJECTS | changed
+    drive_settings = Cia402Settings(**settings)
+    scaling = determine_scaling(values, drive_settings, checked_joint)
     assert not isinstance(scaling, str), scaling
-    return list(find_incompatibilities(values, scaling, used, one or joint()))
+    return list(find_incompatibilities(values, scaling, drive_settings, checked_joint))
 
 
-def test_drive_with_fitting_limits_has_no_objections() -> None:
-    assert objections({}) == []
-    assert objections({MIN_POSITION: 0, MAX_POSITION: 0}) == [], (
-        "equal limits mean that there are none"
+def test_drive_with_fitting_limits_has_no_incompatibilities() -> None:
+    assert list_incompatibilities({}) == []
+    assert list_incompatibilities({MIN_POSITION: 0, MAX_POSITION: 0}) == [], (
+        "equal limits mean that the drive has no position limits"
     )
-    without_speed = dict(FITTING)
+    without_speed = dict(FITTING_OBJECTS)
     del without_speed[MAX_SPEED]
-    scaling = determine_scaling(without_speed, Cia402Settings(), joint())
+    scaling = determine_scaling(without_speed, Cia402Settings(), make_joint())
     assert not isinstance(scaling, str)
-    assert list(find_incompatibilities(without_speed, scaling, Cia402Settings(), joint())) == []
+    assert (
+        list(find_incompatibilities(without_speed, scaling, Cia402Settings(), make_joint())) == []
+    )
 
 
 @pytest.mark.parametrize(
-    ("changed", "settings", "words"),
+    ("changed", "settings", "expected_text"),
     [
         (
             {MAX_TORQUE: 1_900},
@@ -95,23 +100,27 @@ def test_drive_with_fitting_limits_has_no_objections() -> None:
         ),
     ],
 )
-def test_limit_or_unit_that_does_not_suit_the_joint_is_named(
-    changed: dict[ObjectEntry, int], settings: dict[str, Any], words: str
+def test_limit_or_unit_that_does_not_fit_joint_is_named(
+    changed: dict[ObjectEntry, int], settings: dict[str, Any], expected_text: str
 ) -> None:
-    found = objections(changed, **settings)
-    assert any(words in objection for objection in found), found
+    incompatibilities = list_incompatibilities(changed, **settings)
+    assert any(expected_text in incompatibility for incompatibility in incompatibilities), (
+        incompatibilities
+    )
 
 
-def test_gear_sign_and_zero_of_a_joint_apply_to_its_limits() -> None:
-    geared = joint(robot__drive__gear=10.0, robot__drive__sign=-1, robot__drive__zero_rad=1.0)
+def test_limits_of_drive_respect_gear_sign_and_zero() -> None:
+    geared = make_joint(robot__drive__gear=10.0, robot__drive__sign=-1, robot__drive__zero_rad=1.0)
     fitting = {MAX_TORQUE: 200, MAX_SPEED: 480, MIN_POSITION: -22_500, MAX_POSITION: 25_600}
-    assert objections(fitting, geared) == []
-    assert "speed limit" in objections(fitting | {MAX_SPEED: 48}, geared)[0]
-    assert "position limits" in objections(fitting | {MAX_POSITION: 22_500}, geared)[0]
+    assert list_incompatibilities(fitting, geared) == []
+    assert "speed limit" in list_incompatibilities(fitting | {MAX_SPEED: 48}, geared)[0]
+    assert "position limits" in list_incompatibilities(fitting | {MAX_POSITION: 22_500}, geared)[0]
 
 
 def test_units_of_a_drive_convert_both_ways() -> None:
-    scaling = determine_scaling(FITTING, Cia402Settings(velocity_units_per_turn_s=60), joint())
+    scaling = determine_scaling(
+        FITTING_OBJECTS, Cia402Settings(velocity_units_per_turn_s=60), make_joint()
+    )
     assert not isinstance(scaling, str)
     assert scaling.to_position(3.141592653589793) == 5000
     assert scaling.to_velocity(6.283185307179586) == 60
@@ -122,23 +131,25 @@ def test_units_of_a_drive_convert_both_ways() -> None:
     assert scaling.to_torque_nm(-500) == pytest.approx(-1.0)
 
 
-def test_rated_torque_comes_from_rated_current_if_the_drive_has_no_other() -> None:
-    values = {entry: value for entry, value in FITTING.items() if entry != RATED_TORQUE} | {
+def test_rated_torque_of_drive_without_it_follows_rated_current() -> None:
+    values = {entry: value for entry, value in FITTING_OBJECTS.items() if entry != RATED_TORQUE} | {
         RATED_CURRENT: 8_000
     }
-    of_current = determine_scaling(
-        values, Cia402Settings(), joint(robot__motor__torque_constant_nm_per_a=0.25)
+    scaling = determine_scaling(
+        values, Cia402Settings(), make_joint(robot__motor__torque_constant_nm_per_a=0.25)
     )
-    assert not isinstance(of_current, str)
-    assert of_current.rated_torque_nm == pytest.approx(2.0)
-    unknown = determine_scaling(values, Cia402Settings(), joint())
-    assert isinstance(unknown, str) and "rated_torque_nm" in unknown
-    no_counts = {entry: value for entry, value in FITTING.items() if entry != ENCODER_INCREMENTS}
-    unknown = determine_scaling(no_counts, Cia402Settings(), joint())
-    assert isinstance(unknown, str) and "counts_per_turn" in unknown
+    assert not isinstance(scaling, str)
+    assert scaling.rated_torque_nm == pytest.approx(2.0)
+    refusal = determine_scaling(values, Cia402Settings(), make_joint())
+    assert isinstance(refusal, str) and "rated_torque_nm" in refusal
+    no_counts = {
+        entry: value for entry, value in FITTING_OBJECTS.items() if entry != ENCODER_INCREMENTS
+    }
+    refusal = determine_scaling(no_counts, Cia402Settings(), make_joint())
+    assert isinstance(refusal, str) and "counts_per_turn" in refusal
 
 
-def test_each_mapping_is_written_while_off_and_read_back() -> None:
+def test_configuration_writes_each_mapping_while_disabled_and_checks_it() -> None:
     steps = list_configuration_steps(5, Cia402Settings(), 0.01)
     writes = [
         step
@@ -177,7 +188,7 @@ def test_control_period_is_encoded_as_value_and_exponent(
 # --- EDS files -------------------------------------------------------------------------------------------------
 
 
-def test_bundled_eds_has_all_that_the_driver_needs() -> None:
+def test_bundled_eds_has_all_objects_that_the_driver_needs() -> None:
     assert list(read_eds(BUNDLED).find_missing_objects()) == []
     assert len(read_all_eds([str(BUNDLED)])) == 1
 
@@ -200,9 +211,7 @@ def test_bundled_eds_has_all_that_the_driver_needs() -> None:
     ],
     ids=["missing", "other size", "not mappable", "no consumer", "no number", "syntax"],
 )
-def test_eds_of_a_drive_that_cannot_be_driven_is_refused(
-    tmp_path: Path, old: str, new: str
-) -> None:
+def test_eds_without_a_required_object_is_refused(tmp_path: Path, old: str, new: str) -> None:
     text = BUNDLED.read_text(encoding="utf-8")
     assert old in text
     path = tmp_path / "drive.eds"

@@ -1,4 +1,4 @@
-"""Every module is found, checked and given its parameters, and nothing is enabled meanwhile."""
+"""Bring-up finds, checks and configures every module, and enables none of them."""
 
 import re
 import time
@@ -41,37 +41,40 @@ from snakesim_testing.can.frames import heartbeat, read
 from snakesim_testing.can.module_rig import chain
 from snakesim_testing.messages import raises_error
 
-NAMES = [f"joint_{i}" for i in range(1, 5)]
-Spoil = Callable[[CanFrame], list[CanFrame]]
+JOINT_NAMES = [f"joint_{i}" for i in range(1, 5)]
+FrameFilter = Callable[[CanFrame], list[CanFrame]]
 
 
-def as_it_is(frame: CanFrame) -> list[CanFrame]:
+def pass_frame(frame: CanFrame) -> list[CanFrame]:
     return [frame]
 
 
-class Modules:
-    """Four stepped emulators at the other end of a bus. to_modules, to_host: what becomes of each frame."""
+class EmulatedModules:
+    """Four stepped emulators at the other end of a bus.
+
+    `to_modules` and `to_host` receive each frame, and return the frames that arrive instead of it.
+    """
 
     def __init__(self) -> None:
         self.chain = chain()
         self.channel = f"bring-up-{uuid.uuid4().hex[:8]}"
         self.far = VirtualWire(self.channel)
         self.near = VirtualWire(self.channel, self)
-        self.to_modules: Spoil = as_it_is
-        self.to_host: Spoil = as_it_is
-        self.beside: Callable[[], None] = lambda: None
-        self.heard: list[CanFrame] = []
+        self.to_modules: FrameFilter = pass_frame
+        self.to_host: FrameFilter = pass_frame
+        self.on_poll: Callable[[], None] = lambda: None
+        self.received_by_modules: list[CanFrame] = []
         self.bus = ModuleBus(self.near, range(1, 5))
 
     def __call__(self) -> float | None:
         for frame in self.far.receive():
-            self.heard.append(frame)
-            for passed in self.to_modules(frame):
-                self.chain.receive(0, passed)
+            self.received_by_modules.append(frame)
+            for delivered in self.to_modules(frame):
+                self.chain.receive(0, delivered)
         for frame in self.chain.pop_frames(0):
-            for passed in self.to_host(frame):
-                self.far.send(passed)
-        self.beside()
+            for delivered in self.to_host(frame):
+                self.far.send(delivered)
+        self.on_poll()
         return 0.001
 
     def inject(self, injection: FaultInjection, *, begins: bool) -> None:
@@ -82,163 +85,195 @@ class Modules:
 
 
 @pytest.fixture
-def modules() -> Iterator[Modules]:
-    made = Modules()
-    yield made
-    made.near.close()
+def modules() -> Iterator[EmulatedModules]:
+    opened = EmulatedModules()
+    yield opened
+    opened.near.close()
 
 
-def losing(number: int, which: Callable[[CanFrame], bool] = lambda _frame: True) -> Spoil:
-    """Of the frames that are meant, the one of this number gets lost; the first is 1."""
-    met = count(1)
-    return lambda frame: [] if which(frame) and next(met) == number else [frame]
+def drop_selected_frame(
+    number: int, is_selected: Callable[[CanFrame], bool] = lambda _frame: True
+) -> FrameFilter:
+    """Return a filter that drops one of the selected frames. The first one has the number 1."""
+    numbers = count(1)
 
-
-def actions(frames: list[CanFrame]) -> list[float]:
-    return [read(f)["action"] for f in frames if parse_opcode(f.id) == Opcode.COMMAND]
-
-
-# --- who is there ------------------------------------------------------------------------------------------
-
-
-def test_bring_up_finds_every_module_with_identity_requests_only(modules: Modules) -> None:
-    found = find_modules([modules.bus], 5.0)
-    assert [i.node_id for i in found] == [1, 2, 3, 4]
-    assert {i.channel for i in found} == {modules.channel}
-    assert [i.serial for i in found] == [slot.module.serial for slot in modules.chain.slots]
-    assert {(i.firmware, i.protocol, i.is_emulated, i.is_stepped) for i in found} == {
-        ("1.0", 1, True, True)
-    }
-    assert set(actions(modules.heard)) == {CommandAction.IDENTIFY}
-    assert {parse_opcode(frame.id) for frame in modules.heard} == {Opcode.COMMAND}
-    assert find_discovery_errors([modules.bus], found, NAMES, is_lockstep=True) == []
-
-
-def test_bring_up_duplicate_module_id_is_detected_after_first_answer(modules: Modules) -> None:
-    answered_at: list[float] = []
-
-    def watch_the_last(frame: CanFrame) -> list[CanFrame]:
-        if parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 4:
-            answered_at.append(time.monotonic())
+    def drop_frame(frame: CanFrame) -> list[CanFrame]:
+        if is_selected(frame) and next(numbers) == number:
+            return []
         return [frame]
 
-    def later() -> None:
-        if answered_at and time.monotonic() > answered_at[0] + DUPLICATE_WAIT_S / 2:
+    return drop_frame
+
+
+def list_actions(frames: list[CanFrame]) -> list[float]:
+    """Return the actions of the commands among frames."""
+    return [read(frame)["action"] for frame in frames if parse_opcode(frame.id) == Opcode.COMMAND]
+
+
+# --- discovery ---------------------------------------------------------------------------------------------
+
+
+def test_bring_up_finds_every_module_with_identity_requests_only(modules: EmulatedModules) -> None:
+    identities = find_modules([modules.bus], 5.0)
+    assert [identity.node_id for identity in identities] == [1, 2, 3, 4]
+    assert {identity.channel for identity in identities} == {modules.channel}
+    assert [identity.serial for identity in identities] == [
+        slot.module.serial for slot in modules.chain.slots
+    ]
+    assert {
+        (identity.firmware, identity.protocol, identity.is_emulated, identity.is_stepped)
+        for identity in identities
+    } == {("1.0", 1, True, True)}
+    assert set(list_actions(modules.received_by_modules)) == {CommandAction.IDENTIFY}
+    assert {parse_opcode(frame.id) for frame in modules.received_by_modules} == {Opcode.COMMAND}
+    assert find_discovery_errors([modules.bus], identities, JOINT_NAMES, is_lockstep=True) == []
+
+
+def test_bring_up_duplicate_module_id_is_detected_after_first_answer(
+    modules: EmulatedModules,
+) -> None:
+    answer_times_s: list[float] = []
+
+    def note_last_answer(frame: CanFrame) -> list[CanFrame]:
+        if parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 4:
+            answer_times_s.append(time.monotonic())
+        return [frame]
+
+    def send_duplicate_identity() -> None:
+        if answer_times_s and time.monotonic() > answer_times_s[0] + DUPLICATE_WAIT_S / 2:
             modules.far.send(load_layouts()[Opcode.IDENTITY].encode(2, serial=0xBAD, protocol=1))
 
-    modules.to_host, modules.beside = watch_the_last, later
-    found = find_modules([modules.bus], 5.0)
-    assert 0xBAD in [i.serial for i in found if i.node_id == 2]
-    assert len(found) == 5
+    modules.to_host = note_last_answer
+    modules.on_poll = send_duplicate_identity
+    identities = find_modules([modules.bus], 5.0)
+    assert 0xBAD in [identity.serial for identity in identities if identity.node_id == 2]
+    assert len(identities) == 5
 
 
-def test_bring_up_ends_when_all_answered_or_at_timeout(modules: Modules) -> None:
-    began = time.monotonic()
+def test_bring_up_ends_when_all_answered_or_at_timeout(modules: EmulatedModules) -> None:
+    start_s = time.monotonic()
     find_modules([modules.bus], 5.0)
-    assert time.monotonic() - began < 2.0
-    began = time.monotonic()
-    found = find_modules([ModuleBus(modules.near, range(1, 6))], 0.25)
-    assert 0.2 < time.monotonic() - began < 2.0
-    assert len(found) == 4
-    assert 2 <= len(actions(modules.heard)) <= 6, "asks again, but not all the time"
+    assert time.monotonic() - start_s < 2.0
+    start_s = time.monotonic()
+    identities = find_modules([ModuleBus(modules.near, range(1, 6))], 0.25)
+    assert 0.2 < time.monotonic() - start_s < 2.0
+    assert len(identities) == 4
+    assert 2 <= len(list_actions(modules.received_by_modules)) <= 6, (
+        "the driver requests again, but not all the time"
+    )
 
 
-def test_bring_up_lost_identity_answer_is_requested_again(modules: Modules) -> None:
-    modules.to_host = losing(
+def test_bring_up_lost_identity_answer_is_requested_again(modules: EmulatedModules) -> None:
+    modules.to_host = drop_selected_frame(
         1, lambda frame: parse_opcode(frame.id) == Opcode.IDENTITY and parse_node(frame.id) == 3
     )
-    assert [i.node_id for i in find_modules([modules.bus], 5.0)] == [1, 2, 3, 4]
-    assert len(actions(modules.heard)) > 1, "asked again"
+    assert [identity.node_id for identity in find_modules([modules.bus], 5.0)] == [1, 2, 3, 4]
+    assert len(list_actions(modules.received_by_modules)) > 1, "the driver requested again"
 
 
-def test_bring_up_foreign_frames_are_forwarded_and_truncated_ones_ignored(modules: Modules) -> None:
-    beat = heartbeat(3, 1.0)
-    cut = CanFrame(load_layouts()[Opcode.IDENTITY].encode(9).id, b"\x01\x02")
-    for frame in (beat, cut):
+def test_bring_up_foreign_frames_are_forwarded_and_truncated_ones_ignored(
+    modules: EmulatedModules,
+) -> None:
+    foreign_frame = heartbeat(3, 1.0)
+    truncated_frame = CanFrame(load_layouts()[Opcode.IDENTITY].encode(9).id, b"\x01\x02")
+    for frame in (foreign_frame, truncated_frame):
         modules.far.send(frame)
-    handed_on: list[CanFrame] = []
-    assert [i.node_id for i in find_modules([modules.bus], 5.0, handed_on.append)] == [1, 2, 3, 4]
-    assert [frame for frame in handed_on if parse_opcode(frame.id) != Opcode.HEARTBEAT] == [cut]
-    assert beat in handed_on
+    forwarded: list[CanFrame] = []
+    assert [
+        identity.node_id for identity in find_modules([modules.bus], 5.0, forwarded.append)
+    ] == [1, 2, 3, 4]
+    assert [frame for frame in forwarded if parse_opcode(frame.id) != Opcode.HEARTBEAT] == [
+        truncated_frame
+    ]
+    assert foreign_frame in forwarded
 
 
-# --- what is wrong with them -------------------------------------------------------------------------------
+# --- errors of discovery -----------------------------------------------------------------------------------
 
-A, B = "can_a", "can_b"
-GOOD = [
-    ModuleIdentity(n, A if n < 3 else B, 0x1000 + n, "1.0", 1, False, False) for n in (1, 2, 3, 4)
+CHANNEL_A = "can_a"
+CHANNEL_B = "can_b"
+IDENTITIES = [
+    ModuleIdentity(n, CHANNEL_A if n < 3 else CHANNEL_B, 0x1000 + n, "1.0", 1, False, False)
+    for n in (1, 2, 3, 4)
 ]
 
 
-class Named(VirtualWire):
-    """A wire that has a name, and is on no bus."""
+class NamedWire(VirtualWire):
+    """A wire that has only a channel name, and is connected to no bus."""
 
     def __init__(self, channel: str) -> None:
         self.channel = channel
 
 
-def two_buses() -> list[ModuleBus]:
-    wires = {name: Named(name) for name in (A, B)}
-    return [ModuleBus(wires[A], range(1, 3)), ModuleBus(wires[B], range(3, 5))]
+def make_two_buses() -> list[ModuleBus]:
+    """Return two buses with the nodes 1 and 2, and 3 and 4."""
+    wires = {name: NamedWire(name) for name in (CHANNEL_A, CHANNEL_B)}
+    return [ModuleBus(wires[CHANNEL_A], range(1, 3)), ModuleBus(wires[CHANNEL_B], range(3, 5))]
 
 
-def wrong_with(found: list[ModuleIdentity], *, lockstep: bool = False) -> list[str]:
-    return find_discovery_errors(two_buses(), found, NAMES, is_lockstep=lockstep)
+def find_errors(identities: list[ModuleIdentity], *, is_lockstep: bool = False) -> list[str]:
+    """Return the errors of discovery on two buses."""
+    return find_discovery_errors(make_two_buses(), identities, JOINT_NAMES, is_lockstep=is_lockstep)
 
 
 @pytest.mark.parametrize(
-    ("found", "words"),
+    ("identities", "expected_start"),
     [
-        (GOOD[:2] + GOOD[3:], "joint_3 (node 3 on can_b) does not answer"),
+        (IDENTITIES[:2] + IDENTITIES[3:], "joint_3 (node 3 on can_b) does not answer"),
         (
-            [*GOOD, replace(GOOD[1], serial=0xBEEF)],
+            [*IDENTITIES, replace(IDENTITIES[1], serial=0xBEEF)],
             "joint_2 (node 2 on can_a) answers 2 times, serials 00001002 and 0000BEEF: give each module its own",
         ),
         (
-            [*GOOD, replace(GOOD[0], node_id=9)],
+            [*IDENTITIES, replace(IDENTITIES[0], node_id=9)],
             "node 9 with serial 00001001 on can_a is not a joint of this robot",
         ),
         (
-            [*GOOD[:2], replace(GOOD[2], channel=A), GOOD[3]],
+            [*IDENTITIES[:2], replace(IDENTITIES[2], channel=CHANNEL_A), IDENTITIES[3]],
             "joint_3 (node 3 on can_b) does not answer; a node 3 answers on can_a",
         ),
         (
-            [*GOOD, replace(GOOD[2], channel=A, serial=0xF)],
+            [*IDENTITIES, replace(IDENTITIES[2], channel=CHANNEL_A, serial=0xF)],
             "joint_3 (node 3 on can_b) is duplicated on can_a, serial",
         ),
         (
-            [replace(GOOD[0], protocol=2), *GOOD[1:]],
+            [replace(IDENTITIES[0], protocol=2), *IDENTITIES[1:]],
             "joint_1 (node 1 on can_a) has protocol version 2, this driver 1",
         ),
         (
-            [replace(GOOD[0], is_stepped=True), *GOOD[1:]],
+            [replace(IDENTITIES[0], is_stepped=True), *IDENTITIES[1:]],
             "joint_1 (node 1 on can_a) is an emulator whose time is paused",
         ),
     ],
 )
-def test_bring_up_error_names_joint_node_and_bus(found: list[ModuleIdentity], words: str) -> None:
-    (reported,) = wrong_with(found)
-    assert reported.startswith(words)
+def test_bring_up_error_names_joint_node_and_bus(
+    identities: list[ModuleIdentity], expected_start: str
+) -> None:
+    (error,) = find_errors(identities)
+    assert error.startswith(expected_start)
 
 
-def test_modules_that_cannot_wait_are_no_good_for_lockstep() -> None:
-    reported = wrong_with([replace(i, is_stepped=i.node_id > 1) for i in GOOD], lockstep=True)
-    assert reported == [
+def test_bring_up_module_without_stepping_is_refused_for_lockstep() -> None:
+    errors = find_errors(
+        [replace(identity, is_stepped=identity.node_id > 1) for identity in IDENTITIES],
+        is_lockstep=True,
+    )
+    assert errors == [
         "joint_1 (node 1 on can_a) does not support lockstep: use --clock-mode realtime"
     ]
 
 
 def test_bring_up_lists_all_problems_in_one_error() -> None:
-    found = [
-        replace(GOOD[0], protocol=3),
-        replace(GOOD[0], protocol=3, serial=5),
-        replace(GOOD[2], channel=A),
-        replace(GOOD[3], is_stepped=True),
-        replace(GOOD[3], node_id=62),
+    identities = [
+        replace(IDENTITIES[0], protocol=3),
+        replace(IDENTITIES[0], protocol=3, serial=5),
+        replace(IDENTITIES[2], channel=CHANNEL_A),
+        replace(IDENTITIES[3], is_stepped=True),
+        replace(IDENTITIES[3], node_id=62),
     ]
-    reported = wrong_with(found)
-    assert len(reported) == 7
-    for words in (
+    errors = find_errors(identities)
+    assert len(errors) == 7
+    for pattern in (
         "answers 2 times",
         "version 3",
         "joint_2 .*does not answer$",
@@ -246,96 +281,107 @@ def test_bring_up_lists_all_problems_in_one_error() -> None:
         "--stepped",
         "62",
     ):
-        assert any(re.search(words, line) for line in reported), words
+        assert any(re.search(pattern, error) for error in errors), pattern
 
 
 # --- parameters --------------------------------------------------------------------------------------------
 
 
-def wanted(**changed: float) -> dict[int, dict[ModuleParameter, float]]:
+def make_parameters(**changed: float) -> dict[int, dict[ModuleParameter, float]]:
+    """Return the parameters of every node. The changes apply to node 2."""
     run = config()
-    given = plan_parameters(run.robot, CanSettings(), plan_reports(run, CanSettings()))
-    given[2] |= {ModuleParameter[name.upper()]: value for name, value in changed.items()}
-    return given
+    parameters = plan_parameters(run.robot, CanSettings(), plan_reports(run, CanSettings()))
+    parameters[2] |= {ModuleParameter[name.upper()]: value for name, value in changed.items()}
+    return parameters
 
 
-def test_every_parameter_is_written_and_the_others_are_read(modules: Modules) -> None:
-    in_force = configure_modules([modules.bus], wanted(stiffness=12.5), 5.0)
-    assert set(in_force) == {1, 2, 3, 4}
-    for node, values in in_force.items():
+def test_bring_up_writes_every_parameter_and_reads_the_ratings(modules: EmulatedModules) -> None:
+    applied = configure_modules([modules.bus], make_parameters(stiffness=12.5), 5.0)
+    assert set(applied) == {1, 2, 3, 4}
+    for node, values in applied.items():
         assert set(values) == set(ModuleParameter)
         assert values == pytest.approx(modules.chain.slots[node - 1].module.parameters.values)
-    assert in_force[2][ModuleParameter.STIFFNESS] == 12.5
-    assert in_force[1][ModuleParameter.STIFFNESS] == 40.0
-    assert [in_force[node][ModuleParameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
-    assert in_force[1][ModuleParameter.RATED_TORQUE] == pytest.approx(4.0)
-    requests = [read(f) for f in modules.heard]
-    assert {parse_opcode(f.id) for f in modules.heard} == {Opcode.PARAMETER_REQUEST}
-    read_only = [r["index"] for r in requests if r["operation"] == ParameterOperation.READ]
+    assert applied[2][ModuleParameter.STIFFNESS] == 12.5
+    assert applied[1][ModuleParameter.STIFFNESS] == 40.0
+    assert [applied[node][ModuleParameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
+    assert applied[1][ModuleParameter.RATED_TORQUE] == pytest.approx(4.0)
+    requests = [read(frame) for frame in modules.received_by_modules]
+    assert {parse_opcode(frame.id) for frame in modules.received_by_modules} == {
+        Opcode.PARAMETER_REQUEST
+    }
+    read_only = [
+        request["index"] for request in requests if request["operation"] == ParameterOperation.READ
+    ]
     assert set(read_only) == {ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED}
     assert len(requests) == 4 * len(ModuleParameter)
 
 
-@pytest.mark.parametrize("way", ["to_modules", "to_host"])
-def test_bring_up_lost_parameter_answer_is_requested_again(modules: Modules, way: str) -> None:
-    setattr(modules, way, losing(5))
-    began = time.monotonic()
-    in_force = configure_modules([modules.bus], wanted(), 5.0)
-    assert all(set(values) == set(ModuleParameter) for values in in_force.values())
-    assert len(modules.heard) == 4 * len(ModuleParameter) + 1
-    assert time.monotonic() - began > REQUEST_PERIOD_S
+@pytest.mark.parametrize("direction", ["to_modules", "to_host"])
+def test_bring_up_lost_parameter_answer_is_requested_again(
+    modules: EmulatedModules, direction: str
+) -> None:
+    setattr(modules, direction, drop_selected_frame(5))
+    start_s = time.monotonic()
+    applied = configure_modules([modules.bus], make_parameters(), 5.0)
+    assert all(set(values) == set(ModuleParameter) for values in applied.values())
+    assert len(modules.received_by_modules) == 4 * len(ModuleParameter) + 1
+    assert time.monotonic() - start_s > REQUEST_PERIOD_S
 
 
-def test_bring_up_repeated_truncated_or_foreign_answers_are_ignored(modules: Modules) -> None:
-    def noisily(frame: CanFrame) -> list[CanFrame]:
-        other = load_layouts()[Opcode.PARAMETER_ANSWER].encode(
+def test_bring_up_repeated_truncated_or_foreign_answers_are_ignored(
+    modules: EmulatedModules,
+) -> None:
+    def add_noise(frame: CanFrame) -> list[CanFrame]:
+        foreign_answer = load_layouts()[Opcode.PARAMETER_ANSWER].encode(
             parse_node(frame.id), index=200, result=ParameterResult.UNKNOWN_INDEX
         )
-        return [CanFrame(frame.id, frame.data[:3]), other, frame, frame]
+        return [CanFrame(frame.id, frame.data[:3]), foreign_answer, frame, frame]
 
-    modules.to_host = noisily
-    in_force = configure_modules([modules.bus], wanted(damping=0.5), 5.0)
-    assert in_force[2][ModuleParameter.DAMPING] == 0.5
-    assert in_force[2][ModuleParameter.STIFFNESS] == 40.0
-    assert in_force[1][ModuleParameter.DAMPING] == 1.0
-
-
-def test_other_frames_are_not_lost_while_it_waits(modules: Modules) -> None:
-    beat = heartbeat(3, 9.0)
-    modules.far.send(beat)
-    handed_on: list[CanFrame] = []
-    configure_modules([modules.bus], wanted(), 5.0, handed_on.append)
-    assert beat in handed_on
+    modules.to_host = add_noise
+    applied = configure_modules([modules.bus], make_parameters(damping=0.5), 5.0)
+    assert applied[2][ModuleParameter.DAMPING] == 0.5
+    assert applied[2][ModuleParameter.STIFFNESS] == 40.0
+    assert applied[1][ModuleParameter.DAMPING] == 1.0
 
 
-def test_bring_up_value_out_of_range_names_node_and_range(modules: Modules) -> None:
+def test_bring_up_frames_received_during_configuration_are_forwarded(
+    modules: EmulatedModules,
+) -> None:
+    foreign_frame = heartbeat(3, 9.0)
+    modules.far.send(foreign_frame)
+    forwarded: list[CanFrame] = []
+    configure_modules([modules.bus], make_parameters(), 5.0, forwarded.append)
+    assert foreign_frame in forwarded
+
+
+def test_bring_up_value_out_of_range_names_node_and_range(modules: EmulatedModules) -> None:
     with raises_error(BackendError, code="drive/parameter-refused"):
-        configure_modules([modules.bus], wanted(stiffness=2e5), 5.0)
+        configure_modules([modules.bus], make_parameters(stiffness=2e5), 5.0)
 
 
-def test_an_armed_module_refuses(modules: Modules) -> None:
+def test_bring_up_armed_module_refuses_parameters(modules: EmulatedModules) -> None:
     modules.chain.receive(0, make_command(CommandAction.ARM))
     modules.chain.pop_frames(0)
     with raises_error(BackendError, code="drive/parameter-refused"):
-        configure_modules([modules.bus], wanted(), 5.0)
+        configure_modules([modules.bus], make_parameters(), 5.0)
 
 
-def test_bring_up_unknown_result_code_counts_as_refusal(modules: Modules) -> None:
-    def oddly(frame: CanFrame) -> list[CanFrame]:
+def test_bring_up_unknown_result_code_counts_as_refusal(modules: EmulatedModules) -> None:
+    def change_result_code(frame: CanFrame) -> list[CanFrame]:
         if parse_opcode(frame.id) != Opcode.PARAMETER_ANSWER:
             return [frame]
         return [
             CanFrame(frame.id, frame.data[:1] + bytes((frame.data[1] | 0xF0,)) + frame.data[2:])
         ]
 
-    modules.to_host = oddly
+    modules.to_host = change_result_code
     with raises_error(BackendError, code="drive/parameter-refused"):
-        configure_modules([modules.bus], wanted(), 5.0)
+        configure_modules([modules.bus], make_parameters(), 5.0)
 
 
-def test_bring_up_silent_module_is_named_at_the_end(modules: Modules) -> None:
+def test_bring_up_silent_module_is_named_at_the_end(modules: EmulatedModules) -> None:
     modules.to_host = lambda frame: [] if parse_node(frame.id) in (2, 4) else [frame]
     with raises_error(BackendError, code="drive/silent"):
-        configure_modules([modules.bus], wanted(), 0.3)
-    asked = sum(parse_node(frame.id) == 2 for frame in modules.heard)
-    assert 2 <= asked <= 5
+        configure_modules([modules.bus], make_parameters(), 0.3)
+    request_count = sum(parse_node(frame.id) == 2 for frame in modules.received_by_modules)
+    assert 2 <= request_count <= 5

@@ -1,4 +1,4 @@
-"""Every fault of a module, from its first moment to the rest of the joints: what the driver said, and how soon."""
+"""The driver reports each fault of a module in time, with its joint, and every joint comes to rest."""
 
 import numpy as np
 import pytest
@@ -15,20 +15,20 @@ AT_REST_RAD_S = 0.05
 
 
 @pytest.mark.parametrize(
-    ("kind", "what", "within"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS]
+    ("kind", "expected_fault", "max_periods"), MODULE_FAULTS, ids=[row[0] for row in MODULE_FAULTS]
 )
 def test_module_fault_names_its_joint_and_stops_the_robot(
-    kind: str, what: str, within: int
+    kind: str, expected_fault: str, max_periods: int
 ) -> None:
     with loop(faults=[f"{kind}:joint_3@{START_TICK / 100}"]) as run:
         run.arm()
         run.run(START_TICK - run.tick, run.waving)
         assert not run.faults
-        run.run(within, run.waving)
-        assert run.faults, f"{kind} was not seen within {within} periods"
+        run.run(max_periods, run.waving)
+        assert run.faults, f"{kind} was not seen within {max_periods} periods"
         fault = run.faults[0]
         run.run(30)
-        stopped = (
+        rest_tick = (
             max(
                 tick
                 for tick in range(START_TICK, run.tick)
@@ -36,17 +36,20 @@ def test_module_fault_names_its_joint_and_stops_the_robot(
             )
             + 1
         )
-        healthy = [i for i in range(4) if i != 2]
-        assert fault.what in (what, "module_silent" if kind == "reboot" else what)
+        healthy_joints = [i for i in range(4) if i != 2]
+        assert fault.what in (
+            expected_fault,
+            "module_silent" if kind == "reboot" else expected_fault,
+        )
         assert fault.joint == "joint_3"
         assert "joint_3 (node 3 on " in fault.cause
-        assert what in [f.what for f in run.faults]
-        assert stopped < run.tick - 5, "everything comes to rest"
-        assert all(run.states()[i] == ModuleState.DISARMED for i in healthy), run.states()
-        if kind != "reboot":  # it is over by itself
+        assert expected_fault in [reported.what for reported in run.faults]
+        assert rest_tick < run.tick - 5, "everything comes to rest"
+        assert all(run.states()[i] == ModuleState.DISARMED for i in healthy_joints), run.states()
+        if kind != "reboot":  # a reboot ends by itself
             run.backend.inject(parse_injection(f"{kind}:joint_3@0"), begins=False)
             run.run(10)
-        if kind != "overheat":  # it would cool for minutes
+        if kind != "overheat":  # a hot winding cools for minutes
             cleared_and_armed_again(run)
 
 
@@ -72,7 +75,7 @@ def test_persistent_fault_is_reported_again_and_blocks_arming_until_gone() -> No
         run.run(10)
         assert run.states() == [ModuleState.DISARMED] * 4
         assert len(run.faults) == 2
-        before = list(run.samples[-1].joints.angle_rad)
+        angles_before_rad = list(run.samples[-1].joints.angle_rad)
         run.wanted = None
         run.arm()
-        assert np.allclose(run.samples[-1].joints.angle_rad, before, atol=0.02)
+        assert np.allclose(run.samples[-1].joints.angle_rad, angles_before_rad, atol=0.02)

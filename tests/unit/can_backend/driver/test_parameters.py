@@ -1,4 +1,4 @@
-"""A robot file as parameters: what the protocol holds, and what modules can do."""
+"""Parameters of joint modules follow the robot file, within the ranges of the protocol and the ratings."""
 
 from typing import Any
 
@@ -29,35 +29,37 @@ from snakesim_hal.model.scenario import load_scenario
 from snakesim_testing.messages import raises_error
 
 ROBOT = load_scenario("triplet").config.robot
-RATED = (ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED)
+RATINGS = (ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED)
 
 
-def changed(section: str, **values: Any) -> RobotFile:
+def change_robot(section: str, **values: Any) -> RobotFile:
+    """Return the robot with changed values in one section."""
     part = msgspec.structs.replace(getattr(ROBOT, section), **values)
     return msgspec.structs.replace(ROBOT, **{section: part})
 
 
-def rated(torque_nm: float, speed_rad_s: float) -> dict[int, dict[ModuleParameter, float]]:
+def make_ratings(torque_nm: float, speed_rad_s: float) -> dict[int, dict[ModuleParameter, float]]:
+    """Return the parameters of node 4, which contain only its ratings."""
     return {4: {ModuleParameter.RATED_TORQUE: torque_nm, ModuleParameter.RATED_SPEED: speed_rad_s}}
 
 
 @pytest.mark.parametrize("name", list_shipped_names("robots"))
 def test_parameters_of_every_module_exclude_ratings_and_stay_in_range(name: str) -> None:
     robot = decode_table(read_table_with_base(name, "robots"), RobotFile)
-    wanted = plan_parameters(robot, CanSettings(), ReportSchedule(100.0))
-    assert list(wanted) == list(range(1, robot.chain.modules + 1))
-    for values in wanted.values():
-        assert set(values) == set(ModuleParameter) - set(RATED)
+    planned = plan_parameters(robot, CanSettings(), ReportSchedule(100.0))
+    assert list(planned) == list(range(1, robot.chain.modules + 1))
+    for values in planned.values():
+        assert set(values) == set(ModuleParameter) - set(RATINGS)
         for parameter, value in values.items():
             allowed = PARAMETERS[parameter]
             assert allowed.writable and allowed.low <= value <= allowed.high, parameter.name
 
 
 def test_parameters_of_a_geared_module_describe_its_own_shaft() -> None:
-    own = JointExceptions(
+    geared_joint = JointExceptions(
         sign=-1, gear=2.0, zero_rad=0.5, angle_min_rad=-0.4, angle_max_rad=1.2, torque_nm=6.0
     )
-    robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
+    robot = msgspec.structs.replace(ROBOT, joints={"joint_2": geared_joint})
     first, second = (
         plan_parameters(robot, CanSettings(), ReportSchedule(100.0))[node] for node in (1, 2)
     )
@@ -74,7 +76,7 @@ def test_parameters_of_a_geared_module_describe_its_own_shaft() -> None:
     )
 
 
-MISPLACED = {
+INVALID_DRIVES = {
     "an id": (JointExceptions(id=25), {}),
     "a port": (JointExceptions(port="can3"), {}),
     "a zero": (JointExceptions(zero_rad=2.5), {}),
@@ -86,11 +88,11 @@ MISPLACED = {
 }
 
 
-@pytest.mark.parametrize("wrong", MISPLACED)
-def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
-    own, given = MISPLACED[wrong]
-    settings = CanSettings(**given)
-    robot = msgspec.structs.replace(ROBOT, joints={"joint_2": own})
+@pytest.mark.parametrize("case", INVALID_DRIVES)
+def test_drive_settings_that_the_bus_cannot_have_are_refused(case: str) -> None:
+    joint, settings_values = INVALID_DRIVES[case]
+    settings = CanSettings(**settings_values)
+    robot = msgspec.structs.replace(ROBOT, joints={"joint_2": joint})
     with raises_error(
         ConfigError, code=("bus/invalid-channel", "config/conflict", "drive/unsupported-setting")
     ):
@@ -102,38 +104,38 @@ def test_drives_that_the_bus_cannot_have_are_refused(wrong: str) -> None:
 
 
 @pytest.mark.parametrize("tail", [True, False])
-def test_only_the_first_module_reports_the_tail_link(tail: bool) -> None:
-    wanted = plan_parameters(ROBOT, CanSettings(), ReportSchedule(100.0, tail=tail))
-    assert [values[ModuleParameter.TAIL] for values in wanted.values()] == [float(tail)] + [
+def test_parameters_let_only_first_module_report_tail_link(tail: bool) -> None:
+    planned = plan_parameters(ROBOT, CanSettings(), ReportSchedule(100.0, tail=tail))
+    assert [values[ModuleParameter.TAIL] for values in planned.values()] == [float(tail)] + [
         0.0
     ] * 12
 
 
 @pytest.mark.parametrize(
-    ("action", "motion"), [("damp", SafeMotion.DAMP), ("passive", SafeMotion.PASSIVE)]
+    ("action", "stop_mode"), [("damp", SafeMotion.DAMP), ("passive", SafeMotion.PASSIVE)]
 )
 def test_parameters_take_stop_mode_from_robot_and_watchdog_from_settings(
-    action: str, motion: SafeMotion
+    action: str, stop_mode: SafeMotion
 ) -> None:
-    robot = changed("safety", action=action)
-    told = plan_parameters(robot, CanSettings(watchdog_s=0.05), ReportSchedule(100.0, 3, 17))[1]
-    names = (
+    robot = change_robot("safety", action=action)
+    values = plan_parameters(robot, CanSettings(watchdog_s=0.05), ReportSchedule(100.0, 3, 17))[1]
+    parameters = (
         ModuleParameter.STOP_MODE,
         ModuleParameter.WATCHDOG,
         ModuleParameter.CONTACT_EVERY,
         ModuleParameter.IMU_EVERY,
     )
-    assert [told[name] for name in names] == [motion, 0.05, 3.0, 17.0]
+    assert [values[name] for name in parameters] == [stop_mode, 0.05, 3.0, 17.0]
     validate_ratings(robot)
 
 
-def test_stiff_holding_is_nothing_a_module_does_by_itself() -> None:
+def test_stop_mode_hold_is_refused_for_joint_modules() -> None:
     with raises_error(ConfigError, code="drive/unsupported-setting"):
-        validate_ratings(changed("safety", action="hold"))
+        validate_ratings(change_robot("safety", action="hold"))
 
 
 @pytest.mark.parametrize(
-    ("field", "opcode", "signal", "room"),
+    ("field", "opcode", "signal", "range_factor"),
     [
         ("angle_rad", Opcode.JOINT_STATE, "angle", 1.0),
         ("speed_rad_s", Opcode.JOINT_STATE, "velocity", SPEED_RANGE_FACTOR),
@@ -141,14 +143,14 @@ def test_stiff_holding_is_nothing_a_module_does_by_itself() -> None:
         ("stop_at_c", Opcode.HEALTH, "motor_temperature", 1.0),
     ],
 )
-def test_limits_end_where_the_bus_ends(
-    field: str, opcode: Opcode, signal: str, room: float
+def test_limit_beyond_range_of_bus_signal_is_refused(
+    field: str, opcode: Opcode, signal: str, range_factor: float
 ) -> None:
-    most = load_layouts()[opcode].signals[signal].high / room
-    if field != "angle_rad" or most <= 3.1:
-        validate_ratings(changed("limits", **{field: most * 0.999}))
+    max_value = load_layouts()[opcode].signals[signal].high / range_factor
+    if field != "angle_rad" or max_value <= 3.1:
+        validate_ratings(change_robot("limits", **{field: max_value * 0.999}))
     with raises_error(ConfigError, code="drive/unsupported-setting"):
-        validate_ratings(changed("limits", **{field: most * 1.001}))
+        validate_ratings(change_robot("limits", **{field: max_value * 1.001}))
 
 
 @pytest.mark.parametrize(
@@ -159,6 +161,8 @@ def test_limits_end_where_the_bus_ends(
         (float("nan"), 7.5),
     ],
 )
-def test_a_weaker_module_is_named_with_what_to_do(torque_nm: float, speed_rad_s: float) -> None:
+def test_module_with_lower_ratings_is_refused_by_joint_name(
+    torque_nm: float, speed_rad_s: float
+) -> None:
     with raises_error(BackendError, code="drive/unsupported-setting", field="joint_4"):
-        validate_ratings(ROBOT, rated(torque_nm, speed_rad_s))
+        validate_ratings(ROBOT, make_ratings(torque_nm, speed_rad_s))

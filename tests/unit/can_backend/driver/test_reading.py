@@ -1,4 +1,4 @@
-"""What is taken of the modules' frames, and what is noticed of those that are not as they should be."""
+"""Reports of joint modules: which states are accepted, and when a reading is complete."""
 
 import pytest
 
@@ -12,130 +12,132 @@ from snakesim_testing.can.readings import JOINTS, angles, reading
 
 
 def test_reading_states_up_to_three_syncs_late_are_accepted() -> None:
-    for late, taken in ((3, True), (4, False)):
-        made = reading(2)
-        syncs(made, late + 1, [1, 3])
-        made.process_frame(joint_state(2, made.sync - late, 0.9))
-        assert (angles(made)[1] == pytest.approx(0.9)) is taken
-        assert made.modules[1].sync == (made.sync - 3 if taken else 1)
-        assert made.modules[1].wrong_counter_count == (not taken)
-        assert (made.states_missing == 1) is taken, "the newest Sync is not answered by it"
+    for syncs_late, is_accepted in ((3, True), (4, False)):
+        reports = reading(2)
+        syncs(reports, syncs_late + 1, [1, 3])
+        reports.process_frame(joint_state(2, reports.sync - syncs_late, 0.9))
+        assert (angles(reports)[1] == pytest.approx(0.9)) is is_accepted
+        assert reports.modules[1].sync == (reports.sync - 3 if is_accepted else 1)
+        assert reports.modules[1].wrong_counter_count == (not is_accepted)
+        assert (reports.states_missing == 1) is is_accepted, "it does not answer the newest Sync"
 
 
-def test_an_older_state_never_replaces_a_newer_one() -> None:
-    made = reading()
-    begin(made)
-    made.process_frame(joint_state(2, made.sync, 0.5))
-    made.process_frame(joint_state(2, made.sync - 1, -0.5))
-    assert angles(made)[1] == pytest.approx(0.5)
-    assert made.modules[1].sync == made.sync
-    assert made.modules[1].double_answers == 0, "late is not twice"
+def test_reading_older_state_never_replaces_a_newer_one() -> None:
+    reports = reading()
+    begin(reports)
+    reports.process_frame(joint_state(2, reports.sync, 0.5))
+    reports.process_frame(joint_state(2, reports.sync - 1, -0.5))
+    assert angles(reports)[1] == pytest.approx(0.5)
+    assert reports.modules[1].sync == reports.sync
+    assert reports.modules[1].double_answers == 0, "a late answer is not a second answer"
 
 
 def test_reading_two_answers_to_one_sync_count_once() -> None:
-    made = reading()
-    module = made.modules[1]
-    for expected in (1, 2, 3):
-        begin(made)
-        answer(made, [1, 2, 2, 2, 3])
-        assert module.count_double_answers(made.sync) == expected
-    begin(made)
-    assert module.count_double_answers(made.sync) == 3, "this Sync may still be answered twice"
-    answer(made)
-    begin(made)
-    assert module.count_double_answers(made.sync) == 0
-    answer(made, [1, 2, 2, 3])
-    assert module.count_double_answers(made.sync) == 1
+    reports = reading()
+    module = reports.modules[1]
+    for expected_count in (1, 2, 3):
+        begin(reports)
+        answer(reports, [1, 2, 2, 2, 3])
+        assert module.count_double_answers(reports.sync) == expected_count
+    begin(reports)
+    assert module.count_double_answers(reports.sync) == 3, "this Sync may still be answered twice"
+    answer(reports)
+    begin(reports)
+    assert module.count_double_answers(reports.sync) == 0
+    answer(reports, [1, 2, 2, 3])
+    assert module.count_double_answers(reports.sync) == 1
 
 
-def test_an_unknown_state_is_a_fault() -> None:
-    made = reading()
-    begin(made)
-    write = load_layouts()[Opcode.JOINT_STATE].make_writer(
+def test_reading_unknown_state_counts_as_fault() -> None:
+    reports = reading()
+    begin(reports)
+    write_state = load_layouts()[Opcode.JOINT_STATE].make_writer(
         "angle", "velocity", "torque", "count", "state", "derated"
     )
-    made.process_frame(write(2, (0, 0, 0, made.sync, 7, 0)))
-    assert made.modules[1].state == ModuleState.FAULT
-    beat = load_layouts()[Opcode.HEARTBEAT].make_writer("state", "last_stop", "uptime")
-    made.process_frame(beat(3, (15, 200, 1)))
-    assert made.modules[2].state == ModuleState.FAULT
-    assert made.modules[2].last_stop == LastStop.NONE
+    reports.process_frame(write_state(2, (0, 0, 0, reports.sync, 7, 0)))
+    assert reports.modules[1].state == ModuleState.FAULT
+    write_heartbeat = load_layouts()[Opcode.HEARTBEAT].make_writer("state", "last_stop", "uptime")
+    reports.process_frame(write_heartbeat(3, (15, 200, 1)))
+    assert reports.modules[2].state == ModuleState.FAULT
+    assert reports.modules[2].last_stop == LastStop.NONE
 
 
-# --- who is waited for -------------------------------------------------------------------------------------
+# --- complete readings -------------------------------------------------------------------------------------
 
 
 def test_reading_is_complete_when_every_module_has_answered() -> None:
-    made = reading()
-    begin(made)
+    reports = reading()
+    begin(reports)
     for node in (1, 2):
-        answer(made, [node])
-        assert not made.is_complete
-    answer(made, [2])
-    assert not made.is_complete, "an answer that comes twice is not somebody else's"
-    answer(made, [3])
-    assert made.is_complete
+        answer(reports, [node])
+        assert not reports.is_complete
+    answer(reports, [2])
+    assert not reports.is_complete, "a second answer does not count for another module"
+    answer(reports, [3])
+    assert reports.is_complete
 
 
 def test_reading_waits_for_forces_only_at_requested_syncs() -> None:
-    made = reading()
-    begin(made, contacts=True, tail=True)
-    answer(made)
+    reports = reading()
+    begin(reports, contacts=True, tail=True)
+    answer(reports)
     for node in (1, 2, 3):
-        assert not made.is_complete
-        made.process_frame(contact(node, made.sync))
-    made.process_frame(contact(3, made.sync))
-    assert not made.is_complete, "the tail's own is missing"
-    made.process_frame(contact(1, made.sync, tail=True))
-    assert made.is_complete
-    begin(made, contacts=True)
-    answer(made)
+        assert not reports.is_complete
+        reports.process_frame(contact(node, reports.sync))
+    reports.process_frame(contact(3, reports.sync))
+    assert not reports.is_complete, "the contact of the tail link is missing"
+    reports.process_frame(contact(1, reports.sync, tail=True))
+    assert reports.is_complete
+    begin(reports, contacts=True)
+    answer(reports)
     for node in (1, 2, 3):
-        made.process_frame(contact(node, made.sync))
-    assert made.is_complete
+        reports.process_frame(contact(node, reports.sync))
+    assert reports.is_complete
 
 
 def test_reading_does_not_wait_for_a_silent_module() -> None:
-    made = reading()
-    syncs(made, MAX_LATE_SYNCS, [1, 3])
-    begin(made, contacts=True, tail=True)
-    answer(made, [1, 3])
-    assert not made.is_complete and made.states_missing == 1, "three Syncs are not long"
-    begin(made, contacts=True, tail=True)
-    answer(made, [1, 3])
+    reports = reading()
+    syncs(reports, MAX_LATE_SYNCS, [1, 3])
+    begin(reports, contacts=True, tail=True)
+    answer(reports, [1, 3])
+    assert not reports.is_complete and reports.states_missing == 1, (
+        "a module that missed three Syncs is still waited for"
+    )
+    begin(reports, contacts=True, tail=True)
+    answer(reports, [1, 3])
     for node in (1, 3):
-        made.process_frame(contact(node, made.sync))
-    made.process_frame(contact(1, made.sync, tail=True))
-    assert made.is_complete
+        reports.process_frame(contact(node, reports.sync))
+    reports.process_frame(contact(1, reports.sync, tail=True))
+    assert reports.is_complete
 
 
 def test_reading_without_tail_does_not_wait_for_its_link() -> None:
-    made = reading()
-    syncs(made, MAX_LATE_SYNCS + 1, [2, 3])
-    begin(made, contacts=True, tail=True)
-    assert made.states_missing == 2
-    assert made.contacts_missing == 2
+    reports = reading()
+    syncs(reports, MAX_LATE_SYNCS + 1, [2, 3])
+    begin(reports, contacts=True, tail=True)
+    assert reports.states_missing == 2
+    assert reports.contacts_missing == 2
 
 
 def test_reading_waits_for_a_module_never_received() -> None:
-    made = ModuleReports(JOINTS)
-    syncs(made, 10, [1, 3])
-    begin(made)
-    answer(made, [1, 3])
-    assert not made.is_complete
+    reports = ModuleReports(JOINTS)
+    syncs(reports, 10, [1, 3])
+    begin(reports)
+    answer(reports, [1, 3])
+    assert not reports.is_complete
 
 
 def test_reading_returned_module_does_not_replace_another() -> None:
-    made = reading()
-    syncs(made, 10, [1, 3])
-    begin(made, contacts=True)
-    answer(made, [1, 2])
-    made.process_frame(contact(1, made.sync))
-    made.process_frame(contact(2, made.sync))
-    assert made.states_missing == 1
-    assert made.contacts_missing == 1
-    answer(made, [3])
-    made.process_frame(contact(3, made.sync))
-    assert made.is_complete
-    begin(made)
-    assert made.states_missing == JOINTS
+    reports = reading()
+    syncs(reports, 10, [1, 3])
+    begin(reports, contacts=True)
+    answer(reports, [1, 2])
+    reports.process_frame(contact(1, reports.sync))
+    reports.process_frame(contact(2, reports.sync))
+    assert reports.states_missing == 1
+    assert reports.contacts_missing == 1
+    answer(reports, [3])
+    reports.process_frame(contact(3, reports.sync))
+    assert reports.is_complete
+    begin(reports)
+    assert reports.states_missing == JOINTS

@@ -1,4 +1,4 @@
-"""What the reading keeps of forces, IMUs, heartbeats, strangers and noise."""
+"""Reports of joint modules: contact forces, IMUs, heartbeats, unknown nodes and arbitrary frames."""
 
 import copy
 
@@ -35,38 +35,38 @@ from snakesim_testing.can.readings import JOINTS, angles, reading
 
 
 def test_forces_of_another_sync_are_ignored_and_old_ones_dropped() -> None:
-    made = reading()
-    begin(made, contacts=True)
-    made.process_frame(contact(2, made.sync - 1, force_x=9.0))
-    assert made.list_contacts() == []
-    assert made.contacts_missing == JOINTS
-    made.process_frame(contact(2, made.sync, force_x=1.0))
-    made.process_frame(contact(2, made.sync, force_x=5.0))
-    assert [raw[0] for _, raw in made.list_contacts()] == [20], "the first counts"
-    assert made.contacts_missing == JOINTS - 1
-    begin(made, contacts=False)
-    assert len(made.list_contacts()) == 1
-    begin(made, contacts=True)
-    assert made.list_contacts() == []
+    reports = reading()
+    begin(reports, contacts=True)
+    reports.process_frame(contact(2, reports.sync - 1, force_x=9.0))
+    assert reports.list_contacts() == []
+    assert reports.contacts_missing == JOINTS
+    reports.process_frame(contact(2, reports.sync, force_x=1.0))
+    reports.process_frame(contact(2, reports.sync, force_x=5.0))
+    assert [raw[0] for _, raw in reports.list_contacts()] == [20], "the first report counts"
+    assert reports.contacts_missing == JOINTS - 1
+    begin(reports, contacts=False)
+    assert len(reports.list_contacts()) == 1
+    begin(reports, contacts=True)
+    assert reports.list_contacts() == []
 
 
-def test_an_imus_halves_are_of_one_sync() -> None:
-    made = reading()
-    made.process_frame(gyro(2, 7, 1.0))
-    made.process_frame(accelerometer(2, 27, 9.81))  # between them two frames were lost
-    assert made.pop_imu_reports() == []
-    made.process_frame(gyro(2, 47, 2.0))
-    made.process_frame(accelerometer(2, 47, 9.81))
-    assert [list(rates) for _, rates, _ in made.pop_imu_reports()] == [[2000, 0, 0]]
+def test_imu_report_combines_frames_of_one_sync_only() -> None:
+    reports = reading()
+    reports.process_frame(gyro(2, 7, 1.0))
+    reports.process_frame(accelerometer(2, 27, 9.81))  # two frames between them were lost
+    assert reports.pop_imu_reports() == []
+    reports.process_frame(gyro(2, 47, 2.0))
+    reports.process_frame(accelerometer(2, 47, 9.81))
+    assert [list(rates) for _, rates, _ in reports.pop_imu_reports()] == [[2000, 0, 0]]
 
 
 # --- heartbeats --------------------------------------------------------------------------------------------
 
 
-MAX_UPTIME_S = 4294967.295  # the end of the signal's range
+MAX_UPTIME_S = 4294967.295  # upper end of the range of the signal, 49.7 days
 
-UPTIMES = {  # s, and how many restarts they are by then
-    "back, and on from there: a restart": [
+UPTIMES = {  # uptime in s, and the number of restarts that are counted by then
+    "restart that continues": [
         (5.0, 0),
         (5.1, 0),
         (5.1, 0),
@@ -74,14 +74,14 @@ UPTIMES = {  # s, and how many restarts they are by then
         (0.2, 1),
         (0.3, 1),
     ],
-    "and the next restart": [(5.0, 0), (0.1, 0), (0.2, 1), (0.3, 1), (0.1, 1), (0.1, 2), (0.2, 2)],
-    "two clocks in turn: two modules": [
+    "two restarts": [(5.0, 0), (0.1, 0), (0.2, 1), (0.3, 1), (0.1, 1), (0.1, 2), (0.2, 2)],
+    "two modules with one id": [
         (start_s + 0.1 * i, 0) for i in range(20) for start_s in (50.0, 0.0)
     ],
-    "one that comes late": [(5.0, 0), (5.2, 0), (5.1, 0), (5.3, 0), (5.4, 0)],
-    "49.7 days, at the end of the range": [(MAX_UPTIME_S - 0.05, 0), *[(MAX_UPTIME_S, 0)] * 4],
-    "49.7 days, and a restart": [*[(MAX_UPTIME_S, 0)] * 2, (0.1, 0), (0.2, 1), (0.3, 1)],
-    "49.7 days, in firmware that wraps": [
+    "late heartbeat": [(5.0, 0), (5.2, 0), (5.1, 0), (5.3, 0), (5.4, 0)],
+    "end of range": [(MAX_UPTIME_S - 0.05, 0), *[(MAX_UPTIME_S, 0)] * 4],
+    "restart at end of range": [*[(MAX_UPTIME_S, 0)] * 2, (0.1, 0), (0.2, 1), (0.3, 1)],
+    "counter that wraps": [
         (MAX_UPTIME_S - 0.05, 0),
         (0.05, 0),
         (0.15, 0),
@@ -94,68 +94,74 @@ UPTIMES = {  # s, and how many restarts they are by then
 def test_uptime_that_restarts_and_continues_means_module_restart(
     uptimes: list[tuple[float, int]],
 ) -> None:
-    made = reading()
+    reports = reading()
     for uptime_s, restarts in uptimes:
-        made.process_frame(heartbeat(2, uptime_s))
-        assert made.modules[1].restarts == restarts, uptime_s
-        assert made.modules[1].uptime_ms == round(uptime_s * 1000)
-    assert made.modules[0].restarts == 0
+        reports.process_frame(heartbeat(2, uptime_s))
+        assert reports.modules[1].restarts == restarts, uptime_s
+        assert reports.modules[1].uptime_ms == round(uptime_s * 1000)
+    assert reports.modules[0].restarts == 0
 
 
-def test_a_heartbeat_tells_state_faults_and_reason() -> None:
-    made = reading()
-    made.process_frame(
+def test_heartbeat_contains_state_faults_and_stop_reason() -> None:
+    reports = reading()
+    reports.process_frame(
         heartbeat(2, 1.0, ModuleState.FAULT, last_stop=LastStop.LEAK, fault_leak=1, fault_voltage=1)
     )
-    module = made.modules[1]
+    module = reports.modules[1]
     assert module.state == ModuleState.FAULT
     assert module.last_stop == LastStop.LEAK
     assert module.list_fault_names() == ["leak", "voltage"]
     assert module.is_clear_required
-    assert module.heartbeat_sync == made.sync
-    made.process_frame(heartbeat(2, 1.1))
+    assert module.heartbeat_sync == reports.sync
+    reports.process_frame(heartbeat(2, 1.1))
     assert module.list_fault_names() == []
     assert not module.is_clear_required
 
 
 @pytest.mark.parametrize("state", [ModuleState.FAULT, ModuleState.EMERGENCY])
 def test_latched_state_without_reason_needs_clearing_after_three_syncs(state: ModuleState) -> None:
-    made = reading()
-    for needed in (False, False, True):
-        syncs(made, 1, state=state)
-        assert made.modules[0].is_clear_required is needed
-    syncs(made, 1, state=ModuleState.DISARMED)
-    assert not made.modules[0].is_clear_required
+    reports = reading()
+    for is_required in (False, False, True):
+        syncs(reports, 1, state=state)
+        assert reports.modules[0].is_clear_required is is_required
+    syncs(reports, 1, state=ModuleState.DISARMED)
+    assert not reports.modules[0].is_clear_required
 
 
-# --- others ------------------------------------------------------------------------------------------------
+# --- malformed frames and unknown nodes --------------------------------------------------------------------
 
 
 def test_frames_of_another_length_are_counted_and_change_nothing() -> None:
-    made = reading()
-    before = copy.deepcopy(made.modules)
-    good = [joint_state(2, made.sync), heartbeat(2, 0.0), contact(2, 0), gyro(2, 0, 0.0), health(2)]
-    for i, frame in enumerate(good):
-        made.process_frame(CanFrame(frame.id, frame.data[:-1]))
-        made.process_frame(CanFrame(frame.id, b""))
-        assert made.malformed == 2 * (i + 1)
-    before[1].frame_count = made.modules[1].frame_count
-    assert made.modules == before
-    assert made.list_health_reports() == [None] * JOINTS
+    reports = reading()
+    before = copy.deepcopy(reports.modules)
+    valid_frames = [
+        joint_state(2, reports.sync),
+        heartbeat(2, 0.0),
+        contact(2, 0),
+        gyro(2, 0, 0.0),
+        health(2),
+    ]
+    for i, frame in enumerate(valid_frames):
+        reports.process_frame(CanFrame(frame.id, frame.data[:-1]))
+        reports.process_frame(CanFrame(frame.id, b""))
+        assert reports.malformed == 2 * (i + 1)
+    before[1].frame_count = reports.modules[1].frame_count
+    assert reports.modules == before
+    assert reports.list_health_reports() == [None] * JOINTS
 
 
-def test_strangers_are_counted_by_node() -> None:
-    made = reading()
+def test_frames_of_unknown_nodes_are_counted_by_node() -> None:
+    reports = reading()
     for node in (4, 4, LAST_NODE, 0):
-        made.process_frame(CanFrame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
-    assert made.unknown_node_frame_counts == {4: 2, LAST_NODE: 1, 0: 1}
-    assert not made.other_host_frame_counts
+        reports.process_frame(CanFrame(frame_id(Opcode.HEARTBEAT, node), bytes(8)))
+    assert reports.unknown_node_frame_counts == {4: 2, LAST_NODE: 1, 0: 1}
+    assert not reports.other_host_frame_counts
 
 
-# --- whatever comes ----------------------------------------------------------------------------------------
+# --- arbitrary frames --------------------------------------------------------------------------------------
 
-any_frame = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))
-ours = st.builds(
+any_frames = st.builds(CanFrame, st.integers(0, 0x7FF), st.binary(max_size=8))
+valid_frames_of_modules = st.builds(
     lambda opcode, node, data: CanFrame(
         frame_id(opcode, node), data[: load_layouts()[opcode].length]
     ),
@@ -165,35 +171,40 @@ ours = st.builds(
 )
 
 
-@given(st.lists(any_frame | ours, max_size=40), st.lists(st.booleans(), min_size=40, max_size=40))
+@given(
+    st.lists(any_frames | valid_frames_of_modules, max_size=40),
+    st.lists(st.booleans(), min_size=40, max_size=40),
+)
 @example([CanFrame(frame_id(Opcode.JOINT_STATE, 2), b"")], [False] * 40)
 def test_reader_of_arbitrary_frames_never_raises_or_moves_a_joint(
     frames: list[CanFrame], sync_before: list[bool]
 ) -> None:
-    made = reading()
-    for frame, contacts in zip(frames, sync_before, strict=False):
-        if contacts:
-            begin(made, contacts=True, tail=True)
-        before = made.shaft_values()
-        made.process_frame(frame)
+    reports = reading()
+    for frame, begins_sync in zip(frames, sync_before, strict=False):
+        if begins_sync:
+            begin(reports, contacts=True, tail=True)
+        before = reports.shaft_values()
+        reports.process_frame(frame)
         is_state = (
             parse_opcode(frame.id) == Opcode.JOINT_STATE
             and len(frame.data) == 8
             and has_valid_checksum(frame)
         )
-        changed = np.flatnonzero((made.shaft_values() != before).any(axis=0)).tolist()
-        assert changed in ([], [parse_node(frame.id) - 1] if is_state else [])
-        assert made.is_complete in (True, False)
-        assert made.list_contacts() is not None
-        assert made.pop_imu_reports() is not None
-        assert len(made.list_health_reports()) == JOINTS
+        changed_joints = np.flatnonzero((reports.shaft_values() != before).any(axis=0)).tolist()
+        assert changed_joints in ([], [parse_node(frame.id) - 1] if is_state else [])
+        assert reports.is_complete in (True, False)
+        assert reports.list_contacts() is not None
+        assert reports.pop_imu_reports() is not None
+        assert len(reports.list_health_reports()) == JOINTS
 
 
 @given(st.integers(1, JOINTS), st.integers(0, 63))
-def test_no_single_wrong_bit_moves_a_joint(node: int, bit: int) -> None:
-    made = reading()
-    begin(made)
-    whole = int.from_bytes(joint_state(node, made.sync, 0.9).data, "little") ^ 1 << bit
-    made.process_frame(CanFrame(frame_id(Opcode.JOINT_STATE, node), whole.to_bytes(8, "little")))
-    assert angles(made) == pytest.approx([0.1] * JOINTS)
-    assert made.modules[node - 1].corrupt_state_count == 1
+def test_state_with_one_wrong_bit_moves_no_joint(node: int, bit: int) -> None:
+    reports = reading()
+    begin(reports)
+    flipped_data = int.from_bytes(joint_state(node, reports.sync, 0.9).data, "little") ^ 1 << bit
+    reports.process_frame(
+        CanFrame(frame_id(Opcode.JOINT_STATE, node), flipped_data.to_bytes(8, "little"))
+    )
+    assert angles(reports) == pytest.approx([0.1] * JOINTS)
+    assert reports.modules[node - 1].corrupt_state_count == 1

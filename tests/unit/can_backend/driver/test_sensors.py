@@ -1,4 +1,4 @@
-"""What the HAL publishes of the modules' frames, and what the emulators make of a touch, there and back."""
+"""Samples that the driver makes from frames of joint modules, also of contacts that an emulator encodes."""
 
 import math
 from typing import Any
@@ -32,31 +32,33 @@ from snakesim_testing.can.frames import accelerometer, answer, begin, contact, g
 
 JOINTS = 4
 PERIOD_NS = 10_000_000
-EVERYTHING: dict[str, Any] = {
+ALL_SENSORS: dict[str, Any] = {
     "robot__sensors__contacts__rate_hz": 100.0,
     "robot__sensors__imu__rate_hz": 50.0,
     "robot__sensors__pose__rate_hz": 100.0,
 }
 
 
-def sensors_of(
-    run: RunConfig, reports: ReportSchedule | None = None
+def make_sensors(
+    run: RunConfig, schedule: ReportSchedule | None = None
 ) -> tuple[ModuleReports, SampleBuilder]:
-    reading = ModuleReports(run.robot.chain.modules)
-    return reading, SampleBuilder(run, reports or plan_reports(run, CanSettings()), reading, None)
+    """Return module reports, and the builder that makes samples from them."""
+    reports = ModuleReports(run.robot.chain.modules)
+    return reports, SampleBuilder(run, schedule or plan_reports(run, CanSettings()), reports, None)
 
 
-def contacts_of(samples: Samples) -> Contacts:
-    found = samples.by_key[keys.CONTACTS]
-    assert isinstance(found, Contacts)
-    return found
+def get_contacts(samples: Samples) -> Contacts:
+    """Return the contacts of a sample."""
+    contacts = samples.by_key[keys.CONTACTS]
+    assert isinstance(contacts, Contacts)
+    return contacts
 
 
 # --- joints ------------------------------------------------------------------------------------------------
 
 
-def test_joint_state_of_newest_sync_has_its_values_and_age_zero() -> None:
-    reading, sensors = sensors_of(config())
+def test_joint_state_of_newest_sync_has_age_zero() -> None:
+    reading, sensors = make_sensors(config())
     syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
     joints = sensors.make_samples(tick=7, timestamp_ns=70_000_000).joints
     assert joints.tick == 7
@@ -70,7 +72,7 @@ def test_joint_state_of_newest_sync_has_its_values_and_age_zero() -> None:
 
 def test_joint_state_of_silent_module_is_valid_for_the_lease() -> None:
     lease_periods = 5
-    reading, sensors = sensors_of(config())
+    reading, sensors = make_sensors(config())
     syncs(reading, 1, angle=0.5)
     for missed in range(1, 9):
         syncs(reading, 1, [1, 2, 4], angle=0.6)  # node 3 is silent
@@ -81,27 +83,29 @@ def test_joint_state_of_silent_module_is_valid_for_the_lease() -> None:
 
 
 def test_joint_state_never_received_is_invalid() -> None:
-    reading, sensors = sensors_of(config())
+    reading, sensors = make_sensors(config())
     syncs(reading, 1, [1, 2, 4])
     joints = sensors.make_samples(0, 0).joints
     assert joints.valid == [True, True, False, True]
     assert joints.age_ns[2] == NEVER_RECEIVED_AGE_NS
-    assert joints.angle_rad == pytest.approx([0.1, 0.1, 0.0, 0.1]), "a zero that nobody may believe"
+    assert joints.angle_rad == pytest.approx([0.1, 0.1, 0.0, 0.1]), (
+        "an unknown angle is 0.0 and invalid"
+    )
 
 
-# --- forces ------------------------------------------------------------------------------------------------
+# --- contacts ----------------------------------------------------------------------------------------------
 
 
-def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
-    run = config(**EVERYTHING)
-    reports = ReportSchedule(100.0, contact_every=3)
-    reading, sensors = sensors_of(run, reports)
+def test_contacts_are_sampled_only_at_requested_syncs() -> None:
+    run = config(**ALL_SENSORS)
+    schedule = ReportSchedule(100.0, contact_every=3)
+    reading, sensors = make_sensors(run, schedule)
     for tick in range(300):
-        sync = begin(reading, contacts=are_contacts_due(reports, reading.sync + 1))
+        sync = begin(reading, contacts=are_contacts_due(schedule, reading.sync + 1))
         answer(reading)
-        assert are_contacts_due(reports, sync) is (sync % 256 % 3 == 0)
+        assert are_contacts_due(schedule, sync) is (sync % 256 % 3 == 0)
         assert (keys.CONTACTS in sensors.make_samples(tick, 0).by_key) is are_contacts_due(
-            reports, sync
+            schedule, sync
         )
     assert not any(
         are_contacts_due(ReportSchedule(100.0, contact_every=0), sync) for sync in range(300)
@@ -109,50 +113,60 @@ def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
 
 
 def test_contacts_without_touch_are_an_empty_list() -> None:
-    reading, sensors = sensors_of(config(**EVERYTHING))
+    reading, sensors = make_sensors(config(**ALL_SENSORS))
     begin(reading, contacts=True)
     reading.process_frame(contact(2, reading.sync, touched=False, force_x=9.0))
-    assert contacts_of(sensors.make_samples(3, 30)) == Contacts(
+    assert get_contacts(sensors.make_samples(3, 30)) == Contacts(
         tick=3, timestamp_ns=30, contacts=[], measured_force_n=0.0
     )
 
 
 def test_contact_is_in_the_frame_of_its_link() -> None:
-    run = config(**EVERYTHING)
-    reading, sensors = sensors_of(run)
+    run = config(**ALL_SENSORS)
+    reading, sensors = make_sensors(run)
     begin(reading, contacts=True)
     reading.process_frame(
         contact(2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2)
     )
-    (found,) = contacts_of(sensors.make_samples(3, 30)).contacts
+    (reported,) = get_contacts(sensors.make_samples(3, 30)).contacts
     radius_m = run.robot.module.radius_m
-    assert found.link == 2
-    assert found.obstacle is None
-    assert found.torque_l == (0.0, 0.0, 0.0)
-    assert found.position_l == pytest.approx((0.04, 0.0, radius_m))
-    assert found.normal_l == pytest.approx((0.0, 0.0, -1.0)), "from the obstacle into the body"
-    assert found.force_l == pytest.approx((1.0, -3.0, 0.0))
-    frame = np.array((found.normal_l, found.tangent_1_l, found.tangent_2_l))
-    assert np.allclose(frame @ frame.T, np.eye(3))
-    assert found.tangent_1_l[0] > 0
+    assert reported.link == 2
+    assert reported.obstacle is None
+    assert reported.torque_l == (0.0, 0.0, 0.0)
+    assert reported.position_l == pytest.approx((0.04, 0.0, radius_m))
+    assert reported.normal_l == pytest.approx((0.0, 0.0, -1.0)), "from the obstacle into the body"
+    assert reported.force_l == pytest.approx((1.0, -3.0, 0.0))
+    axes = np.array((reported.normal_l, reported.tangent_1_l, reported.tangent_2_l))
+    assert np.allclose(axes @ axes.T, np.eye(3))
+    assert reported.tangent_1_l[0] > 0
 
 
 def test_contact_below_threshold_of_robot_is_omitted() -> None:
-    reading, sensors = sensors_of(config(**EVERYTHING, robot__sensors__contacts__threshold_n=1.0))
+    reading, sensors = make_sensors(
+        config(**ALL_SENSORS, robot__sensors__contacts__threshold_n=1.0)
+    )
     begin(reading, contacts=True)
-    for node, force in ((1, 0.9), (2, 1.0), (3, -1.05)):
-        reading.process_frame(contact(node, reading.sync, force_z=force))
-    assert [found.link for found in contacts_of(sensors.make_samples(0, 0)).contacts] == [2, 3]
+    for node, force_n in ((1, 0.9), (2, 1.0), (3, -1.05)):
+        reading.process_frame(contact(node, reading.sync, force_z=force_n))
+    assert [reported.link for reported in get_contacts(sensors.make_samples(0, 0)).contacts] == [
+        2,
+        3,
+    ]
 
 
-# The place of a touch, from the physics model through emulator and bus to the HAL.
+# The position of a contact, from the physics model through emulator and bus to the HAL.
 
 
-def capsule_point(
+def compute_capsule_point(
     along_m: float, polar: float, bearing: float, length_m: float, radius_m: float
 ) -> Vector:
-    """A point of a capsule: on the cylinder for polar 0, on the ball at the nearer end otherwise."""
-    base_m = along_m if polar == 0 else (length_m if polar > 0 else 0.0)
+    """Return a point of a capsule: on the cylinder if polar is 0, on the sphere at the nearer end otherwise."""
+    if polar == 0:
+        base_m = along_m
+    elif polar > 0:
+        base_m = length_m
+    else:
+        base_m = 0.0
     across = radius_m * math.cos(polar)
     return (
         base_m + radius_m * math.sin(polar),
@@ -163,35 +177,38 @@ def capsule_point(
 
 @given(
     link=st.integers(0, JOINTS),
-    share=st.floats(0, 1),
+    position_fraction=st.floats(0, 1),
     polar=st.just(0.0) | st.floats(-1.4, 1.4),
     bearing=st.floats(-math.pi, math.pi),
 )
 def test_contact_anywhere_on_a_capsule_is_reported_within_bus_resolution(
-    link: int, share: float, polar: float, bearing: float
+    link: int, position_fraction: float, polar: float, bearing: float
 ) -> None:
-    run = config(**EVERYTHING)
-    length_m, radius_m = run.robot.link_lengths_m[link], run.robot.module.radius_m
-    point = capsule_point(share * length_m, polar, bearing, length_m, radius_m)
-    reading, sensors = sensors_of(run)
+    run = config(**ALL_SENSORS)
+    length_m = run.robot.link_lengths_m[link]
+    radius_m = run.robot.module.radius_m
+    point = compute_capsule_point(position_fraction * length_m, polar, bearing, length_m, radius_m)
+    reading, sensors = make_sensors(run)
     sync = begin(reading, contacts=True)
-    numbers = (*encode_contact(LinkLoad(link, point, (1.0, 2.0, 3.0))), sync)
+    values = (*encode_contact(LinkLoad(link, point, (1.0, 2.0, 3.0))), sync)
     reading.process_frame(
-        write_tail_contact(1, numbers) if link == 0 else write_contact(link, numbers)
+        write_tail_contact(1, values) if link == 0 else write_contact(link, values)
     )
-    (found,) = contacts_of(sensors.make_samples(0, 0)).contacts
-    assert found.link == link
-    base = (min(max(point[0], 0.0), length_m), 0.0, 0.0)
-    outward = [(p - b) / radius_m for p, b in zip(point, base, strict=True)]
-    cosine = -float(np.dot(outward, found.normal_l))
-    # a step along the link turns the normal most where the ball ends: by step / (radius x cos(polar))
-    turned = load_layouts()[Opcode.CONTACT].signals["bearing"].scale / 2
-    leaned = (
+    (reported,) = get_contacts(sensors.make_samples(0, 0)).contacts
+    assert reported.link == link
+    axis_point = (min(max(point[0], 0.0), length_m), 0.0, 0.0)
+    outward = [
+        (point_m - base_m) / radius_m for point_m, base_m in zip(point, axis_point, strict=True)
+    ]
+    cosine = -float(np.dot(outward, reported.normal_l))
+    # A position step along the link changes the normal by up to step / (radius x cos(polar)).
+    bearing_error_rad = load_layouts()[Opcode.CONTACT].signals["bearing"].scale / 2
+    along_error_rad = (
         load_layouts()[Opcode.CONTACT].signals["along"].scale / 2 / (radius_m * math.cos(polar))
     )
-    allowed = 1.5 * (turned * math.cos(polar) + leaned) + 1e-9
-    assert math.acos(min(cosine, 1.0)) <= allowed
-    assert math.dist(point, found.position_l) <= radius_m * allowed + 0.00025
+    max_error_rad = 1.5 * (bearing_error_rad * math.cos(polar) + along_error_rad) + 1e-9
+    assert math.acos(min(cosine, 1.0)) <= max_error_rad
+    assert math.dist(point, reported.position_l) <= radius_m * max_error_rad + 0.00025
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-4, 4), st.floats(0.01, 0.2), st.floats(0.005, 0.1))
@@ -210,7 +227,7 @@ def test_contact_position_is_on_the_capsule(
 
 
 def test_imu_sample_has_only_new_and_complete_reports() -> None:
-    reading, sensors = sensors_of(config(**EVERYTHING))
+    reading, sensors = make_sensors(config(**ALL_SENSORS))
     syncs(reading, 1)
     assert keys.IMU not in sensors.make_samples(0, 0).by_key
     reading.process_frame(gyro(3, 0, 0.5))
@@ -227,7 +244,7 @@ def test_imu_sample_has_only_new_and_complete_reports() -> None:
 
 
 def test_power_sample_is_made_every_half_second() -> None:
-    reading, sensors = sensors_of(config())
+    reading, sensors = make_sensors(config())
     syncs(reading, 1)
     ticks_with_power = [
         tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).by_key
@@ -236,7 +253,7 @@ def test_power_sample_is_made_every_half_second() -> None:
 
 
 def test_power_sample_of_modules_without_report_is_invalid() -> None:
-    reading, sensors = sensors_of(config())
+    reading, sensors = make_sensors(config())
     syncs(reading, 1)
     reading.process_frame(
         health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1)
@@ -256,37 +273,40 @@ def test_power_sample_of_modules_without_report_is_invalid() -> None:
 
 
 def test_power_values_of_a_module_expire() -> None:
-    reading, sensors = sensors_of(config())
+    reading, sensors = make_sensors(config())
     syncs(reading, 1)
     reading.process_frame(health(2, voltage=23.5))
 
-    def valid(tick: int) -> list[bool]:
+    def get_valid_flags(tick: int) -> list[bool]:
         power = sensors.make_samples(tick, 0).by_key[keys.POWER]
         assert isinstance(power, Power)
         return power.valid
 
-    syncs(reading, 125)  # of 100 Hz: two reports and a half
-    assert valid(50) == [False, True, False, False]
+    syncs(reading, 125)  # at 100 Hz: two and a half report periods
+    assert get_valid_flags(50) == [False, True, False, False]
     syncs(reading, 1)
-    assert valid(100) == [False] * JOINTS
+    assert get_valid_flags(100) == [False] * JOINTS
     reading.process_frame(health(2, voltage=23.5))
-    assert valid(150) == [False, True, False, False]
+    assert get_valid_flags(150) == [False, True, False, False]
 
 
-# --- what is described -------------------------------------------------------------------------------------
+# --- descriptions ------------------------------------------------------------------------------------------
 
 
-def test_sensors_are_described_with_their_rates() -> None:
-    run = config(**EVERYTHING)
+def test_sensor_descriptions_have_rates_and_delays() -> None:
+    run = config(**ALL_SENSORS)
     sensors = describe_sensors(run, ReportSchedule(100.0, 4, 20), pose_delay_s=0.02)
-    found = {s.key: s.rate_hz for s in sensors}
-    assert found == {
+    rates_hz = {sensor.key: sensor.rate_hz for sensor in sensors}
+    assert rates_hz == {
         keys.JOINTS: 100.0,
         keys.CONTACTS: 25.0,
         keys.IMU: 5.0,
         keys.POWER: 2.0,
         keys.POSE: 100.0,
     }
-    assert {s.key: s.delay_s for s in sensors if s.delay_s} == {keys.POSE: 0.02}
-    bare = {s.key for s in describe_sensors(run, ReportSchedule(100.0, 0, 0), pose_delay_s=None)}
-    assert bare == {keys.JOINTS, keys.POWER}
+    assert {sensor.key: sensor.delay_s for sensor in sensors if sensor.delay_s} == {keys.POSE: 0.02}
+    minimal_keys = {
+        sensor.key
+        for sensor in describe_sensors(run, ReportSchedule(100.0, 0, 0), pose_delay_s=None)
+    }
+    assert minimal_keys == {keys.JOINTS, keys.POWER}

@@ -1,4 +1,4 @@
-"""Each finding: its word, its joint, where it sends a person; told once, and again when it is still there."""
+"""The module monitor reports each fault once with its joint and cause, and again if it is present after a reset."""
 
 import pytest
 
@@ -27,50 +27,62 @@ from snakesim_testing.can.monitor_rig import (
     reporting,
 )
 
-# --- what one module can do wrong --------------------------------------------------------------------------
+# --- faults of one module ----------------------------------------------------------------------------------
 
 
-def frozen(reading: ModuleReports) -> None:
+def repeat_old_answer(reading: ModuleReports) -> None:
+    """Let node 2 answer an old Sync again."""
     reading.process_frame(joint_state(2, 2))
 
 
-def miscounting(reading: ModuleReports) -> None:
+def answer_with_wrong_counter(reading: ModuleReports) -> None:
     reading.process_frame(joint_state(2, reading.sync + 7))
 
 
-def corrupt(reading: ModuleReports) -> None:
+def answer_with_wrong_checksum(reading: ModuleReports) -> None:
     reading.process_frame(corrupted(joint_state(2, reading.sync)))
 
 
-def doubled(reading: ModuleReports) -> None:
+def answer_twice(reading: ModuleReports) -> None:
     reading.process_frame(joint_state(2, reading.sync))
     reading.process_frame(joint_state(2, reading.sync))
 
 
-def babbling(reading: ModuleReports) -> None:
+def flood_bus(reading: ModuleReports) -> None:
+    """Let node 2 answer, and send too many heartbeats."""
     reading.process_frame(joint_state(2, reading.sync))
     for _ in range(MAX_FRAMES_PER_CYCLE):
         reading.process_frame(heartbeat(2, 1.0))
 
 
-WRONGS = [
+MODULE_FAULTS = [
     (quiet, 3, "module_silent", "is silent: no state for 30 ms"),
-    (frozen, 3, "module_frozen", "is frozen: it repeats its answer number 2 to every Sync"),
     (
-        miscounting,
+        repeat_old_answer,
+        3,
+        "module_frozen",
+        "is frozen: it repeats its answer number 2 to every Sync",
+    ),
+    (
+        answer_with_wrong_counter,
         3,
         "wrong_counter",
         "answers Syncs that were not sent: 3 wrong counters in a row",
     ),
-    (corrupt, 3, "bad_checksum", "sends corrupt states: 3 wrong checksums in a row"),
     (
-        doubled,
+        answer_with_wrong_checksum,
+        3,
+        "bad_checksum",
+        "sends corrupt states: 3 wrong checksums in a row",
+    ),
+    (
+        answer_twice,
         3,
         "duplicate_node",
         "is duplicated: every Sync is answered twice; give each module its own node id",
     ),
     (
-        babbling,
+        flood_bus,
         1,
         "module_babbling",
         f"floods the bus: {MAX_FRAMES_PER_CYCLE + 1} frames within one period",
@@ -79,204 +91,216 @@ WRONGS = [
 
 
 @pytest.mark.parametrize(
-    ("speak", "after", "what", "cause"), WRONGS, ids=[row[2] for row in WRONGS]
+    ("send_frames", "periods", "what", "cause"),
+    MODULE_FAULTS,
+    ids=[row[2] for row in MODULE_FAULTS],
 )
-def test_watch_fault_is_reported_once_and_again_after_clearing(
-    speak: Speak, after: int, what: str, cause: str
+def test_watch_fault_is_reported_once_and_again_after_reset(
+    send_frames: Speak, periods: int, what: str, cause: str
 ) -> None:
-    bench = MonitorRig()
-    assert bench.ticks(after - 1, speak) == [], "a glitch is nothing to stop for"
-    assert bench.tick(speak) == [
+    rig = MonitorRig()
+    assert rig.ticks(periods - 1, send_frames) == [], "a glitch does not stop the robot"
+    assert rig.tick(send_frames) == [
         FaultFinding(what, WHO + cause, 1, affects_only_joint=what not in ROBOT_FAULT_KINDS)
     ]
-    assert bench.ticks(40, speak) == []
-    bench.reset()
-    assert (what, 1) in list_findings(bench.ticks(CLEAR_GRACE_SYNCS + 1, speak))
-    assert bench.ticks(40, speak) == []
+    assert rig.ticks(40, send_frames) == []
+    rig.reset()
+    assert (what, 1) in list_findings(rig.ticks(CLEAR_GRACE_SYNCS + 1, send_frames))
+    assert rig.ticks(40, send_frames) == []
 
 
-@pytest.mark.parametrize("speak", [quiet, frozen, miscounting, corrupt, doubled])
+@pytest.mark.parametrize(
+    "send_frames",
+    [quiet, repeat_old_answer, answer_with_wrong_counter, answer_with_wrong_checksum, answer_twice],
+)
 @pytest.mark.parametrize("length", [1, 2])
-def test_watch_glitches_report_nothing(speak: Speak, length: int) -> None:
-    bench = MonitorRig()
+def test_watch_glitches_report_nothing(send_frames: Speak, length: int) -> None:
+    rig = MonitorRig()
     for _ in range(20):
-        assert bench.ticks(length, speak) == []
-        assert bench.ticks(2) == []
+        assert rig.ticks(length, send_frames) == []
+        assert rig.ticks(2) == []
 
 
-@pytest.mark.parametrize("bad", [corrupt, miscounting])
-def test_watch_module_with_invalid_frames_is_not_silent(bad: Speak) -> None:
-    bench = MonitorRig()
-    assert bench.ticks(2, bad) == []
-    assert bench.tick(quiet) == []
-    assert bench.ticks(1) == []
+@pytest.mark.parametrize(
+    "send_invalid_frame", [answer_with_wrong_checksum, answer_with_wrong_counter]
+)
+def test_watch_module_with_invalid_frames_is_not_silent(send_invalid_frame: Speak) -> None:
+    rig = MonitorRig()
+    assert rig.ticks(2, send_invalid_frame) == []
+    assert rig.tick(quiet) == []
+    assert rig.ticks(1) == []
 
 
 def test_watch_module_never_received_is_reported_only_as_silent() -> None:
-    reading, watch = ModuleReports(1), ModuleMonitor(["joint_1"], ["can0"], PERIOD_S)
-    found = [
-        f for _ in range(4) for f in (begin(reading), watch.find_faults(reading, "disarmed"))[1]
-    ]
-    assert list_findings(found) == [("module_silent", 0)]
-    assert found[0].cause.endswith("ms")
+    reports = ModuleReports(1)
+    monitor = ModuleMonitor(["joint_1"], ["can0"], PERIOD_S)
+    findings: list[FaultFinding] = []
+    for _ in range(4):
+        begin(reports)
+        findings += monitor.find_faults(reports, "disarmed")
+    assert list_findings(findings) == [("module_silent", 0)]
+    assert findings[0].cause.endswith("ms")
 
 
 def test_watch_silent_module_with_heartbeat_differs_from_dead_one() -> None:
-    bench = MonitorRig()
-    bench.tick(lambda reading: reading.process_frame(heartbeat(2, 1.0)))
-    (found,) = bench.ticks(2, quiet)
-    assert "it still sends heartbeats" in found.cause
-    bench = MonitorRig()
-    bench.tick(reporting())
-    (found,) = bench.ticks(3, quiet)
-    assert "no heartbeat either: power, cable or reset" in found.cause
+    rig = MonitorRig()
+    rig.tick(lambda reading: reading.process_frame(heartbeat(2, 1.0)))
+    (finding,) = rig.ticks(2, quiet)
+    assert "it still sends heartbeats" in finding.cause
+    rig = MonitorRig()
+    rig.tick(reporting())
+    (finding,) = rig.ticks(3, quiet)
+    assert "no heartbeat either: power, cable or reset" in finding.cause
 
 
 # --- restarts ----------------------------------------------------------------------------------------------
 
 
-def restarting(bench: MonitorRig) -> list[FaultFinding]:
-    found: list[FaultFinding] = []
+def restart_module(rig: MonitorRig) -> list[FaultFinding]:
+    """Let node 2 restart, and return the findings."""
+    findings: list[FaultFinding] = []
     for uptime_s in (50.0, 0.1, 0.2):
-        found += bench.tick(answering(ModuleState.DISARMED, heartbeat(2, uptime_s)))
-    return found
+        findings += rig.tick(answering(ModuleState.DISARMED, heartbeat(2, uptime_s)))
+    return findings
 
 
 def test_watch_restart_is_reported_once_with_joint_and_lost_settings() -> None:
-    bench = MonitorRig()
-    found = restarting(bench) + bench.ticks(10)
-    assert list_findings(found) == [("module_restarted", 1)]
-    assert found[0].cause.startswith(WHO + "has restarted")
-    assert "0.20 s" in found[0].cause
-    assert bench.watch.pop_changed_joints() == {1}
-    assert bench.watch.pop_changed_joints() == set()
-    bench.reset()
-    assert bench.ticks(10) == []
-    assert list_findings(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)], (
-        "the next one is another"
+    rig = MonitorRig()
+    findings = restart_module(rig) + rig.ticks(10)
+    assert list_findings(findings) == [("module_restarted", 1)]
+    assert findings[0].cause.startswith(WHO + "has restarted")
+    assert "0.20 s" in findings[0].cause
+    assert rig.watch.pop_changed_joints() == {1}
+    assert rig.watch.pop_changed_joints() == set()
+    rig.reset()
+    assert rig.ticks(10) == []
+    assert list_findings(restart_module(rig) + rig.ticks(10)) == [("module_restarted", 1)], (
+        "the next restart is another fault"
     )
 
 
 def test_watch_missing_parameters_at_arming_are_reported_once() -> None:
-    bench = MonitorRig()
-    assert bench.watch.find_faults(bench.reading, "disarmed", unconfigured_joints={1}) == []
+    rig = MonitorRig()
+    assert rig.watch.find_faults(rig.reading, "disarmed", unconfigured_joints={1}) == []
     assert (
-        bench.watch.find_faults(
-            bench.reading, "armed", unconfigured_joints={1}, isolated_joints={1}
-        )
+        rig.watch.find_faults(rig.reading, "armed", unconfigured_joints={1}, isolated_joints={1})
         == []
-    ), "set aside"
-    (found,) = bench.watch.find_faults(bench.reading, "armed", unconfigured_joints={1})
-    assert list_findings([found]) == [("module_not_configured", 1)]
-    assert not found.affects_only_joint
-    assert bench.watch.find_faults(bench.reading, "armed", unconfigured_joints={1}) == []
+    ), "the joint is isolated"
+    (finding,) = rig.watch.find_faults(rig.reading, "armed", unconfigured_joints={1})
+    assert list_findings([finding]) == [("module_not_configured", 1)]
+    assert not finding.affects_only_joint
+    assert rig.watch.find_faults(rig.reading, "armed", unconfigured_joints={1}) == []
 
 
-def test_two_modules_with_one_id_are_not_called_a_restart() -> None:
-    def two_hearts(reading: ModuleReports) -> None:
-        doubled(reading)
+def test_watch_two_modules_with_one_id_are_no_restart() -> None:
+    def send_two_heartbeats(reading: ModuleReports) -> None:
+        answer_twice(reading)
         reading.process_frame(heartbeat(2, 50.0 + 0.01 * reading.sync))
         reading.process_frame(heartbeat(2, 0.01 * reading.sync))
 
-    bench = MonitorRig()
-    assert list_findings(bench.ticks(30, two_hearts)) == [("duplicate_node", 1)]
-    assert bench.watch.pop_changed_joints() == set()
+    rig = MonitorRig()
+    assert list_findings(rig.ticks(30, send_two_heartbeats)) == [("duplicate_node", 1)]
+    assert rig.watch.pop_changed_joints() == set()
 
 
-def test_after_one_doubled_frame_a_restart_is_still_seen() -> None:
-    bench = MonitorRig()
-    bench.tick(doubled)
-    bench.ticks(5)
-    assert list_findings(restarting(bench) + bench.ticks(10)) == [("module_restarted", 1)]
+def test_watch_restart_after_one_doubled_answer_is_reported() -> None:
+    rig = MonitorRig()
+    rig.tick(answer_twice)
+    rig.ticks(5)
+    assert list_findings(restart_module(rig) + rig.ticks(10)) == [("module_restarted", 1)]
 
 
 def test_watch_isolated_joint_reports_only_robot_wide_faults() -> None:
-    bench = MonitorRig()
-    bench.isolated = {1}
-    assert bench.ticks(9, answering(ModuleState.FAULT)) == []
-    (found,) = bench.ticks(9, HOT_AND_WET)
-    assert found.what == "module_overheat"
-    assert found.joint == 1
-    assert not found.affects_only_joint
+    rig = MonitorRig()
+    rig.isolated = {1}
+    assert rig.ticks(9, answering(ModuleState.FAULT)) == []
+    (finding,) = rig.ticks(9, HOT_AND_WET)
+    assert finding.what == "module_overheat"
+    assert finding.joint == 1
+    assert not finding.affects_only_joint
 
 
-def test_an_emergency_concerns_all_whatever_else_is_wrong() -> None:
-    bench = MonitorRig()
-    bench.isolated = {1}
-    stopped = reporting(ModuleState.EMERGENCY, last_stop=LastStop.EMERGENCY, fault_overheat=1)
-    (found,) = bench.ticks(9, stopped)
-    assert found.what == "module_overheat"
-    assert not found.affects_only_joint
+def test_watch_emergency_with_other_fault_concerns_the_robot() -> None:
+    rig = MonitorRig()
+    rig.isolated = {1}
+    report_emergency = reporting(
+        ModuleState.EMERGENCY, last_stop=LastStop.EMERGENCY, fault_overheat=1
+    )
+    (finding,) = rig.ticks(9, report_emergency)
+    assert finding.what == "module_overheat"
+    assert not finding.affects_only_joint
 
 
-def test_water_after_heat_is_told_again_with_all_reasons() -> None:
-    bench = MonitorRig()
-    (found,) = bench.ticks(9, HOT)
-    assert found.affects_only_joint
-    reasons = "reports overheat, leak; it stopped because of overheat"
-    assert bench.ticks(9, HOT_AND_WET) == [
-        FaultFinding("module_overheat", WHO + reasons, 1, affects_only_joint=False)
+def test_watch_leak_after_overheating_is_reported_with_all_reasons() -> None:
+    rig = MonitorRig()
+    (finding,) = rig.ticks(9, HOT)
+    assert finding.affects_only_joint
+    cause = "reports overheat, leak; it stopped because of overheat"
+    assert rig.ticks(9, HOT_AND_WET) == [
+        FaultFinding("module_overheat", WHO + cause, 1, affects_only_joint=False)
     ]
 
 
 def test_watch_fault_without_heartbeat_is_reported_from_state() -> None:
-    bench = MonitorRig()
-    found = bench.ticks(9, answering(ModuleState.FAULT))
-    assert list_findings(found) == [("module_fault", 1)]
+    rig = MonitorRig()
+    findings = rig.ticks(9, answering(ModuleState.FAULT))
+    assert list_findings(findings) == [("module_fault", 1)]
 
 
-def test_a_modules_fault_has_time_to_go_after_a_clearing() -> None:
-    bench = MonitorRig()
-    bench.tick(HOT_AND_WET)
-    bench.reset()
-    assert bench.ticks(CLEAR_GRACE_SYNCS - 1, HOT_AND_WET) == []
-    bench.tick(reporting())
-    assert bench.ticks(10) == []
-    bench.reset()
-    assert bench.ticks(CLEAR_GRACE_SYNCS - 1, HOT_AND_WET) == []
-    assert list_findings(bench.tick(HOT_AND_WET)) == [("module_overheat", 1)], (
-        "and is told again when it stays"
+def test_watch_fault_after_reset_is_reported_after_grace() -> None:
+    rig = MonitorRig()
+    rig.tick(HOT_AND_WET)
+    rig.reset()
+    assert rig.ticks(CLEAR_GRACE_SYNCS - 1, HOT_AND_WET) == []
+    rig.tick(reporting())
+    assert rig.ticks(10) == []
+    rig.reset()
+    assert rig.ticks(CLEAR_GRACE_SYNCS - 1, HOT_AND_WET) == []
+    assert list_findings(rig.tick(HOT_AND_WET)) == [("module_overheat", 1)], (
+        "a fault that remains is reported again"
     )
 
 
 @pytest.mark.parametrize(
-    ("lifecycle", "reported"), [("estop", []), ("disarmed", [("module_emergency", 1)])]
+    ("lifecycle", "expected"), [("estop", []), ("disarmed", [("module_emergency", 1)])]
 )
-def test_an_emergency_is_as_it_should_be_only_in_one(
-    lifecycle: LifecycleState, reported: list[tuple[str, int]]
+def test_watch_emergency_is_a_fault_unless_robot_is_stopped(
+    lifecycle: LifecycleState, expected: list[tuple[str, int]]
 ) -> None:
-    bench = MonitorRig()
-    bench.lifecycle = lifecycle
-    assert list_findings(bench.ticks(9, answering(ModuleState.EMERGENCY))) == reported
+    rig = MonitorRig()
+    rig.lifecycle = lifecycle
+    assert list_findings(rig.ticks(9, answering(ModuleState.EMERGENCY))) == expected
 
 
 def test_watch_module_that_does_not_arm_is_reported_after_grace() -> None:
-    bench = MonitorRig()
-    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
-    found = [bench.tick(answering(ModuleState.DISARMED)) for _ in range(20)]
-    first = next(i for i, reported in enumerate(found) if reported)
-    assert ARM_GRACE_SYNCS < first <= ARM_GRACE_SYNCS + 3
-    assert [f for reported in found for f in reported] == [
+    rig = MonitorRig()
+    rig.lifecycle = "armed"
+    rig.state = ModuleState.ARMED
+    findings_of_ticks = [rig.tick(answering(ModuleState.DISARMED)) for _ in range(20)]
+    first_tick = next(tick for tick, findings in enumerate(findings_of_ticks) if findings)
+    assert ARM_GRACE_SYNCS < first_tick <= ARM_GRACE_SYNCS + 3
+    assert [finding for findings in findings_of_ticks for finding in findings] == [
         FaultFinding("module_not_armed", WHO + "does not arm: it is disarmed", 1)
     ]
 
 
 def test_watch_module_armed_within_grace_is_not_reported() -> None:
-    bench = MonitorRig()
-    bench.lifecycle = "armed"
-    assert bench.ticks(ARM_GRACE_SYNCS) == []
-    bench.state = ModuleState.ARMED
-    assert bench.ticks(10) == []
-    assert bench.ticks(2, answering(ModuleState.STOPPING)) == []
-    assert bench.ticks(10) == []
+    rig = MonitorRig()
+    rig.lifecycle = "armed"
+    assert rig.ticks(ARM_GRACE_SYNCS) == []
+    rig.state = ModuleState.ARMED
+    assert rig.ticks(10) == []
+    assert rig.ticks(2, answering(ModuleState.STOPPING)) == []
+    assert rig.ticks(10) == []
 
 
 def test_watch_module_that_disarms_itself_is_reported_at_once() -> None:
-    bench = MonitorRig()
-    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
-    assert bench.ticks(2) == [], "within the grace"
-    found = bench.tick(answering(ModuleState.DISARMED))
-    assert found == [
+    rig = MonitorRig()
+    rig.lifecycle = "armed"
+    rig.state = ModuleState.ARMED
+    assert rig.ticks(2) == [], "the grace period has not ended"
+    findings = rig.tick(answering(ModuleState.DISARMED))
+    assert findings == [
         FaultFinding(
             "module_not_armed",
             WHO + "is not armed any more: it is disarmed",
@@ -286,11 +310,13 @@ def test_watch_module_that_disarms_itself_is_reported_at_once() -> None:
     ]
 
 
-def test_the_grace_begins_with_every_arming() -> None:
-    bench = MonitorRig()
-    bench.lifecycle, bench.state = "armed", ModuleState.ARMED
-    bench.ticks(20)
-    bench.lifecycle, bench.state = "disarmed", ModuleState.DISARMED
-    assert bench.ticks(20) == [], "disarmed modules of a disarmed robot"
-    bench.lifecycle = "armed"
-    assert bench.ticks(ARM_GRACE_SYNCS) == []
+def test_watch_grace_period_starts_with_every_arming() -> None:
+    rig = MonitorRig()
+    rig.lifecycle = "armed"
+    rig.state = ModuleState.ARMED
+    rig.ticks(20)
+    rig.lifecycle = "disarmed"
+    rig.state = ModuleState.DISARMED
+    assert rig.ticks(20) == [], "modules of a disarmed robot may be disarmed"
+    rig.lifecycle = "armed"
+    assert rig.ticks(ARM_GRACE_SYNCS) == []

@@ -1,4 +1,4 @@
-"""What the watch tells of buses, and of who should not be there."""
+"""The module monitor reports faults of buses, unknown nodes and other programs that command the modules."""
 
 import pytest
 
@@ -30,69 +30,70 @@ from snakesim_testing.can.monitor_rig import MonitorRig, answering, list_finding
         ("receive_overflow", "states may be missing"),
     ],
 )
-def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> None:
-    bench = MonitorRig()
+def test_bus_watch_bus_failure_is_reported_without_joint(kind: Kind, advice: str) -> None:
+    rig = MonitorRig()
     error = BusError(kind, "can0", "transmit errors 200, receive errors 3")
-    (found,) = bench.tick(errors=[error])
-    assert found.what == kind
-    assert found.joint is None
-    assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ")
-    assert advice in found.cause
-    assert bench.tick(errors=[error]) == []
-    assert [f.cause[:5] for f in bench.tick(errors=[BusError(kind, "can1", "")])] == ["can1:"], (
-        "the other bus is new"
-    )
-    bench.reset()
-    assert list_findings(bench.tick(errors=[error])) == [(kind, None)]
+    (finding,) = rig.tick(errors=[error])
+    assert finding.what == kind
+    assert finding.joint is None
+    assert finding.cause.startswith("can0: transmit errors 200, receive errors 3; ")
+    assert advice in finding.cause
+    assert rig.tick(errors=[error]) == []
+    assert [reported.cause[:5] for reported in rig.tick(errors=[BusError(kind, "can1", "")])] == [
+        "can1:"
+    ], "the same fault of another bus is a new fault"
+    rig.reset()
+    assert list_findings(rig.tick(errors=[error])) == [(kind, None)]
 
 
 @pytest.mark.parametrize(
     "kind", ["error_warning", "not_acknowledged", "queue_full", "error_frames", "interface_up"]
 )
-def test_lesser_errors_are_only_counted(kind: Kind) -> None:
-    bench = MonitorRig()
+def test_bus_watch_minor_errors_are_only_counted(kind: Kind) -> None:
+    rig = MonitorRig()
     for _ in range(2):
-        assert bench.tick(errors=[BusError(kind, "can0", "")]) == []
-    assert bench.watch.minor_error_counts == {kind: 2}
+        assert rig.tick(errors=[BusError(kind, "can0", "")]) == []
+    assert rig.watch.minor_error_counts == {kind: 2}
 
 
-def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
-    bench = MonitorRig()
-    for unsent in ("can1", "can1", "", "can1", "can1"):
-        assert bench.tick(unsent=unsent) == [], "full for a moment"
-    (found,) = bench.tick(unsent="can1")
-    assert found.what == "bus_stuck"
-    assert found.joint is None
-    for words in (
+def test_bus_watch_bus_full_for_three_periods_is_stuck() -> None:
+    rig = MonitorRig()
+    for full_channel in ("can1", "can1", "", "can1", "can1"):
+        assert rig.tick(unsent=full_channel) == [], "a queue may be full for a moment"
+    (finding,) = rig.tick(unsent="can1")
+    assert finding.what == "bus_stuck"
+    assert finding.joint is None
+    for text in (
         "can1: ",
         "no frames sent for 30 ms",
         "no node acknowledges",
         "txqueuelen is below 64",
     ):
-        assert words in found.cause
-    assert bench.tick(unsent="can1") == []
+        assert text in finding.cause
+    assert rig.tick(unsent="can1") == []
 
 
-# --- who should not be there -------------------------------------------------------------------------------
+# --- unknown nodes and other hosts -------------------------------------------------------------------------
 
 
-def stranger(reading: ModuleReports) -> None:
+def answer_with_unknown_node(reading: ModuleReports) -> None:
+    """Let node 9 answer, too, which is no joint of the robot."""
     answer(reading, [2])
     reading.process_frame(joint_state(9, reading.sync))
 
 
-def test_a_stranger_that_answers_every_sync_is_found() -> None:
-    bench = MonitorRig()
-    assert bench.ticks(2, stranger) == []
-    (found,) = bench.tick(stranger)
-    assert found == FaultFinding(
+def test_bus_watch_unknown_node_answering_every_sync_is_reported() -> None:
+    rig = MonitorRig()
+    assert rig.ticks(2, answer_with_unknown_node) == []
+    (finding,) = rig.tick(answer_with_unknown_node)
+    assert finding == FaultFinding(
         "unknown_node", "node 9 is on the bus, but is not a joint of this robot"
     )
-    assert bench.ticks(5, stranger) == []
+    assert rig.ticks(5, answer_with_unknown_node) == []
 
 
 @pytest.mark.parametrize(
-    ("frame", "what", "words"),
+    ("frame", "expected_fault", "expected_text"),
     [
         (
             load_layouts()[Opcode.SYNC].encode(0),
@@ -113,50 +114,54 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
         ),
     ],
 )
-def test_bus_watch_reports_a_second_host(frame: CanFrame, what: str, words: str) -> None:
-    bench, speak = MonitorRig(), answering(ModuleState.DISARMED, frame)
-    (found,) = bench.tick(speak)
-    assert found.what == what
-    assert found.joint is None
-    assert words in found.cause
-    assert bench.tick(speak) == []
-    bench.reset()
-    assert bench.tick() == [], "it was there once and is no more"
-    assert list_findings(bench.tick(speak)) == [(what, None)]
+def test_bus_watch_reports_a_second_host(
+    frame: CanFrame, expected_fault: str, expected_text: str
+) -> None:
+    rig = MonitorRig()
+    send_frame = answering(ModuleState.DISARMED, frame)
+    (finding,) = rig.tick(send_frame)
+    assert finding.what == expected_fault
+    assert finding.joint is None
+    assert expected_text in finding.cause
+    assert rig.tick(send_frame) == []
+    rig.reset()
+    assert rig.tick() == [], "the second host has ended"
+    assert list_findings(rig.tick(send_frame)) == [(expected_fault, None)]
 
 
-def test_what_another_host_may_have_changed_is_written_anew() -> None:
-    bench = MonitorRig()
-    bench.reading.process_frame(
+def test_bus_watch_parameters_changed_by_another_host_are_rewritten() -> None:
+    rig = MonitorRig()
+    rig.reading.process_frame(
         load_layouts()[Opcode.PARAMETER_REQUEST].encode(2, index=1, operation=1)
     )
-    assert list_findings(bench.tick()) == [("second_host", None)]
-    assert bench.watch.pop_changed_joints() == {0, 1, 2}
+    assert list_findings(rig.tick()) == [("second_host", None)]
+    assert rig.watch.pop_changed_joints() == {0, 1, 2}
 
 
 def test_bus_watch_identity_request_is_no_second_host() -> None:
-    bench = MonitorRig()
-    bench.reading.process_frame(make_command(CommandAction.IDENTIFY))
-    assert bench.tick() == []
-    assert bench.watch.pop_changed_joints() == set()
+    rig = MonitorRig()
+    rig.reading.process_frame(make_command(CommandAction.IDENTIFY))
+    assert rig.tick() == []
+    assert rig.watch.pop_changed_joints() == set()
 
 
-def test_a_module_is_not_silent_that_was_not_asked() -> None:
-    bench = MonitorRig()
+def test_bus_watch_module_without_sync_is_not_silent() -> None:
+    rig = MonitorRig()
     for i in range(10):
-        assert list_findings(bench.tick(quiet, unsent="can0")) == (
+        assert list_findings(rig.tick(quiet, unsent="can0")) == (
             [("bus_stuck", None)] if i == 2 else []
         )
-    assert bench.ticks(2, quiet) == []
-    assert list_findings(bench.tick(quiet)) == [("module_silent", 1)]
+    assert rig.ticks(2, quiet) == []
+    assert list_findings(rig.tick(quiet)) == [("module_silent", 1)]
 
 
 def test_bus_watch_interface_down_is_not_also_reported_stuck() -> None:
-    bench = MonitorRig()
-    down, up = (BusError(kind, "can1", "") for kind in ("interface_down", "interface_up"))
-    assert list_findings(bench.tick(errors=[down], unsent="can1")) == [("interface_down", None)]
+    rig = MonitorRig()
+    down = BusError("interface_down", "can1", "")
+    up = BusError("interface_up", "can1", "")
+    assert list_findings(rig.tick(errors=[down], unsent="can1")) == [("interface_down", None)]
     for _ in range(10):
-        assert bench.tick(unsent="can1") == []
-    bench.tick(errors=[up], unsent="can1")
-    found = [f for _ in range(3) for f in bench.tick(unsent="can1")]
-    assert list_findings(found) == [("bus_stuck", None)]
+        assert rig.tick(unsent="can1") == []
+    rig.tick(errors=[up], unsent="can1")
+    findings = [finding for _ in range(3) for finding in rig.tick(unsent="can1")]
+    assert list_findings(findings) == [("bus_stuck", None)]

@@ -1,4 +1,4 @@
-"""The texts of faults on request; what they do to modules is in `driver/test_faults_seen.py`."""
+"""Texts of injected faults are parsed and refused. `driver/test_faults_seen.py` tests their effects."""
 
 import pytest
 
@@ -21,7 +21,7 @@ def test_emulator_typed_fault_starts_or_ends_immediately():
 @pytest.mark.parametrize(
     "text", ["mute", "mute joint_2 on", "boil joint_1", "mute joint_2=1", "x" * 400]
 )
-def test_typed_fault_of_another_form_is_refused(text: str):
+def test_emulator_typed_fault_of_another_form_is_refused(text: str):
     with raises_error(ConfigError, code="injection/unknown-fault"):
         parse_typed_fault(text)
 

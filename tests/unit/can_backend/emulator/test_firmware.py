@@ -1,4 +1,4 @@
-"""The rules of one module's firmware, one by one, and what holds whatever a host sends."""
+"""The rules of the firmware of one joint module, and properties that hold for any frames of a host."""
 
 from typing import Any
 
@@ -34,16 +34,18 @@ from snakesim_testing.can.module_rig import (
 )
 from snakesim_testing.hypothesis_profiles import choose_trial_count
 
-WITHOUT_KEY = load_layouts()[Opcode.COMMAND].encode(BROADCAST, action=CommandAction.ARM)
+ARM_COMMAND_WITHOUT_KEY = load_layouts()[Opcode.COMMAND].encode(BROADCAST, action=CommandAction.ARM)
 
 
-def drive(module: ModuleFirmware, count: int, now_us: float, **how: Any) -> None:
-    """A setpoint, and the Sync that enacts it."""
-    module.receive_setpoint(setpoint(count, **how), now_us)
+def apply_setpoint(
+    module: ModuleFirmware, count: int, now_us: float, **setpoint_fields: Any
+) -> None:
+    """Send a setpoint, and the Sync that applies it."""
+    module.receive_setpoint(setpoint(count, **setpoint_fields), now_us)
     module.handle_sync(count, QUIET)
 
 
-def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
+def test_firmware_boots_silently_until_its_first_heartbeat():
     module = new_module()
     module.poll(0.0)
     module.receive(make_command(CommandAction.IDENTIFY), 50 * MS)
@@ -53,89 +55,88 @@ def test_it_boots_silent_and_answers_nothing_until_its_first_heartbeat():
     assert module.frames == []
     assert module.state == ModuleState.BOOT
     module.poll(100 * MS)
-    [beat] = only(module.frames, Opcode.HEARTBEAT)
-    assert beat["state"] == ModuleState.DISARMED
-    assert beat["uptime"] == pytest.approx(0.1)
+    [first_heartbeat] = only(module.frames, Opcode.HEARTBEAT)
+    assert first_heartbeat["state"] == ModuleState.DISARMED
+    assert first_heartbeat["uptime"] == pytest.approx(0.1)
     assert len(module.frames) == 1
 
 
 def test_firmware_sends_ten_heartbeats_and_two_health_reports_per_second():
     module = booted()
-    for k in range(1, 1001):
-        module.poll(BOOTED + k * MS)
+    for ms in range(1, 1001):
+        module.poll(BOOTED + ms * MS)
     assert len(only(module.frames, Opcode.HEARTBEAT)) == 10
     assert len(only(module.frames, Opcode.HEALTH)) == 2
 
 
-def test_position_targets_end_at_the_angle_limit():
+def test_firmware_position_target_is_limited_to_the_angle_limit():
     module = armed(angle_limit=0.5)
-    drive(module, 0, BOOTED, mode=JointMode.POSITION, target=-1.0)
+    apply_setpoint(module, 0, BOOTED, mode=JointMode.POSITION, target=-1.0)
     assert module.demand.target == -0.5
 
 
 @pytest.mark.parametrize(
-    ("sensed", "fault"), [("leak", ModuleFault.LEAK), ("hot", ModuleFault.OVERHEAT)]
+    ("cause", "fault"), [("leak", ModuleFault.LEAK), ("hot", ModuleFault.OVERHEAT)]
 )
-def test_firmware_fault_remains_until_cause_is_gone_and_cleared(sensed: str, fault: ModuleFault):
+def test_firmware_fault_remains_until_cause_is_gone_and_cleared(cause: str, fault: ModuleFault):
     module = armed()
-    module.health.leak, module.health.winding_c = (
-        sensed == "leak",
-        110.0 if sensed == "hot" else 20.0,
-    )
+    module.health.leak = cause == "leak"
+    module.health.winding_c = 110.0 if cause == "hot" else 20.0
     module.poll(BOOTED + MS)
-    [beat] = only(module.frames, Opcode.HEARTBEAT)
-    assert beat[f"fault_{fault.name.lower()}"] == 1
-    assert beat["last_stop"] == LastStop[fault.name]
-    module.health.winding_c = 80.0 if sensed == "hot" else 20.0
+    [heartbeat] = only(module.frames, Opcode.HEARTBEAT)
+    assert heartbeat[f"fault_{fault.name.lower()}"] == 1
+    assert heartbeat["last_stop"] == LastStop[fault.name]
+    module.health.winding_c = 80.0 if cause == "hot" else 20.0
     module.receive(make_command(CommandAction.CLEAR), BOOTED + 2 * MS)
     assert module.state == ModuleState.FAULT
-    module.health.leak, module.health.winding_c = False, 79.0
+    module.health.leak = False
+    module.health.winding_c = 79.0
     module.poll(BOOTED + 3 * MS)
-    assert module.state == ModuleState.FAULT, "latched"
+    assert module.state == ModuleState.FAULT, "the fault is latched"
     module.receive(make_command(CommandAction.CLEAR), BOOTED + 3 * MS)
     assert module.state == ModuleState.DISARMED
     assert module.faults == 0
 
 
 @pytest.mark.parametrize(
-    ("first", "count", "taken"),
+    ("first", "count", "is_accepted"),
     [
-        (15, 0, True),  # the first may be anything, the next is one more
-        (0, 2, True),  # one is lost, or two: that costs nothing but themselves
+        (15, 0, True),  # the first counter is arbitrary, the next is one higher
+        (0, 2, True),  # one or two lost setpoints are allowed
         (0, 3, True),
         (0, 4, False),  # too far ahead
         (0, 8, False),
         (0, 0, False),  # repeated
-        (0, 15, False),  # of before
+        (0, 15, False),  # earlier than the last one
     ],
 )
 def test_firmware_out_of_sequence_setpoint_is_dropped_and_counting_continues(
-    first: int, count: int, taken: bool
+    first: int, count: int, is_accepted: bool
 ):
     module = armed()
-    drive(module, first, BOOTED, target=1.0)
-    drive(module, count, BOOTED, target=2.0)
-    assert module.demand.target == pytest.approx(2.0 if taken else 1.0)
-    assert module.rejected_frame_count == (not taken)
-    drive(module, count + 1, BOOTED, target=3.0)
+    apply_setpoint(module, first, BOOTED, target=1.0)
+    apply_setpoint(module, count, BOOTED, target=2.0)
+    assert module.demand.target == pytest.approx(2.0 if is_accepted else 1.0)
+    assert module.rejected_frame_count == (not is_accepted)
+    apply_setpoint(module, count + 1, BOOTED, target=3.0)
     assert module.demand.target == pytest.approx(3.0)
     assert module.state == ModuleState.ARMED
 
 
-def test_set_points_without_syncs_do_not_keep_a_module_alive():
+def test_firmware_setpoints_without_syncs_do_not_feed_the_watchdog():
     module = armed()
-    drive(module, 0, BOOTED)
-    for k in range(1, 30):
-        module.receive_setpoint(setpoint(k, JointMode.PASSIVE), BOOTED + k * 10 * MS)
-        module.poll(BOOTED + k * 10 * MS)
+    apply_setpoint(module, 0, BOOTED)
+    for count in range(1, 30):
+        module.receive_setpoint(setpoint(count, JointMode.PASSIVE), BOOTED + count * 10 * MS)
+        module.poll(BOOTED + count * 10 * MS)
     assert module.state == ModuleState.FAULT
     assert module.last_stop == LastStop.WATCHDOG
     assert module.demand.mode == JointMode.PASSIVE
 
 
-def test_a_wrong_checksum_is_as_if_nothing_had_come():
+def test_firmware_setpoint_with_wrong_checksum_is_ignored():
     module = armed()
-    drive(module, 0, BOOTED, target=1.0)
+    apply_setpoint(module, 0, BOOTED, target=1.0)
     module.receive_setpoint(corrupted(setpoint(1, target=2.0)), BOOTED + 50 * MS)
     module.handle_sync(1, QUIET)
     assert module.demand.target == pytest.approx(1.0)
@@ -143,9 +144,9 @@ def test_a_wrong_checksum_is_as_if_nothing_had_come():
     assert module.rejected_frame_count == 1
 
 
-def test_stopping_damps_until_at_rest():
+def test_firmware_stopping_module_damps_until_at_rest():
     module = armed()
-    drive(module, 0, BOOTED)
+    apply_setpoint(module, 0, BOOTED)
     module.health.speed_rad_s = 3.0
     module.receive(make_command(CommandAction.STOP), BOOTED)
     assert module.state == ModuleState.STOPPING
@@ -169,14 +170,16 @@ def test_firmware_stopping_ends_after_watchdog_time():
     assert module.state == ModuleState.DISARMED
 
 
-@pytest.mark.parametrize("frame", [WITHOUT_KEY, corrupted(make_command(CommandAction.ARM))])
-def test_commands_need_key_and_checksum(frame):
+@pytest.mark.parametrize(
+    "frame", [ARM_COMMAND_WITHOUT_KEY, corrupted(make_command(CommandAction.ARM))]
+)
+def test_firmware_command_without_key_or_checksum_is_ignored(frame):
     module = booted()
     module.receive(frame, BOOTED)
     assert module.state == ModuleState.DISARMED
 
 
-def test_a_reboot_forgets_what_was_not_saved():
+def test_firmware_reboot_loses_unsaved_parameters():
     module = armed()
     module.receive(make_command(CommandAction.DISARM), BOOTED)
     module.receive(parameter(ModuleParameter.STIFFNESS, 12.0), BOOTED)
@@ -186,57 +189,57 @@ def test_a_reboot_forgets_what_was_not_saved():
     assert module.state == ModuleState.BOOT
     module.frames.clear()
     module.poll(BOOTED + 100 * MS)
-    [beat] = only(module.frames, Opcode.HEARTBEAT)
-    assert beat["uptime"] == pytest.approx(0.1)
+    [heartbeat] = only(module.frames, Opcode.HEARTBEAT)
+    assert heartbeat["uptime"] == pytest.approx(0.1)
     values = module.parameters.values
     assert values[ModuleParameter.STIFFNESS] == 0.0
     assert values[ModuleParameter.DAMPING] == 2.0
 
 
 def test_firmware_uptime_saturates_at_end_of_range() -> None:
-    """The protocol forbids a number that wraps around: an uptime of 0 would look like a restart."""
+    """Check that the uptime does not wrap around, because an uptime of 0 would look like a restart."""
     module = booted()
     module._boot_start_us = -(2**32 - 50) * MS
-    beats = [
+    heartbeats = [
         load_layouts()[Opcode.HEARTBEAT].decode(module.make_heartbeat(at_us).data)
         for at_us in (0.0, 100 * MS, 500 * MS)
     ]
-    assert [beat["uptime"] for beat in beats] == pytest.approx(
+    assert [heartbeat["uptime"] for heartbeat in heartbeats] == pytest.approx(
         [4294967.246, 4294967.295, 4294967.295], abs=1e-6
     )
 
 
-def test_every_sync_is_answered_with_its_own_count():
+def test_firmware_answers_every_sync_with_its_count():
     module = booted(contact_every=4, imu_every=5, tail=1)
     for count in range(20):
         module.handle_sync(count, QUIET)
     states = only(module.frames, Opcode.JOINT_STATE)
-    assert [s["count"] for s in states] == [c % 16 for c in range(20)]
-    assert [c["count"] for c in only(module.frames, Opcode.CONTACT)] == [0, 4, 8, 12, 0]
+    assert [state["count"] for state in states] == [count % 16 for count in range(20)]
+    assert [report["count"] for report in only(module.frames, Opcode.CONTACT)] == [0, 4, 8, 12, 0]
     assert len(only(module.frames, Opcode.TAIL_CONTACT)) == 5
 
 
-def test_firmware_hanging_module_repeats_state_until_hardware_watchdog_opens_bridge():
+def test_firmware_hanging_module_repeats_state_until_hardware_watchdog():
     module = armed()
-    drive(module, 3, BOOTED)
+    apply_setpoint(module, 3, BOOTED)
     module.is_hanging = True
     module.frames.clear()
     module.handle_sync(4, QUIET)
     [state] = only(module.frames, Opcode.JOINT_STATE)
     assert state["count"] == 3
     assert module.demand.mode == JointMode.TORQUE
-    for k in range(1, 300):
-        module.poll(BOOTED + k * MS)
-        assert (module.demand.mode == JointMode.PASSIVE) == (k >= 100)
+    for elapsed_ms in range(1, 300):
+        module.poll(BOOTED + elapsed_ms * MS)
+        assert (module.demand.mode == JointMode.PASSIVE) == (elapsed_ms >= 100)
     assert not only(module.frames, Opcode.HEARTBEAT)
     module.is_hanging = False
     module.poll(BOOTED + 301 * MS)
     assert module.last_stop == LastStop.WATCHDOG
 
 
-# --- whatever a host sends ---------------------------------------------------------------------------------
+# --- arbitrary frames of a host ----------------------------------------------------------------------------
 
-ANYTHING = st.one_of(
+ANY_FRAMES = st.one_of(
     st.sampled_from(list(CommandAction)).map(make_command),
     st.just(make_emergency()),
     st.builds(setpoint, st.integers(0, 15), st.sampled_from(list(JointMode))),
@@ -248,7 +251,8 @@ ANYTHING = st.one_of(
 PAUSES = st.sampled_from([0.0, 1.0 * MS, 20 * MS, 120 * MS])
 
 
-def give(module: ModuleFirmware, frame, now_us: float) -> None:
+def deliver_frame(module: ModuleFirmware, frame, now_us: float) -> None:
+    """Deliver a frame to the handler of its opcode."""
     opcode = frame.id >> 6
     if opcode == Opcode.SYNC:
         module.handle_sync(frame.data[0], QUIET)
@@ -259,29 +263,32 @@ def give(module: ModuleFirmware, frame, now_us: float) -> None:
 
 
 @settings(max_examples=choose_trial_count(100), deadline=None)
-@given(st.lists(st.tuples(ANYTHING, PAUSES, st.booleans()), max_size=60))
-def test_firmware_drives_only_when_armed_with_valid_setpoints(sent):
-    module, now_us = booted(), BOOTED
+@given(st.lists(st.tuples(ANY_FRAMES, PAUSES, st.booleans()), max_size=60))
+def test_firmware_drives_only_when_armed_with_valid_setpoints(events):
+    module = booted()
+    now_us = BOOTED
     module.health.speed_rad_s = 1.0
-    for frame, pause_us, leak in sent:
+    for frame, pause_us, leak in events:
         now_us += pause_us
         module.health.leak = leak and pause_us > 0
         module.poll(now_us)
-        before, state, refused = module._watchdog_fed_us, module.state, module.rejected_frame_count
-        give(module, frame, now_us)
+        fed_before_us = module._watchdog_fed_us
+        state_before = module.state
+        rejected_before = module.rejected_frame_count
+        deliver_frame(module, frame, now_us)
         if (
-            module._watchdog_fed_us != before
-            and state == ModuleState.ARMED
+            module._watchdog_fed_us != fed_before_us
+            and state_before == ModuleState.ARMED
             and module.state == ModuleState.ARMED
         ):
             assert frame.id >> 6 == Opcode.SET_POINT
-            assert module.rejected_frame_count == refused
+            assert module.rejected_frame_count == rejected_before
         if module.state not in (ModuleState.ARMED, ModuleState.STOPPING):
             assert module.demand.mode == JointMode.PASSIVE
 
 
 @pytest.mark.parametrize(("voltage_v", "faults"), [(18.0, 0), (17.99, 1 << ModuleFault.VOLTAGE)])
-def test_it_is_driven_down_to_18_v_and_not_below(voltage_v: float, faults: int) -> None:
+def test_firmware_supply_below_18_v_is_a_fault(voltage_v: float, faults: int) -> None:
     module = armed()
     module.health.voltage_v = voltage_v
     module.poll(BOOTED + 10 * MS)

@@ -1,4 +1,4 @@
-"""A physics model whose drives reach their links through backlash, or through a coupling that slips."""
+"""A physics model whose drives move their links through backlash, or through a coupling that slips."""
 
 import numpy as np
 import pytest
@@ -23,19 +23,19 @@ def test_backlash_drive_turns_through_gap_before_its_link_moves() -> None:
         move_rotor_inertia_to_motor_side(run, joints, looseness), InertiaSettings(drag_nm=0.02)
     )
     physics_model = LooseGearModel(links, joints, looseness, seed=1)
-    sound = InertiaModel(run, InertiaSettings(drag_nm=0.02))
-    apart: list[float] = []
+    rigid_model = InertiaModel(run, InertiaSettings(drag_nm=0.02))
+    gaps_rad: list[float] = []
     for step in range(600):
         torque_nm = np.full(3, 0.1 if (step // 150) % 2 == 0 else -0.1)
         physics_model.advance(torque_nm)
-        sound.advance(torque_nm)
-        apart.append(float(physics_model.angle_rad[1] - links.angle_rad[1]))
-    assert np.ptp(apart) == pytest.approx(BACKLASH_RAD, abs=0.003)
-    assert physics_model.angle_rad[[0, 2]] == pytest.approx(sound.angle_rad[[0, 2]])
-    assert np.ptp(apart[:3]) < 0.01  # a rotor has mass
+        rigid_model.advance(torque_nm)
+        gaps_rad.append(float(physics_model.angle_rad[1] - links.angle_rad[1]))
+    assert np.ptp(gaps_rad) == pytest.approx(BACKLASH_RAD, abs=0.003)
+    assert physics_model.angle_rad[[0, 2]] == pytest.approx(rigid_model.angle_rad[[0, 2]])
+    assert np.ptp(gaps_rad[:3]) < 0.01  # a rotor has inertia, and cannot cross the gap at once
 
 
-def test_link_behind_slipping_coupling_gets_no_more_than_the_torque_at_which_it_slips() -> None:
+def test_link_behind_slipping_coupling_gets_at_most_the_slip_torque() -> None:
     run = config(3)
     joints = run.robot.joint_table
     looseness = {"joint_2": Looseness(slip_torque_nm=SLIP_NM)}
@@ -54,11 +54,11 @@ def test_link_behind_slipping_coupling_gets_no_more_than_the_torque_at_which_it_
         drive_rad.append(float(physics_model.angle_rad[1]))
     assert np.max(np.abs(shaft_torque_nm)) == pytest.approx(SLIP_NM)
     assert shaft_torque_nm[190] == -shaft_torque_nm[-1] == pytest.approx(SLIP_NM)
-    assert max(drive_rad) - start_rad[1] > 0.1, "the drive turns on"
+    assert max(drive_rad) - start_rad[1] > 0.1, "the drive continues to rotate"
     assert links.angle_rad == pytest.approx(start_rad, abs=1e-9)
 
 
-def test_link_follows_drive_below_the_torque_at_which_its_coupling_slips() -> None:
+def test_link_below_slip_torque_follows_its_drive() -> None:
     run = config(3)
     joints = run.robot.joint_table
     looseness = {"joint_2": Looseness(slip_torque_nm=5.0)}
@@ -68,5 +68,5 @@ def test_link_follows_drive_below_the_torque_at_which_its_coupling_slips() -> No
     physics_model = LooseGearModel(links, joints, looseness, seed=1)
     for step in range(600):
         physics_model.advance(np.full(3, 0.1 if (step // 150) % 2 == 0 else -0.1))
-        # 0.1 N·m bend the spring of the teeth by a third of a milliradian.
+        # A torque of 0.1 N·m bends the spring of the teeth by a third of a milliradian.
         assert abs(physics_model.angle_rad[1] - links.angle_rad[1]) < 1e-3

@@ -1,4 +1,4 @@
-"""The motors' law, and that the simulator's motors have the same one."""
+"""The motor model of the emulators, which equals that of the simulator."""
 
 import numpy as np
 import pytest
@@ -13,86 +13,104 @@ from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
 from snakesim_testing.can.driver_loop import config
 
-STEP_S, RESPONSE_S, RATED_NM, SPEED = 1e-3, 0.01, 4.0, 5.0
-REST = np.zeros(1)
+STEP_S = 1e-3
+RESPONSE_S = 0.01
+RATED_NM = 4.0
+SPEED_LIMIT_RAD_S = 5.0  # speed limit
+AT_REST = np.zeros(1)
 
 
-def motor(**robot):
+def make_motor(**robot):
+    """Return the power stage of one motor, and the configuration of its run."""
     run = config(1, **{f"robot__{key}": value for key, value in robot.items()})
     return PowerStages(run.robot, STEP_S), run
 
 
-def drive(motors, mode, target, limit=RATED_NM):
-    motors.set_demand(0, mode, target, limit, 40.0, 1.0, SPEED)
+def set_demand(motors, mode, target, limit=RATED_NM):
+    """Set mode, target and torque limit of the motor."""
+    motors.set_demand(0, mode, target, limit, 40.0, 1.0, SPEED_LIMIT_RAD_S)
 
 
-def test_torque_mode_follows_as_a_first_order_lag():
-    motors, _ = motor()
-    drive(motors, JointMode.TORQUE, 2.0)
-    for k in range(1, 40):
-        assert motors.compute_torques(REST, REST)[0] == pytest.approx(
-            2.0 * (1 - np.exp(-k * STEP_S / RESPONSE_S))
+def test_motor_torque_follows_demand_with_first_order_lag():
+    motors, _ = make_motor()
+    set_demand(motors, JointMode.TORQUE, 2.0)
+    for step in range(1, 40):
+        assert motors.compute_torques(AT_REST, AT_REST)[0] == pytest.approx(
+            2.0 * (1 - np.exp(-step * STEP_S / RESPONSE_S))
         )
 
 
-def test_a_motor_without_response_time_answers_at_once():
-    motors, _ = motor(motor__response_time_s=0.0)
-    drive(motors, JointMode.TORQUE, 2.0)
-    assert motors.compute_torques(REST, REST)[0] == pytest.approx(2.0)
-    drive(motors, JointMode.PASSIVE, 0.0)
-    assert motors.compute_torques(REST, REST)[0] == 0.0
+def test_motor_without_response_time_reaches_demand_immediately():
+    motors, _ = make_motor(motor__response_time_s=0.0)
+    set_demand(motors, JointMode.TORQUE, 2.0)
+    assert motors.compute_torques(AT_REST, AT_REST)[0] == pytest.approx(2.0)
+    set_demand(motors, JointMode.PASSIVE, 0.0)
+    assert motors.compute_torques(AT_REST, AT_REST)[0] == 0.0
 
 
 @pytest.mark.parametrize("mode", list(JointMode))
 def test_motor_mode_change_moves_torque_at_motor_response(mode):
-    motors, _ = motor()
-    drive(motors, JointMode.TORQUE, 3.0)
+    motors, _ = make_motor()
+    set_demand(motors, JointMode.TORQUE, 3.0)
     for _ in range(100):
-        motors.compute_torques(REST, REST)
-    drive(motors, mode, -3.0)
-    after = motors.compute_torques(REST, REST)[0]
-    assert abs(after - 3.0) <= 2 * RATED_NM * (10 + 1) * (1 - np.exp(-STEP_S / RESPONSE_S))
-    assert after > -RATED_NM
-    motors, _ = motor()
-    drive(motors, JointMode.TORQUE, 3.0)
+        motors.compute_torques(AT_REST, AT_REST)
+    set_demand(motors, mode, -3.0)
+    torque_nm = motors.compute_torques(AT_REST, AT_REST)[0]
+    assert abs(torque_nm - 3.0) <= 2 * RATED_NM * (10 + 1) * (1 - np.exp(-STEP_S / RESPONSE_S))
+    assert torque_nm > -RATED_NM
+    motors, _ = make_motor()
+    set_demand(motors, JointMode.TORQUE, 3.0)
     motors.torque_nm[:] = 3.0
-    drive(motors, JointMode.PASSIVE, 0.0)
-    assert motors.compute_torques(REST, REST)[0] == pytest.approx(
+    set_demand(motors, JointMode.PASSIVE, 0.0)
+    assert motors.compute_torques(AT_REST, AT_REST)[0] == pytest.approx(
         3.0 * np.exp(-STEP_S / RESPONSE_S)
     )
 
 
 def test_motor_torque_stays_within_rating_and_setpoint_limit():
-    motors, _ = motor()
-    drive(motors, JointMode.TORQUE, 30.0, limit=9.0)
+    motors, _ = make_motor()
+    set_demand(motors, JointMode.TORQUE, 30.0, limit=9.0)
     for _ in range(200):
-        assert motors.compute_torques(REST, REST)[0] <= RATED_NM
-    drive(motors, JointMode.TORQUE, 30.0, limit=1.0)
-    first = motors.compute_torques(REST, REST)[0]
-    assert first == pytest.approx(RATED_NM * np.exp(-STEP_S / RESPONSE_S))
+        assert motors.compute_torques(AT_REST, AT_REST)[0] <= RATED_NM
+    set_demand(motors, JointMode.TORQUE, 30.0, limit=1.0)
+    first_torque_nm = motors.compute_torques(AT_REST, AT_REST)[0]
+    assert first_torque_nm == pytest.approx(RATED_NM * np.exp(-STEP_S / RESPONSE_S))
     for _ in range(50):
-        motors.compute_torques(REST, REST)
+        motors.compute_torques(AT_REST, AT_REST)
     assert motors.torque_nm[0] == 1.0
 
 
 def test_motor_torque_fades_to_zero_at_speed_limit():
-    motors, _ = motor()
-    drive(motors, JointMode.TORQUE, RATED_NM)
-    for speed, torque in ((0.89 * SPEED, RATED_NM), (SPEED, 0.0), (0.95 * SPEED, 0.5 * RATED_NM)):
+    motors, _ = make_motor()
+    set_demand(motors, JointMode.TORQUE, RATED_NM)
+    for speed_rad_s, expected_nm in (
+        (0.89 * SPEED_LIMIT_RAD_S, RATED_NM),
+        (SPEED_LIMIT_RAD_S, 0.0),
+        (0.95 * SPEED_LIMIT_RAD_S, 0.5 * RATED_NM),
+    ):
         for _ in range(200):
-            motors.compute_torques(REST, np.array([speed]))
-        assert motors.torque_nm[0] == pytest.approx(torque, abs=1e-6)
-    motors, _ = motor()
-    assert motors.compute_torques(REST, np.array([3 * SPEED]))[0] == 0.0, "and none when passive"
+            motors.compute_torques(AT_REST, np.array([speed_rad_s]))
+        assert motors.torque_nm[0] == pytest.approx(expected_nm, abs=1e-6)
+    motors, _ = make_motor()
+    assert motors.compute_torques(AT_REST, np.array([3 * SPEED_LIMIT_RAD_S]))[0] == 0.0, (
+        "a passive motor has no torque at this speed"
+    )
 
 
 def test_motor_position_mode_at_1_ms_is_stable_and_arrives():
     run = load_scenario("triplet").config
     physics_model = InertiaModel(run, InertiaSettings())
-    motors, m = PowerStages(run.robot, physics_model.step_s), run.robot.motor
+    motors = PowerStages(run.robot, physics_model.step_s)
+    motor_data = run.robot.motor
     for i in range(13):
         motors.set_demand(
-            i, JointMode.POSITION, 0.4, 7.0, m.stiffness_nm_per_rad, m.damping_nm_s_per_rad, 7.5
+            i,
+            JointMode.POSITION,
+            0.4,
+            7.0,
+            motor_data.stiffness_nm_per_rad,
+            motor_data.damping_nm_s_per_rad,
+            7.5,
         )
     for _ in range(1000):
         physics_model.advance(
@@ -102,14 +120,14 @@ def test_motor_position_mode_at_1_ms_is_stable_and_arrives():
     assert np.abs(physics_model.velocity_rad_s).max() < 1e-3
 
 
-TICKS_UNTIL_STEADY = 100  # until the torque has followed its demand
+TICKS_UNTIL_STEADY = 100  # by then, the torque has reached its demand
 
 
 def make_hot_motor() -> PowerStages:
     """Return a motor that demands 3 N·m and may have half of its rated torque because of heat."""
-    motors, _ = motor()
-    drive(motors, JointMode.TORQUE, 3.0)
-    motors.compute_torques(REST, REST)
+    motors, _ = make_motor()
+    set_demand(motors, JointMode.TORQUE, 3.0)
+    motors.compute_torques(AT_REST, AT_REST)
     motors.apply_derating(np.array([0.5]))
     return motors
 
@@ -118,45 +136,47 @@ def test_motor_torque_of_hot_motor_is_derated() -> None:
     motors = make_hot_motor()
     assert motors.find_derated()[0]
     for _ in range(TICKS_UNTIL_STEADY):
-        motors.compute_torques(REST, REST)
+        motors.compute_torques(AT_REST, AT_REST)
     assert motors.torque_nm[0] == RATED_NM / 2
 
 
 def test_motor_small_demand_of_hot_motor_is_not_derated() -> None:
     motors = make_hot_motor()
-    drive(motors, JointMode.TORQUE, 1.0)
-    motors.compute_torques(REST, REST)
+    set_demand(motors, JointMode.TORQUE, 1.0)
+    motors.compute_torques(AT_REST, AT_REST)
     assert not motors.find_derated()[0]
 
 
 def test_motor_demanded_limit_below_heat_limit_is_not_reduced_further() -> None:
     motors = make_hot_motor()
-    drive(motors, JointMode.TORQUE, 3.0, limit=RATED_NM / 4)
+    set_demand(motors, JointMode.TORQUE, 3.0, limit=RATED_NM / 4)
     for _ in range(TICKS_UNTIL_STEADY):
-        motors.compute_torques(REST, REST)
+        motors.compute_torques(AT_REST, AT_REST)
     assert motors.torque_nm[0] == RATED_NM / 4
 
 
-def test_the_simulator_s_motors_do_the_same():
+def test_motor_model_equals_that_of_the_simulator():
     run = load_scenario("triplet").config
-    count, motor, limits = run.robot.chain.modules, run.robot.motor, run.robot.limits
-    fine_s = 2e-4
-    sim = SimBackend(run, SimSettings(timestep_s=fine_s))
-    physics_model = MujocoPhysicsModel(run, PhysicsModelSettings(timestep_s=fine_s))
+    count = run.robot.chain.modules
+    motor_data = run.robot.motor
+    limits = run.robot.limits
+    timestep_s = 2e-4
+    sim = SimBackend(run, SimSettings(timestep_s=timestep_s))
+    physics_model = MujocoPhysicsModel(run, PhysicsModelSettings(timestep_s=timestep_s))
     motors = PowerStages(run.robot, physics_model.step_s)
-    swing = 0.1 * np.sin(np.arange(count))
+    offsets = 0.1 * np.sin(np.arange(count))
     for mode, target in (
-        (JointMode.POSITION, physics_model.angle_rad + swing),
-        (JointMode.VELOCITY, 3 * swing),
-        (JointMode.TORQUE, 5 * swing),
+        (JointMode.POSITION, physics_model.angle_rad + offsets),
+        (JointMode.VELOCITY, 3 * offsets),
+        (JointMode.TORQUE, 5 * offsets),
     ):
         damping = (
-            motor.damping_nm_s_per_rad
+            motor_data.damping_nm_s_per_rad
             if mode == JointMode.POSITION
-            else motor.velocity_gain_nm_s_per_rad
+            else motor_data.velocity_gain_nm_s_per_rad
         )
         for i in range(count):
-            gains = (motor.stiffness_nm_per_rad, damping, limits.speed_rad_s)
+            gains = (motor_data.stiffness_nm_per_rad, damping, limits.speed_rad_s)
             motors.set_demand(i, mode, float(target[i]), limits.torque_nm, *gains)
         for _ in range(4):
             sim.enact(
@@ -167,6 +187,6 @@ def test_the_simulator_s_motors_do_the_same():
                 physics_model.advance(
                     motors.compute_torques(physics_model.angle_rad, physics_model.velocity_rad_s)
                 )
-        truth = sim.true_state()
-        assert physics_model.angle_rad == pytest.approx(truth.angles_rad, abs=1e-3)
-        assert motors.torque_nm == pytest.approx(truth.torques_nm, abs=0.05)
+        true_state = sim.true_state()
+        assert physics_model.angle_rad == pytest.approx(true_state.angles_rad, abs=1e-3)
+        assert motors.torque_nm == pytest.approx(true_state.torques_nm, abs=0.05)

@@ -1,4 +1,4 @@
-"""Parameters by the bus: ranges, refusals, what is kept."""
+"""An emulated module reads and writes parameters over the bus: ranges and refusals."""
 
 import struct
 
@@ -15,18 +15,26 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_testing.can.module_rig import BOOTED, armed, booted, only, parameter
 
 
-def ask(module, *request, **given):
+def request_parameter(module, *request, **fields):
+    """Send a parameter request, and return the result and the value of the answer."""
     module.frames.clear()
-    module.receive(parameter(*request, **given), BOOTED)
+    module.receive(parameter(*request, **fields), BOOTED)
     [answer] = only(module.frames, Opcode.PARAMETER_ANSWER)
     return ParameterResult(int(answer["result"])), answer["value"]
 
 
-@pytest.mark.parametrize("index", [p for p, r in PARAMETERS.items() if r.writable])
+@pytest.mark.parametrize(
+    "index",
+    [
+        parameter_index
+        for parameter_index, description in PARAMETERS.items()
+        if description.writable
+    ],
+)
 def test_parameter_range_ends_can_be_written_in_single_precision(index):
     module = booted()
     for end in (PARAMETERS[index].low, PARAMETERS[index].high):
-        result, value = ask(module, index, end)
+        result, value = request_parameter(module, index, end)
         assert result == ParameterResult.DONE
         assert value == pytest.approx(end, rel=1e-6)
 
@@ -42,29 +50,37 @@ def test_parameter_range_ends_can_be_written_in_single_precision(index):
         (14, 1.0, ParameterResult.UNKNOWN_INDEX),
     ],
 )
-def test_what_is_wrong_is_refused_and_changes_nothing(index, value, result):
+def test_parameter_invalid_request_is_refused_and_changes_nothing(index, value, result):
     module = booted()
     before = dict(module.parameters.values)
-    assert ask(module, index, value)[0] == result
+    assert request_parameter(module, index, value)[0] == result
     assert module.parameters.values == before
 
 
-def test_nan_is_refused():
+def test_parameter_value_nan_is_refused():
     module = booted()
-    good = parameter(ModuleParameter.DAMPING, 1.0)
-    module.receive(CanFrame(good.id, good.data[:2] + struct.pack("<f", float("nan"))), BOOTED)
+    valid_request = parameter(ModuleParameter.DAMPING, 1.0)
+    module.receive(
+        CanFrame(valid_request.id, valid_request.data[:2] + struct.pack("<f", float("nan"))), BOOTED
+    )
     assert only(module.frames, Opcode.PARAMETER_ANSWER)[0]["result"] == ParameterResult.OUT_OF_RANGE
 
 
-def test_an_armed_module_may_be_read_and_not_written():
+def test_parameter_of_armed_module_is_read_but_not_written():
     module = armed()
-    assert ask(module, ModuleParameter.DAMPING, 1.0)[0] == ParameterResult.NOT_WHILE_ARMED
     assert (
-        ask(module, ModuleParameter.DAMPING, operation=ParameterOperation.SAVE)[0]
+        request_parameter(module, ModuleParameter.DAMPING, 1.0)[0]
         == ParameterResult.NOT_WHILE_ARMED
     )
     assert (
-        ask(module, ModuleParameter.DAMPING, operation=ParameterOperation.READ)[0]
+        request_parameter(module, ModuleParameter.DAMPING, operation=ParameterOperation.SAVE)[0]
+        == ParameterResult.NOT_WHILE_ARMED
+    )
+    assert (
+        request_parameter(module, ModuleParameter.DAMPING, operation=ParameterOperation.READ)[0]
         == ParameterResult.DONE
     )
-    assert ask(module, ModuleParameter.DAMPING, operation=3)[0] == ParameterResult.UNKNOWN_OPERATION
+    assert (
+        request_parameter(module, ModuleParameter.DAMPING, operation=3)[0]
+        == ParameterResult.UNKNOWN_OPERATION
+    )

@@ -1,4 +1,4 @@
-"""What the reference firmware is given, and what it needs: no process is started here."""
+"""Description of modules for the reference firmware, and its dependencies. These tests start no process."""
 
 import re
 from typing import Any
@@ -21,47 +21,47 @@ INCLUDE = re.compile(r"^#include <(.+)>$", re.MULTILINE)
 
 
 def read_modules(settings: CanSettings | None = None, **dotted: Any) -> dict[str, dict[str, float]]:
-    """The description of every module, by the name of its joint."""
+    """Return the description of every module, by the name of its joint."""
     modules: dict[str, dict[str, float]] = {}
     for line in describe_modules(config(**dotted), settings or CanSettings()).splitlines():
-        name, *words = line.split()
+        name, *fields = line.split()
         modules[name] = {
-            key: float(value) for key, value in zip(words[::2], words[1::2], strict=True)
+            key: float(value) for key, value in zip(fields[::2], fields[1::2], strict=True)
         }
     return modules
 
 
-def test_the_firmware_needs_no_library() -> None:
+def test_firmware_includes_only_two_standard_headers() -> None:
     included = {name for file in FIRMWARE.iterdir() for name in INCLUDE.findall(file.read_text())}
     assert included == {"stdbool.h", "stdint.h"}
 
 
-def test_both_programs_contain_the_firmware() -> None:
+def test_firmware_sources_are_part_of_both_programs() -> None:
     sources = set(FIRMWARE.glob("*.c"))
     assert len(sources) > 4
     assert sources <= set(JOINT_MODULES.list_sources())
     assert sources <= set(JOINT_MODULE_REPLAY.list_sources())
 
 
-def test_every_module_has_its_node_and_a_serial_number_of_its_own() -> None:
+def test_module_descriptions_have_nodes_and_distinct_serial_numbers() -> None:
     modules = read_modules()
     assert [values["node"] for values in modules.values()] == [1, 2, 3, 4]
     assert len({values["serial"] for values in modules.values()}) == 4
 
 
-def test_a_module_behind_a_gear_is_described_at_its_shaft() -> None:
-    plain = read_modules()["joint_2"]
+def test_module_description_with_gear_is_at_its_shaft() -> None:
+    direct = read_modules()["joint_2"]
     mounted = {"drive": {"gear": 4.0, "sign": -1, "zero_rad": 0.5}}
     geared = read_modules(robot__drive=mounted["drive"])["joint_2"]
-    assert geared["rated_torque_nm"] == pytest.approx(plain["rated_torque_nm"] / 4)
-    assert geared["rated_speed_rad_s"] == pytest.approx(plain["rated_speed_rad_s"] * 4)
-    assert geared["inertia_kg_m2"] == pytest.approx(plain["inertia_kg_m2"] / 16)
-    assert geared["start_rad"] == pytest.approx(0.5 - 4 * plain["start_rad"])
-    assert geared["upper_rad"] == pytest.approx(0.5 - 4 * plain["lower_rad"])
+    assert geared["rated_torque_nm"] == pytest.approx(direct["rated_torque_nm"] / 4)
+    assert geared["rated_speed_rad_s"] == pytest.approx(direct["rated_speed_rad_s"] * 4)
+    assert geared["inertia_kg_m2"] == pytest.approx(direct["inertia_kg_m2"] / 16)
+    assert geared["start_rad"] == pytest.approx(0.5 - 4 * direct["start_rad"])
+    assert geared["upper_rad"] == pytest.approx(0.5 - 4 * direct["lower_rad"])
     assert geared["lower_rad"] < geared["upper_rad"]
 
 
-def test_settings_that_the_firmware_cannot_follow_are_refused() -> None:
+def test_settings_that_the_firmware_does_not_support_are_refused() -> None:
     with raises_error(ConfigError, code="injection/not-supported"):
         validate_firmware_settings(CanSettings(faults=["mute:joint_1@1"]))
     with raises_error(ConfigError, code="drive/unsupported-setting"):

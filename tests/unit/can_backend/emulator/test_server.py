@@ -1,4 +1,4 @@
-"""Emulators served: over python-can's virtual bus, by the clock and stepped, and what a hiccup does not look like."""
+"""The emulator server on a virtual bus of python-can, in real time and stepped, also after pauses of the server."""
 
 import time
 import uuid
@@ -18,92 +18,94 @@ from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.can.module_rig import chain, only, setpoint
 from snakesim_testing.messages import raises_error
 
-Wall = tuple[VirtualWire, EmulatorServer, Callable[[float], list[CanFrame]]]
+ServedChain = tuple[VirtualWire, EmulatorServer, Callable[[float], list[CanFrame]]]
 JOINTS = 4
 
 
 @contextmanager
-def served(made: ModuleChain) -> Iterator[Wall]:
-    """The host's wire, the server, and a function that lets it run until a time in s."""
+def serve_chain(module_chain: ModuleChain) -> Iterator[ServedChain]:
+    """Serve a chain, and yield the wire of the host, the server, and a function that runs it until a time in s."""
     name = f"test-{uuid.uuid4().hex[:8]}"
-    near, far = VirtualWire(name), VirtualWire(name)
-    server = EmulatorServer([far], made)
+    host_wire = VirtualWire(name)
+    server_wire = VirtualWire(name)
+    server = EmulatorServer([server_wire], module_chain)
     now_s = 0.0
 
-    def until(end_s: float) -> list[CanFrame]:
+    def run_until(end_s: float) -> list[CanFrame]:
         nonlocal now_s
         while True:
             pause_s = server.run_due(round(now_s * 1e9))
             if pause_s is None or now_s + pause_s > end_s:
                 now_s = end_s
                 server.run_due(round(now_s * 1e9))
-                return near.receive()
+                return host_wire.receive()
             now_s += pause_s
 
     try:
-        yield near, server, until
+        yield host_wire, server, run_until
     finally:
-        near.close()
-        far.close()
+        host_wire.close()
+        server_wire.close()
 
 
-def send_tick(near: VirtualWire, tick: int) -> None:
-    near.send(make_sync(tick, 0))
+def send_tick(host_wire: VirtualWire, tick: int) -> None:
+    """Send the Sync and the setpoints of one control cycle."""
+    host_wire.send(make_sync(tick, 0))
     for node in range(1, JOINTS + 1):
-        near.send(setpoint(tick, JointMode.POSITION, 0.2, node_id=node))
+        host_wire.send(setpoint(tick, JointMode.POSITION, 0.2, node_id=node))
 
 
 def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():
-    made = chain(is_stepped=False)
-    with served(made) as (near, _, until):
-        assert until(0.09) == []
-        assert len(only(until(0.11), Opcode.HEARTBEAT)) == JOINTS
-        near.send(make_command(CommandAction.ARM))
-        answers = []
+    module_chain = chain(is_stepped=False)
+    with serve_chain(module_chain) as (host_wire, _, run_until):
+        assert run_until(0.09) == []
+        assert len(only(run_until(0.11), Opcode.HEARTBEAT)) == JOINTS
+        host_wire.send(make_command(CommandAction.ARM))
+        frames = []
         for tick in range(50):
-            send_tick(near, tick)
-            answers += until(0.11 + 0.01 * (tick + 1))
-        states = only(answers, Opcode.JOINT_STATE, 1)
-        assert [s["count"] for s in states] == [tick % 16 for tick in range(50)]
+            send_tick(host_wire, tick)
+            frames += run_until(0.11 + 0.01 * (tick + 1))
+        states = only(frames, Opcode.JOINT_STATE, 1)
+        assert [state["count"] for state in states] == [tick % 16 for tick in range(50)]
         assert states[-1]["angle"] == pytest.approx(0.2, abs=0.01)
-        until(0.69)
-        assert [slot.module.state for slot in made.slots] == [ModuleState.ARMED] * JOINTS
-        until(0.705)
-        assert [slot.module.state for slot in made.slots] == [ModuleState.FAULT] * JOINTS
+        run_until(0.69)
+        assert [slot.module.state for slot in module_chain.slots] == [ModuleState.ARMED] * JOINTS
+        run_until(0.705)
+        assert [slot.module.state for slot in module_chain.slots] == [ModuleState.FAULT] * JOINTS
 
 
 def test_server_pause_does_not_look_like_a_host_pause():
-    made = chain(is_stepped=False)
-    with served(made) as (near, server, until):
-        until(0.11)
-        near.send(make_command(CommandAction.ARM))
+    module_chain = chain(is_stepped=False)
+    with serve_chain(module_chain) as (host_wire, server, run_until):
+        run_until(0.11)
+        host_wire.send(make_command(CommandAction.ARM))
         for tick in range(5):
-            send_tick(near, tick)
-            until(0.11 + 0.01 * (tick + 1))
-        for tick in range(5, 20):  # the host goes on while the server sleeps for 150 ms
-            send_tick(near, tick)
+            send_tick(host_wire, tick)
+            run_until(0.11 + 0.01 * (tick + 1))
+        for tick in range(5, 20):  # the host continues while the server pauses for 150 ms
+            send_tick(host_wire, tick)
         server.run_due(round(0.31e9))
-        assert [slot.module.state for slot in made.slots] == [ModuleState.ARMED] * JOINTS
+        assert [slot.module.state for slot in module_chain.slots] == [ModuleState.ARMED] * JOINTS
 
 
-def test_stepped_twins_run_when_the_host_has_nothing_to_do():
-    made = chain()
+def test_server_stepped_emulators_run_while_the_host_waits():
+    module_chain = chain()
     name = f"test-{uuid.uuid4().hex[:8]}"
-    far = VirtualWire(name)
-    server = EmulatorServer([far], made)
-    near = VirtualWire(name, InProcessEmulators(server, None, time.monotonic_ns))
+    server_wire = VirtualWire(name)
+    server = EmulatorServer([server_wire], module_chain)
+    host_wire = VirtualWire(name, InProcessEmulators(server, None, time.monotonic_ns))
     try:
-        assert wait([near], 1.0), "their first heartbeats"
-        near.receive()
-        assert not wait([near], 1.0), "nothing can come before something is sent"
-        near.send(make_sync(0, 0))
-        assert wait([near], 1.0)
-        assert len(only(near.receive(), Opcode.JOINT_STATE)) == JOINTS
+        assert wait([host_wire], 1.0), "the modules send their first heartbeats"
+        host_wire.receive()
+        assert not wait([host_wire], 1.0), "stepped modules send nothing before the next Sync"
+        host_wire.send(make_sync(0, 0))
+        assert wait([host_wire], 1.0)
+        assert len(only(host_wire.receive(), Opcode.JOINT_STATE)) == JOINTS
     finally:
-        near.close()
+        host_wire.close()
 
 
 @pytest.mark.parametrize("address", ["nowhere", ":7450", "host:0", "host:99999", "host:x"])
-def test_a_wrong_pose_address_is_refused(address: str):
+def test_pose_sender_with_invalid_address_is_refused(address: str):
     with raises_error(ConfigError, code="network/invalid-address"):
         PoseSender(address)

@@ -1,4 +1,4 @@
-"""A physics model of which one encoder has a dead zone."""
+"""A physics model in which one encoder has a dead zone."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from snakesim_testing.can.driver_loop import config
 DEAD_ZONE_RAD = 0.02
 
 
-def test_measured_angle_sticks_within_the_dead_zone_and_then_jumps_to_the_shaft() -> None:
+def test_measured_angle_sticks_in_dead_zone_then_jumps_to_shaft() -> None:
     run = config(3)
     shafts = InertiaModel(run, InertiaSettings(drag_nm=0.0))
     model = StickingEncoderModel(shafts, run.robot.joint_table, {"joint_2": DEAD_ZONE_RAD})

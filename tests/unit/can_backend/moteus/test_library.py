@@ -1,4 +1,4 @@
-"""Our frames against mjbots' own library: what one encodes the other reads, both ways, and so do the emulators."""
+"""Our moteus frames and the library of mjbots encode and decode each other, also with our emulators."""
 
 import math
 from typing import Any
@@ -27,39 +27,40 @@ from snakesim_testing.can.driver_loop import config
 from snakesim_testing.drivers.drive_rig import drives_of
 from snakesim_testing.messages import raises_error
 
-TYPES = (moteus.INT8, moteus.INT16, moteus.INT32, moteus.F32)
+VALUE_TYPES = (moteus.INT8, moteus.INT16, moteus.INT32, moteus.F32)
 JOINTS = 4
 CONFIG = config(JOINTS, backend="moteus")
 
 
-def theirs(number: int = 1, **options: Any) -> moteus.Controller:
-    """Their client of one controller; only its frames are used."""
+def make_library_client(number: int = 1, **options: Any) -> moteus.Controller:
+    """Return the client of the library for one controller. Only its frames are used."""
     return moteus.Controller(id=number, transport=object(), **options)  # pyright: ignore[reportArgumentType]
 
 
-def as_frame(command: Any, number: int = 1) -> CanFrame:
+def to_frame(command: Any, number: int = 1) -> CanFrame:
+    """Convert a command of the library to our type of frame."""
     return CanFrame(
         (0x8000 if command.reply_required else 0) | command.source << 8 | number,
         bytes(command.data),
     )
 
 
-def test_registers_modes_and_faults_have_their_numbers() -> None:
-    same = {
+def test_moteus_registers_and_modes_equal_those_of_its_library() -> None:
+    library_names = {
         "MODE": "MODE", "POSITION": "POSITION", "VELOCITY": "VELOCITY", "TORQUE": "TORQUE", "POWER": "POWER",
         "MOTOR_TEMPERATURE": "MOTOR_TEMPERATURE", "HOME_STATE": "HOME_STATE", "VOLTAGE": "VOLTAGE",
         "BOARD_TEMPERATURE": "TEMPERATURE", "FAULT": "FAULT", "COMMAND": "COMMAND_POSITION",
         "WATCHDOG": "COMMAND_TIMEOUT", "MAP_VERSION": "REGISTER_MAP_VERSION", "SERIAL": "SERIAL_NUMBER",
     }  # fmt: skip
-    assert {one.name: moteus.Register[same[one.name]] for one in protocol.Register} == {
-        one.name: one.value for one in protocol.Register
-    }
-    modes = {one.name: moteus.Mode[one.name].value for one in protocol.MoteusMode}
-    assert modes == {one.name: one.value for one in protocol.MoteusMode}
+    assert {
+        member.name: moteus.Register[library_names[member.name]] for member in protocol.Register
+    } == {member.name: member.value for member in protocol.Register}
+    modes = {member.name: moteus.Mode[member.name].value for member in protocol.MoteusMode}
+    assert modes == {member.name: member.value for member in protocol.MoteusMode}
 
 
 @pytest.mark.parametrize(
-    "law",
+    "target",
     [
         {
             "position": 0.25,
@@ -85,53 +86,61 @@ def test_registers_modes_and_faults_have_their_numbers() -> None:
     ],
     ids=["position", "velocity", "torque"],
 )
-def test_moteus_command_frame_equals_that_of_its_library(law: dict[str, float]) -> None:
-    floats = dict.fromkeys(
-        (*law, "maximum_torque", "watchdog_timeout", "velocity_limit", "accel_limit"), moteus.F32
+def test_moteus_command_frame_equals_that_of_its_library(target: dict[str, float]) -> None:
+    resolutions = dict.fromkeys(
+        (*target, "maximum_torque", "watchdog_timeout", "velocity_limit", "accel_limit"), moteus.F32
     )
     resolution = moteus.PositionResolution()
-    for name, kind in floats.items():
-        setattr(resolution, name, kind)
-    rest: dict[str, Any] = {
+    for name, resolution_type in resolutions.items():
+        setattr(resolution, name, resolution_type)
+    limits: dict[str, Any] = {
         "maximum_torque": 3.0,
         "watchdog_timeout": 0.125,
         "velocity_limit": -1.0,
         "accel_limit": -1.0,
     }
-    sent = theirs(5, position_resolution=resolution).make_position(**dict[str, Any](rest | law))
-    ours = protocol.make_frame(
+    library_frame = make_library_client(5, position_resolution=resolution).make_position(
+        **dict[str, Any](limits | target)
+    )
+    our_frame = protocol.make_frame(
         0,
         5,
         protocol.encode_subframe(
             protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.POSITION
         ),
         protocol.encode_subframe(
-            protocol.WRITE, protocol.FLOAT, protocol.Register.COMMAND, *law.values(), 3.0
+            protocol.WRITE, protocol.FLOAT, protocol.Register.COMMAND, *target.values(), 3.0
         ),
         protocol.encode_subframe(
             protocol.WRITE, protocol.FLOAT, protocol.Register.WATCHDOG, 0.125, -1.0, -1.0
         ),
     )
-    assert parse_registers(ours.data).command == pytest.approx(
-        parse_registers(sent.data).command, nan_ok=True
+    assert parse_registers(our_frame.data).command == pytest.approx(
+        parse_registers(library_frame.data).command, nan_ok=True
     )
-    assert as_frame(sent, 5).id == ours.id
-    assert len(ours.data) == 48
-    read = [
-        one for one in protocol.decode_subframes(bytes(sent.data)) if one.kind == protocol.WRITE
+    assert to_frame(library_frame, 5).id == our_frame.id
+    assert len(our_frame.data) == 48
+    writes = [
+        subframe
+        for subframe in protocol.decode_subframes(bytes(library_frame.data))
+        if subframe.kind == protocol.WRITE
     ]
-    values = {one.register + k: value for one in read for k, value in enumerate(one.values)}
-    assert values == pytest.approx(parse_registers(sent.data).command, nan_ok=True)
+    values = {
+        subframe.register + offset: value
+        for subframe in writes
+        for offset, value in enumerate(subframe.values)
+    }
+    assert values == pytest.approx(parse_registers(library_frame.data).command, nan_ok=True)
 
 
 def test_moteus_stop_frame_and_extended_ids_equal_its_library() -> None:
     stop = protocol.encode_subframe(
         protocol.WRITE, protocol.INT8, protocol.Register.MODE, protocol.MoteusMode.STOPPED
     )
-    assert protocol.make_frame(0, 1, stop) == as_frame(theirs().make_stop())
-    asked = protocol.make_frame(0, 1, *MOTION_REQUESTS, reply=True)
-    assert asked.id == as_frame(theirs().make_query()).id == 0x8001
-    assert to_python_can(asked, fd=True).is_extended_id
+    assert protocol.make_frame(0, 1, stop) == to_frame(make_library_client().make_stop())
+    query = protocol.make_frame(0, 1, *MOTION_REQUESTS, reply=True)
+    assert query.id == to_frame(make_library_client().make_query()).id == 0x8001
+    assert to_python_can(query, fd=True).is_extended_id
     assert not to_python_can(CanFrame(0x100, b""), fd=True).is_extended_id
     assert len(protocol.make_frame(0, 1, *HEALTH_REQUESTS).data) == 6
     assert len(protocol.make_frame(0, 1, *MOTION_REQUESTS).data) == 5
@@ -143,60 +152,62 @@ def test_moteus_stop_frame_and_extended_ids_equal_its_library() -> None:
 
 @pytest.fixture
 def bus() -> Any:
-    """Emulated controllers of a robot, and their bus."""
-    wire, clock = VirtualWire("moteus-theirs", fd=True), DriverClock(CONFIG)
+    """Emulated controllers of a robot, their clock, and the bus to them."""
+    wire = VirtualWire("moteus-theirs", fd=True)
+    clock = DriverClock(CONFIG)
     emulator = MoteusBackend.make_emulator(
         CONFIG, MoteusSettings(physics_model="inertia"), [wire], clock, None
     )
     with can.Bus(
         interface="virtual", channel="moteus-theirs", protocol=can.CanProtocol.CAN_FD
-    ) as ours:
-        yield ours, emulator, clock
+    ) as host_bus:
+        yield host_bus, emulator, clock
     emulator.close()
 
 
 def test_moteus_library_client_drives_and_reads_our_emulator(bus: Any) -> None:
-    ours, emulator, clock = bus
-    client, number = theirs(3), 3
+    host_bus, emulator, clock = bus
+    number = 3
+    client = make_library_client(number)
 
-    def ask(command: Any) -> dict[int, Any]:
-        ours.send(to_python_can(as_frame(command, number), fd=True))
+    def send_command(command: Any) -> dict[int, Any]:
+        host_bus.send(to_python_can(to_frame(command, number), fd=True))
         emulator()
-        if (message := ours.recv(0)) is None:
+        if (message := host_bus.recv(0)) is None:
             return {}
         result = parse_message(message)
         assert result.id == number
         assert message.is_fd
         return result.values
 
-    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
+    assert send_command(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
     for _ in range(100):
-        ask(client.make_position(position=0.05, velocity=0.0, watchdog_timeout=0.1))
+        send_command(client.make_position(position=0.05, velocity=0.0, watchdog_timeout=0.1))
         clock.robot_time_ns += 10_000_000
         emulator()
-    for kind, close in zip(TYPES, (0.01, 0.0002, 0.0002, 0.0002), strict=True):
-        fields = dict.fromkeys((0, 1, 2, 3, 13, 14, 15), kind)
-        said = ask(client.make_custom_query(fields))
-        assert said[moteus.Register.MODE] == moteus.Mode.POSITION
-        assert said[moteus.Register.FAULT] == 0
-        assert said[moteus.Register.POSITION] == pytest.approx(0.05, abs=max(close, 0.003))
-        assert said[moteus.Register.VOLTAGE] == pytest.approx(
+    for value_type, tolerance in zip(VALUE_TYPES, (0.01, 0.0002, 0.0002, 0.0002), strict=True):
+        fields = dict.fromkeys((0, 1, 2, 3, 13, 14, 15), value_type)
+        answer = send_command(client.make_custom_query(fields))
+        assert answer[moteus.Register.MODE] == moteus.Mode.POSITION
+        assert answer[moteus.Register.FAULT] == 0
+        assert answer[moteus.Register.POSITION] == pytest.approx(0.05, abs=max(tolerance, 0.003))
+        assert answer[moteus.Register.VOLTAGE] == pytest.approx(
             emulator.body.read_supply(2)[0], abs=0.3
         )
     clock.robot_time_ns += 150_000_000
     emulator()
-    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT
-    ask(client.make_position(position=0.1, velocity=0.0))
-    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT, (
-        "only a stop ends it"
+    assert send_command(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT
+    send_command(client.make_position(position=0.1, velocity=0.0))
+    assert send_command(client.make_query())[moteus.Register.MODE] == moteus.Mode.TIMEOUT, (
+        "only a stop ends the timeout"
     )
-    ask(client.make_stop())
-    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
-    ask(client.make_position(position=0.1, velocity=0.0))
-    everybody = theirs(127)
-    ours.send(to_python_can(as_frame(everybody.make_stop(), 127), fd=True))
+    send_command(client.make_stop())
+    assert send_command(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED
+    send_command(client.make_position(position=0.1, velocity=0.0))
+    broadcast_client = make_library_client(127)
+    host_bus.send(to_python_can(to_frame(broadcast_client.make_stop(), 127), fd=True))
     emulator()
-    assert ask(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED, (
+    assert send_command(client.make_query())[moteus.Register.MODE] == moteus.Mode.STOPPED, (
         "127 is the broadcast address"
     )
 
@@ -218,10 +229,10 @@ def test_moteus_library_reads_every_frame_of_a_run() -> None:
         )
         backend.advance()
     backend.close()
-    read = [parse_registers(frame.data) for frame in sent]
-    assert all(one.command or one.query for one in read)
-    assert not any(one.errors for one in read)
-    command = next(one.command for one in read if len(one.command) > 2)
+    parsed_frames = [parse_registers(frame.data) for frame in sent]
+    assert all(parsed.command or parsed.query for parsed in parsed_frames)
+    assert not any(parsed.errors for parsed in parsed_frames)
+    command = next(parsed.command for parsed in parsed_frames if len(parsed.command) > 2)
     motor = CONFIG.robot.joint_table[0].motor
     kp = (
         command[moteus.Register.COMMAND_KP_SCALE]
@@ -235,10 +246,10 @@ def test_moteus_library_reads_every_frame_of_a_run() -> None:
 
 @pytest.mark.parametrize("number", [0, 127])
 def test_moteus_ids_of_host_and_broadcast_are_no_controllers(number: int) -> None:
-    """Their firmware's filters and mjbots' library take 127 for a broadcast: all controllers would follow one joint."""
-    wrong = config(backend="moteus", robot__joints={"joint_2": {"id": number}})
+    """Refuse 127, because the firmware uses it as broadcast: all controllers would follow one joint."""
+    invalid_config = config(backend="moteus", robot__joints={"joint_2": {"id": number}})
     with raises_error(ConfigError, code="drive/unsupported-setting"):
-        MoteusBackend.check(wrong, MoteusSettings())
+        MoteusBackend.check(invalid_config, MoteusSettings())
     MoteusBackend.check(
         config(backend="moteus", robot__joints={"joint_2": {"id": 126}}), MoteusSettings()
     )

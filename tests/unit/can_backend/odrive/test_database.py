@@ -1,8 +1,8 @@
-"""Our messages against ODrive's own database, read by cantools: the same ids, places, types and states.
+"""Our ODrive messages equal those of the database of ODrive, read by cantools: ids, layouts, types and states.
 
 `odrive-cansimple.dbc` holds the messages of one axis from ODrive Robotics' file of that name (repository
-odriverobotics/ODrive, MIT license), which is of firmware 0.5.6. It lacks what 0.6 added or changed (version, errors,
-temperature); of those the error bits were compared with the enumeration of PyPI's `odrive` 0.6.11.
+odriverobotics/ODrive, MIT license), which is of firmware 0.5.6. It does not contain what 0.6 added or
+changed (version, errors, temperature). The error bits were compared with the enumeration of PyPI's `odrive` 0.6.11.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ from snakesim_can_backend.odrive.protocol import (
 from snakesim_can_backend.protocol.definitions import CanFrame
 
 DATABASE: Any = cantools.database.load_file(Path(__file__).with_name("odrive-cansimple.dbc"))
-SAME = {
+EXAMPLES = {
     MessageId.HEARTBEAT: ("Heartbeat", {"Axis_Error": 5, "Axis_State": 8}),
     MessageId.SET_STATE: ("Set_Axis_State", {"Axis_Requested_State": 8}),
     MessageId.MOTION: ("Get_Encoder_Estimates", {"Pos_Estimate": 1.5, "Vel_Estimate": -0.25}),
@@ -41,26 +41,28 @@ SAME = {
     MessageId.SET_POSITION_GAIN: ("Set_Pos_Gain", {"Pos_Gain": 40.0}),
     MessageId.SET_VELOCITY_GAINS: ("Set_Vel_Gains", {"Vel_Gain": 0.5, "Vel_Integrator_Gain": 0.25}),
 }
-SCALED = {"Vel_FF": 1000, "Torque_FF": 1000}  # integers by 0.001
+SCALES = {"Vel_FF": 1000, "Torque_FF": 1000}  # integers in units of 0.001
 
 
-@pytest.mark.parametrize("message", SAME, ids=lambda message: message.name)
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda message: message.name)
 def test_odrive_database_and_our_codec_read_each_other(message: MessageId) -> None:
-    name, values = SAME[message]
-    theirs = DATABASE.get_message_by_name(f"Axis0_{name}")
-    ours = [round(value * SCALED[key]) if key in SCALED else value for key, value in values.items()]
-    spare = [0, 0] if message is MessageId.HEARTBEAT else []
-    frame = encode_message(0, message, *ours, *spare)
-    read = theirs.decode(frame.data.ljust(8, b"\0"), decode_choices=False)
-    assert frame.id == theirs.frame_id
-    assert {key: read[key] for key in values} == pytest.approx(values)
-    data = theirs.encode({signal.name: 0 for signal in theirs.signals} | values)
-    assert PAYLOADS[message].unpack(data[: PAYLOADS[message].size])[: len(ours)] == pytest.approx(
-        ours
-    )
+    name, values = EXAMPLES[message]
+    database_message = DATABASE.get_message_by_name(f"Axis0_{name}")
+    our_values = [
+        round(value * SCALES[key]) if key in SCALES else value for key, value in values.items()
+    ]
+    padding = [0, 0] if message is MessageId.HEARTBEAT else []
+    frame = encode_message(0, message, *our_values, *padding)
+    decoded = database_message.decode(frame.data.ljust(8, b"\0"), decode_choices=False)
+    assert frame.id == database_message.frame_id
+    assert {key: decoded[key] for key in values} == pytest.approx(values)
+    data = database_message.encode({signal.name: 0 for signal in database_message.signals} | values)
+    assert PAYLOADS[message].unpack(data[: PAYLOADS[message].size])[
+        : len(our_values)
+    ] == pytest.approx(our_values)
 
 
-def test_messages_without_data_and_ids_of_other_axes_are_theirs() -> None:
+def test_odrive_messages_without_data_equal_the_database() -> None:
     assert (
         DATABASE.get_message_by_name("Axis0_Clear_Errors").frame_id
         == encode_message(0, MessageId.CLEAR_ERRORS).id
@@ -70,7 +72,7 @@ def test_messages_without_data_and_ids_of_other_axes_are_theirs() -> None:
     assert split_id(CanFrame(62 << 5 | 0x1B, b"")) == (62, MessageId.SET_VELOCITY_GAINS)
 
 
-def test_states_modes_and_senders_are_theirs() -> None:
+def test_odrive_states_modes_and_senders_equal_the_database() -> None:
     states = (
         DATABASE.get_message_by_name("Axis0_Heartbeat").get_signal_by_name("Axis_State").choices
     )
@@ -81,14 +83,18 @@ def test_states_modes_and_senders_are_theirs() -> None:
         .get_signal_by_name("Control_Mode")
         .choices
     )
-    assert [modes[one].name for one in ControlMode] == [
+    assert [modes[mode].name for mode in ControlMode] == [
         "TORQUE_CONTROL",
         "VELOCITY_CONTROL",
         "POSITION_CONTROL",
     ]
-    theirs = {
+    database_messages = {
         message: DATABASE.get_message_by_name(f"Axis0_{name}")
-        for message, (name, _) in SAME.items()
+        for message, (name, _) in EXAMPLES.items()
     }
-    of_hosts = {message for message, described in theirs.items() if "Master" in described.senders}
-    assert of_hosts == FROM_HOST - {MessageId.ESTOP, MessageId.CLEAR_ERRORS}
+    host_messages = {
+        message
+        for message, database_message in database_messages.items()
+        if "Master" in database_message.senders
+    }
+    assert host_messages == FROM_HOST - {MessageId.ESTOP, MessageId.CLEAR_ERRORS}

@@ -1,4 +1,4 @@
-"""What goes out: setpoints in raw numbers, and what modules are told when the robot's lifecycle changes."""
+"""Frames of the host: setpoints in raw numbers, and commands when the lifecycle of the robot changes."""
 
 import math
 from typing import get_args
@@ -20,14 +20,15 @@ from snakesim_hal.wire.messages import JointMode, LifecycleState
 from snakesim_testing.can.frames import read
 
 LIFECYCLES: tuple[LifecycleState, ...] = get_args(LifecycleState)
-TARGET = {
+TARGET_SIGNALS = {
     JointMode.POSITION: "position",
     JointMode.VELOCITY: "velocity",
     JointMode.TORQUE: "torque",
 }
 
 
-def one(mode: JointMode, target: float, limit_nm: float = 4.0) -> CanFrame:
+def encode_setpoint(mode: JointMode, target: float, limit_nm: float = 4.0) -> CanFrame:
+    """Encode the setpoint of one joint."""
     (frame,) = commands.SetpointWriter(1).encode([mode], np.array([target]), np.array([limit_nm]))
     return frame
 
@@ -35,46 +36,46 @@ def one(mode: JointMode, target: float, limit_nm: float = 4.0) -> CanFrame:
 # --- setpoints --------------------------------------------------------------------------------------------
 
 
-@given(st.sampled_from(list(TARGET)), st.floats(-3.2767, 3.2767), st.floats(0, 65.535))
-def test_targets_and_limits_are_rounded_to_the_nearest_step(
+@given(st.sampled_from(list(TARGET_SIGNALS)), st.floats(-3.2767, 3.2767), st.floats(0, 65.535))
+def test_setpoint_target_and_limit_are_rounded_to_nearest_step(
     mode: JointMode, target: float, limit_nm: float
 ) -> None:
-    said = read(one(mode, target, limit_nm))
-    step = load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
-    assert abs(said[TARGET[mode]] - target) <= step / 2 * (1 + 1e-9)
-    assert abs(said["torque_limit"] - limit_nm) <= 0.0005 * (1 + 1e-9)
+    sent = read(encode_setpoint(mode, target, limit_nm))
+    step = load_layouts()[Opcode.SET_POINT].signals[TARGET_SIGNALS[mode]].scale
+    assert abs(sent[TARGET_SIGNALS[mode]] - target) <= step / 2 * (1 + 1e-9)
+    assert abs(sent["torque_limit"] - limit_nm) <= 0.0005 * (1 + 1e-9)
 
 
-@given(st.sampled_from(list(TARGET)), st.floats(33, 1e9) | st.just(math.inf), st.booleans())
-def test_what_is_beyond_the_range_is_sent_as_its_end(
-    mode: JointMode, beyond: float, negative: bool
+@given(st.sampled_from(list(TARGET_SIGNALS)), st.floats(33, 1e9) | st.just(math.inf), st.booleans())
+def test_setpoint_beyond_the_range_is_sent_as_its_end(
+    mode: JointMode, magnitude: float, is_negative: bool
 ) -> None:
-    said = read(one(mode, -beyond if negative else beyond, 65.6 + beyond))
-    most = 32767 * load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
-    assert said[TARGET[mode]] == pytest.approx(-most if negative else most)
-    assert said["torque_limit"] == pytest.approx(65.535)
-    assert read(one(mode, 0.0, -1.0))["torque_limit"] == 0.0
+    sent = read(encode_setpoint(mode, -magnitude if is_negative else magnitude, 65.6 + magnitude))
+    max_target = 32767 * load_layouts()[Opcode.SET_POINT].signals[TARGET_SIGNALS[mode]].scale
+    assert sent[TARGET_SIGNALS[mode]] == pytest.approx(-max_target if is_negative else max_target)
+    assert sent["torque_limit"] == pytest.approx(65.535)
+    assert read(encode_setpoint(mode, 0.0, -1.0))["torque_limit"] == 0.0
 
 
 @given(st.floats(-1e6, 1e6))
-def test_a_passive_joint_gets_no_target(target: float) -> None:
-    frame = one(JointMode.PASSIVE, target, 0.0)
+def test_setpoint_of_passive_joint_has_no_target(target: float) -> None:
+    frame = encode_setpoint(JointMode.PASSIVE, target, 0.0)
     assert frame.data[:5] == bytes(5)
 
 
-def test_joints_and_set_points_must_be_as_many() -> None:
+def test_setpoint_count_other_than_joint_count_is_refused() -> None:
     with pytest.raises(ValueError):
         commands.SetpointWriter(3).encode([JointMode.PASSIVE] * 2, np.zeros(2), np.zeros(2))
 
 
 # --- changes of the robot's lifecycle ----------------------------------------------------------------------
 
-CLEAR, ARM, STOP, DISARM = (
-    commands.make_command(a)
-    for a in (CommandAction.CLEAR, CommandAction.ARM, CommandAction.STOP, CommandAction.DISARM)
-)
+CLEAR = commands.make_command(CommandAction.CLEAR)
+ARM = commands.make_command(CommandAction.ARM)
+STOP = commands.make_command(CommandAction.STOP)
+DISARM = commands.make_command(CommandAction.DISARM)
 EMERGENCY = commands.make_emergency()
-TOLD: dict[tuple[LifecycleState, LifecycleState], list[CanFrame]] = {
+TRANSITION_FRAMES: dict[tuple[LifecycleState, LifecycleState], list[CanFrame]] = {
     ("disarmed", "armed"): [ARM],
     ("disarmed", "fault"): [],
     ("disarmed", "estop"): [EMERGENCY],
@@ -91,12 +92,14 @@ TOLD: dict[tuple[LifecycleState, LifecycleState], list[CanFrame]] = {
 
 
 @pytest.mark.parametrize("before", LIFECYCLES)
-@pytest.mark.parametrize("now", LIFECYCLES)
+@pytest.mark.parametrize("after", LIFECYCLES)
 def test_commands_on_state_change_address_all_modules(
-    before: LifecycleState, now: LifecycleState
+    before: LifecycleState, after: LifecycleState
 ) -> None:
-    assert commands.make_transition_frames(before, now) == TOLD.get((before, now), [])
-    assert before == now or (before, now) in TOLD
+    assert commands.make_transition_frames(before, after) == TRANSITION_FRAMES.get(
+        (before, after), []
+    )
+    assert before == after or (before, after) in TRANSITION_FRAMES
 
 
 @pytest.mark.parametrize("lifecycle", LIFECYCLES)
@@ -118,7 +121,7 @@ def test_commands_repeat_state_to_a_module_that_differs(
 
 
 @given(st.integers(0, 2**40), st.integers(0, 2**50))
-def test_a_sync_carries_count_and_time_modulo_their_ranges(count: int, time_us: int) -> None:
+def test_sync_contains_count_and_time_modulo_their_ranges(count: int, time_us: int) -> None:
     frame = commands.make_sync(count, time_us)
     assert frame.id == 0x080
     assert read(frame) == {"count": count % 256, "time": time_us % 2**32}

@@ -1,4 +1,4 @@
-"""The numbers of the protocol are those of the DBC file."""
+"""The enumerations and constants of the protocol agree with the DBC file."""
 
 from enum import IntEnum
 from itertools import combinations
@@ -32,7 +32,7 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_hal.wire.messages import JointMode
 
 DATABASE = load_database()
-NAMED: dict[str, type[IntEnum]] = {
+ENUMERATIONS: dict[str, type[IntEnum]] = {
     "state": ModuleState,
     "mode": JointMode,
     "action": CommandAction,
@@ -44,48 +44,55 @@ NAMED: dict[str, type[IntEnum]] = {
 }
 
 
-def test_every_opcode_is_a_message_of_the_same_name() -> None:
-    found = {message.name: message.frame_id for message in DATABASE.messages}
-    assert found == {opcode.name.title().replace("_", ""): opcode << NODE_BITS for opcode in Opcode}
-    assert max(found.values()) | NODE_MASK <= 0x7FF
-
-
-def test_every_enumeration_is_a_value_table() -> None:
-    tables = {
-        (m.name, s.name): s.choices for m in DATABASE.messages for s in m.signals if s.choices
+def test_opcodes_equal_the_messages_of_the_dbc() -> None:
+    frame_ids = {message.name: message.frame_id for message in DATABASE.messages}
+    assert frame_ids == {
+        opcode.name.title().replace("_", ""): opcode << NODE_BITS for opcode in Opcode
     }
-    assert {signal for _, signal in tables} == set(NAMED)
+    assert max(frame_ids.values()) | NODE_MASK <= 0x7FF
+
+
+def test_enumerations_equal_the_value_tables_of_the_dbc() -> None:
+    tables = {
+        (database_message.name, database_signal.name): database_signal.choices
+        for database_message in DATABASE.messages
+        for database_signal in database_message.signals
+        if database_signal.choices
+    }
+    assert {signal for _, signal in tables} == set(ENUMERATIONS)
     for (message, signal), table in tables.items():
-        ours = {int(member): member.name.lower() for member in NAMED[signal]}
-        assert {number: str(name) for number, name in table.items()} == ours, (message, signal)
+        members = {int(member): member.name.lower() for member in ENUMERATIONS[signal]}
+        assert {number: str(name) for number, name in table.items()} == members, (message, signal)
 
 
 def test_signal_with_a_table_has_no_narrower_range() -> None:
     for message in DATABASE.messages:
         for signal in message.signals:
-            if signal.name in NAMED:
+            if signal.name in ENUMERATIONS:
                 assert signal.choices, (message.name, signal.name)
-                most = max(NAMED[signal.name])
-                assert float(signal.maximum or 0) >= most and most < 1 << signal.length, (
+                max_value = max(ENUMERATIONS[signal.name])
+                assert float(signal.maximum or 0) >= max_value and max_value < 1 << signal.length, (
                     message.name,
                     signal.name,
                 )
 
 
-def test_fault_bits_stand_in_the_heartbeat_in_their_order() -> None:
+def test_fault_bits_of_the_heartbeat_are_in_order() -> None:
     signals = load_layouts()[Opcode.HEARTBEAT].signals
-    first = signals["fault_watchdog"].shift
-    found = {
-        name: signal.shift - first for name, signal in signals.items() if name.startswith("fault_")
+    first_bit = signals["fault_watchdog"].shift
+    positions = {
+        name: signal.shift - first_bit
+        for name, signal in signals.items()
+        if name.startswith("fault_")
     }
-    assert found == {f"fault_{fault.name.lower()}": int(fault) for fault in ModuleFault}
+    assert positions == {f"fault_{fault.name.lower()}": int(fault) for fault in ModuleFault}
 
 
 def test_protocol_messages_have_the_declared_direction() -> None:
     for message in DATABASE.messages:
-        host = Opcode(message.frame_id >> NODE_BITS) in FROM_HOST
-        assert message.senders == (["Host"] if host else ["Module"]), message.name
-        assert message.receivers == ({"Module"} if host else {"Host"}), message.name
+        is_from_host = Opcode(message.frame_id >> NODE_BITS) in FROM_HOST
+        assert message.senders == (["Host"] if is_from_host else ["Module"]), message.name
+        assert message.receivers == ({"Module"} if is_from_host else {"Host"}), message.name
 
 
 def test_checksum_is_last_byte_of_messages_that_have_one() -> None:
@@ -99,21 +106,22 @@ def test_checksum_is_last_byte_of_messages_that_have_one() -> None:
 
 def test_signals_of_a_message_overlap_only_for_setpoint_targets() -> None:
     for opcode, layout in load_layouts().items():
-        for a, b in combinations(layout.signals.values(), 2):
-            shared = (a.mask << a.shift) & (b.mask << b.shift)
-            targets = opcode == Opcode.SET_POINT and {a.name, b.name} <= {
+        for first, second in combinations(layout.signals.values(), 2):
+            shared_bits = (first.mask << first.shift) & (second.mask << second.shift)
+            are_targets = opcode == Opcode.SET_POINT and {first.name, second.name} <= {
                 "position",
                 "velocity",
                 "torque",
             }
-            assert bool(shared) == targets, (opcode, a.name, b.name)
-            assert (a.mask << a.shift).bit_length() <= 8 * layout.length
+            assert bool(shared_bits) == are_targets, (opcode, first.name, second.name)
+            assert (first.mask << first.shift).bit_length() <= 8 * layout.length
 
 
 # --- checksum ----------------------------------------------------------------------------------------------
 
 
-def checked(opcode: Opcode, node: int, payload: bytes) -> CanFrame:
+def make_frame_with_checksum(opcode: Opcode, node: int, payload: bytes) -> CanFrame:
+    """Return a frame with its checksum."""
     identifier = frame_id(opcode, node)
     data = payload[: load_layouts()[opcode].length - 1]
     return CanFrame(identifier, data + bytes((checksum(identifier, data),)))
@@ -124,12 +132,12 @@ def checked(opcode: Opcode, node: int, payload: bytes) -> CanFrame:
 def test_checksum_detects_every_single_bit_error_and_wrong_node(
     opcode: Opcode, node: int, payload: bytes
 ) -> None:
-    frame = checked(opcode, node, payload)
+    frame = make_frame_with_checksum(opcode, node, payload)
     assert has_valid_checksum(frame)
     number = int.from_bytes(frame.data, "little")
     for bit in range(8 * len(frame.data)):
-        wrong = (number ^ 1 << bit).to_bytes(len(frame.data), "little")
-        assert not has_valid_checksum(CanFrame(frame.id, wrong)), bit
+        damaged = (number ^ 1 << bit).to_bytes(len(frame.data), "little")
+        assert not has_valid_checksum(CanFrame(frame.id, damaged)), bit
     for bit in range(11):
         assert not has_valid_checksum(CanFrame(frame.id ^ 1 << bit, frame.data)), bit
     for other in range(NODE_MASK + 1):

@@ -1,4 +1,4 @@
-"""A hand that bends emulated joints whose motors are off."""
+"""An emulated hand bends joints whose motors are off."""
 
 from pathlib import Path
 
@@ -14,8 +14,8 @@ STEPS = 1500
 
 
 def make_model(pose_file: Path) -> InertiaModel:
-    sets = (f"robot.chain.modules={JOINTS}", "start.on_route=false")
-    config = load_scenario("joint_check", [parse_set_option(text) for text in sets]).config
+    options = (f"robot.chain.modules={JOINTS}", "start.on_route=false")
+    config = load_scenario("joint_check", [parse_set_option(text) for text in options]).config
     return InertiaModel(config, InertiaSettings(hand_file=str(pose_file)))
 
 
@@ -39,12 +39,14 @@ def test_hand_does_not_touch_a_joint_that_a_motor_drives(tmp_path: Path) -> None
     pose_file.write_text("0.5 0.5 0.5")
     model = make_model(pose_file)
     for _ in range(STEPS // 3):
-        model.advance(np.array([0.09, 0.0, 0.0]))  # less than its dry friction
+        model.advance(
+            np.array([0.09, 0.0, 0.0])
+        )  # this torque is below the dry friction of the joint
     assert model.angle_rad == pytest.approx([0.0, 0.5, 0.5], abs=1e-6)
 
 
 @pytest.mark.parametrize("text", ["0.5 0.5", "0.5 0.5 left", "0.5 0.5 nan"])
-def test_pose_that_is_no_pose_is_an_error(tmp_path: Path, text: str) -> None:
+def test_hand_invalid_pose_file_is_an_error(tmp_path: Path, text: str) -> None:
     pose_file = tmp_path / "pose.txt"
     pose_file.write_text(text)
     with pytest.raises(BackendError, match="write 3 angles in rad"):

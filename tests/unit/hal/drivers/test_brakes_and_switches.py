@@ -1,4 +1,4 @@
-"""Holding brakes, limit switches and the safe-torque-off input of drives."""
+"""The driver kit controls holding brakes, and reacts to limit switches and safe torque off."""
 
 import numpy as np
 import pytest
@@ -13,52 +13,55 @@ PERIOD_NS = 10_000_000
 ANGLE_RAD = np.array([0.5])
 
 
-def command(
+def make_command(
     *,
-    follow: bool,
+    is_enabled: bool,
     mode: JointMode = JointMode.POSITION,
     target: float = 0.9,
     emergency: bool = False,
 ) -> BusCommand:
-    following = frozenset({0}) if follow else frozenset[int]()
+    """Return the command of one drive."""
+    following = frozenset({0}) if is_enabled else frozenset[int]()
     return BusCommand(
         following,
         [mode],
         np.array([target]),
         np.array([2.0]),
-        may_enable=follow,
+        may_enable=is_enabled,
         emergency=emergency,
     )
 
 
-class Brake:
-    """One drive with a brake that opens in 50 ms and closes in 30 ms; the drive obeys at once."""
+class BrakedDrive:
+    """One drive with a brake that opens in 50 ms and closes in 30 ms. The drive follows each command immediately."""
 
     def __init__(self) -> None:
         self.now_ns = 0
         self.is_enabled = False
         self.brakes = HoldingBrakes(1, release_s=0.05, engage_s=0.03, clock_ns=lambda: self.now_ns)
 
-    def step(self, asked: BusCommand) -> BrakePlan:
-        plan = self.brakes.update_brakes(asked, [0] if self.is_enabled else [], ANGLE_RAD)
+    def step(self, requested: BusCommand) -> BrakePlan:
+        """Update the brake with a command, and let one period pass."""
+        plan = self.brakes.update_brakes(requested, [0] if self.is_enabled else [], ANGLE_RAD)
         self.is_enabled = 0 in plan.command.enabled_drives
         self.now_ns += PERIOD_NS
         return plan
 
 
-def test_brake_opens_after_enabling_and_the_joint_holds_until_it_is_open() -> None:
-    brake = Brake()
-    plans = [brake.step(command(follow=True)) for _ in range(8)]
+def test_brake_of_enabled_drive_opens_before_the_joint_moves() -> None:
+    brake = BrakedDrive()
+    plans = [brake.step(make_command(is_enabled=True)) for _ in range(8)]
     assert [bool(plan.released) for plan in plans] == [False] + [True] * 7
     assert [plan.command.targets[0] for plan in plans] == [0.5] * 6 + [0.9] * 2
 
 
 def test_torque_is_held_until_the_brake_has_closed() -> None:
-    brake = Brake()
+    brake = BrakedDrive()
     for _ in range(8):
-        brake.step(command(follow=True))
+        brake.step(make_command(is_enabled=True))
     plans = [
-        brake.step(command(follow=False, mode=JointMode.PASSIVE, target=0.0)) for _ in range(5)
+        brake.step(make_command(is_enabled=False, mode=JointMode.PASSIVE, target=0.0))
+        for _ in range(5)
     ]
     assert not any(plan.released for plan in plans)
     assert [bool(plan.command.enabled_drives) for plan in plans] == [True] * 3 + [False] * 2
@@ -67,39 +70,40 @@ def test_torque_is_held_until_the_brake_has_closed() -> None:
     assert plans[0].command.limits_nm[0] == 2.0
 
 
-def test_emergency_stop_closes_the_brake_and_switches_torque_off_at_once() -> None:
-    brake = Brake()
+def test_emergency_stop_closes_brake_and_disables_torque_immediately() -> None:
+    brake = BrakedDrive()
     for _ in range(8):
-        brake.step(command(follow=True))
-    plan = brake.step(command(follow=False, emergency=True))
-    assert not plan.released and not plan.command.enabled_drives
+        brake.step(make_command(is_enabled=True))
+    plan = brake.step(make_command(is_enabled=False, emergency=True))
+    assert not plan.released
+    assert not plan.command.enabled_drives
 
 
-def test_drive_that_was_never_enabled_holds_nothing_when_disarmed() -> None:
-    assert not Brake().step(command(follow=False)).command.enabled_drives
+def test_drive_that_was_never_enabled_stays_off_when_disarmed() -> None:
+    assert not BrakedDrive().step(make_command(is_enabled=False)).command.enabled_drives
 
 
 @pytest.mark.parametrize(
-    ("mode", "into", "kept_at", "away"),
+    ("mode", "towards", "expected_towards", "away"),
     [
         (JointMode.POSITION, 0.9, 0.5, 0.1),
         (JointMode.VELOCITY, 1.0, 0.0, -1.0),
         (JointMode.TORQUE, 1.0, 0.0, -1.0),
     ],
 )
-def test_closed_switch_allows_motion_away_from_it_alone(
-    mode: JointMode, into: float, kept_at: float, away: float
+def test_closed_limit_switch_allows_only_motion_away(
+    mode: JointMode, towards: float, expected_towards: float, away: float
 ) -> None:
     switches = LimitSwitches(["joint_1"])
     switches.record_switches(0, lower=False, upper=True)
-    for target, expected in ((into, kept_at), (away, away)):
+    for target, expected in ((towards, expected_towards), (away, away)):
         restricted = switches.restrict_command(
-            command(follow=True, mode=mode, target=target), ANGLE_RAD
+            make_command(is_enabled=True, mode=mode, target=target), ANGLE_RAD
         )
         assert restricted.targets[0] == expected
 
 
-def test_switch_is_a_fault_once_and_a_reset_allows_to_leave_it() -> None:
+def test_closed_limit_switch_is_reported_once_until_reset() -> None:
     switches = LimitSwitches(["joint_1"])
     switches.record_switches(0, lower=True, upper=False)
     [finding] = switches.list_findings()
@@ -110,10 +114,10 @@ def test_switch_is_a_fault_once_and_a_reset_allows_to_leave_it() -> None:
     assert switches.list_findings() == []
     switches.record_switches(0, lower=False, upper=False)
     switches.record_switches(0, lower=True, upper=False)
-    assert len(switches.list_findings()) == 1, "it has closed again"
+    assert len(switches.list_findings()) == 1, "the switch has closed again"
 
 
-def test_safe_torque_off_has_a_fault_of_its_own_that_stops_the_robot() -> None:
+def test_safe_torque_off_is_a_fault_that_stops_the_robot() -> None:
     states = DriveStates(["joint_1"], PERIOD_NS, lambda: 0)
     states.drives[0].safe_torque_off = True
     states.drives[0].errors = "something else, which is its consequence"

@@ -1,4 +1,4 @@
-"""The log of emulated drives: it has a line for each change, and none otherwise."""
+"""The log of emulated drives has one line for each change."""
 
 import io
 import json
@@ -6,7 +6,7 @@ import json
 from snakesim_drivers.emulation.emulator_control import LOGGED_STEP_RAD, DriveLog, TrueState
 
 
-def test_drive_log_has_a_line_for_each_change_of_torque_or_angle():
+def test_drive_log_has_a_line_for_each_change():
     file = io.StringIO()
     log = DriveLog(file)
     for enabled, angle_rad in [

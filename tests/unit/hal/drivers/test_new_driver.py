@@ -1,4 +1,4 @@
-"""The package that `snakesim drive new` writes: its names, its files, and what it refuses."""
+"""`snakesim drive new` writes a driver package with the new name, and refuses bad names and folders."""
 
 import ast
 from pathlib import Path
@@ -30,22 +30,22 @@ def test_written_test_imports_every_subject_of_the_suite() -> None:
     assert sorted(SUBJECTS) == sorted(plugin.SECTION_ORDER)
 
 
-def test_example_is_the_template() -> None:
+def test_example_driver_equals_the_template() -> None:
     assert EXAMPLE.read_text() == DRIVER.read_text()
 
 
 @pytest.mark.parametrize(
     "name", ["", "Acme", "acme-servo", "1st", "a__b", "../acme", "x" * 41, "lambda", "odrive"]
 )
-def test_bad_names_are_refused(name: str) -> None:
+def test_invalid_driver_name_is_refused(name: str) -> None:
     with raises_error(ConfigError, code=("config/invalid-value", "config/duplicate-name")):
         validate_driver_name(name)
 
 
 def test_existing_folder_is_refused_and_kept(tmp_path: Path) -> None:
-    kept = tmp_path / "acme" / "kept.txt"
-    kept.parent.mkdir()
-    kept.write_text("mine")
+    existing_file = tmp_path / "acme" / "kept.txt"
+    existing_file.parent.mkdir()
+    existing_file.write_text("mine")
     with raises_error(ConfigError, code="file/already-exists", field="--out"):
-        write_driver_package("acme", kept.parent)
-    assert [path.name for path in kept.parent.iterdir()] == ["kept.txt"]
+        write_driver_package("acme", existing_file.parent)
+    assert [path.name for path in existing_file.parent.iterdir()] == ["kept.txt"]

@@ -1,4 +1,4 @@
-"""What the host makes of samples where the backend itself knows no faults, and what it passes on or refuses."""
+"""The host injects faults into samples of backends that cannot do this, and forwards or refuses other faults."""
 
 import math
 import time
@@ -17,15 +17,15 @@ from snakesim_testing.hal.small_robots import PERIOD_NS, make_run_config
 from snakesim_testing.messages import raises_error
 
 
-class Emulated(LagBackend):
-    """Says that nothing real moves."""
+class EmulatedLagBackend(LagBackend):
+    """A backend that declares itself as emulated."""
 
     def describe(self) -> RobotDescription:
         return msgspec.structs.replace(super().describe(), emulated=True)
 
 
-class Leaky(Emulated):
-    """Knows one fault by itself."""
+class LeakyBackend(EmulatedLagBackend):
+    """A backend that can inject one kind of fault by itself."""
 
     def __init__(self, config: Any) -> None:
         super().__init__(config)
@@ -38,14 +38,15 @@ class Leaky(Emulated):
         return True
 
 
-class Bench:
-    """A backend whose joints all move, tick by tick."""
+class FaultyRig:
+    """A backend with fault injection whose joints all move with constant velocity."""
 
     def __init__(self, inner: Backend) -> None:
         self.backend = FaultyBackend(inner)
         self.tick = 0
 
-    def sample(self) -> JointState:
+    def read_joints(self) -> JointState:
+        """Move all joints for a tick, and return their state."""
         self.backend.enact(SafeSetpoints([JointMode.VELOCITY] * 3, [1.0] * 3, [4.0] * 3), "armed")
         self.backend.advance()
         self.tick += 1
@@ -56,77 +57,77 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Bench:
-    made = Bench(Emulated(make_run_config(rate_hz=100)))
-    made.sample()
-    return made
+def rig() -> FaultyRig:
+    faulty_robot = FaultyRig(EmulatedLagBackend(make_run_config(rate_hz=100)))
+    faulty_robot.read_joints()
+    return faulty_robot
 
 
-def test_without_a_fault_everything_is_the_backends(bench: Bench) -> None:
-    assert bench.sample().angle_rad == [0.02] * 3
-    assert bench.backend.describe().backend == "lag"
-    assert bench.backend.faults() == []
+def test_faulty_backend_without_fault_changes_nothing(rig: FaultyRig) -> None:
+    assert rig.read_joints().angle_rad == [0.02] * 3
+    assert rig.backend.describe().backend == "lag"
+    assert rig.backend.faults() == []
 
 
-def test_a_mute_joint_says_nothing_and_its_age_grows(bench: Bench) -> None:
-    bench.inject("mute:joint_2")
-    reported = [bench.sample() for _ in range(3)]
-    assert [joints.angle_rad[1] for joints in reported] == [0.01] * 3
-    assert [joints.valid for joints in reported] == [[True, False, True]] * 3
-    assert [joints.age_ns[1] for joints in reported] == [PERIOD_NS, 2 * PERIOD_NS, 3 * PERIOD_NS]
-    assert reported[-1].angle_rad[0] == pytest.approx(0.04)
-    assert reported[-1].age_ns[0] == 0
-    bench.inject("mute:joint_2", begins=False)
-    back = bench.sample()
-    assert back.valid == [True] * 3
-    assert back.age_ns == [0] * 3
-    assert back.angle_rad[1] == pytest.approx(0.05)
+def test_faulty_backend_mute_joint_is_invalid_and_ages(rig: FaultyRig) -> None:
+    rig.inject("mute:joint_2")
+    joint_states = [rig.read_joints() for _ in range(3)]
+    assert [state.angle_rad[1] for state in joint_states] == [0.01] * 3
+    assert [state.valid for state in joint_states] == [[True, False, True]] * 3
+    assert [state.age_ns[1] for state in joint_states] == [PERIOD_NS, 2 * PERIOD_NS, 3 * PERIOD_NS]
+    assert joint_states[-1].angle_rad[0] == pytest.approx(0.04)
+    assert joint_states[-1].age_ns[0] == 0
+    rig.inject("mute:joint_2", begins=False)
+    state_after_end = rig.read_joints()
+    assert state_after_end.valid == [True] * 3
+    assert state_after_end.age_ns == [0] * 3
+    assert state_after_end.angle_rad[1] == pytest.approx(0.05)
 
 
-def test_a_frozen_joint_repeats_itself_and_grows_old(bench: Bench) -> None:
-    bench.inject("freeze:joint_1")
-    reported = [bench.sample() for _ in range(3)]
-    assert [joints.angle_rad[0] for joints in reported] == [0.01] * 3
-    assert all(joints.valid[0] for joints in reported)
-    assert reported[-1].age_ns == [3 * PERIOD_NS, 0, 0]
+def test_faulty_backend_frozen_joint_repeats_its_state_and_ages(rig: FaultyRig) -> None:
+    rig.inject("freeze:joint_1")
+    joint_states = [rig.read_joints() for _ in range(3)]
+    assert [state.angle_rad[0] for state in joint_states] == [0.01] * 3
+    assert all(state.valid[0] for state in joint_states)
+    assert joint_states[-1].age_ns == [3 * PERIOD_NS, 0, 0]
 
 
-def test_an_angle_can_be_off_and_can_be_no_number(bench: Bench) -> None:
-    bench.inject("wrong:joint_3")
-    bench.inject("nan:joint_1")
-    reported = bench.sample()
-    assert math.isnan(reported.angle_rad[0])
-    assert reported.angle_rad[1:] == [pytest.approx(0.02), pytest.approx(0.52)]
-    bench.inject("wrong:joint_3", begins=False)
-    bench.inject("nan:joint_1", begins=False)
-    assert bench.sample().angle_rad == [pytest.approx(0.03)] * 3
+def test_faulty_backend_angle_can_be_wrong_or_nan(rig: FaultyRig) -> None:
+    rig.inject("wrong:joint_3")
+    rig.inject("nan:joint_1")
+    joint_state = rig.read_joints()
+    assert math.isnan(joint_state.angle_rad[0])
+    assert joint_state.angle_rad[1:] == [pytest.approx(0.02), pytest.approx(0.52)]
+    rig.inject("wrong:joint_3", begins=False)
+    rig.inject("nan:joint_1", begins=False)
+    assert rig.read_joints().angle_rad == [pytest.approx(0.03)] * 3
 
 
 def test_slow_simulator_sample_takes_the_amount(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    rig: FaultyRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slept_s: list[float] = []
     monkeypatch.setattr(time, "sleep", slept_s.append)
-    bench.backend.inject(parse_injection("slow:simulator@0=0.2"), begins=True)
-    bench.sample()
-    bench.inject("slow:simulator", begins=False)
-    bench.sample()
+    rig.backend.inject(parse_injection("slow:simulator@0=0.2"), begins=True)
+    rig.read_joints()
+    rig.inject("slow:simulator", begins=False)
+    rig.read_joints()
     assert [seconds > 0.0 for seconds in slept_s] == [True, *[False] * (len(slept_s) - 1)]
     assert slept_s[0] <= 0.05
 
 
-def test_injection_is_offered_to_backend_first_else_refused(bench: Bench) -> None:
-    leaky = Leaky(make_run_config())
-    able = Bench(leaky)
-    able.inject("leak:joint_1")
-    able.inject("leak:joint_1", begins=False)
-    assert leaky.injected == [("leak:joint_1@0", True), ("leak:joint_1@0", False)]
-    able.inject("mute:joint_1")
-    assert able.sample().valid == [False, True, True]
-    for backend in (able, bench):
+def test_injection_is_offered_to_backend_first_else_refused(rig: FaultyRig) -> None:
+    leaky_backend = LeakyBackend(make_run_config())
+    injecting_rig = FaultyRig(leaky_backend)
+    injecting_rig.inject("leak:joint_1")
+    injecting_rig.inject("leak:joint_1", begins=False)
+    assert leaky_backend.injected == [("leak:joint_1@0", True), ("leak:joint_1@0", False)]
+    injecting_rig.inject("mute:joint_1")
+    assert injecting_rig.read_joints().valid == [False, True, True]
+    for tested_rig in (injecting_rig, rig):
         with raises_error(ConfigError, code="injection/not-supported", field="lag"):
-            backend.inject("reboot:joint_1")
+            tested_rig.inject("reboot:joint_1")
     with raises_error(ConfigError, code="injection/unknown-target", field="joint_4"):
-        bench.inject("mute:joint_4")
+        rig.inject("mute:joint_4")
     with raises_error(ConfigError, code="injection/not-supported"):
-        Bench(LagBackend(make_run_config())).inject("slow:simulator")
+        FaultyRig(LagBackend(make_run_config())).inject("slow:simulator")

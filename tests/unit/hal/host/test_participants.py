@@ -1,4 +1,4 @@
-"""Which services the end of a lockstep tick waits for."""
+"""The end of a lockstep tick waits only for services that answer this tick."""
 
 import pytest
 
@@ -20,8 +20,8 @@ def test_service_that_connects_at_tick_zero_is_awaited_there() -> None:
     assert participants.find_services_behind(1) == ["control"]
 
 
-def test_service_is_not_awaited_for_a_tick_that_was_published_before_it_connected() -> None:
-    """The host would wait for an answer to a clock that the service never gets, and the service for the next clock."""
+def test_service_is_not_awaited_for_ticks_before_it_connected() -> None:
+    """Avoid a deadlock: the service waits for the next clock, and never receives the present one."""
     participants = LockstepParticipants(SERVICES)
     participants.mark_present("control", 8)  # it connects while the host waits at the end of tick 7
     assert participants.find_services_behind(7) == []
@@ -29,10 +29,10 @@ def test_service_is_not_awaited_for_a_tick_that_was_published_before_it_connecte
 
 
 @pytest.mark.parametrize(("next_tick", "awaited_from"), [(5, 9), (8, 9), (9, 13)])
-def test_service_with_decimation_is_awaited_from_its_first_due_tick_on(
+def test_service_with_decimation_is_awaited_from_first_due_tick(
     next_tick: int, awaited_from: int
 ) -> None:
-    """The end of tick 9 needs the answer to tick 8: navigation is due every 4 ticks, and has 2 ticks for it."""
+    """Check that the end of tick 9 needs the answer to tick 8: decimation 4, latency 2 ticks."""
     participants = LockstepParticipants(SERVICES)
     participants.mark_present("navigation", next_tick)
     assert [tick for tick in range(16) if participants.find_services_behind(tick)] == list(
@@ -47,7 +47,7 @@ def test_second_token_of_a_connected_service_changes_nothing() -> None:
     assert participants.find_services_behind(3) == ["control"]
 
 
-def test_service_that_reconnects_counts_anew() -> None:
+def test_service_that_reconnects_is_awaited_from_next_tick() -> None:
     participants = LockstepParticipants(SERVICES)
     participants.mark_present("control", 0)
     participants.mark_done("control", 4)

@@ -1,4 +1,4 @@
-"""Backends around another pass on every call: a default of the base class would hide what the inner one answers."""
+"""Backends around another one forward every call. A default of the base class would hide the inner result."""
 
 import inspect
 
@@ -8,15 +8,18 @@ from snakesim_hal.backend import Backend
 from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.host.guarded_backend import GuardedBackend
 
-OF_THE_CLASS = {"check", "limit_modes"}  # used before a backend is opened, on the inner class
+CLASS_METHODS = {
+    "check",
+    "limit_modes",
+}  # these are called on the inner class, before a backend is opened
 
 
 @pytest.mark.parametrize("wrapper", [FaultyBackend, GuardedBackend])
-def test_wrapped_backend_passes_on_every_method(wrapper: type[Backend]) -> None:
+def test_wrapper_backend_forwards_every_method(wrapper: type[Backend]) -> None:
     methods = {
         name
         for name, _ in inspect.getmembers(Backend, inspect.isfunction)
         if not name.startswith("_")
     }
-    missing = {name for name in methods - OF_THE_CLASS if name not in vars(wrapper)}
+    missing = {name for name in methods - CLASS_METHODS if name not in vars(wrapper)}
     assert not missing

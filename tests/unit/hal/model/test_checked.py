@@ -1,4 +1,4 @@
-"""When a real robot counts as checked."""
+"""A start check counts only for the joints, drives and bus that were checked."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from snakesim_hal.wire.messages import RobotDescription
 from snakesim_testing.hal.small_robots import make_description, make_robot_file
 
 JOINTS = make_robot_file().joint_table
-CHECKED = StartCheckRecord(
+RECORD = StartCheckRecord(
     by="anna",
     on="2026-11-24",
     joints=compute_mounting_digest(JOINTS),
@@ -25,15 +25,16 @@ CHECKED = StartCheckRecord(
 )
 
 
-def robot(serials: str = "", **fields: Any) -> RobotDescription:
-    plain = make_description()
-    given = serials.split(",") if serials else [""] * len(plain.joints)
+def describe_can_robot(serials: str = "", **fields: Any) -> RobotDescription:
+    """Return the description of a robot on can0, with these serial numbers of its drives."""
+    description = make_description()
+    serial_list = serials.split(",") if serials else [""] * len(description.joints)
     joints = [
-        msgspec.structs.replace(one, serial=serial)
-        for one, serial in zip(plain.joints, given, strict=True)
+        msgspec.structs.replace(joint, serial=serial)
+        for joint, serial in zip(description.joints, serial_list, strict=True)
     ]
     return msgspec.structs.replace(
-        plain, **{"backend": "can", "hardware": "can0", "joints": joints, **fields}
+        description, **{"backend": "can", "hardware": "can0", "joints": joints, **fields}
     )
 
 
@@ -41,41 +42,44 @@ SERIALS = [f"S{i}" for i in range(len(JOINTS))]
 
 
 @pytest.mark.parametrize(
-    ("checked", "here", "words"),
+    ("record", "description", "expected_text"),
     [
-        (None, robot(emulated=True), ""),
-        (None, robot(), "have not been checked"),
-        (CHECKED, robot(), ""),
+        (None, describe_can_robot(emulated=True), ""),
+        (None, describe_can_robot(), "have not been checked"),
+        (RECORD, describe_can_robot(), ""),
         (
-            msgspec.structs.replace(CHECKED, confirmed=["drive", "order", "sign"]),
-            robot(),
+            msgspec.structs.replace(RECORD, confirmed=["drive", "order", "sign"]),
+            describe_can_robot(),
             "of every joint: gear, zero",
         ),
         (
-            CHECKED,
-            robot(hardware="can1"),
+            RECORD,
+            describe_can_robot(hardware="can1"),
             "it is on can can1 now, can can0 since anna checked it on 2026-11-24",
         ),
-        (CHECKED, robot(",".join(SERIALS)), "joint_1 has drive S0, and had unknown"),
+        (RECORD, describe_can_robot(",".join(SERIALS)), "joint_1 has drive S0, and had unknown"),
         (
-            msgspec.structs.replace(CHECKED, serials=SERIALS),
-            robot(",".join(SERIALS), hardware="can1"),
+            msgspec.structs.replace(RECORD, serials=SERIALS),
+            describe_can_robot(",".join(SERIALS), hardware="can1"),
             "",
         ),
         (
-            msgspec.structs.replace(CHECKED, serials=SERIALS),
-            robot(),
+            msgspec.structs.replace(RECORD, serials=SERIALS),
+            describe_can_robot(),
             "joint_1 has drive unknown, and had S0",
         ),
         (
-            msgspec.structs.replace(CHECKED, joints="0"),
-            robot(),
+            msgspec.structs.replace(RECORD, joints="0"),
+            describe_can_robot(),
             "was changed in its file since anna",
         ),
     ],
 )
-def test_check_counts_only_for_judged_joints_and_drives(
-    checked: StartCheckRecord | None, here: RobotDescription, words: str
+def test_start_check_counts_only_for_checked_joints_and_drives(
+    record: StartCheckRecord | None, description: RobotDescription, expected_text: str
 ) -> None:
-    found = find_unchecked_reason(checked, JOINTS, here)
-    assert words in found if words else found == ""
+    reason = find_unchecked_reason(record, JOINTS, description)
+    if expected_text:
+        assert expected_text in reason
+    else:
+        assert reason == ""

@@ -1,4 +1,4 @@
-"""The documentation of a Struct's fields: from the literals behind them, and from their types."""
+"""Documentation of the fields of a Struct comes from their docstrings and their types."""
 
 import sys
 from pathlib import Path
@@ -44,13 +44,14 @@ class Kart(FileStruct, frozen=True, kw_only=True, tag="kart", tag_field="kind"):
 
 
 class SpareWheel(Wheel, frozen=True, kw_only=True):
-    """A wheel with another description of its spokes, and of what it inherits."""
+    """A wheel with another description of its spokes, which inherits the other ones."""
 
     spokes: int = 0
     """Number of spokes."""
 
 
-def docs_of(struct: type[msgspec.Struct]) -> dict[str, FieldDoc]:
+def document_by_name(struct: type[msgspec.Struct]) -> dict[str, FieldDoc]:
+    """Return the documentation of all fields by name."""
     return {doc.name: doc for doc in document_fields(struct)}
 
 
@@ -63,7 +64,7 @@ def test_field_without_literal_uses_description_of_its_type() -> None:
     assert collect_field_descriptions(Wheel)["slip_m_s"] == "speed at the ground"
 
 
-def test_descriptions_are_inherited_and_overridden() -> None:
+def test_field_description_is_inherited_and_overridden() -> None:
     assert collect_field_descriptions(SpareWheel)["spokes"] == "Number of spokes."
     assert (
         collect_field_descriptions(SpareWheel)["radius_m"]
@@ -74,14 +75,18 @@ def test_descriptions_are_inherited_and_overridden() -> None:
 def test_joint_exception_fields_use_descriptions_of_their_section() -> None:
     assert collect_field_descriptions(MotionLimits)["torque_nm"] == "Maximum torque of the joint."
     exceptions: Any = JointExceptions
-    described = collect_field_descriptions(exceptions)
-    assert described["torque_nm"] == "Maximum torque of the joint. None: as in the section for all."
-    assert described["rated_nm"].count("None:") == 1
+    descriptions = collect_field_descriptions(exceptions)
+    assert (
+        descriptions["torque_nm"] == "Maximum torque of the joint. None: as in the section for all."
+    )
+    assert descriptions["rated_nm"].count("None:") == 1
 
 
-def test_a_class_without_a_source_file_has_no_descriptions(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: Any = msgspec.defstruct("Made", [("x", int)], module="gone")
-    assert collect_field_descriptions(made) == {}
+def test_fields_of_class_without_source_have_no_descriptions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    struct: Any = msgspec.defstruct("Made", [("x", int)], module="gone")
+    assert collect_field_descriptions(struct) == {}
     monkeypatch.setattr(sys.modules[__name__], "__file__", str(Path("gone.pyc").absolute()))
 
     class Local(FileStruct, frozen=True):
@@ -91,7 +96,7 @@ def test_a_class_without_a_source_file_has_no_descriptions(monkeypatch: pytest.M
     assert collect_field_descriptions(Local) == {}
 
 
-def test_a_plugin_in_a_file_is_described(tmp_path: Path) -> None:
+def test_fields_of_plugin_file_have_descriptions(tmp_path: Path) -> None:
     code = '''
 from snakesim_hal.model.files import FileStruct
 
@@ -124,7 +129,7 @@ class Wave:
         (Kart, "name", "text", "", "1 to 8 characters", None),
     ],
 )
-def test_type_unit_range_and_default(
+def test_field_type_unit_range_and_default_are_documented(
     struct: type[msgspec.Struct],
     field: str,
     type_words: str,
@@ -132,7 +137,7 @@ def test_type_unit_range_and_default(
     range_words: str,
     default: str | None,
 ) -> None:
-    doc = docs_of(struct)[field]
+    doc = document_by_name(struct)[field]
     assert doc.type_words == type_words
     assert doc.unit == unit
     assert doc.range_words == range_words
@@ -145,21 +150,21 @@ def test_type_unit_range_and_default(
         ("reach_m", "m"),
         ("speed_rad_s", "rad/s"),
         ("gain_nm_s_per_rad", "N·m·s/rad"),
-        ("growth_per_s", ""),  # a unit that the table does not have, not seconds
+        ("growth_per_s", ""),  # a unit that is not in the table, and not seconds
         ("count", ""),
     ],
 )
-def test_a_number_without_a_unit_has_that_of_its_name(name: str, unit: str) -> None:
+def test_field_number_without_unit_has_that_of_its_name(name: str, unit: str) -> None:
     assert find_unit(name, msgspec.inspect.type_info(float)) == unit
     assert find_unit(name, msgspec.inspect.type_info(str)) == ""
 
 
-def test_values_are_written_as_in_a_file() -> None:
+def test_field_default_is_formatted_as_in_a_file() -> None:
     value = {"on": True, "to": [1, 2.5], "name": "α"}
     assert format_value(value) == '{on = true, to = [1, 2.5], name = "α"}'
 
 
-def test_the_schema_has_descriptions_defaults_and_units() -> None:
+def test_schema_of_struct_has_descriptions_defaults_and_units() -> None:
     schema = make_schema(Kart)
     properties = schema["$defs"]["Kart"]["properties"]
     assert properties["wheels"]["description"] == "Its wheels."
@@ -169,7 +174,7 @@ def test_the_schema_has_descriptions_defaults_and_units() -> None:
     assert list_structs(Kart) == [Kart, Wheel]
 
 
-def test_two_classes_of_one_name_have_descriptions_each() -> None:
+def test_schema_of_two_classes_with_one_name_describes_both() -> None:
     class Other:
         class Wheel(FileStruct, frozen=True):
             """A toothed wheel."""

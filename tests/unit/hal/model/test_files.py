@@ -1,4 +1,4 @@
-"""Reading files: whatever is wrong ends in one ConfigError that says where, what, and what is allowed instead."""
+"""Any error in a file causes one ConfigError that names the place, the value, and what is allowed."""
 
 from enum import Enum
 from pathlib import Path
@@ -23,7 +23,7 @@ from snakesim_testing.messages import raises_error
 
 
 class Part(FileStruct, frozen=True):
-    """Something inside."""
+    """A section of a file."""
 
     size_m: Annotated[float, Meta(gt=0, le=2, extra_json_schema={"unit": "m"})]
     many: Annotated[int, Meta(ge=1, lt=10)] = 1
@@ -44,9 +44,9 @@ class Whole(FileStruct, frozen=True):
     word: str = ""
 
 
-GOOD = {"part": {"size_m": 1.0}}
+VALID_VALUES = {"part": {"size_m": 1.0}}
 
-WRONG: dict[str, dict[str, Any]] = {
+INVALID_VALUES: dict[str, dict[str, Any]] = {
     "missing": {"part": {}},
     "missing section": {},
     "type": {"part": {"size_m": "big"}},
@@ -58,26 +58,26 @@ WRONG: dict[str, dict[str, Any]] = {
     "infinite": {"part": {"size_m": float("inf")}},
     "fraction": {"part": {"size_m": 1, "many": 1.5}},
     "unknown": {"part": {"size_m": 1, "mnay": 2}},
-    "unknown, nothing like it": {**GOOD, "zzz": 1},
-    "unknown section": {**GOOD, "prat": {"x": 1}},
-    "no list": {**GOOD, "parts": 1},
-    "in a list": {**GOOD, "parts": [{"size_m": 1}, {"size_m": 9}]},
-    "unknown in a list": {**GOOD, "parts": [{"size": 1}]},
-    "in a tuple": {**GOOD, "at_m": [9.0, 0.0]},
-    "tuple too short": {**GOOD, "at_m": [1.0]},
-    "free key": {**GOOD, "by_name": {"a": {"size_m": 1}, "b": {"size_m": 1, "many": 99}}},
+    "unknown, nothing like it": {**VALID_VALUES, "zzz": 1},
+    "unknown section": {**VALID_VALUES, "prat": {"x": 1}},
+    "no list": {**VALID_VALUES, "parts": 1},
+    "in a list": {**VALID_VALUES, "parts": [{"size_m": 1}, {"size_m": 9}]},
+    "unknown in a list": {**VALID_VALUES, "parts": [{"size": 1}]},
+    "in a tuple": {**VALID_VALUES, "at_m": [9.0, 0.0]},
+    "tuple too short": {**VALID_VALUES, "at_m": [1.0]},
+    "free key": {**VALID_VALUES, "by_name": {"a": {"size_m": 1}, "b": {"size_m": 1, "many": 99}}},
     "unknown under a free key": {
-        **GOOD,
+        **VALID_VALUES,
         "by_name": {"ok": {"size_m": 1}, "b-2": {"size_m": 1, "mnay": 1}},
     },
-    "missing under a free key": {**GOOD, "by_name": {"b": {}}},
-    "free key that is no section": {**GOOD, "free": {"a": {}, "b": 3}},
-    "flag": {**GOOD, "open": 1},
-    "text": {**GOOD, "word": 1},
+    "missing under a free key": {**VALID_VALUES, "by_name": {"b": {}}},
+    "free key that is no section": {**VALID_VALUES, "free": {"a": {}, "b": 3}},
+    "flag": {**VALID_VALUES, "open": 1},
+    "text": {**VALID_VALUES, "word": 1},
 }
 
 
-def test_a_section_of_a_larger_file_names_its_place_there() -> None:
+def test_section_of_larger_file_is_named_by_its_place() -> None:
     table = ConfigTable({"size_m": 5}, "my.toml", {"box.size_m": "--set box.size_m=5"})
     with raises_error(ConfigError, code="config/out-of-range", field="--set", value=5):
         decode_table(table, Part, "box")
@@ -108,28 +108,28 @@ class Round(FileStruct, frozen=True, tag="round", tag_field="kind"):
 
 
 class Square(FileStruct, frozen=True, tag="square", tag_field="kind"):
-    """The other."""
+    """The other shape."""
 
     edge_m: float
     color: Literal["red", "blue"] = "red"
 
 
 class Grip(Enum):
-    """How it holds."""
+    """The kinds of a grip."""
 
     FIRM = "firm"
     LOOSE = "loose"
 
 
 class Thing(FileStruct, frozen=True):
-    """Has a shape."""
+    """A file with a choice of shapes."""
 
     shape: Round | Square | None = None
     shapes: list[Round | Square] = []
     grip: Grip = Grip.FIRM
 
 
-UNION: dict[str, dict[str, Any]] = {
+INVALID_CHOICES: dict[str, dict[str, Any]] = {
     "unknown kind": {"shape": {"kind": "spiral"}},
     "unknown kind in a list": {"shapes": [{"kind": "round", "radius_m": 1}, {"kind": "x"}]},
     "kind of another type": {"shape": {"kind": 3}},
@@ -142,9 +142,9 @@ UNION: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("wrong", [*WRONG, *UNION])
-def test_a_wrong_value_is_explained_by_what_is_allowed(wrong: str) -> None:
-    values = WRONG[wrong] if wrong in WRONG else UNION[wrong]
+@pytest.mark.parametrize("case", [*INVALID_VALUES, *INVALID_CHOICES])
+def test_invalid_value_is_refused_with_what_is_allowed(case: str) -> None:
+    values = INVALID_VALUES[case] if case in INVALID_VALUES else INVALID_CHOICES[case]
     with raises_error(
         ConfigError,
         code=(
@@ -154,11 +154,11 @@ def test_a_wrong_value_is_explained_by_what_is_allowed(wrong: str) -> None:
             "config/unknown-key",
         ),
         field="my.toml",
-    ) as caught:
-        decode_table(ConfigTable(values, "my.toml"), Whole if wrong in WRONG else Thing)
-    assert "\n" not in str(caught.value)
-    assert caught.value.__cause__ is None
-    assert caught.value.__suppress_context__
+    ) as refusal:
+        decode_table(ConfigTable(values, "my.toml"), Whole if case in INVALID_VALUES else Thing)
+    assert "\n" not in str(refusal.value)
+    assert refusal.value.__cause__ is None
+    assert refusal.value.__suppress_context__
 
 
 @pytest.mark.parametrize(
@@ -171,10 +171,10 @@ def test_a_wrong_value_is_explained_by_what_is_allowed(wrong: str) -> None:
         {"part": {"size_m": 1}, "a\nb": 1},
     ],
 )
-def test_what_is_quoted_is_short(values: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError) as caught:
+def test_long_invalid_value_is_quoted_shortly(values: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError) as refusal:
         decode_table(ConfigTable(values, "my.toml"), Whole)
-    assert len(str(caught.value)) < 600
+    assert len(str(refusal.value)) < 600
 
 
 JSON = st.recursive(
@@ -195,7 +195,7 @@ JSON = st.recursive(
         st.sampled_from(["part", "parts", "by_name", "free", "at_m", "open", "zz"]), JSON
     )
 )
-def test_any_values_decode_or_end_in_a_config_error(values: dict[str, Any]) -> None:
+def test_arbitrary_values_are_decoded_or_cause_a_config_error(values: dict[str, Any]) -> None:
     try:
         assert isinstance(decode_table(ConfigTable(values, "my.toml"), Whole), Whole)
     except ConfigError as error:
@@ -215,12 +215,12 @@ def test_any_values_decode_or_end_in_a_config_error(values: dict[str, Any]) -> N
         ("a.json", b"{"),
     ],
 )
-def test_a_file_that_is_none_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
+def test_file_with_invalid_syntax_is_refused(tmp_path: Path, name: str, content: bytes) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    with raises_error(ConfigError, code="file/invalid-syntax") as caught:
+    with raises_error(ConfigError, code="file/invalid-syntax") as refusal:
         read_table(path)
-    assert str(caught.value).startswith(f"{path}: ")
+    assert str(refusal.value).startswith(f"{path}: ")
 
 
 def test_missing_file_error_names_it_and_existing_ones(tmp_path: Path) -> None:
@@ -229,22 +229,22 @@ def test_missing_file_error_names_it_and_existing_ones(tmp_path: Path) -> None:
         read_table(tmp_path / "a.toml")
 
 
-def test_find_takes_names_and_paths(tmp_path: Path) -> None:
+def test_file_path_is_resolved_from_name_or_path(tmp_path: Path) -> None:
     assert resolve_file_path("triplet", "scenes").is_file()
     assert resolve_file_path("x.toml", "robots", tmp_path) == tmp_path / "x.toml"
     assert resolve_file_path("/abs/x.toml", "robots", tmp_path) == Path("/abs/x.toml")
     assert resolve_file_path("sub/x", "robots", tmp_path) == tmp_path / "sub/x"
     with raises_error(
         ConfigError, code="config/unknown-name", field="planar31", stored=False
-    ) as caught:
+    ) as refusal:
         resolve_file_path("planar31", "robots")
-    assert all(name in str(caught.value) for name in list_shipped_names("robots"))
+    assert all(name in str(refusal.value) for name in list_shipped_names("robots"))
 
 
-# --- where values come from ------------------------------------------------------------------------------------
+# --- origins of values -----------------------------------------------------------------------------------------
 
 
-def test_origins_follow_the_last_writer(tmp_path: Path) -> None:
+def test_origin_of_a_value_is_its_last_writer(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text(
         "word = 'x'\n[part]\nsize_m = 1.0\nmany = 2\n[[parts]]\nsize_m = 1.0\n[free]\n"
     )
@@ -257,13 +257,13 @@ def test_origins_follow_the_last_writer(tmp_path: Path) -> None:
     assert table.find_origin("part.many") == "--many 3"
     assert table.find_origin("parts.0.size_m") == "--set parts.0.size_m=0.5"
     assert table.find_origin("at_m") == "default"
-    assert table.find_origin("free.a.b") == "default"  # an empty section sets nothing
+    assert table.find_origin("free.a.b") == "default"  # an empty section sets no value
     table.set_value("part", {"size_m": 2.0}, "other.toml")
     assert table.find_origin("part.size_m") == "other.toml"
     assert table.find_origin("part.many") == "default"
 
 
-def test_putting_into_lists() -> None:
+def test_value_in_a_list_is_set_only_at_valid_index() -> None:
     table = ConfigTable({"at_m": [0.0, 0.0], "parts": [{"size_m": 1.0}], "word": "x"}, "my.toml")
     table.set_value("at_m.1", 2.0, "--set at_m.1=2")
     assert table.values["at_m"] == [0.0, 2.0]
@@ -284,11 +284,11 @@ def test_putting_into_lists() -> None:
 @given(
     st.recursive(
         st.integers(),
-        lambda x: st.dictionaries(st.sampled_from("abc"), x, min_size=1),
+        lambda children: st.dictionaries(st.sampled_from("abc"), children, min_size=1),
         max_leaves=9,
     )
 )
-def test_leaves_and_put_are_each_others_inverse(value: Any) -> None:
+def test_leaves_set_one_by_one_restore_the_table(value: Any) -> None:
     table = ConfigTable({}, "my.toml")
     for dotted, leaf in iterate_leaves({"root": value}):
         table.set_value(dotted, leaf, "flag")

@@ -1,4 +1,4 @@
-"""Coefficients of friction by direction: what skins, wheels and surfaces make of them, and which files are refused."""
+"""Coefficients of friction by direction depend on skins, wheels and surfaces. Impossible values are refused."""
 
 from typing import Any
 
@@ -20,18 +20,18 @@ MILK_SNAKE = msgspec.convert(SCALES, Skin)
 BALL_BEARINGS = msgspec.convert(WHEELS, PassiveWheels)
 
 
-def test_robot_without_skin_rubs_equally_in_all_directions() -> None:
+def test_friction_without_skin_is_equal_in_all_directions() -> None:
     assert compute_surface_friction(0.3, Surface(), None, None) == (0.3, 0.3, 0.3)
 
 
 @pytest.mark.parametrize("friction", [0.19, 0.38])
-def test_only_ratios_of_a_skin_matter(friction: float) -> None:
+def test_friction_of_skin_uses_only_its_ratios(friction: float) -> None:
     scale = friction / 0.19
     expected = pytest.approx((0.11 * scale, 0.14 * scale, 0.19 * scale))
     assert compute_surface_friction(friction, Surface(), MILK_SNAKE, None) == expected
 
 
-def test_coefficients_of_a_surface_replace_those_of_the_skin() -> None:
+def test_friction_of_surface_replaces_that_of_the_skin() -> None:
     surface = Surface(forward_friction=0.05)
     assert compute_surface_friction(0.19, surface, MILK_SNAKE, None) == pytest.approx(
         (0.05, 0.14, 0.19)
@@ -39,7 +39,7 @@ def test_coefficients_of_a_surface_replace_those_of_the_skin() -> None:
     assert compute_surface_friction(0.3, surface, None, None) == (0.05, 0.3, 0.3)
 
 
-def test_wheels_roll_along_and_slide_sideways() -> None:
+def test_friction_of_wheels_is_rolling_along_and_sliding_sideways() -> None:
     wheels = msgspec.convert(
         {**WHEELS, "rolling_resistance": 0.01, "tire_friction": 0.6}, PassiveWheels
     )
@@ -51,11 +51,11 @@ def test_wheels_roll_along_and_slide_sideways() -> None:
     )
 
 
-def test_wheels_on_ice_slide_instead_of_rolling() -> None:
+def test_friction_of_wheels_on_ice_is_sliding() -> None:
     assert compute_surface_friction(0.001, None, None, BALL_BEARINGS) == (0.001, 0.001, 0.001)
 
 
-def test_factors_of_a_link_are_its_coefficients_over_those_of_the_skin() -> None:
+def test_friction_factors_of_link_are_relative_to_the_skin() -> None:
     skin = msgspec.convert(
         {**SCALES, "links": {"link_2": {"forward": 0.22, "sideways": 0.095}}}, Skin
     )
@@ -69,7 +69,7 @@ def test_factors_of_a_link_are_its_coefficients_over_those_of_the_skin() -> None
 
 
 @pytest.mark.parametrize(
-    ("robot", "words"),
+    ("robot", "expected_texts"),
     [
         (
             {"skin": {**SCALES, "links": {"link_14": {}}}},
@@ -80,8 +80,10 @@ def test_factors_of_a_link_are_its_coefficients_over_those_of_the_skin() -> None
         ({"skin": {**SCALES, "sideways": 0.0}}, ["> 0"]),
     ],
 )
-def test_impossible_skins_and_wheels_are_refused(robot: dict[str, Any], words: list[str]) -> None:
-    with pytest.raises(msgspec.ValidationError) as refused:
+def test_impossible_skins_and_wheels_are_refused(
+    robot: dict[str, Any], expected_texts: list[str]
+) -> None:
+    with pytest.raises(msgspec.ValidationError) as refusal:
         make_config(robot)
-    for word in words:
-        assert word in str(refused.value)
+    for text in expected_texts:
+        assert text in str(refusal.value)

@@ -1,4 +1,4 @@
-"""Nodes of many poses at once against those of each pose alone, bit for bit."""
+"""Body points of many poses at once are bit-identical to those of each pose alone."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ ROUNDS = 50
 
 @pytest.mark.parametrize("scenario", ["peg_row", "mamba_flat"])
 @pytest.mark.parametrize("pose_count", [1, 2, 50])
-def test_many_poses_have_the_nodes_of_each_pose_alone(scenario: str, pose_count: int) -> None:
+def test_body_points_of_many_poses_equal_those_of_each(scenario: str, pose_count: int) -> None:
     robot = describe_run_robot(load_scenario(scenario).config)
     random = np.random.default_rng(1)
     kinematics = ForwardKinematics(robot)

@@ -1,4 +1,4 @@
-"""Plugins by name and by file, and their settings."""
+"""Plugins are loaded by name or from a file, and their settings are checked."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ from snakesim_hal.model.plugins import (
 )
 from snakesim_testing.messages import raises_error
 
-WAVE = """\
+WAVE_CODE = """\
 import msgspec
 
 class Wave:
@@ -31,7 +31,7 @@ class Wave:
 
 
 @pytest.mark.parametrize("group", [BACKENDS, CONTROLLERS, SERVICES])
-def test_everything_installed_loads_and_backends_declare_their_settings(group: str) -> None:
+def test_plugin_of_every_installed_name_can_be_loaded(group: str) -> None:
     assert list_installed_plugins(group) == sorted(set(list_installed_plugins(group))) != []
     for name in list_installed_plugins(group):
         plugin: Any = load_plugin(group, name)
@@ -43,19 +43,19 @@ def test_everything_installed_loads_and_backends_declare_their_settings(group: s
 def test_plugin_unknown_name_lists_installed_ones_and_how_to_add() -> None:
     with raises_error(
         ConfigError, code="plugin/not-found", field=("wiggle", "snakesim.controllers"), stored=False
-    ) as caught:
+    ) as refusal:
         load_plugin(CONTROLLERS, "wiggle")
-    assert all(name in str(caught.value) for name in list_installed_plugins(CONTROLLERS))
+    assert all(name in str(refusal.value) for name in list_installed_plugins(CONTROLLERS))
 
 
-def test_a_class_of_a_file_is_a_plugin(tmp_path: Path) -> None:
-    (tmp_path / "wave.py").write_text(WAVE)
+def test_plugin_class_in_a_file_can_be_loaded(tmp_path: Path) -> None:
+    (tmp_path / "wave.py").write_text(WAVE_CODE)
     wave = load_plugin(CONTROLLERS, f"{tmp_path}/wave.py:Wave")
     assert wave.__name__ == "Wave"
     assert decode_plugin_settings(wave, {"gain": 2.0}, "a.toml", "c").gain == 2.0
 
 
-TRAP = """\
+CODE_WITH_SIDE_EFFECT = """\
 from pathlib import Path
 Path({mark!r}).write_text("executed")
 
@@ -66,30 +66,30 @@ class Other: ...
 
 def make(): ...
 """
-NAMELESS = {"no class": "", "empty class": ":", "unknown class": ":Wove"}
+CLASS_SUFFIXES = {"no class": "", "empty class": ":", "unknown class": ":Wove"}
 
 
-@pytest.mark.parametrize("nameless", NAMELESS)
-@pytest.mark.parametrize("find", [load_plugin, load_plugin_unless_file])
-def test_a_file_without_its_class_lists_the_classes(
-    find: Any, nameless: str, tmp_path: Path
+@pytest.mark.parametrize("case", CLASS_SUFFIXES)
+@pytest.mark.parametrize("load", [load_plugin, load_plugin_unless_file])
+def test_plugin_file_without_class_is_refused_with_its_classes(
+    load: Any, case: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "wave.py").write_text(TRAP.format(mark=str(tmp_path / "mark")))
+    (tmp_path / "wave.py").write_text(CODE_WITH_SIDE_EFFECT.format(mark=str(tmp_path / "mark")))
     with raises_error(ConfigError, code="plugin/not-found", field=f"{tmp_path}/wave.py:Wave"):
-        find(CONTROLLERS, f"{tmp_path}/wave.py{NAMELESS[nameless]}")
-    assert (tmp_path / "mark").exists() == (find is load_plugin and nameless == "unknown class")
+        load(CONTROLLERS, f"{tmp_path}/wave.py{CLASS_SUFFIXES[case]}")
+    assert (tmp_path / "mark").exists() == (load is load_plugin and case == "unknown class")
 
 
-def test_looking_at_a_file_runs_none_of_it(tmp_path: Path) -> None:
-    (tmp_path / "wave.py").write_text(TRAP.format(mark=str(tmp_path / "mark")))
+def test_plugin_file_is_inspected_without_running_it(tmp_path: Path) -> None:
+    (tmp_path / "wave.py").write_text(CODE_WITH_SIDE_EFFECT.format(mark=str(tmp_path / "mark")))
     for name in ("Wave", "make", "Path"):
         assert load_plugin_unless_file(CONTROLLERS, f"{tmp_path}/wave.py:{name}") is None
     assert not (tmp_path / "mark").exists()
     assert load_plugin_unless_file(CONTROLLERS, "hold") is load_plugin(CONTROLLERS, "hold")
 
 
-BROKEN = {
-    "no such class": (WAVE, "Wove"),
+BROKEN_FILES = {
+    "no such class": (WAVE_CODE, "Wove"),
     "not Python": ("class Wave(:\n", "Wave"),
     "import that fails": ("import no_such_module_anywhere\n", "Wave"),
     "name that is not there": ("x = undefined_thing\n", "Wave"),
@@ -100,22 +100,22 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("broken", BROKEN)
-def test_a_file_that_cannot_be_loaded_is_one_error(broken: str, tmp_path: Path) -> None:
-    text, name = BROKEN[broken]
+@pytest.mark.parametrize("case", BROKEN_FILES)
+def test_plugin_file_that_cannot_be_loaded_is_refused(case: str, tmp_path: Path) -> None:
+    text, name = BROKEN_FILES[case]
     (tmp_path / "wave.py").write_text(text)
     with raises_error(ConfigError, code=("plugin/not-found", "plugin/not-loadable")):
         load_plugin(CONTROLLERS, f"{tmp_path}/wave.py:{name}")
 
 
-def test_a_program_may_offer_what_a_name_stands_for() -> None:
-    installed_one = load_plugin(CONTROLLERS, "hold")
+def test_plugin_registered_temporarily_replaces_an_installed_one() -> None:
+    installed = load_plugin(CONTROLLERS, "hold")
     with (
         register_plugin_temporarily(CONTROLLERS, "hold", Plugin),
         register_plugin_temporarily(CONTROLLERS, "mine", Plugin),
     ):
         assert load_plugin(CONTROLLERS, "hold") is load_plugin(CONTROLLERS, "mine") is Plugin
-    assert load_plugin(CONTROLLERS, "hold") is installed_one
+    assert load_plugin(CONTROLLERS, "hold") is installed
     with raises_error(ConfigError, code="plugin/not-found", field="mine"):
         load_plugin(CONTROLLERS, "mine")
 
@@ -134,10 +134,10 @@ def test_plugin_settings_are_checked_by_its_struct_naming_the_source() -> None:
         decode_plugin_settings(Plugin, {"gain": "x"}, "a.toml", "controllers.p", origin)
 
 
-def test_a_plugin_without_settings_is_told_to_state_them() -> None:
-    for bad in (object(), type("Bare", (), {}), type("Odd", (), {"Settings": dict})):
+def test_plugin_class_without_settings_is_refused() -> None:
+    for plugin in (object(), type("Bare", (), {}), type("Odd", (), {"Settings": dict})):
         with raises_error(ConfigError, code="plugin/not-loadable", field="Settings"):
-            decode_plugin_settings(bad, {}, "a.toml", "x")
+            decode_plugin_settings(plugin, {}, "a.toml", "x")
 
 
 def test_plugin_name_in_two_packages_is_refused(
@@ -153,9 +153,9 @@ def test_plugin_name_in_two_packages_is_refused(
             f"[snakesim.controllers]\nwave = {package}:Wave\n"
         )
     monkeypatch.syspath_prepend(tmp_path)
-    with raises_error(ConfigError, code="plugin/ambiguous", field="wave") as raised:
+    with raises_error(ConfigError, code="plugin/ambiguous", field="wave") as refusal:
         load_plugin(CONTROLLERS, "wave")
     assert {"waves (waves:Wave)", "gaits (gaits:Wave)"} <= set(
-        re.split(": | and |; ", str(raised.value))
+        re.split(": | and |; ", str(refusal.value))
     )
     assert load_plugin(CONTROLLERS, "hold").__name__ == "HoldPose"

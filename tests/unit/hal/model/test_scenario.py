@@ -1,4 +1,4 @@
-"""Scenarios: files and flags in, one effective configuration out, that says where each value came from."""
+"""A scenario combines files and options to one effective configuration, with the origin of each value."""
 
 import itertools
 from pathlib import Path
@@ -46,14 +46,15 @@ from snakesim_testing.hal.small_robots import (
 from snakesim_testing.messages import raises_error
 
 
-def with_flags(path: str, *flags: str) -> LoadedScenario:
+def load_with_options(path: str, *flags: str) -> LoadedScenario:
+    """Load a scenario with `--set` options."""
     return load_scenario(path, [parse_set_option(flag) for flag in flags])
 
 
-# --- what is good ----------------------------------------------------------------------------------------------
+# --- valid scenarios -------------------------------------------------------------------------------------------
 
 
-def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
+def test_scenario_combines_its_files(tmp_path: Path) -> None:
     config = load_scenario(write_scenario_files(tmp_path)).config
     assert config.name == "crawl"
     assert config.robot.name == "worm"
@@ -70,27 +71,29 @@ def test_a_scenario_is_put_together_from_its_files(tmp_path: Path) -> None:
     assert config.period_ns == 10_000_000
 
 
-def test_a_flag_makes_another_field_or_another_goal() -> None:
-    first, other = with_flags("clutter"), with_flags("clutter", "scene.random_field.0.seed=7")
-    assert place_obstacles(first.config) != place_obstacles(other.config)
-    points = with_flags("clutter", 'mission.goal={kind="waypoints", points_m=[[3, 0], [5, 0.5]]}')
+def test_scenario_option_changes_field_or_goal() -> None:
+    first = load_with_options("clutter")
+    changed = load_with_options("clutter", "scene.random_field.0.seed=7")
+    assert place_obstacles(first.config) != place_obstacles(changed.config)
+    points = load_with_options(
+        "clutter", 'mission.goal={kind="waypoints", points_m=[[3, 0], [5, 0.5]]}'
+    )
     assert points.config.mission.goal == WaypointGoal(points_m=[(3.0, 0.0), (5.0, 0.5)])
     with raises_error(ConfigError, code="config/invalid-value"):
-        with_flags("clutter", "mission.map=guessed")
+        load_with_options("clutter", "mission.map=guessed")
 
 
 def test_scenario_survey_error_is_the_same_for_all_services() -> None:
-    exact, off = (
-        with_flags("surveyed_clutter", f"mission.map_error_m={sd}").config for sd in (0.0, 0.005)
-    )
-    truth = np.array([placed.obstacle.position_w for placed in place_obstacles(off)])
-    assert np.array_equal([one.position_w for one in get_noisy_obstacle_map(exact)], truth)
-    errors_m = np.array([one.position_w for one in get_noisy_obstacle_map(off)]) - truth
+    exact = load_with_options("surveyed_clutter", "mission.map_error_m=0.0").config
+    noisy = load_with_options("surveyed_clutter", "mission.map_error_m=0.005").config
+    truth = np.array([placed.obstacle.position_w for placed in place_obstacles(noisy)])
+    assert np.array_equal([known.position_w for known in get_noisy_obstacle_map(exact)], truth)
+    errors_m = np.array([known.position_w for known in get_noisy_obstacle_map(noisy)]) - truth
     assert 0.003 < errors_m[:, :2].std() < 0.007
     assert not errors_m[:, 2].any()
-    assert get_noisy_obstacle_map(off) == get_noisy_obstacle_map(off)
+    assert get_noisy_obstacle_map(noisy) == get_noisy_obstacle_map(noisy)
     with raises_error(ConfigError, code="config/invalid-value"):
-        with_flags("clutter", "mission.map_error_m=0.005")
+        load_with_options("clutter", "mission.map_error_m=0.005")
 
 
 def test_scenario_parts_beside_it_or_shipped_are_named_by_flags(tmp_path: Path) -> None:
@@ -99,40 +102,40 @@ def test_scenario_parts_beside_it_or_shipped_are_named_by_flags(tmp_path: Path) 
         tmp_path, scenario=SCENARIO_TOML.replace('"worm.toml"', '"planar13"')
     )
     assert load_scenario(path).config.robot.name == "planar13"
-    other = tmp_path / "elsewhere" / "other.toml"
-    other.write_text(ROBOT_TOML.replace('"worm"', '"other"'))
-    flag = KeyOverride("robot", str(other), f"--set robot={other}")
-    found = load_scenario(path, [flag])
-    assert found.config.robot.name == "other"
-    assert found.table.find_origin("robot.name") == str(other)
+    other_robot = tmp_path / "elsewhere" / "other.toml"
+    other_robot.write_text(ROBOT_TOML.replace('"worm"', '"other"'))
+    flag = KeyOverride("robot", str(other_robot), f"--set robot={other_robot}")
+    loaded = load_scenario(path, [flag])
+    assert loaded.config.robot.name == "other"
+    assert loaded.table.find_origin("robot.name") == str(other_robot)
 
 
 @pytest.mark.parametrize("name", list_shipped_names("scenarios"))
-def test_every_shipped_scenario_repeats_itself_from_its_effective_configuration(
+def test_shipped_scenario_equals_that_of_its_effective_configuration(
     name: str, tmp_path: Path
 ) -> None:
     config = load_scenario(name).config
     write_config(config, tmp_path / "config.json")
     assert read_config(tmp_path / "config.json") == config
-    again = load_scenario(str(tmp_path / "config.json")).config
-    assert again == config
-    assert compute_config_hash(again) == compute_config_hash(config)
+    reloaded = load_scenario(str(tmp_path / "config.json")).config
+    assert reloaded == config
+    assert compute_config_hash(reloaded) == compute_config_hash(config)
 
 
-def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Path) -> None:
-    first = with_flags(
+def test_effective_configuration_keeps_options_and_accepts_new_ones(tmp_path: Path) -> None:
+    first = load_with_options(
         write_scenario_files(tmp_path), "robot.limits.torque_nm=2.5", "control.gain=3", "seed=9"
     ).config
     write_config(first, tmp_path / "config.json")
     assert read_config(tmp_path / "config.json") == first
-    again = with_flags(str(tmp_path / "config.json"), "seed=10")
-    assert again.config == msgspec.structs.replace(first, seed=10)
-    assert again.table.find_origin("seed") == "--set seed=10"
-    assert again.table.find_origin("robot.limits.torque_nm") == str(tmp_path / "config.json")
+    reloaded = load_with_options(str(tmp_path / "config.json"), "seed=10")
+    assert reloaded.config == msgspec.structs.replace(first, seed=10)
+    assert reloaded.table.find_origin("seed") == "--set seed=10"
+    assert reloaded.table.find_origin("robot.limits.torque_nm") == str(tmp_path / "config.json")
 
 
 @pytest.mark.parametrize(
-    ("change", "same"),
+    ("change", "is_same"),
     [
         ({}, True),
         ({"seed": 2}, False),
@@ -140,24 +143,23 @@ def test_an_effective_configuration_keeps_flags_and_takes_new_ones(tmp_path: Pat
         ({"rate_hz": 50.0}, False),
     ],
 )
-def test_the_hash_follows_everything_that_matters(change: dict[str, Any], same: bool) -> None:
+def test_config_hash_depends_on_every_value(change: dict[str, Any], is_same: bool) -> None:
     assert (
         compute_config_hash(make_run_config(**change)) == compute_config_hash(make_run_config())
-    ) == same
+    ) == is_same
     assert 1 <= len(compute_config_hash(make_run_config())) <= 64
 
 
-def test_an_external_service_is_waited_for_and_not_started() -> None:
-    own, external = (
-        with_flags("triplet", *flags).config for flags in ([], ["services.control.external=true"])
-    )
-    assert own.has_internal_control
-    assert own.commander_name == "obstacle_triplet"
-    assert "control" in own.internal_services
+def test_scenario_external_service_is_awaited_but_not_started() -> None:
+    internal = load_with_options("triplet").config
+    external = load_with_options("triplet", "services.control.external=true").config
+    assert internal.has_internal_control
+    assert internal.commander_name == "obstacle_triplet"
+    assert "control" in internal.internal_services
     assert not external.has_internal_control
     assert external.commander_name == "external"
     policies = [
-        with_flags("triplet", f"controller=policy:{model}").config
+        load_with_options("triplet", f"controller=policy:{model}").config
         for model in ("clutter", "./mine.onnx")
     ]
     assert [policy.commander_name for policy in policies] == [
@@ -165,12 +167,14 @@ def test_an_external_service_is_waited_for_and_not_started() -> None:
         "policy:./mine.onnx",
     ]
     assert set(external.services) - set(external.internal_services) == {"control"}
-    assert list(LockstepParticipants(external.services)) == list(own.services)
+    assert list(LockstepParticipants(external.services)) == list(internal.services)
     for text in ("kill:control@1", "hang:control@1", "drop:actuator/joints@1"):
-        parse_and_validate_planned_faults(with_flags("triplet", f'faults=["{text}"]').config)
+        parse_and_validate_planned_faults(load_with_options("triplet", f'faults=["{text}"]').config)
         with raises_error(ConfigError, code="injection/unknown-target", field="faults[0]"):
             parse_and_validate_planned_faults(
-                with_flags("triplet", f'faults=["{text}"]', "services.control.external=true").config
+                load_with_options(
+                    "triplet", f'faults=["{text}"]', "services.control.external=true"
+                ).config
             )
 
 
@@ -182,18 +186,24 @@ def test_scenario_lease_is_five_periods_between_50_and_100_ms(rate_hz: float) ->
         assert config.lease_ns == 5 * config.period_ns
 
 
-@given(tick=st.integers(0, 10_000), every=st.integers(1, 50), lag=st.integers(1, 50))
-def test_scenario_samples_at_a_tick_are_due_and_aged(tick: int, every: int, lag: int) -> None:
-    service = ServiceSchedule(decimation=every, latency_ticks=lag)
-    counting = service.used_output_tick(tick)
-    assert counting % every == 0
-    assert counting >= 0
-    assert counting == 0 or counting <= tick - lag
-    assert tick - lag - counting < every  # and it is the newest such
-    assert service.used_output_tick(tick + 1) >= counting
+@given(
+    tick=st.integers(0, 10_000),
+    decimation=st.integers(1, 50),
+    latency_ticks=st.integers(1, 50),
+)
+def test_scenario_samples_at_a_tick_are_due_and_aged(
+    tick: int, decimation: int, latency_ticks: int
+) -> None:
+    service = ServiceSchedule(decimation=decimation, latency_ticks=latency_ticks)
+    output_tick = service.used_output_tick(tick)
+    assert output_tick % decimation == 0
+    assert output_tick >= 0
+    assert output_tick == 0 or output_tick <= tick - latency_ticks
+    assert tick - latency_ticks - output_tick < decimation  # no newer output may be used
+    assert service.used_output_tick(tick + 1) >= output_tick
 
 
-# --- flags and where values come from --------------------------------------------------------------------------
+# --- options and origins of values -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -211,18 +221,18 @@ def test_scenario_samples_at_a_tick_are_due_and_aged(tick: int, every: int, lag:
         ("services={control = {}}", "services", {"control": {}}),
     ],
 )
-def test_set_reads_values_as_toml_and_else_as_text(text: str, key: str, value: Any) -> None:
+def test_set_option_value_is_toml_or_text(text: str, key: str, value: Any) -> None:
     assert parse_set_option(text) == KeyOverride(key, value, f"--set {text}")
 
 
 @pytest.mark.parametrize("text", ["", "seed", "=3", " = 3"])
-def test_set_without_key_or_value_is_refused(text: str) -> None:
+def test_set_option_without_key_or_value_is_refused(text: str) -> None:
     with raises_error(ConfigError, code="command/invalid-option", field="section.key"):
         parse_set_option(text)
 
 
-def test_every_value_says_where_it_came_from(tmp_path: Path) -> None:
-    loaded = with_flags(
+def test_scenario_lists_every_value_with_its_origin(tmp_path: Path) -> None:
+    loaded = load_with_options(
         write_scenario_files(tmp_path),
         "robot.limits.torque_nm=2.0",
         "start.tail_s_m=0.2",
@@ -245,39 +255,44 @@ def test_every_value_says_where_it_came_from(tmp_path: Path) -> None:
         "clock_mode",
     ):
         assert reported[key][1] == "default", key
-    assert set(reported) == {key for key, _ in flat(msgspec.to_builtins(loaded.config))}
+    assert set(reported) == {key for key, _ in list_leaves(msgspec.to_builtins(loaded.config))}
 
 
-def flat(value: Any, at: str = "") -> list[tuple[str, Any]]:
+def list_leaves(value: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """Return the dotted keys and the values of all leaves."""
     if isinstance(value, dict) and value:
         return [
-            leaf for key, inner in value.items() for leaf in flat(inner, f"{at}.{key}".lstrip("."))
+            leaf
+            for key, child in value.items()
+            for leaf in list_leaves(child, f"{prefix}.{key}".lstrip("."))
         ]
     if isinstance(value, list) and value and isinstance(value[0], dict):
-        return [leaf for i, inner in enumerate(value) for leaf in flat(inner, f"{at}.{i}")]
-    return [(at, value)]
+        return [
+            leaf for i, child in enumerate(value) for leaf in list_leaves(child, f"{prefix}.{i}")
+        ]
+    return [(prefix, value)]
 
 
-def test_scenario_control_alias_means_chosen_controller_in_any_flag_order(tmp_path: Path) -> None:
+def test_scenario_control_alias_means_chosen_controller_in_any_order(tmp_path: Path) -> None:
     path = write_scenario_files(tmp_path)
-    assert with_flags(path, "control.gain=3").config.controllers == {"hold": {"gain": 3}}
+    assert load_with_options(path, "control.gain=3").config.controllers == {"hold": {"gain": 3}}
     for flags in (
         ["control.gain=3", "controller=./w.py:Wave"],
         ["controller=./w.py:Wave", "control.gain=3"],
     ):
-        config = with_flags(path, *flags).config
+        config = load_with_options(path, *flags).config
         assert config.controllers == {"hold": {}, "Wave": {"gain": 3}}
         assert config.controller_parameters == {"gain": 3}
         assert config.control_section == "controllers.Wave"
-    assert with_flags(path, "backend.step=1").config.backends == {"sim": {"step": 1}}
-    assert with_flags(path, "backend=emulator", "backend.step=1").config.backends == {
+    assert load_with_options(path, "backend.step=1").config.backends == {"sim": {"step": 1}}
+    assert load_with_options(path, "backend=emulator", "backend.step=1").config.backends == {
         "emulator": {"step": 1}
     }
 
 
-# --- what is wrong: one error, in words ------------------------------------------------------------------------
+# --- invalid scenarios -----------------------------------------------------------------------------------------
 
-FILES = {
+INVALID_FILES = {
     "scenario type": ("crawl.toml", "rate_hz = 100", 'rate_hz = "100"'),
     "scenario missing": ("crawl.toml", 'controller = "hold"\n', ""),
     "not TOML": ("crawl.toml", "rate_hz = 100", "rate_hz = "),
@@ -288,9 +303,9 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("wrong", FILES)
-def test_a_wrong_file_is_named(wrong: str, tmp_path: Path) -> None:
-    name, old, new = FILES[wrong]
+@pytest.mark.parametrize("case", INVALID_FILES)
+def test_scenario_with_invalid_file_is_refused_by_file_name(case: str, tmp_path: Path) -> None:
+    name, old, new = INVALID_FILES[case]
     path = write_scenario_files(tmp_path)
     text = (tmp_path / name).read_text()
     assert old in text
@@ -303,15 +318,16 @@ def test_a_wrong_file_is_named(wrong: str, tmp_path: Path) -> None:
             "config/out-of-range",
             "file/invalid-syntax",
         ),
-    ) as caught:
+    ) as refusal:
         load_scenario(path)
-    said = str(caught.value)
-    if wrong != "robot empty":  # an empty file has no neighbor that could tell whose the field is
-        assert said.startswith(f"{tmp_path / name}: "), said
-    assert "\n" not in said
+    message = str(refusal.value)
+    # An empty file has no other value that names the file of a missing key.
+    if case != "robot empty":
+        assert message.startswith(f"{tmp_path / name}: "), message
+    assert "\n" not in message
 
 
-def test_absent_files_are_named(tmp_path: Path) -> None:
+def test_scenario_with_missing_file_is_refused_by_file_name(tmp_path: Path) -> None:
     path = write_scenario_files(tmp_path)
     with raises_error(ConfigError, code="config/unknown-name", field="nowhere"):
         load_scenario("nowhere")
@@ -321,19 +337,19 @@ def test_absent_files_are_named(tmp_path: Path) -> None:
     with raises_error(ConfigError, code="file/not-found", field="worm.toml"):
         load_scenario(path)
     with raises_error(ConfigError, code="config/unknown-name", field="wurm"):
-        with_flags(path, "robot=wurm")
+        load_with_options(path, "robot=wurm")
 
 
-SCENES = {
+INVALID_SCENES = {
     "overlap": ("position_m = [1.0, 1.0]", "position_m = [0.2, 0.0]"),
     "no route": ('[route]\nkind = "sine"\namplitude_m = 0.05\nwavelength_m = 0.8\nlength_m = 2.0\n', ""),
     "too sharp": ("wavelength_m = 0.8", "wavelength_m = 0.1"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("wrong", SCENES)
-def test_scenes_that_do_not_fit_the_robot_are_refused(wrong: str, tmp_path: Path) -> None:
-    old, new = SCENES[wrong]
+@pytest.mark.parametrize("case", INVALID_SCENES)
+def test_scenario_scene_that_does_not_fit_robot_is_refused(case: str, tmp_path: Path) -> None:
+    old, new = INVALID_SCENES[case]
     assert old in SCENE_TOML
     with raises_error(ConfigError, code=("config/out-of-range", "scene/no-route", "scene/overlap")):
         load_scenario(write_scenario_files(tmp_path, scene=SCENE_TOML.replace(old, new)))
@@ -342,7 +358,7 @@ def test_scenes_that_do_not_fit_the_robot_are_refused(wrong: str, tmp_path: Path
 # --- the start -------------------------------------------------------------------------------------------------
 
 
-def test_the_snake_lies_on_its_route_with_every_joint(tmp_path: Path) -> None:
+def test_start_pose_has_every_joint_on_the_route(tmp_path: Path) -> None:
     config = load_scenario(write_scenario_files(tmp_path)).config
     route = make_route(config.scene)
     assert route is not None
@@ -360,7 +376,7 @@ def test_the_snake_lies_on_its_route_with_every_joint(tmp_path: Path) -> None:
         )
 
 
-def test_a_snake_with_pitch_joints_lies_flat_on_its_route(tmp_path: Path) -> None:
+def test_start_pose_with_pitch_joints_is_flat_on_route(tmp_path: Path) -> None:
     mixed = ROBOT_TOML.replace('axes = ["yaw"]', 'axes = ["pitch", "yaw"]').replace(
         "modules = 3", "modules = 6"
     )
@@ -369,7 +385,7 @@ def test_a_snake_with_pitch_joints_lies_flat_on_its_route(tmp_path: Path) -> Non
     assert np.abs(pose.angles_rad[1::2]).min() > 0
 
 
-def test_off_the_route_the_snake_lies_straight_where_told() -> None:
+def test_start_pose_off_the_route_is_straight() -> None:
     config = make_run_config(start={"on_route": False, "position_m": [1.0, 2.0], "yaw_rad": 0.5})
     pose = compute_start_pose(config)
     assert pose.position_w == (1.0, 2.0)
@@ -379,10 +395,13 @@ def test_off_the_route_the_snake_lies_straight_where_told() -> None:
     assert len(capsules) == 4
     assert capsules[0].rear_m == (1.0, 2.0)
     assert capsules[-1].front_m == pytest.approx((1.0 + 0.3 * np.cos(0.5), 2.0 + 0.3 * np.sin(0.5)))
-    assert all(a.front_m == pytest.approx(b.rear_m) for a, b in itertools.pairwise(capsules))
+    assert all(
+        rear_link.front_m == pytest.approx(front_link.rear_m)
+        for rear_link, front_link in itertools.pairwise(capsules)
+    )
 
 
-def test_random_fields_stay_clear_of_the_start() -> None:
+def test_random_fields_keep_clearance_to_the_start_pose() -> None:
     field = {
         "seed": 1,
         "min_corner_m": [-0.3, -0.3],
@@ -394,11 +413,9 @@ def test_random_fields_stay_clear_of_the_start() -> None:
     placed = place_obstacles(config)
     assert len(placed) == 18
     snake = make_start_capsules(config)
-    rears, fronts = (
-        np.array([link.rear_m for link in snake]),
-        np.array([link.front_m for link in snake]),
-    )
-    links = ObstacleOutlines.from_segments(rears, fronts, snake[0].radius_m)
+    rears_m = np.array([link.rear_m for link in snake])
+    fronts_m = np.array([link.front_m for link in snake])
+    links = ObstacleOutlines.from_segments(rears_m, fronts_m, snake[0].radius_m)
     for item in placed:
         assert (
             links.compute_distances_m(np.array(item.obstacle.position_w[:2])).min()

@@ -1,4 +1,4 @@
-"""Stairs, gaps and pipes of a scene: the blocks that they make, and which are refused."""
+"""Stairs, gaps and pipes of a scene consist of blocks, and invalid ones are refused."""
 
 import math
 from typing import Any
@@ -58,6 +58,7 @@ def find_height_m(scene: SceneFile, x: float, y: float) -> float:
 
 
 def check_start(scene: SceneFile, y: float, radius_m: float = 0.04) -> None:
+    """Check the clearance of a link that starts along x at this y."""
     link = CapsuleOutline(name="link_0", rear_m=(-0.1, y), front_m=(0.1, y), radius_m=radius_m)
     validate_start_clearance(scene, place_scene_obstacles(scene), [link])
 
@@ -130,9 +131,7 @@ def test_pipe_that_cannot_be_built_is_refused(change: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("y", "is_refused"), [(0.0, False), (0.055, False), (0.065, True), (0.14, True), (0.16, False)]
 )
-def test_snake_starts_in_a_pipe_or_beside_it_but_not_in_its_wall(
-    y: float, is_refused: bool
-) -> None:
+def test_snake_in_the_wall_of_a_pipe_is_refused(y: float, is_refused: bool) -> None:
     scene = decode_scene(pipe=[PIPE])
     if not is_refused:
         check_start(scene, y)
@@ -141,7 +140,7 @@ def test_snake_starts_in_a_pipe_or_beside_it_but_not_in_its_wall(
         check_start(scene, y)
 
 
-def test_snake_that_is_thicker_than_the_pipe_does_not_start_in_it() -> None:
+def test_snake_thicker_than_the_pipe_is_refused() -> None:
     with raises_error(ConfigError, code="scene/overlap"):
         check_start(decode_scene(pipe=[PIPE]), 0.0, radius_m=0.12)
 
@@ -160,6 +159,6 @@ def test_snake_starts_on_a_solid_pipe() -> None:
         {"pipe": [{**PIPE, "radius_m": 0}]},
     ],
 )
-def test_values_out_of_range_are_refused(sections: dict[str, Any]) -> None:
+def test_terrain_value_out_of_range_is_refused(sections: dict[str, Any]) -> None:
     with raises_error(ConfigError, code="config/out-of-range"):
         decode_scene(**sections)

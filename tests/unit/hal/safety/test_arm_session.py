@@ -1,4 +1,4 @@
-"""Where targets may be for an arming."""
+"""Arming requires targets that are near the joints."""
 
 import numpy as np
 import pytest
@@ -7,22 +7,30 @@ from snakesim_hal.safety.lifecycle import find_far_targets
 from snakesim_testing.hal.small_robots import make_description, make_joint_command
 
 ROBOT = make_description()
-MAX = ROBOT.max_step_rad
-NONE = np.zeros(len(ROBOT.joints), dtype=np.bool_)
+MAX_STEP_RAD = ROBOT.max_step_rad
+NO_JOINTS = np.zeros(len(ROBOT.joints), dtype=np.bool_)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_arming_target_may_be_one_step_away_at_most(side: float) -> None:
-    here = np.zeros(len(ROBOT.joints))
-    assert find_far_targets(make_joint_command(ROBOT, side * MAX), here, ROBOT, NONE) == []
-    further = np.nextafter(MAX, np.inf)
+def test_arming_target_more_than_one_step_away_is_refused(side: float) -> None:
+    angles_rad = np.zeros(len(ROBOT.joints))
+    assert (
+        find_far_targets(
+            make_joint_command(ROBOT, side * MAX_STEP_RAD), angles_rad, ROBOT, NO_JOINTS
+        )
+        == []
+    )
+    beyond_rad = np.nextafter(MAX_STEP_RAD, np.inf)
     assert len(
-        find_far_targets(make_joint_command(ROBOT, side * further), here, ROBOT, NONE)
+        find_far_targets(make_joint_command(ROBOT, side * beyond_rad), angles_rad, ROBOT, NO_JOINTS)
     ) == len(ROBOT.joints)
 
 
-def test_a_joint_that_is_set_aside_may_be_anywhere() -> None:
-    here, aside = np.zeros(len(ROBOT.joints)), NONE.copy()
-    aside[1] = True
-    reported = find_far_targets(make_joint_command(ROBOT, 2 * MAX), here, ROBOT, aside)
-    assert [words.partition(" ")[0] for words in reported] == ["joint_1", "joint_3"]
+def test_arming_target_of_isolated_joint_may_be_anywhere() -> None:
+    angles_rad = np.zeros(len(ROBOT.joints))
+    is_isolated = NO_JOINTS.copy()
+    is_isolated[1] = True
+    descriptions = find_far_targets(
+        make_joint_command(ROBOT, 2 * MAX_STEP_RAD), angles_rad, ROBOT, is_isolated
+    )
+    assert [description.partition(" ")[0] for description in descriptions] == ["joint_1", "joint_3"]

@@ -1,4 +1,4 @@
-"""Named regressions of the authority. The specification is the model: test_authority_machine.py tries every order."""
+"""Regressions of the command authority. test_authority_machine.py compares it with a model, in any order of inputs."""
 
 from typing import Any
 
@@ -54,7 +54,7 @@ def test_arming_unmet_conditions_are_named_until_met() -> None:
     assert answer.lifecycle == "armed"
 
 
-def test_arming_stopped_robot_asks_for_reset() -> None:
+def test_arming_stopped_robot_is_refused_until_reset() -> None:
     rig = make_armed_rig()
     rig.authority.latch_fault(HOT)
     assert "state is fault, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
@@ -100,7 +100,7 @@ def test_arming_hundred_unknown_joints_is_refused_within_message_length() -> Non
 
 @pytest.mark.parametrize("stop", ["estop", "fault", "disarm"])
 def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
-    """Reset and armed again within one period, the backend would never report_power the stop."""
+    """Reset and armed again within one period, the backend would never receive the stop."""
     rig = make_armed_rig()
     rig.tick_with(0.1)
     match stop:
@@ -111,7 +111,7 @@ def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
         case _:
             rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     if stop != "disarm":
-        rig.pass_tick()  # the motors report_power the stop, but not yet its reset
+        rig.pass_tick()  # the motors receive the stop, but not yet its reset
         rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
     rig.acquire()
     rig.send(0.1)
@@ -151,10 +151,10 @@ def test_arming_after_commands_ended_is_refused_despite_renewals() -> None:
 
 
 def test_arming_unchecked_robot_needs_explicit_request() -> None:
-    rig = make_commanded_rig(unchecked="nobody has checked it")
+    rig = make_commanded_rig(unchecked="the joints are not checked")
     answer = rig.arm()
     assert answer.refusal == "not_checked"
-    assert "nobody has checked it; to arm it" in answer.reason
+    assert "the joints are not checked; to arm it" in answer.reason
     assert rig.authority.handle_lifecycle_request(ARM_UNCHECKED, rig.now_ns).ok
     assert ", unchecked" in rig.authority.reason
 
@@ -171,7 +171,7 @@ def test_arming_waits_until_backend_reports_no_obstacle() -> None:
 
 def test_arming_with_unknown_cable_is_refused_even_unchecked() -> None:
     rig = make_commanded_rig(
-        unchecked="nobody has checked it", cables=CableTracker((), {}, {"joint_2": "unknown"})
+        unchecked="the joints are not checked", cables=CableTracker((), {}, {"joint_2": "unknown"})
     )
     answer = rig.authority.handle_lifecycle_request(ARM_UNCHECKED, rig.now_ns)
     assert answer.refusal == "cable"
@@ -179,7 +179,7 @@ def test_arming_with_unknown_cable_is_refused_even_unchecked() -> None:
 
 
 def test_arming_in_lockstep_does_not_wait_for_power_reports() -> None:
-    """Time may stand still until the robot is armed, so that no report can arrive."""
+    """Arm without a report, because time may be paused until the robot is armed."""
     power_sensor = SensorDescription(key=keys.POWER, rate_hz=2.0, delay_s=0.0)
     rig = AuthorityRig()
     rig.authority = CommandAuthority(
@@ -193,13 +193,13 @@ def test_arming_in_lockstep_does_not_wait_for_power_reports() -> None:
 
 
 @pytest.mark.parametrize("was_used", [True, False])
-def test_arming_in_lockstep_forgets_commands_of_the_last_session(was_used: bool) -> None:
+def test_arming_in_lockstep_drops_commands_of_the_last_session(was_used: bool) -> None:
     rig = make_armed_rig()
     rig.send(0.3)
     if was_used:
         rig.authority.compute_setpoints(rig.tick)
     assert rig.authority.handle_lifecycle_request(DISARM, rig.now_ns).ok
-    rig.authority.compute_setpoints(rig.tick)  # the stop goes out
+    rig.authority.compute_setpoints(rig.tick)  # the motors receive the stop
     rig.send(0.1)
     assert rig.arm().ok
     decision = rig.authority.compute_setpoints(rig.tick)
@@ -265,11 +265,11 @@ def test_lease_taken_by_higher_priority_disarms_and_rejects_old_holder() -> None
     assert list_modes(rig.pass_tick()) == {JointMode.PASSIVE}
     assert rig.send(0.1, lease_epoch=1) == "wrong_epoch"
     assert rig.arm().reason == "no commands from teleop yet"
-    rig.send(0.1, sequence=1)  # the sequence numbers of a new holder start anew
+    rig.send(0.1, sequence=1)  # a new holder starts with new sequence numbers
     assert rig.arm().ok
 
 
-def test_lease_taken_while_disarmed_forgets_the_old_commands() -> None:
+def test_lease_taken_while_disarmed_drops_the_old_commands() -> None:
     rig = make_commanded_rig()
     rig.acquire("teleop", priority=200)
     assert rig.arm().reason == "no commands from teleop yet"
@@ -311,7 +311,7 @@ def test_decision_in_lockstep_uses_the_command_of_its_tick() -> None:
 
 
 def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
-    """The pose at arming would be a jump that no limiter has limited."""
+    """Keep the last command, because the pose at arming would be a jump without a limit."""
     rig = make_armed_rig()
     decisions: list[TickOutput] = []
     for tick in range(5):
@@ -358,11 +358,8 @@ def test_fault_starts_the_stop_mode_of_the_robot(
     rig = make_armed_rig(safety__action=stop_mode)
     rig.observe(0.4)
     rig.authority.latch_fault(HOT)
-    for angle_rad in (
-        0.4,
-        0.6,
-        0.9,
-    ):  # later motion of the joint does not change the pose that is held
+    # Later motion of the joint does not change the pose that is held.
+    for angle_rad in (0.4, 0.6, 0.9):
         rig.observe(angle_rad)
         decision = rig.pass_tick()
         assert list_modes(decision) == {mode}
@@ -370,7 +367,7 @@ def test_fault_starts_the_stop_mode_of_the_robot(
 
 
 def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
-    """From 1 rad/s at 50 rad/s² the joint is at rest after two periods of 10 ms."""
+    """Brake from 1 rad/s at 50 rad/s², which takes two periods of 10 ms."""
     rig = make_armed_rig(
         joints={"joint_2": {"modes": ["position"]}}, limits__acceleration_rad_s2=50.0
     )
@@ -385,7 +382,7 @@ def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
 
 
 def test_fault_holds_a_moving_joint_where_it_comes_to_rest() -> None:
-    """From 1 rad/s at 50 rad/s² a joint needs 0.01 rad and two periods of 10 ms."""
+    """Brake from 1 rad/s at 50 rad/s², which takes 0.01 rad and two periods of 10 ms."""
     rig = make_armed_rig(safety__action="hold", limits__acceleration_rad_s2=50.0)
     rig.observe(0.1, 1.0)
     rig.authority.latch_fault(HOT)
@@ -444,7 +441,7 @@ def test_heat_derates_then_stops_then_blocks_arming() -> None:
     assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [
         ("overheated", "joint_2")
     ]
-    # Also while stopping.
+    # Torque is also derated while the robot stops.
     assert stopped.setpoints.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])
     rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
     rig.acquire()
@@ -486,7 +483,7 @@ def test_joint_state_with_nan_is_published_as_last_good() -> None:
     assert published.valid == [True, False, True]
 
 
-# --- single decisions that the model does not distinguish --------------------------------------------------------
+# --- details that the model does not contain ---------------------------------------------------------------------
 
 
 def test_reset_without_a_fault_is_refused_with_its_reason() -> None:
@@ -496,24 +493,24 @@ def test_reset_without_a_fault_is_refused_with_its_reason() -> None:
     assert answer.reason == "nothing to reset in state armed"
 
 
-def test_fault_that_reaches_nothing_is_recorded_and_stops_nothing() -> None:
+def test_fault_without_scope_is_recorded_and_stops_nothing() -> None:
     rig = make_armed_rig()
     rig.authority.latch_fault(Fault(tick=1, what="noted", cause="a test", scope="none"))
     assert rig.authority.state == "armed"
     assert [fault.what for fault in rig.authority.faults] == ["noted"]
 
 
-def test_command_with_a_sequence_number_again_is_a_replay() -> None:
+def test_command_with_a_repeated_sequence_number_is_a_replay() -> None:
     rig = make_armed_rig()
     assert rig.send(0.1, sequence=50) is None
     assert rig.send(0.1, sequence=50) == "replayed"
 
 
 @pytest.mark.parametrize("is_armed", [False, True], ids=["disarmed", "armed"])
-def test_angles_that_never_change_are_implausible_only_while_commanded_to_move(
+def test_constant_angles_are_implausible_only_while_commanded_to_move(
     is_armed: bool,
 ) -> None:
-    """A robot that nothing commands may rest for as long as it likes."""
+    """Accept constant angles of a robot without commands for any time."""
     rig = make_armed_rig() if is_armed else make_commanded_rig()
     for tick in range(1, 400):
         rig.tick_with(0.1 + 0.001 * tick)

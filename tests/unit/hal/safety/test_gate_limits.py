@@ -1,4 +1,4 @@
-"""Nothing beyond a limit ever comes out of the limiter, also at the ends of a joint and when modes change."""
+"""The command limiter never applies a setpoint beyond a limit, also at joint ends and at mode changes."""
 
 import dataclasses
 from typing import Any
@@ -39,124 +39,131 @@ from snakesim_testing.hal.small_robots import make_description, make_joint_comma
 from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 
-def ends(mode: JointMode, measured: MeasuredState, i: int) -> tuple[float, float]:
-    angle, velocity = float(measured.angle_rad[i]), float(measured.velocity_rad_s[i])
+def compute_bounds(mode: JointMode, measured: MeasuredState, i: int) -> tuple[float, float]:
+    """Return the bounds of a velocity or torque that keep a joint inside its range."""
+    angle = float(measured.angle_rad[i])
+    velocity = float(measured.velocity_rad_s[i])
     if mode is JointMode.VELOCITY:
         return compute_velocity_bounds(ROBOT.joints[i], angle, LIMITS.period_s)
     return compute_torque_bounds(ROBOT.joints[i], angle, velocity, LIMITS.period_s)
 
 
-def at_a_bound(target: float, most: float, low: float, high: float) -> bool:
-    """The speed, torque and angle limits outrank the rate."""
-    return abs(target) == most or target in (low, high)
+def is_at_bound(target: float, max_target: float, low: float, high: float) -> bool:
+    """Return whether a target is at a speed, torque or angle limit, which has priority over the rate limit."""
+    return abs(target) == max_target or target in (low, high)
 
 
 HUGE = st.floats(-1e5, 1e5)
 ANY_ANGLE = st.floats(-3, 3) | st.floats(-1e4, 1e4)
 
 
-def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
+def draw_per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
+    """Return a strategy for lists with one value for each joint."""
     return st.lists(values, min_size=JOINTS, max_size=JOINTS)
 
 
 @st.composite
-def situations(draw: st.DrawFn) -> tuple[JointCommand, MeasuredState, AppliedSetpoints]:
-    """Any command that passes the refusals, any state, and any setpoints that were applied before."""
+def draw_situation(draw: st.DrawFn) -> tuple[JointCommand, MeasuredState, AppliedSetpoints]:
+    """Draw a command that is not refused, a measured state, and the setpoints that were applied before."""
     any_target = st.floats(-2, 2) | HUGE
     torque_limit = draw(
-        st.none() | per_joint(st.sampled_from([0.0, 1e-12, 2.0, 4.0, 1e5]) | st.floats(0, 10))
+        st.none() | draw_per_joint(st.sampled_from([0.0, 1e-12, 2.0, 4.0, 1e5]) | st.floats(0, 10))
     )
-    modes = draw(per_joint(st.sampled_from(list(JointMode))))
-    asked = make_joint_command(
-        ROBOT, draw(per_joint(any_target)), modes, torque_limit_nm=torque_limit
+    modes = draw(draw_per_joint(st.sampled_from(list(JointMode))))
+    command = make_joint_command(
+        ROBOT, draw(draw_per_joint(any_target)), modes, torque_limit_nm=torque_limit
     )
     measured = MeasuredState(
-        np.array(draw(per_joint(ANY_ANGLE))),
-        np.array(draw(per_joint(st.floats(-10, 10) | HUGE))),
-        np.array(draw(per_joint(st.floats(-5, 5) | HUGE))),
+        np.array(draw(draw_per_joint(ANY_ANGLE))),
+        np.array(draw(draw_per_joint(st.floats(-10, 10) | HUGE))),
+        np.array(draw(draw_per_joint(st.floats(-5, 5) | HUGE))),
     )
     last = AppliedSetpoints(
-        np.array(draw(per_joint(st.sampled_from([0, 1, 2, 3])))),
-        np.array(draw(per_joint(any_target))),
+        np.array(draw(draw_per_joint(st.sampled_from([0, 1, 2, 3])))),
+        np.array(draw(draw_per_joint(any_target))),
         LIMITS.torque_nm,
     )
-    return asked, measured, last
+    return command, measured, last
 
 
-@given(situations())
+@given(draw_situation())
 @settings(max_examples=choose_trial_count(300))
-def test_whatever_is_asked_what_is_applied_is_inside_every_limit(
+def test_limiter_setpoints_for_any_command_are_inside_every_limit(
     case: tuple[JointCommand, MeasuredState, AppliedSetpoints],
 ) -> None:
-    asked, measured, last = case
-    applied = limited(asked, measured, last)
+    command, measured, last = case
+    applied = limited(command, measured, last)
     assert np.isfinite(applied.target).all()
     assert np.isfinite(applied.torque_limit_nm).all()
     assert (applied.torque_limit_nm >= 0).all()
     assert (applied.torque_limit_nm <= LIMITS.torque_nm).all()
-    if asked.torque_limit_nm is not None:
-        assert (applied.torque_limit_nm <= np.array(asked.torque_limit_nm)).all()
-    start = np.where(applied.mode == last.mode, last.target, bumpless(asked.mode, measured))
+    if command.torque_limit_nm is not None:
+        assert (applied.torque_limit_nm <= np.array(command.torque_limit_nm)).all()
+    start = np.where(applied.mode == last.mode, last.target, bumpless(command.mode, measured))
     for i in range(JOINTS):
-        target, moved = applied.target[i], abs(applied.target[i] - start[i])
-        assert applied.mode[i] == asked.mode[i]
-        match asked.mode[i]:
+        target = applied.target[i]
+        change = abs(target - start[i])
+        assert applied.mode[i] == command.mode[i]
+        match command.mode[i]:
             case JointMode.PASSIVE:
                 assert target == 0.0
             case JointMode.POSITION:
                 assert LIMITS.angle_min_rad[i] <= target <= LIMITS.angle_max_rad[i]
-                near = abs(target - measured.angle_rad[i])
-                inside = abs(measured.angle_rad[i]) <= 1.5 + 0.3
-                assert not inside or near <= 0.3 + TINY
-                if not inside:  # pushed beyond its end: straight back to the end, no further
+                step_rad = abs(target - measured.angle_rad[i])
+                is_inside = abs(measured.angle_rad[i]) <= 1.5 + 0.3
+                assert not is_inside or step_rad <= 0.3 + TINY
+                if not is_inside:  # the joint is beyond its end, and the target is its end
                     assert target == np.clip(measured.angle_rad[i], -1.5, 1.5)
-                # Only where staying near the measured angle, or inside the limits, leaves no choice:
+                # The rate limit is exceeded only to stay near the measured angle, or inside the limits.
                 edges = np.clip(measured.angle_rad[i] + np.array([-0.3, 0.3]), -1.5, 1.5)
                 assert (
-                    moved <= ANGLE_STEP + TINY * abs(start[i]) + TINY
+                    change <= ANGLE_STEP + TINY * abs(start[i]) + TINY
                     or np.abs(edges - target).min() < TINY
                 )
             case JointMode.VELOCITY:
-                low, high = ends(asked.mode[i], measured, i)
+                low, high = compute_bounds(command.mode[i], measured, i)
                 assert abs(target) <= 5.0
                 assert low - TINY <= target <= high + TINY
-                assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or at_a_bound(
+                assert change <= SPEED_STEP + TINY * abs(start[i]) + TINY or is_at_bound(
                     target, 5.0, low, high
                 )
             case JointMode.TORQUE:
-                low, high = ends(asked.mode[i], measured, i)
-                most = applied.torque_limit_nm[i]
-                assert abs(target) <= most
-                assert target <= max(high, -most)
-                assert target >= min(low, most)
-                assert moved <= TORQUE_STEP + TINY * abs(start[i]) + TINY or at_a_bound(
-                    target, most, low, high
+                low, high = compute_bounds(command.mode[i], measured, i)
+                max_torque_nm = applied.torque_limit_nm[i]
+                assert abs(target) <= max_torque_nm
+                assert target <= max(high, -max_torque_nm)
+                assert target >= min(low, max_torque_nm)
+                assert change <= TORQUE_STEP + TINY * abs(start[i]) + TINY or is_at_bound(
+                    target, max_torque_nm, low, high
                 )
 
 
-@given(situations())
-def test_gate_names_exactly_the_targets_it_changes(
+@given(draw_situation())
+def test_limiter_names_exactly_the_targets_it_changes(
     case: tuple[JointCommand, MeasuredState, AppliedSetpoints],
 ) -> None:
-    asked, measured, last = case
-    applied = limited(asked, measured, last)
+    command, measured, last = case
+    applied = limited(command, measured, last)
     changed = {
         i
         for i in range(JOINTS)
-        if asked.mode[i] != JointMode.PASSIVE and applied.target[i] != asked.target[i]
+        if command.mode[i] != JointMode.PASSIVE and applied.target[i] != command.target[i]
     }
-    assert set(words(asked, applied, measured)) == changed
-    again = limited(
-        msgspec.structs.replace(asked, target=applied.target.tolist()), measured, applied
+    assert set(words(command, applied, measured)) == changed
+    repeated = limited(
+        msgspec.structs.replace(command, target=applied.target.tolist()), measured, applied
     )
-    assert (again.target == applied.target).all()  # what came out once passes unchanged
+    assert (repeated.target == applied.target).all()  # applied setpoints pass unchanged
 
 
-@given(st.lists(per_joint(st.floats(-1.5, 1.5)), min_size=2, max_size=30))
-def test_gate_random_targets_never_exceed_speed_limit(stream: list[list[float]]) -> None:
-    """A joint that follows at once, so that nearness to the measured angle never overrides the rate."""
-    zero, last = np.zeros(JOINTS), before(JointMode.POSITION)
-    for target in stream:
+@given(st.lists(draw_per_joint(st.floats(-1.5, 1.5)), min_size=2, max_size=30))
+def test_limiter_random_targets_never_exceed_speed_limit(
+    target_sequence: list[list[float]],
+) -> None:
+    """Use a joint that follows immediately, so that only the rate limit applies."""
+    zero = np.zeros(JOINTS)
+    last = before(JointMode.POSITION)
+    for target in target_sequence:
         applied = limited(
             make_joint_command(ROBOT, target), MeasuredState(last.target, zero, zero), last
         )
@@ -164,44 +171,46 @@ def test_gate_random_targets_never_exceed_speed_limit(stream: list[list[float]])
         last = applied
 
 
-def test_a_target_that_waits_is_reached() -> None:
-    for mode, wanted, step in (
+def test_limiter_constant_target_is_reached_at_the_rate_limit() -> None:
+    for mode, requested, step in (
         (JointMode.POSITION, 0.2, ANGLE_STEP),
         (JointMode.VELOCITY, 4.0, SPEED_STEP),
         (JointMode.TORQUE, 3.0, TORQUE_STEP),
     ):
         last = before(mode)
-        steps = int(np.ceil(wanted / step - 1e-9))
-        for k in range(1, steps + 1):
-            last = limited(make_joint_command(ROBOT, wanted, mode), every(), last)
-            assert last.target[0] == pytest.approx(min(k * step, wanted))
+        steps = int(np.ceil(requested / step - 1e-9))
+        for step_count in range(1, steps + 1):
+            last = limited(make_joint_command(ROBOT, requested, mode), every(), last)
+            assert last.target[0] == pytest.approx(min(step_count * step, requested))
 
 
 @pytest.mark.parametrize("angle", [1.6, 1.8, 2.5, 1e4])
 @pytest.mark.parametrize("side", [1, -1])
-def test_gate_joint_beyond_its_end_is_only_commanded_back(angle: float, side: int) -> None:
-    for wanted in (-1e4, -1.5, 0.0, 1.5, 1e4):
-        target = applied_for(make_joint_command(ROBOT, wanted), angle=side * angle).target
+def test_limiter_joint_beyond_its_end_is_only_commanded_back(angle: float, side: int) -> None:
+    for requested in (-1e4, -1.5, 0.0, 1.5, 1e4):
+        target = applied_for(make_joint_command(ROBOT, requested), angle=side * angle).target
         assert (np.abs(target) <= 1.5).all()
-        assert (side * target >= min(angle - 0.3, 1.5) - TINY).all()  # and not past what is near
+        assert (
+            side * target >= min(angle - 0.3, 1.5) - TINY
+        ).all()  # and not further than the maximum step
 
 
-def test_with_no_torque_allowed_there_is_none() -> None:
-    none = [0.0] * JOINTS
+def test_limiter_torque_limit_zero_allows_no_torque() -> None:
+    no_torque = [0.0] * JOINTS
     for mode in JointMode:
         applied = applied_for(
-            make_joint_command(ROBOT, 1.0, mode, torque_limit_nm=none), torque=3.0
+            make_joint_command(ROBOT, 1.0, mode, torque_limit_nm=no_torque), torque=3.0
         )
         assert (applied.torque_limit_nm == 0).all()
     assert (
         applied_for(
-            make_joint_command(ROBOT, 1.0, JointMode.TORQUE, torque_limit_nm=none), torque=3.0
+            make_joint_command(ROBOT, 1.0, JointMode.TORQUE, torque_limit_nm=no_torque), torque=3.0
         ).target
         == 0
     ).all()
 
 
-def test_a_negative_torque_limit_is_none_at_all() -> None:
+def test_limiter_negative_torque_limit_counts_as_zero() -> None:
     assert (
         applied_for(
             make_joint_command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINTS)
@@ -217,30 +226,30 @@ FROZEN_VALUES = [
 ]
 
 
-@pytest.mark.parametrize("held", FROZEN_VALUES)
-def test_what_was_decided_stays(held: Any) -> None:
+@pytest.mark.parametrize("frozen_value", FROZEN_VALUES)
+def test_limiter_limits_states_and_setpoints_are_immutable(frozen_value: Any) -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
-        held.torque_nm = 1.0
+        frozen_value.torque_nm = 1.0
 
 
-def test_a_torque_limit_never_raises_the_robots_own() -> None:
+def test_limiter_torque_limit_never_exceeds_that_of_the_robot() -> None:
     applied = applied_for(make_joint_command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
     assert applied.torque_limit_nm.tolist() == [4.0, 4.0, 1.0]
     assert applied_for(make_joint_command(ROBOT, 0.0)).torque_limit_nm.tolist() == [4.0] * JOINTS
 
 
-def test_modes_may_differ_from_joint_to_joint() -> None:
-    mixed = make_joint_command(
+def test_limiter_joints_may_have_different_modes() -> None:
+    command = make_joint_command(
         ROBOT, 9.0, [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE]
     )
-    assert applied_for(mixed).target == pytest.approx([ANGLE_STEP, SPEED_STEP, TORQUE_STEP])
+    assert applied_for(command).target == pytest.approx([ANGLE_STEP, SPEED_STEP, TORQUE_STEP])
 
 
-# --- bumpless --------------------------------------------------------------------------------------------------
+# --- mode changes without a jump of torque -----------------------------------------------------------------------
 
 
-def motor_torque(target: float, angle: float, velocity: float) -> float:
-    """What a joint's motor does with a target in position mode, by the description's gains."""
+def compute_motor_torque_nm(target: float, angle: float, velocity: float) -> float:
+    """Return the torque of a motor in position mode, with the gains of the description."""
     return 40.0 * (target - angle) - 1.0 * velocity
 
 
@@ -248,35 +257,37 @@ def motor_torque(target: float, angle: float, velocity: float) -> float:
     angle=st.floats(-1.0, 1.0),
     velocity=st.floats(-2, 2),
     torque=st.floats(-4, 4),
-    wanted=st.floats(-10, 10),
+    requested=st.floats(-10, 10),
     mode=st.sampled_from([JointMode.PASSIVE, JointMode.VELOCITY, JointMode.TORQUE]),
 )
-def test_gate_switch_to_position_mode_keeps_present_torque(
-    angle: float, velocity: float, torque: float, wanted: float, mode: JointMode
+def test_limiter_switch_to_position_mode_keeps_present_torque(
+    angle: float, velocity: float, torque: float, requested: float, mode: JointMode
 ) -> None:
-    applied = applied_for(make_joint_command(ROBOT, wanted), angle, velocity, torque, mode)
-    implied = motor_torque(applied.target[0], angle, velocity)
-    assert abs(implied - torque) <= 40.0 * ANGLE_STEP + 1e-6
+    applied = applied_for(make_joint_command(ROBOT, requested), angle, velocity, torque, mode)
+    torque_after_switch = compute_motor_torque_nm(applied.target[0], angle, velocity)
+    assert abs(torque_after_switch - torque) <= 40.0 * ANGLE_STEP + 1e-6
 
 
 @given(
     torque=st.floats(-4, 4),
-    wanted=st.floats(-10, 10),
+    requested=st.floats(-10, 10),
     mode=st.sampled_from([JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY]),
 )
-def test_gate_switch_to_torque_mode_keeps_present_torque(
-    torque: float, wanted: float, mode: JointMode
+def test_limiter_switch_to_torque_mode_keeps_present_torque(
+    torque: float, requested: float, mode: JointMode
 ) -> None:
     applied = applied_for(
-        make_joint_command(ROBOT, wanted, JointMode.TORQUE), 0.3, 1.0, torque, mode
+        make_joint_command(ROBOT, requested, JointMode.TORQUE), 0.3, 1.0, torque, mode
     )
     assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
 
 
-@given(velocity=st.floats(-5, 5), wanted=st.floats(-10, 10))
-def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, wanted: float) -> None:
+@given(velocity=st.floats(-5, 5), requested=st.floats(-10, 10))
+def test_limiter_switch_to_velocity_mode_keeps_present_torque(
+    velocity: float, requested: float
+) -> None:
     applied = applied_for(
-        make_joint_command(ROBOT, wanted, JointMode.VELOCITY),
+        make_joint_command(ROBOT, requested, JointMode.VELOCITY),
         0.3,
         velocity,
         1.0,
@@ -284,47 +295,56 @@ def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, want
     )
     joint = ROBOT.joints[0]
     bumpless_rad_s = velocity + 1.0 / joint.velocity_gain_nm_s_per_rad
-    top = joint.speed_limit_rad_s
-    assert min(max(bumpless_rad_s - SPEED_STEP, -top), top) - TINY <= applied.target[0]
-    assert applied.target[0] <= max(min(bumpless_rad_s + SPEED_STEP, top), -top) + TINY
+    max_speed_rad_s = joint.speed_limit_rad_s
+    assert (
+        min(max(bumpless_rad_s - SPEED_STEP, -max_speed_rad_s), max_speed_rad_s) - TINY
+        <= applied.target[0]
+    )
+    assert (
+        applied.target[0]
+        <= max(min(bumpless_rad_s + SPEED_STEP, max_speed_rad_s), -max_speed_rad_s) + TINY
+    )
 
 
-def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
-    none = AppliedSetpoints(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
-    applied = limited(make_joint_command(ROBOT, 0.3, JointMode.POSITION), every(), none)
+def test_limiter_torque_limit_rises_at_the_torque_rate() -> None:
+    last = AppliedSetpoints(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
+    applied = limited(make_joint_command(ROBOT, 0.3, JointMode.POSITION), every(), last)
     assert applied.torque_limit_nm == pytest.approx(np.full(JOINTS, TORQUE_STEP))
 
 
-def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
+def test_limiter_mode_switch_without_motion_keeps_every_torque() -> None:
     measured = MeasuredState(
         np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0])
     )
     hold = bumpless([JointMode.POSITION] * JOINTS, measured)
-    implied = [
-        motor_torque(*row)
+    torques_after_switch = [
+        compute_motor_torque_nm(*row)
         for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)
     ]
-    assert implied == pytest.approx(measured.torque_nm.tolist())
+    assert torques_after_switch == pytest.approx(measured.torque_nm.tolist())
     assert bumpless([JointMode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
 
 
-def test_a_switch_to_velocity_mode_reckons_with_the_gain() -> None:
+def test_limiter_switch_to_velocity_mode_uses_the_velocity_gain() -> None:
     joint = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=2.0)
     assert compute_bumpless_target(joint, JointMode.VELOCITY, 0.3, 1.0, 3.0) == 2.5
     assert compute_bumpless_target(joint, JointMode.PASSIVE, 0.3, 1.0, 3.0) == 0.0
 
 
-def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
-    limp = msgspec.structs.replace(ROBOT.joints[0], stiffness_nm_per_rad=0.0)
-    assert compute_bumpless_target(limp, JointMode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
+def test_limiter_joint_without_stiffness_has_a_finite_target() -> None:
+    joint_without_stiffness = msgspec.structs.replace(ROBOT.joints[0], stiffness_nm_per_rad=0.0)
+    assert compute_bumpless_target(
+        joint_without_stiffness, JointMode.POSITION, 0.0, 0.0, 1.0
+    ) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
-    soft = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
-    measured, last = every(torque=4.0), before(JointMode.PASSIVE)
+    limits = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
+    measured = every(torque=4.0)
+    last = before(JointMode.PASSIVE)
     applied = limit_command(
         make_joint_command(ROBOT, 0.0),
         measured=measured,
         last=last,
-        limits=soft,
+        limits=limits,
         torque_fraction=COOL,
     )
     assert np.abs(applied.target).max() <= 0.3
@@ -333,8 +353,8 @@ def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
 # --- near the ends ---------------------------------------------------------------------------------------------
 
 
-def test_a_joint_can_stop_before_its_end() -> None:
-    """Four periods on at that speed, then braked by the acceleration limit, it comes to rest at the very end."""
+def test_limiter_stoppable_speed_ends_exactly_at_the_joint_end() -> None:
+    """Check that a joint stops exactly at its end, after four periods at this speed and braking."""
     for distance in (1e-6, 0.01, 0.3, 3.0):
         speed = compute_stoppable_speed(distance, 100.0, 0.01)
         assert speed * 0.04 + speed**2 / 200.0 == pytest.approx(distance)
@@ -348,134 +368,133 @@ def test_a_joint_can_stop_before_its_end() -> None:
 
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("delay", [1, 2])
-def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) -> None:
-    """A joint that turns as it is told, one or two periods later."""
-    angle, reported = 0.0, [0.0] * delay
+def test_limiter_velocity_towards_joint_end_stops_before_it(side: int, delay: int) -> None:
+    """Drive a joint that follows its target after one or two periods."""
+    angle = 0.0
+    delayed = [0.0] * delay
     last = before(JointMode.VELOCITY)
     speeds: list[float] = []
     for _ in range(400):
         last = limited(
             make_joint_command(ROBOT, side * 5.0, JointMode.VELOCITY),
-            every(angle, reported[0]),
+            every(angle, delayed[0]),
             last,
         )
-        reported = [*reported[1:], float(last.target[0])]
-        angle += reported[0] * 0.01
-        speeds.append(abs(reported[0]))
+        delayed = [*delayed[1:], float(last.target[0])]
+        angle += delayed[0] * 0.01
+        speeds.append(abs(delayed[0]))
         assert abs(angle) <= 1.5
     assert max(speeds) == 5.0
     assert abs(angle) > 1.49
-    # What outranks the rate limit hardly needs to.
+    # The limit at the end has priority over the rate limit, but hardly needs it.
     assert max(np.abs(np.diff(speeds))) <= SPEED_STEP + TINY
 
 
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("mode", [JointMode.VELOCITY, JointMode.TORQUE])
-@pytest.mark.parametrize("beyond", [0.0, 0.2])
-def test_at_the_end_nothing_drives_outwards(side: int, mode: JointMode, beyond: float) -> None:
+@pytest.mark.parametrize("beyond_rad", [0.0, 0.2])
+def test_limiter_joint_at_its_end_is_never_driven_outwards(
+    side: int, mode: JointMode, beyond_rad: float
+) -> None:
     for velocity in (-50.0, -1.0, 0.0, 1.0, 50.0):
         for last in (before(mode, side * 3.0), before(JointMode.POSITION, side * 3.0)):
-            for wanted in (-9.0, 9.0):
+            for requested in (-9.0, 9.0):
                 applied = limited(
-                    make_joint_command(ROBOT, wanted, mode),
-                    every(side * (1.5 + beyond), velocity),
+                    make_joint_command(ROBOT, requested, mode),
+                    every(side * (1.5 + beyond_rad), velocity),
                     last,
                 )
                 assert (side * applied.target <= 0.0).all()
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_gate_torque_mode_brakes_a_fast_joint(side: int) -> None:
-    measured, asked = (
-        every(side * 1.4, side * 5.0),
-        make_joint_command(ROBOT, side * 4.0, JointMode.TORQUE),
-    )
-    applied = limited(asked, measured, before(JointMode.TORQUE, side * 4.0))
-    allowed = compute_stoppable_speed(0.1, 100.0, 0.01)
-    # Gain 1 N·m·s/rad.
-    assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed - 5.0)))
-    assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "angle")
+def test_limiter_torque_mode_brakes_a_fast_joint(side: int) -> None:
+    measured = every(side * 1.4, side * 5.0)
+    command = make_joint_command(ROBOT, side * 4.0, JointMode.TORQUE)
+    applied = limited(command, measured, before(JointMode.TORQUE, side * 4.0))
+    allowed_rad_s = compute_stoppable_speed(0.1, 100.0, 0.01)
+    # The velocity gain is 1 N·m·s/rad.
+    assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed_rad_s - 5.0)))
+    assert words(command, applied, measured) == dict.fromkeys(range(JOINTS), "angle")
 
 
-def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
-    weak = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=1e-3)
-    low, high = compute_torque_bounds(weak, 0.0, 0.0, 0.01)
+def test_limiter_torque_bounds_with_weak_gain_allow_full_torque() -> None:
+    weak_joint = msgspec.structs.replace(ROBOT.joints[0], velocity_gain_nm_s_per_rad=1e-3)
+    low, high = compute_torque_bounds(weak_joint, 0.0, 0.0, 0.01)
     assert high == -low == pytest.approx(4.0 / 5.0 * compute_stoppable_speed(1.5, 100.0, 0.01))
     assert high > 4.0
-    slow = msgspec.structs.replace(weak, speed_limit_rad_s=0.5)
-    low, high = compute_torque_bounds(slow, 0.0, 0.0, 0.01)
+    slow_joint = msgspec.structs.replace(weak_joint, speed_limit_rad_s=0.5)
+    low, high = compute_torque_bounds(slow_joint, 0.0, 0.0, 0.01)
     assert high == -low == pytest.approx(4.0 / 0.5 * compute_stoppable_speed(1.5, 100.0, 0.01))
-    still = msgspec.structs.replace(weak, speed_limit_rad_s=0.0)
-    low, high = compute_torque_bounds(still, 0.0, 0.0, 0.01)
+    stationary_joint = msgspec.structs.replace(weak_joint, speed_limit_rad_s=0.0)
+    low, high = compute_torque_bounds(stationary_joint, 0.0, 0.0, 0.01)
     assert high == -low > 4.0
 
 
-def test_gate_joint_near_its_end_is_named_angle_limited() -> None:
-    asked = make_joint_command(ROBOT, 5.0, JointMode.VELOCITY)
-    applied = limited(asked, every(1.45), before(JointMode.VELOCITY, 5.0))
-    assert words(asked, applied, every(1.45)) == dict.fromkeys(range(JOINTS), "angle")
-    assert words(asked, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
+def test_limiter_joint_near_its_end_is_named_angle_limited() -> None:
+    command = make_joint_command(ROBOT, 5.0, JointMode.VELOCITY)
+    applied = limited(command, every(1.45), before(JointMode.VELOCITY, 5.0))
+    assert words(command, applied, every(1.45)) == dict.fromkeys(range(JOINTS), "angle")
+    assert words(command, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
 
 
-def test_gate_torque_far_from_ends_is_not_named_angle_limited() -> None:
-    asked = make_joint_command(ROBOT, 5.0, JointMode.TORQUE)
+def test_limiter_torque_far_from_ends_is_not_named_angle_limited() -> None:
+    command = make_joint_command(ROBOT, 5.0, JointMode.TORQUE)
     measured = every(0.0, 1.45)
-    applied = limited(asked, measured, before(JointMode.TORQUE, 4.0))
-    assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "torque")
+    applied = limited(command, measured, before(JointMode.TORQUE, 4.0))
+    assert words(command, applied, measured) == dict.fromkeys(range(JOINTS), "torque")
 
 
-# The maximum speed there: below the speed limit of 5 rad/s.
-BRAKED = compute_stoppable_speed(1.5 - 1.45, 100.0, 0.01)
+# The maximum speed at 1.45 rad, which is below the speed limit of 5 rad/s.
+STOPPABLE_RAD_S = compute_stoppable_speed(1.5 - 1.45, 100.0, 0.01)
 
 
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize(
-    ("angle", "wanted", "speed_limit", "word"),
+    ("angle", "requested", "speed_limit", "limit_name"),
     [
-        (1.45, BRAKED - 0.1, 5.0, "acceleration"),
-        (1.45, BRAKED, 5.0, "acceleration"),
-        (1.45, BRAKED + 0.1, 5.0, "angle"),
-        (1.45, BRAKED + 0.1, BRAKED, "speed"),
+        (1.45, STOPPABLE_RAD_S - 0.1, 5.0, "acceleration"),
+        (1.45, STOPPABLE_RAD_S, 5.0, "acceleration"),
+        (1.45, STOPPABLE_RAD_S + 0.1, 5.0, "angle"),
+        (1.45, STOPPABLE_RAD_S + 0.1, STOPPABLE_RAD_S, "speed"),
         (0.0, 20.0, 5.0, "speed"),
     ],
 )
-def test_the_tightest_limit_is_the_one_that_is_named(
-    side: int, angle: float, wanted: float, speed_limit: float, word: str
+def test_limiter_names_the_tightest_limit(
+    side: int, angle: float, requested: float, speed_limit: float, limit_name: str
 ) -> None:
     robot = make_description(limits__speed_rad_s=speed_limit)
-    asked, limits = (
-        make_joint_command(robot, side * wanted, JointMode.VELOCITY),
-        JointLimits.from_description(robot),
-    )
-    named = find_active_limits(
-        asked,
+    command = make_joint_command(robot, side * requested, JointMode.VELOCITY)
+    limits = JointLimits.from_description(robot)
+    active_limits = find_active_limits(
+        command,
         before(JointMode.VELOCITY),
         measured=every(side * angle),
         limits=limits,
         torque_fraction=COOL,
     )
-    assert named == dict.fromkeys(range(JOINTS), word)
+    assert active_limits == dict.fromkeys(range(JOINTS), limit_name)
 
 
 @pytest.mark.parametrize("velocity", [-3.0, 0.0, 3.0])
-def test_gate_joint_at_its_end_needs_no_torque(velocity: float) -> None:
-    """Outwards nothing, and inwards only what brakes a joint that still goes outwards."""
+def test_limiter_joint_at_its_end_needs_no_torque(velocity: float) -> None:
+    """Allow no torque outwards, and inwards only torque that brakes an outward motion."""
     joint = ROBOT.joints[0]
-    _, most = compute_torque_bounds(joint, joint.angle_max_rad, velocity, 0.01)
-    least, _ = compute_torque_bounds(joint, joint.angle_min_rad, velocity, 0.01)
-    assert most == (0.0 if velocity <= 0.0 else -velocity)  # gain 1 N·m·s/rad
-    assert least == (0.0 if velocity >= 0.0 else -velocity)
+    _, max_nm = compute_torque_bounds(joint, joint.angle_max_rad, velocity, 0.01)
+    min_nm, _ = compute_torque_bounds(joint, joint.angle_min_rad, velocity, 0.01)
+    assert max_nm == (0.0 if velocity <= 0.0 else -velocity)  # gain 1 N·m·s/rad
+    assert min_nm == (0.0 if velocity >= 0.0 else -velocity)
 
 
-def test_a_range_without_width_leaves_no_torque() -> None:
-    stuck = msgspec.structs.replace(ROBOT.joints[0], angle_min_rad=0.0, angle_max_rad=0.0)
+def test_limiter_joint_range_without_width_allows_no_outward_torque() -> None:
+    joint = msgspec.structs.replace(ROBOT.joints[0], angle_min_rad=0.0, angle_max_rad=0.0)
     for velocity in (-3.0, 0.0, 3.0):
-        low, high = compute_torque_bounds(stuck, 0.0, velocity, 0.01)
+        low, high = compute_torque_bounds(joint, 0.0, velocity, 0.01)
         assert low <= 0.0 >= high
         assert low <= high
 
 
-def test_joint_limits_are_those_of_the_description() -> None:
+def test_joint_limits_come_from_the_description() -> None:
     robot = make_description(joints={"joint_2": {"speed_rad_s": 2.0}})
     limits = JointLimits.from_description(robot)
     assert limits.angle_min_rad.tolist() == [-1.5] * 3

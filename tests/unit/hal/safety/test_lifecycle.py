@@ -1,4 +1,4 @@
-"""The lifecycle, as one table."""
+"""The lifecycle has the transitions of one table."""
 
 from typing import get_args
 
@@ -7,8 +7,9 @@ import pytest
 from snakesim_hal.safety.lifecycle import LifecycleEvent, next_state
 from snakesim_hal.wire.messages import LifecycleState
 
-STATES, EVENTS = get_args(LifecycleState), get_args(LifecycleEvent)
-TABLE: dict[str, dict[str, str | None]] = {
+STATES = get_args(LifecycleState)
+EVENTS = get_args(LifecycleEvent)
+TRANSITIONS: dict[str, dict[str, str | None]] = {
     "disarmed": {
         "arm": "armed",
         "disarm": "disarmed",
@@ -24,5 +25,7 @@ TABLE: dict[str, dict[str, str | None]] = {
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("event", EVENTS)
-def test_transition(state: LifecycleState, event: LifecycleEvent) -> None:
-    assert next_state(state, event) == TABLE[state][event]
+def test_lifecycle_transition_equals_the_table(
+    state: LifecycleState, event: LifecycleEvent
+) -> None:
+    assert next_state(state, event) == TRANSITIONS[state][event]

@@ -1,4 +1,4 @@
-"""The limiter: what is refused and why, what is changed and how that is named."""
+"""The command limiter refuses invalid commands with a reason, and names the limits that change others."""
 
 from typing import Any, get_args
 
@@ -25,7 +25,8 @@ from snakesim_testing.hal.limiter_rig import (
 from snakesim_testing.hal.small_robots import LEASE_NS, make_description, make_joint_command
 
 
-def judge(given: JointCommand, **changes: Any) -> RejectionReason | None:
+def find_reason(command: JointCommand, **changes: Any) -> RejectionReason | None:
+    """Return why a command is refused, in usual circumstances with some changes."""
     values: dict[str, Any] = {
         "lease": LEASE,
         "now_ns": 900,
@@ -34,28 +35,27 @@ def judge(given: JointCommand, **changes: Any) -> RejectionReason | None:
         "age_ns": 0,
     } | changes
     limits = values.pop("limits", LIMITS)
-    return find_rejection_reason(given, limits=limits, **values)
+    return find_rejection_reason(command, limits=limits, **values)
 
 
 # --- refusals --------------------------------------------------------------------------------------------------
 
-SERVOS = JointLimits.from_description(
+SERVO_LIMITS = JointLimits.from_description(
     make_description(
         drive__modes=["position"], joints={"joint_3": {"modes": ["position", "velocity"]}}
     )
 )
-NAN, INF = float("nan"), float("inf")
-REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
+NAN = float("nan")
+INF = float("inf")
+REFUSED_COMMANDS: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
     "no_lease": [({}, {"lease": CommandLease(epoch=1)}), ({}, {"now_ns": 1001})],
     "wrong_epoch": [({"lease_epoch": 0}, {}), ({"lease_epoch": 2}, {})],
     "replayed": [({"sequence": 1}, {"last_sequence": 1}), ({"sequence": 1}, {"last_sequence": 2})],
     "from_the_future": [({"tick": 6}, {})],
     "stale": [
         ({"valid_for_ns": 10}, {"age_ns": 11}),
-        (
-            {"valid_for_ns": 2**62},
-            {"age_ns": LEASE_NS + 1},
-        ),  # nobody may ask for more than a lease term
+        # No command may be valid for more than a lease term.
+        ({"valid_for_ns": 2**62}, {"age_ns": LEASE_NS + 1}),
         ({"valid_for_ns": 2**62}, {"age_ns": 2**61}),
     ],
     "wrong_layout": [({"layout": "of another robot"}, {})],
@@ -69,8 +69,11 @@ REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
         ({"torque_limit_nm": []}, {}),
     ],
     "wrong_mode": [
-        ({"mode": [JointMode.POSITION, JointMode.TORQUE, JointMode.POSITION]}, {"limits": SERVOS}),
-        ({"mode": [JointMode.VELOCITY] * JOINTS}, {"limits": SERVOS}),
+        (
+            {"mode": [JointMode.POSITION, JointMode.TORQUE, JointMode.POSITION]},
+            {"limits": SERVO_LIMITS},
+        ),
+        ({"mode": [JointMode.VELOCITY] * JOINTS}, {"limits": SERVO_LIMITS}),
     ],
     "not_finite": [
         ({"target": [0.0, NAN, 0.0]}, {}),
@@ -83,39 +86,40 @@ REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
 }
 
 
-def test_a_good_command_passes() -> None:
-    assert judge(make_joint_command(ROBOT)) is None
-    assert judge(make_joint_command(ROBOT, torque_limit_nm=[0.0] * JOINTS)) is None
-    assert judge(make_joint_command(ROBOT, tick=5), now_ns=1000) is None
-    assert judge(make_joint_command(ROBOT, valid_for_ns=10), age_ns=10) is None
-    assert judge(make_joint_command(ROBOT, valid_for_ns=0), age_ns=0) is None
+def test_limiter_valid_command_is_accepted() -> None:
+    assert find_reason(make_joint_command(ROBOT)) is None
+    assert find_reason(make_joint_command(ROBOT, torque_limit_nm=[0.0] * JOINTS)) is None
+    assert find_reason(make_joint_command(ROBOT, tick=5), now_ns=1000) is None
+    assert find_reason(make_joint_command(ROBOT, valid_for_ns=10), age_ns=10) is None
+    assert find_reason(make_joint_command(ROBOT, valid_for_ns=0), age_ns=0) is None
     assert (
-        judge(
+        find_reason(
             make_joint_command(
                 ROBOT, mode=[JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY]
             ),
-            limits=SERVOS,
+            limits=SERVO_LIMITS,
         )
         is None
     )
 
 
 @pytest.mark.parametrize(
-    ("reason", "case"), [(reason, case) for reason, cases in REFUSED.items() for case in cases]
+    ("reason", "case"),
+    [(reason, case) for reason, cases in REFUSED_COMMANDS.items() for case in cases],
 )
-def test_refused_with_its_reason(
+def test_limiter_invalid_command_is_refused_with_its_reason(
     reason: RejectionReason, case: tuple[dict[str, Any], dict[str, Any]]
 ) -> None:
     changes, circumstances = case
-    assert judge(make_joint_command(ROBOT, **changes), **circumstances) == reason
+    assert find_reason(make_joint_command(ROBOT, **changes), **circumstances) == reason
 
 
-def test_every_reason_is_tried() -> None:
-    assert list(REFUSED) == list(get_args(RejectionReason))
+def test_limiter_every_rejection_reason_has_a_test() -> None:
+    assert list(REFUSED_COMMANDS) == list(get_args(RejectionReason))
 
 
-def test_what_is_checked_first_is_told_first() -> None:
-    worse: list[tuple[RejectionReason, dict[str, Any], dict[str, Any]]] = [
+def test_limiter_reports_the_first_reason_in_its_order() -> None:
+    defects: list[tuple[RejectionReason, dict[str, Any], dict[str, Any]]] = [
         ("not_finite", {"target": [NAN] * JOINTS}, {}),
         ("wrong_length", {"torque_limit_nm": [1.0]}, {}),
         ("wrong_layout", {"layout": "other"}, {}),
@@ -125,24 +129,24 @@ def test_what_is_checked_first_is_told_first() -> None:
         ("wrong_epoch", {"lease_epoch": 0}, {}),
         ("no_lease", {}, {"now_ns": 1001}),
     ]
-    worst: dict[str, Any] = {}
-    around: dict[str, Any] = {}
-    for reason, changes, circumstances in worse:
-        worst |= changes
-        around |= circumstances
-        assert judge(make_joint_command(ROBOT, **worst), **around) == reason
+    fields: dict[str, Any] = {}
+    all_circumstances: dict[str, Any] = {}
+    for reason, changes, circumstances in defects:
+        fields |= changes
+        all_circumstances |= circumstances
+        assert find_reason(make_joint_command(ROBOT, **fields), **all_circumstances) == reason
 
 
 # --- heat ------------------------------------------------------------------------------------------------------
 
 
-TORQUE_FRACTIONS = np.array([1.0, 0.5, 0.25])  # of the 4 N·m of each joint, which its heat permits
+TORQUE_FRACTIONS = np.array([1.0, 0.5, 0.25])  # allowed part of the 4 N·m of each joint
 
 
-def limit_hot_joints(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
+def limit_hot_joints(command: JointCommand) -> tuple[list[float], dict[int, str]]:
     """Limit a command to joints that are cool, warm and hot; return torque limits, and reasons by joint."""
-    applied = limited(asked, every(), before(JointMode.TORQUE, 2.0), TORQUE_FRACTIONS)
-    return applied.torque_limit_nm.tolist(), words(asked, applied, every(), TORQUE_FRACTIONS)
+    applied = limited(command, every(), before(JointMode.TORQUE, 2.0), TORQUE_FRACTIONS)
+    return applied.torque_limit_nm.tolist(), words(command, applied, every(), TORQUE_FRACTIONS)
 
 
 @pytest.mark.parametrize(
@@ -150,19 +154,16 @@ def limit_hot_joints(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
     [
         (None, [4.0, 2.0, 1.0], {1: "thermal", 2: "thermal"}),
         (2.0, [2.0, 2.0, 1.0], {2: "thermal"}),
-        (
-            1.0,
-            [1.0, 1.0, 1.0],
-            {0: "torque", 1: "torque", 2: "torque"},
-        ),  # the command's own limit is below its target
+        # The limit in the command is below its target.
+        (1.0, [1.0, 1.0, 1.0], {0: "torque", 1: "torque", 2: "torque"}),
     ],
 )
 def test_limiter_hot_joint_has_lower_torque_limit(
     commanded_limit_nm: float | None, applied_limit_nm: list[float], reasons: dict[int, str]
 ) -> None:
     limits_nm = None if commanded_limit_nm is None else [commanded_limit_nm] * JOINTS
-    asked = make_joint_command(ROBOT, 2.0, JointMode.TORQUE, torque_limit_nm=limits_nm)
-    assert limit_hot_joints(asked) == (applied_limit_nm, reasons)
+    command = make_joint_command(ROBOT, 2.0, JointMode.TORQUE, torque_limit_nm=limits_nm)
+    assert limit_hot_joints(command) == (applied_limit_nm, reasons)
 
 
 def test_limiter_cool_joint_with_excessive_torque_is_limited_by_rating() -> None:
@@ -180,11 +181,11 @@ def test_limiter_passive_hot_joint_is_not_limited() -> None:
     assert reasons == {}
 
 
-# --- words -----------------------------------------------------------------------------------------------------
+# --- names of limits -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("mode", "wanted", "word"),
+    ("mode", "requested", "limit_name"),
     [
         (JointMode.POSITION, 2.0, "angle"),
         (JointMode.POSITION, -2.0, "angle"),
@@ -203,34 +204,36 @@ def test_limiter_passive_hot_joint_is_not_limited() -> None:
         (JointMode.PASSIVE, 3.0, None),
     ],
 )
-def test_a_changed_target_is_named_by_its_limit(
-    mode: JointMode, wanted: float, word: str | None
+def test_limiter_changed_target_is_named_by_its_limit(
+    mode: JointMode, requested: float, limit_name: str | None
 ) -> None:
-    asked = make_joint_command(ROBOT, [0.0, wanted, 0.0], mode)
-    applied = limited(asked, every(), before(mode))
-    assert words(asked, applied, every()) == ({} if word is None else {1: word})
+    command = make_joint_command(ROBOT, [0.0, requested, 0.0], mode)
+    applied = limited(command, every(), before(mode))
+    assert words(command, applied, every()) == ({} if limit_name is None else {1: limit_name})
 
 
-def test_set_points_for_the_backend_are_plain_python() -> None:
+def test_limiter_setpoints_for_the_backend_are_plain_python() -> None:
     applied = applied_for(make_joint_command(ROBOT, 0.01))
-    points = make_safe_setpoints(applied, frozenset({1}))
-    assert points.isolated == {1}
-    assert points.mode == [JointMode.POSITION] * JOINTS
-    assert all(type(m) is JointMode for m in points.mode)
-    assert all(type(value) is float for value in points.target + points.torque_limit_nm)
+    setpoints = make_safe_setpoints(applied, frozenset({1}))
+    assert setpoints.isolated == {1}
+    assert setpoints.mode == [JointMode.POSITION] * JOINTS
+    assert all(type(mode) is JointMode for mode in setpoints.mode)
+    assert all(type(value) is float for value in setpoints.target + setpoints.torque_limit_nm)
 
 
 @pytest.mark.parametrize(
-    ("period_ms", "delay_ms", "oldest_ms"),
+    ("period_ms", "delay_ms", "max_age_ms"),
     [(10, 0, 30), (1, 0, 30), (20, 0, 60), (40, 0, 100), (10, 5, 35), (10, 40, 50)],
 )
-def test_how_old_a_joint_state_may_be(period_ms: int, delay_ms: int, oldest_ms: int) -> None:
-    """Three periods, or 30 ms, and its delay; never longer than the lease."""
+def test_limiter_max_state_age_follows_period_and_delay(
+    period_ms: int, delay_ms: int, max_age_ms: int
+) -> None:
+    """Allow three periods or 30 ms, and the delay of the sensor, but never more than the lease."""
     period_ns = period_ms * 1_000_000
     sensor = SensorDescription(key=keys.JOINTS, rate_hz=100.0, delay_s=delay_ms * 1e-3)
     lease_ns = min(max(5 * period_ns, 50_000_000), 100_000_000)
     robot = msgspec.structs.replace(ROBOT, period_ns=period_ns, lease_ns=lease_ns, sensors=[sensor])
-    assert JointLimits.from_description(robot).max_state_age_ns == oldest_ms * 1_000_000
+    assert JointLimits.from_description(robot).max_state_age_ns == max_age_ms * 1_000_000
 
 
 def test_limiter_without_joint_sensor_assumes_oldest_allowed_state() -> None:

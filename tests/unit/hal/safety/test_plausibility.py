@@ -1,4 +1,4 @@
-"""Which joint states are believed: glitches, lost and late samples, and sensors that are stuck."""
+"""The plausibility checker rejects glitches and frozen sensors, and accepts lost and late samples."""
 
 import math
 import random
@@ -22,278 +22,283 @@ from snakesim_testing.hal.small_robots import (
 )
 from snakesim_testing.hypothesis_profiles import choose_trial_count
 
-REACH = 0.05 + 2 * 5.0 * 0.01  # rad in a period
-WORD = "state_invalid"
-NOBODY: JointMask = np.zeros(JOINTS, dtype=np.bool_)
+REACH_RAD = 0.05 + 2 * 5.0 * 0.01  # rad that an angle may change in a period
+FAULT_KIND = "state_invalid"
+NO_JOINTS: JointMask = np.zeros(JOINTS, dtype=np.bool_)
 
 
-def targets(
+def make_applied(
     target: Any = 0.0, mode: JointMode = JointMode.POSITION, torque_limit: float = 4.0
 ) -> AppliedSetpoints:
+    """Return the same applied setpoint for every joint."""
     return AppliedSetpoints(
         np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit)
     )
 
 
-class Bench:
-    """A watch that gets a sample a period."""
+class CheckerRig:
+    """A plausibility checker that receives a sample each period."""
 
     def __init__(self, **values: Any) -> None:
-        self.watch = PlausibilityChecker(LIMITS)
+        self.checker = PlausibilityChecker(LIMITS)
         self.timestamp_ns = 0
-        assert self.see(**values) is None
+        assert self.check_sample(**values) is None
 
-    def see(
+    def check_sample(
         self,
         angle: Any = 0.0,
         *values: Any,
         applied: AppliedSetpoints | None = None,
         periods: float = 1,
         late_ns: int = 0,
-        aside: JointMask = NOBODY,
-        **other: Any,
+        isolated: JointMask = NO_JOINTS,
+        **fields: Any,
     ) -> Fault | None:
+        """Check a sample, which the host receives late by some time, and return the fault."""
         self.timestamp_ns += round(periods * PERIOD_NS)
-        seen = make_joint_state(
-            ROBOT, angle, *values, timestamp_ns=self.timestamp_ns, tick=7, **other
+        joint_state = make_joint_state(
+            ROBOT, angle, *values, timestamp_ns=self.timestamp_ns, tick=7, **fields
         )
-        doubt = self.watch.check(
-            seen, now_ns=self.timestamp_ns + late_ns, applied=applied, isolated=aside
+        doubt = self.checker.check(
+            joint_state, now_ns=self.timestamp_ns + late_ns, applied=applied, isolated=isolated
         )
-        self.doubted = [] if doubt is None else np.flatnonzero(doubt.joints).tolist()
+        self.doubted_joints = [] if doubt is None else np.flatnonzero(doubt.joints).tolist()
         return None if doubt is None else doubt.fault
 
     @property
     def angles(self) -> list[float]:
-        return self.watch.measured.angle_rad.tolist()
+        return self.checker.measured.angle_rad.tolist()
 
 
 # --- jumps -----------------------------------------------------------------------------------------------------
 
 
-def test_the_first_angle_is_believed_wherever_it_is() -> None:
-    assert Bench(angle=1.4).angles == [1.4] * JOINTS
+def test_plausibility_first_angle_is_always_accepted() -> None:
+    assert CheckerRig(angle=1.4).angles == [1.4] * JOINTS
 
 
-@pytest.mark.parametrize("applied", [None, targets()])
+@pytest.mark.parametrize("applied", [None, make_applied()])
 @pytest.mark.parametrize("side", [1, -1])
 def test_plausibility_angle_jump_is_rejected_as_fault_of_its_joint(
     applied: AppliedSetpoints | None, side: int
 ) -> None:
-    bench = Bench()
-    assert bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied) is None
-    fault = bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
+    rig = CheckerRig()
+    assert rig.check_sample([0.0, side * (REACH_RAD - 1e-6), 0.0], applied=applied) is None
+    fault = rig.check_sample([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
     assert fault is not None
-    assert fault.what == WORD
+    assert fault.what == FAULT_KIND
     assert fault.joint == "joint_2"
     assert fault.tick == 7
-    jump_rad = side * (0.9 - REACH)
+    jump_rad = side * (0.9 - REACH_RAD)
     assert (
         fault.cause
         == f"faster than any joint turns: a jump of joint_2 by {jump_rad:+.2f} rad in 10 ms"
     )
 
 
-@pytest.mark.parametrize("applied", [None, targets()])
+@pytest.mark.parametrize("applied", [None, make_applied()])
 @pytest.mark.parametrize("side", [1, -1])
 def test_plausibility_jumping_joint_keeps_last_valid_angle(
     applied: AppliedSetpoints | None, side: int
 ) -> None:
-    bench = Bench()
-    bench.see([0.0, side * (REACH - 1e-6), 0.0], applied=applied)
-    bench.see([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
-    assert bench.angles == pytest.approx([0.01, side * REACH, 0.0], abs=1e-5)
-    assert bench.watch.measured.velocity_rad_s.tolist() == [1.0, 0.0, 1.0]
-    assert bench.watch.measured.torque_nm.tolist() == [2.0, 0.0, 2.0]
-    returned = [0.02, side * (REACH + 0.01), 0.0]
-    assert bench.see(returned, applied=applied) is None
+    rig = CheckerRig()
+    rig.check_sample([0.0, side * (REACH_RAD - 1e-6), 0.0], applied=applied)
+    rig.check_sample([0.01, side * 0.9, 0.0], 1.0, 2.0, applied=applied)
+    assert rig.angles == pytest.approx([0.01, side * REACH_RAD, 0.0], abs=1e-5)
+    assert rig.checker.measured.velocity_rad_s.tolist() == [1.0, 0.0, 1.0]
+    assert rig.checker.measured.torque_nm.tolist() == [2.0, 0.0, 2.0]
+    returned = [0.02, side * (REACH_RAD + 0.01), 0.0]
+    assert rig.check_sample(returned, applied=applied) is None
 
 
-def test_a_jump_of_several_joints_names_them_all() -> None:
-    fault = Bench().see([0.5, 0.0, -0.6])
+def test_plausibility_jump_of_several_joints_names_them_all() -> None:
+    fault = CheckerRig().check_sample([0.5, 0.0, -0.6])
     assert fault is not None
     assert fault.joint is None
     assert fault.cause.endswith("joint_1 by +0.50 rad in 10 ms, joint_3 by -0.60 rad in 10 ms")
 
 
 @pytest.mark.parametrize("periods", [2, 10])
-def test_after_lost_samples_a_joint_may_be_further_away(periods: int) -> None:
-    far = 0.05 + 10.0 * periods * 0.01
-    assert Bench().see(far - 1e-6, periods=periods) is None
-    assert Bench().see(far + 1e-6, periods=periods) is not None
+def test_plausibility_lost_samples_extend_the_reachable_angle(periods: int) -> None:
+    max_change_rad = 0.05 + 10.0 * periods * 0.01
+    assert CheckerRig().check_sample(max_change_rad - 1e-6, periods=periods) is None
+    assert CheckerRig().check_sample(max_change_rad + 1e-6, periods=periods) is not None
 
 
-def test_age_counts_as_time() -> None:
-    """A sample that says again what was taken before may not differ from it; one that was old has time to make good."""
-    bench = Bench()
-    assert bench.see(0.1, age_ns=[PERIOD_NS] * JOINTS) is not None
-    assert bench.see(0.04, age_ns=[2 * PERIOD_NS] * JOINTS) is None
-    bench = Bench(age_ns=[3 * PERIOD_NS] * JOINTS)
-    assert bench.see(0.4, age_ns=[0] * JOINTS) is None
+def test_plausibility_age_of_a_sample_counts_as_time() -> None:
+    """Allow no change for a repeated measurement, and more change after an old one."""
+    rig = CheckerRig()
+    assert rig.check_sample(0.1, age_ns=[PERIOD_NS] * JOINTS) is not None
+    assert rig.check_sample(0.04, age_ns=[2 * PERIOD_NS] * JOINTS) is None
+    rig = CheckerRig(age_ns=[3 * PERIOD_NS] * JOINTS)
+    assert rig.check_sample(0.4, age_ns=[0] * JOINTS) is None
 
 
 def test_plausibility_host_pause_extends_the_reachable_angle() -> None:
-    assert Bench().see(0.5) is not None
-    assert Bench().see(0.5, late_ns=4 * PERIOD_NS) is None
+    assert CheckerRig().check_sample(0.5) is not None
+    assert CheckerRig().check_sample(0.5, late_ns=4 * PERIOD_NS) is None
 
 
 def test_plausibility_new_place_is_accepted_after_repeats_unless_armed() -> None:
-    """A joint that was bent by hand between two samples; slowly, so that time alone does not make it good."""
-    for applied, seen in ((None, 5), (targets(), 6)):
-        bench = Bench()
-        found = [bench.see(1.2 + 0.01 * k, applied=applied) for k in range(5)] + [
-            bench.see(1.25, periods=0.5)
-        ]
-        assert [fault is None for fault in found].index(True) == seen - 1
-        assert bench.angles == pytest.approx([1.24 if seen == 5 else 1.25] * JOINTS, abs=0.011)
+    """Accept a joint that was bent by hand between two samples, after some consistent samples."""
+    for applied, accepted_sample in ((None, 5), (make_applied(), 6)):
+        rig = CheckerRig()
+        faults = [rig.check_sample(1.2 + 0.01 * k, applied=applied) for k in range(5)]
+        faults.append(rig.check_sample(1.25, periods=0.5))
+        assert [fault is None for fault in faults].index(True) == accepted_sample - 1
+        accepted_rad = 1.24 if accepted_sample == 5 else 1.25
+        assert rig.angles == pytest.approx([accepted_rad] * JOINTS, abs=0.011)
 
 
-def test_places_that_do_not_agree_are_not_believed() -> None:
-    bench = Bench()
-    for k in range(6):
-        assert bench.see((5.0, -5.0)[k % 2]) is not None
-    for _ in range(3):  # the newest place, once more than before
-        assert bench.see(-5.0) is not None
-    assert bench.see(0.0) is None
-    assert bench.see(-5.0) is not None  # one good sample, and counting begins again
+def test_plausibility_inconsistent_jumps_are_never_accepted() -> None:
+    rig = CheckerRig()
+    for sample in range(6):
+        assert rig.check_sample((5.0, -5.0)[sample % 2]) is not None
+    for _ in range(3):  # the newest angle, repeated
+        assert rig.check_sample(-5.0) is not None
+    assert rig.check_sample(0.0) is None
+    assert rig.check_sample(-5.0) is not None  # after one plausible sample, counting starts again
     for _ in range(3):
-        assert bench.see(-5.0) is not None
-    assert bench.see(-5.0) is None
+        assert rig.check_sample(-5.0) is not None
+    assert rig.check_sample(-5.0) is None
 
 
 @pytest.mark.parametrize(("farther_rad", "agrees"), [(0.0, True), (1e-12, False)])
-def test_places_that_are_just_within_reach_agree(farther_rad: float, agrees: bool) -> None:
-    bench = Bench(angle=-3.0)
-    bench.timestamp_ns = -5 * PERIOD_NS
-    assert bench.see(5.0) is not None
+def test_plausibility_jumps_exactly_within_reach_are_consistent(
+    farther_rad: float, agrees: bool
+) -> None:
+    rig = CheckerRig(angle=-3.0)
+    rig.timestamp_ns = -5 * PERIOD_NS
+    assert rig.check_sample(5.0) is not None
     for _ in range(4):
-        assert bench.see(0.0) is not None
-    assert bench.timestamp_ns == 0  # so that the time to the next sample is exact
-    assert (bench.see(REACH + farther_rad) is None) == agrees
+        assert rig.check_sample(0.0) is not None
+    assert rig.timestamp_ns == 0  # the time to the next sample is exact
+    assert (rig.check_sample(REACH_RAD + farther_rad) is None) == agrees
 
 
-def test_a_sample_that_is_repeated_does_not_count_again() -> None:
-    bench = Bench()
-    for k in range(8):
-        assert bench.see(1.4, periods=0.0 if k else 1.0) is not None
+def test_plausibility_repeated_sample_does_not_count_again() -> None:
+    rig = CheckerRig()
+    for sample in range(8):
+        assert rig.check_sample(1.4, periods=0.0 if sample else 1.0) is not None
     for _ in range(3):
-        assert bench.see(1.4) is not None
-    assert bench.see(1.4) is None
+        assert rig.check_sample(1.4) is not None
+    assert rig.check_sample(1.4) is None
 
 
 def test_plausibility_repeated_sample_never_counts_twice() -> None:
-    bench = Bench()
-    for k in range(12):
-        assert bench.see(1.4, periods=0.0 if k else 1.0, late_ns=k) is not None
+    rig = CheckerRig()
+    for sample in range(12):
+        assert rig.check_sample(1.4, periods=0.0 if sample else 1.0, late_ns=sample) is not None
 
 
 def test_plausibility_earlier_timestamp_leaves_at_least_the_slack() -> None:
-    assert Bench().see(0.04, periods=-0.5) is None
+    assert CheckerRig().check_sample(0.04, periods=-0.5) is None
 
 
-def test_who_strays_first_does_not_help_who_strays_later() -> None:
-    """All must be at a new place for as many samples, also one that goes to zero."""
-    bench = Bench(angle=[0.0, 1.0, 0.0])
-    assert bench.see([3.0, 1.0, 0.0]) is not None
-    for k in range(4):
-        assert bench.see([3.0, 0.0, 0.0]) is not None, k
-    assert bench.angles[:2] == [3.0, 1.0]
-    assert bench.see([3.0, 0.0, 0.0]) is None
+def test_plausibility_jumping_joints_are_counted_separately() -> None:
+    """Require the same number of samples from each joint, also from one that jumps to zero."""
+    rig = CheckerRig(angle=[0.0, 1.0, 0.0])
+    assert rig.check_sample([3.0, 1.0, 0.0]) is not None
+    for sample in range(4):
+        assert rig.check_sample([3.0, 0.0, 0.0]) is not None, sample
+    assert rig.angles[:2] == [3.0, 1.0]
+    assert rig.check_sample([3.0, 0.0, 0.0]) is None
 
 
-def test_joints_are_judged_each_by_itself() -> None:
-    bench = Bench()
+def test_plausibility_second_jumping_joint_is_reported_alone() -> None:
+    rig = CheckerRig()
     for _ in range(4):
-        assert bench.see([1.4, 0.0, 0.0]) is not None
-    fault = bench.see([1.4, 0.0, 1.4])
+        assert rig.check_sample([1.4, 0.0, 0.0]) is not None
+    fault = rig.check_sample([1.4, 0.0, 1.4])
     assert fault is not None
     assert fault.joint == "joint_3"
-    assert bench.angles == [1.4, 0.0, 0.0]
+    assert rig.angles == [1.4, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(
-    "bad",
+    "defect",
     [
         {"valid": [True, False, True]},
         {"age_ns": [0, LEASE_NS + 1, 0]},
         {"angle": [0.1, float("nan"), 0.1]},
     ],
 )
-def test_plausibility_unknown_joint_leaves_others_unchanged(bad: dict[str, Any]) -> None:
-    bench = Bench()
-    values: dict[str, Any] = {"angle": 0.1, **bad}
-    fault = bench.see(**values)
+def test_plausibility_unknown_joint_leaves_others_unchanged(defect: dict[str, Any]) -> None:
+    rig = CheckerRig()
+    values: dict[str, Any] = {"angle": 0.1, **defect}
+    fault = rig.check_sample(**values)
     assert fault is not None
     assert fault.joint == "joint_2"
     assert fault.cause == "no valid and fresh state of joint_2"
-    assert bench.angles == [0.1, 0.0, 0.1]
+    assert rig.angles == [0.1, 0.0, 0.1]
 
 
-def test_a_long_story_fits_into_a_message() -> None:
+def test_plausibility_fault_of_many_joints_has_bounded_length() -> None:
     robot = make_description(chain__modules=100)
-    watch = PlausibilityChecker(JointLimits.from_description(robot))
-    nobody = np.zeros(100, dtype=np.bool_)
-    watch.check(make_joint_state(robot), now_ns=0, applied=None, isolated=nobody)
-    doubt = watch.check(make_joint_state(robot, 1.0), now_ns=0, applied=None, isolated=nobody)
+    checker = PlausibilityChecker(JointLimits.from_description(robot))
+    no_joints = np.zeros(100, dtype=np.bool_)
+    checker.check(make_joint_state(robot), now_ns=0, applied=None, isolated=no_joints)
+    doubt = checker.check(make_joint_state(robot, 1.0), now_ns=0, applied=None, isolated=no_joints)
     assert doubt is not None
     assert len(doubt.fault.cause) == 400
     assert doubt.joints.all()
 
 
-@pytest.mark.parametrize("at", [1, 2])
-def test_who_is_set_aside_is_not_looked_at(at: int) -> None:
-    bench, aside = Bench(), NOBODY.copy()
-    aside[1] = True
-    valid = [i != at for i in range(JOINTS)]
-    found = bench.see(valid=valid, aside=aside)
-    assert (found is None) == (at == 1)
-    assert bench.doubted == [2] * (at == 2)
-    jumped = [0.0, 0.0, 0.0]
-    jumped[at] = 1.0
-    assert (bench.see(jumped, aside=aside) is None) == (at == 1)
-    assert bench.doubted == [2] * (at == 2)
+@pytest.mark.parametrize("failing_joint", [1, 2])
+def test_plausibility_isolated_joint_is_not_checked(failing_joint: int) -> None:
+    rig = CheckerRig()
+    isolated = NO_JOINTS.copy()
+    isolated[1] = True
+    valid = [i != failing_joint for i in range(JOINTS)]
+    fault = rig.check_sample(valid=valid, isolated=isolated)
+    assert (fault is None) == (failing_joint == 1)
+    assert rig.doubted_joints == [2] * (failing_joint == 2)
+    angles = [0.0, 0.0, 0.0]
+    angles[failing_joint] = 1.0
+    assert (rig.check_sample(angles, isolated=isolated) is None) == (failing_joint == 1)
+    assert rig.doubted_joints == [2] * (failing_joint == 2)
 
 
 def test_plausibility_fault_reaches_joints_or_the_whole_robot() -> None:
-    bench = Bench()
-    fault = bench.see(valid=[True, False, False])
+    rig = CheckerRig()
+    fault = rig.check_sample(valid=[True, False, False])
     assert fault is not None
     assert fault.scope == "joint"
-    assert bench.doubted == [1, 2]
-    fault = bench.see(valid=[])
+    assert rig.doubted_joints == [1, 2]
+    fault = rig.check_sample(valid=[])
     assert fault is not None
     assert fault.scope == "robot"
-    assert bench.doubted == [0, 1, 2]
+    assert rig.doubted_joints == [0, 1, 2]
     assert fault.tick == 7
-    assert fault.what == WORD
+    assert fault.what == FAULT_KIND
     assert fault.cause == "no joint state of 3 joints"
     assert fault.joint is None
 
 
 def test_plausibility_angle_exactly_at_reach_is_accepted() -> None:
-    assert Bench(angle=0.0).see(0.05, periods=0) is None
-    assert Bench(angle=0.0).see(float(np.nextafter(0.05, 1.0)), periods=0) is not None
+    assert CheckerRig(angle=0.0).check_sample(0.05, periods=0) is None
+    assert CheckerRig(angle=0.0).check_sample(float(np.nextafter(0.05, 1.0)), periods=0) is not None
 
 
 @pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm"])
-def test_what_is_published_has_numbers_only(column: str) -> None:
-    bench = Bench(angle=0.1)
-    sound = make_joint_state(ROBOT, 0.12, 0.2, 0.3)
-    assert replace_non_finite_values(sound, bench.watch.measured) is sound
-    corrupted = msgspec.structs.replace(sound, **{column: [0.5, float("nan"), 0.7]})
-    published = replace_non_finite_values(corrupted, bench.watch.measured)
+def test_plausibility_published_state_has_only_finite_values(column: str) -> None:
+    rig = CheckerRig(angle=0.1)
+    valid_state = make_joint_state(ROBOT, 0.12, 0.2, 0.3)
+    assert replace_non_finite_values(valid_state, rig.checker.measured) is valid_state
+    corrupted = msgspec.structs.replace(valid_state, **{column: [0.5, float("nan"), 0.7]})
+    published = replace_non_finite_values(corrupted, rig.checker.measured)
     assert published.valid == [True, False, True]
     assert published.angle_rad[1] == 0.1
     assert published.velocity_rad_s[1] == published.torque_nm[1] == 0.0
     assert getattr(published, column)[::2] == [0.5, 0.7]
-    assert published.age_ns == sound.age_ns
+    assert published.age_ns == valid_state.age_ns
     assert [published.angle_rad[0], published.velocity_rad_s[2], published.torque_nm[2]] != [
         0.1,
         0.0,
         0.0,
     ]
     assert replace_non_finite_values(
-        msgspec.structs.replace(corrupted, valid=[False, True, True]), bench.watch.measured
+        msgspec.structs.replace(corrupted, valid=[False, True, True]), rig.checker.measured
     ).valid == [
         False,
         False,
@@ -303,36 +308,43 @@ def test_what_is_published_has_numbers_only(column: str) -> None:
 
 @pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm", "valid"])
 def test_plausibility_state_of_wrong_length_is_published_unchanged(column: str) -> None:
-    odd = msgspec.structs.replace(make_joint_state(ROBOT, float("nan")), **{column: [float("nan")]})
-    assert replace_non_finite_values(odd, Bench().watch.measured) is odd
+    short_state = msgspec.structs.replace(
+        make_joint_state(ROBOT, float("nan")), **{column: [float("nan")]}
+    )
+    assert replace_non_finite_values(short_state, CheckerRig().checker.measured) is short_state
 
 
-# --- stuck sensors ---------------------------------------------------------------------------------------------
+# --- frozen sensors --------------------------------------------------------------------------------------------
 
 LEASE_PERIODS = LEASE_NS // PERIOD_NS
 
 
-FAR_PERIODS = 4  # until a target that moves by 0.02 rad a period is further than 0.075 rad
+FAR_PERIODS = 4  # by then, a target that moves by 0.02 rad per period is more than 0.075 rad away
 
 
-def stuck(
-    bench: Bench,
+def repeat_state(
+    rig: CheckerRig,
     periods: int,
-    step: float = 0.02,
+    target_step_rad: float = 0.02,
     torque: float = 0.5,
     mode: JointMode = JointMode.POSITION,
-    aside: JointMask = NOBODY,
+    isolated: JointMask = NO_JOINTS,
 ) -> Fault | None:
-    return [
-        bench.see(0.0, 0.0, torque, applied=targets(step * k, mode), aside=aside)
-        for k in range(periods)
-    ][-1]
+    """Repeat a joint state while the target moves, and return the last fault."""
+    fault = None
+    for k in range(periods):
+        fault = rig.check_sample(
+            0.0, 0.0, torque, applied=make_applied(target_step_rad * k, mode), isolated=isolated
+        )
+    return fault
 
 
 def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
-    bench = Bench(torque=0.5)
-    assert stuck(bench, FAR_PERIODS + LEASE_PERIODS + 1) is None  # for a lease, and no longer
-    fault = bench.see(0.0, 0.0, 0.5, applied=targets(0.2))
+    rig = CheckerRig(torque=0.5)
+    assert (
+        repeat_state(rig, FAR_PERIODS + LEASE_PERIODS + 1) is None
+    )  # repeated for one lease, which is allowed
+    fault = rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.2))
     assert fault is not None
     assert fault.what == "joint_frozen"
     assert (
@@ -341,163 +353,197 @@ def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
 
 
 def test_plausibility_isolated_joint_is_not_reported_as_frozen() -> None:
-    isolated = NOBODY.copy()
+    isolated = NO_JOINTS.copy()
     isolated[1] = True
-    bench = Bench(torque=0.5)
-    assert stuck(bench, FAR_PERIODS + LEASE_PERIODS + 2, aside=isolated) is not None
-    assert bench.doubted == [0, 2]
-    everybody = ~NOBODY
-    assert stuck(Bench(torque=0.5), FAR_PERIODS + LEASE_PERIODS + 2, aside=everybody) is None
+    rig = CheckerRig(torque=0.5)
+    assert repeat_state(rig, FAR_PERIODS + LEASE_PERIODS + 2, isolated=isolated) is not None
+    assert rig.doubted_joints == [0, 2]
+    all_joints = ~NO_JOINTS
+    assert (
+        repeat_state(CheckerRig(torque=0.5), FAR_PERIODS + LEASE_PERIODS + 2, isolated=all_joints)
+        is None
+    )
 
 
 def test_plausibility_joint_freezes_while_an_isolated_joint_is_frozen() -> None:
-    isolated = NOBODY.copy()
+    isolated = NO_JOINTS.copy()
     isolated[0] = True
-    bench = Bench(torque=0.5)
+    rig = CheckerRig(torque=0.5)
     faults: list[Fault | None] = []
-    for k in range(60):
-        angle = [0.0, 0.01 * min(k, 30), 0.01 * k]  # the second joint stops after a while
-        faults.append(bench.see(angle, 0.0, 0.5, applied=targets(0.02 * k), aside=isolated))
+    for sample in range(60):
+        angle = [
+            0.0,
+            0.01 * min(sample, 30),
+            0.01 * sample,
+        ]  # the second joint stops after 30 samples
+        faults.append(
+            rig.check_sample(
+                angle, 0.0, 0.5, applied=make_applied(0.02 * sample), isolated=isolated
+            )
+        )
     assert not any(faults[:30])
     assert faults[-1] is not None
-    assert bench.doubted == [1]
+    assert rig.doubted_joints == [1]
 
 
 def test_plausibility_joint_freezes_after_its_mode_has_changed() -> None:
-    isolated = NOBODY.copy()
+    isolated = NO_JOINTS.copy()
     isolated[0] = True
-    bench = Bench(torque=0.5)
+    rig = CheckerRig(torque=0.5)
     fault = None
-    for k in range(60):
-        applied = targets(0.02 * k)
-        if k < 30:
+    for sample in range(60):
+        applied = make_applied(0.02 * sample)
+        if sample < 30:
             applied.mode[1] = JointMode.VELOCITY
-        fault = bench.see([0.0, 0.0, 0.01 * k], 0.0, 0.5, applied=applied, aside=isolated)
-        assert fault is None or k > 30
+        fault = rig.check_sample(
+            [0.0, 0.0, 0.01 * sample], 0.0, 0.5, applied=applied, isolated=isolated
+        )
+        assert fault is None or sample > 30
     assert fault is not None
-    assert bench.doubted == [1]
+    assert rig.doubted_joints == [1]
 
 
 def test_plausibility_state_may_repeat_for_exactly_one_lease() -> None:
-    bench = Bench(torque=0.5)
-    # The target is far at time 0, so that the sum of the times is exact.
-    bench.timestamp_ns = -2 * PERIOD_NS
+    rig = CheckerRig(torque=0.5)
+    # The target becomes far at time 0, so that the sum of the times is exact.
+    rig.timestamp_ns = -2 * PERIOD_NS
     for target in (0.0, 0.2):
-        assert bench.see(0.0, 0.0, 0.5, applied=targets(target)) is None
-    assert bench.timestamp_ns == 0
+        assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(target)) is None
+    assert rig.timestamp_ns == 0
     lease_periods = LEASE_NS / PERIOD_NS
-    assert bench.see(0.0, 0.0, 0.5, applied=targets(0.2), periods=lease_periods) is None
-    assert bench.see(0.0, 0.0, 0.5, applied=targets(0.2), periods=1e-6) is not None
+    assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.2), periods=lease_periods) is None
+    assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.2), periods=1e-6) is not None
 
 
 @pytest.mark.parametrize("step", [0.02, -0.02])
-def test_the_way_of_the_target_counts_in_both_directions(step: float) -> None:
-    assert stuck(Bench(torque=0.5), 20, step) is not None
+def test_plausibility_target_motion_in_both_directions_reveals_frozen_joint(step: float) -> None:
+    assert repeat_state(CheckerRig(torque=0.5), 20, step) is not None
 
 
-def test_a_target_that_hardly_moves_proves_nothing() -> None:
-    assert stuck(Bench(torque=0.5), 50, 0.0014) is None  # 0.069 rad of the 0.075 that it takes
-    assert stuck(Bench(torque=0.5), 70, 0.0014) is not None
+def test_plausibility_slow_target_reveals_frozen_joint_only_later() -> None:
+    assert (
+        repeat_state(CheckerRig(torque=0.5), 50, 0.0014) is None
+    )  # the target moves by 0.069 rad, and 0.075 rad is required
+    assert repeat_state(CheckerRig(torque=0.5), 70, 0.0014) is not None
 
 
 def test_plausibility_rested_joint_has_one_lease_to_follow_a_jump() -> None:
-    bench = Bench(torque=0.5)
-    assert stuck(bench, 100, 0.0) is None
-    seen = [bench.see(0.0, 0.0, 0.5, applied=targets(0.3)) for _ in range(LEASE_PERIODS + 2)]
-    assert seen[:LEASE_PERIODS] == [None] * LEASE_PERIODS
-    assert seen[-1] is not None
+    rig = CheckerRig(torque=0.5)
+    assert repeat_state(rig, 100, 0.0) is None
+    faults = [
+        rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.3)) for _ in range(LEASE_PERIODS + 2)
+    ]
+    assert faults[:LEASE_PERIODS] == [None] * LEASE_PERIODS
+    assert faults[-1] is not None
 
 
 def test_plausibility_saturated_motor_may_repeat_its_state() -> None:
-    assert stuck(Bench(torque=4.0), 50, torque=3.9) is None
-    assert stuck(Bench(torque=-4.0), 50, torque=-3.9) is None
-    bench = Bench()
+    assert repeat_state(CheckerRig(torque=4.0), 50, torque=3.9) is None
+    assert repeat_state(CheckerRig(torque=-4.0), 50, torque=-3.9) is None
+    rig = CheckerRig()
     for k in range(50):
-        assert bench.see(applied=targets(0.02 * k, torque_limit=0.0)) is None
+        assert rig.check_sample(applied=make_applied(0.02 * k, torque_limit=0.0)) is None
 
 
 def test_plausibility_frozen_needs_position_target_of_armed_robot() -> None:
     for mode in (JointMode.PASSIVE, JointMode.VELOCITY, JointMode.TORQUE):
-        assert stuck(Bench(torque=0.5), 50, mode=mode) is None
-    bench = Bench(torque=0.5)
+        assert repeat_state(CheckerRig(torque=0.5), 50, mode=mode) is None
+    rig = CheckerRig(torque=0.5)
     for _ in range(50):
-        assert bench.see(0.0, 0.0, 0.5) is None
-    stuck(bench, FAR_PERIODS + LEASE_PERIODS)
-    assert bench.see(0.0, 0.0, 0.5) is None  # disarmed, and everything begins again
-    assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None
+        assert rig.check_sample(0.0, 0.0, 0.5) is None
+    repeat_state(rig, FAR_PERIODS + LEASE_PERIODS)
+    assert rig.check_sample(0.0, 0.0, 0.5) is None  # while disarmed, counting starts again
+    assert repeat_state(rig, FAR_PERIODS + LEASE_PERIODS) is None
 
 
-def test_a_mode_between_begins_anew() -> None:
-    bench = Bench(torque=0.5)
+def test_plausibility_mode_change_starts_the_frozen_time_again() -> None:
+    rig = CheckerRig(torque=0.5)
     for _ in range(4):
-        assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None
-        assert bench.see(0.0, 0.0, 0.5, applied=targets(9.0, JointMode.VELOCITY)) is None
+        assert repeat_state(rig, FAR_PERIODS + LEASE_PERIODS) is None
+        assert (
+            rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(9.0, JointMode.VELOCITY)) is None
+        )
 
 
 def test_plausibility_revived_joint_has_a_full_lease_until_frozen() -> None:
-    bench = Bench(torque=0.5)
-    assert stuck(bench, FAR_PERIODS + LEASE_PERIODS) is None  # far for nearly a lease
-    assert bench.see(1e-9, 0.0, 0.5, applied=targets(0.2)) is None  # every joint moves
-    assert [bench.see(1e-9, 0.0, 0.5, applied=targets(0.4)) for _ in range(LEASE_PERIODS)] == [
-        None
-    ] * LEASE_PERIODS
+    rig = CheckerRig(torque=0.5)
+    assert (
+        repeat_state(rig, FAR_PERIODS + LEASE_PERIODS) is None
+    )  # the target is far for nearly one lease
+    assert rig.check_sample(1e-9, 0.0, 0.5, applied=make_applied(0.2)) is None  # every joint moves
+    assert [
+        rig.check_sample(1e-9, 0.0, 0.5, applied=make_applied(0.4)) for _ in range(LEASE_PERIODS)
+    ] == [None] * LEASE_PERIODS
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
-def test_whatever_still_changes_is_alive(column: int) -> None:
-    bench = Bench()
+def test_plausibility_joint_with_any_changing_value_is_not_frozen(column: int) -> None:
+    rig = CheckerRig()
     for k in range(50):
         row = np.array([0.0, 0.0, 0.5]) + 1e-9 * (k % 2) * (np.arange(3) == column)
         assert (
-            bench.see(float(row[0]), float(row[1]), float(row[2]), applied=targets(0.02 * k))
+            rig.check_sample(
+                float(row[0]), float(row[1]), float(row[2]), applied=make_applied(0.02 * k)
+            )
             is None
         )
 
 
-def test_a_target_that_moved_just_so_far_proves_nothing() -> None:
-    bench = Bench(torque=0.5)
-    assert bench.see(0.0, 0.0, 0.5, applied=targets(0.0)) is None
+def test_plausibility_target_exactly_at_threshold_reveals_nothing() -> None:
+    rig = CheckerRig(torque=0.5)
+    assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.0)) is None
     for _ in range(3 * LEASE_PERIODS):
-        assert bench.see(0.0, 0.0, 0.5, applied=targets(0.075)) is None
+        assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.075)) is None
 
 
-def test_that_the_host_was_held_up_makes_no_joint_frozen() -> None:
-    bench = Bench(torque=0.5)
+def test_plausibility_host_pauses_do_not_count_as_frozen() -> None:
+    rig = CheckerRig(torque=0.5)
     for k in range(FAR_PERIODS + 4):
-        assert bench.see(0.0, 0.0, 0.5, applied=targets(0.02 * k), late_ns=k * LEASE_NS) is None
+        assert (
+            rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.02 * k), late_ns=k * LEASE_NS)
+            is None
+        )
 
 
-def test_a_sample_that_is_only_old_is_not_frozen() -> None:
-    """It was taken once: what is lost is judged by its age."""
-    bench = Bench(torque=0.5)
+def test_plausibility_old_sample_is_not_frozen() -> None:
+    """Accept a state that was measured once and grows old, because its age is checked instead."""
+    rig = CheckerRig(torque=0.5)
     for k in range(1, FRESH_PERIODS + 1):
         assert (
-            bench.see(0.0, 0.0, 0.5, applied=targets(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS)
+            rig.check_sample(
+                0.0, 0.0, 0.5, applied=make_applied(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS
+            )
             is None
         )
 
 
-# --- the shortcut for ordinary states ----------------------------------------------------------------------------
+# --- the fast path for ordinary states -----------------------------------------------------------------------------
 
 
-class Whole(PlausibilityChecker):
-    """The checks without the shortcut."""
+class FullChecker(PlausibilityChecker):
+    """A plausibility checker without the fast path."""
 
     def _is_ordinary(self, joints: JointState) -> bool:
         del joints
         return False
 
 
-def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, AppliedSetpoints | None]]:
-    """States at the edges of every check, in which at most one joint is not like the others; and what was applied."""
-    timestamp_ns, target, angle = 0, 0.0, [0.4] * JOINTS
+def generate_states(
+    rng: random.Random, length: int
+) -> Iterator[tuple[JointState, AppliedSetpoints | None]]:
+    """Yield states at the edges of every check, in which at most one joint differs, and applied setpoints."""
+    timestamp_ns = 0
+    target = 0.0
+    angle = [0.4] * JOINTS
     limit_ns = LIMITS.max_state_age_ns
     for _ in range(length):
         timestamp_ns += rng.choice((0, PERIOD_NS, PERIOD_NS, PERIOD_NS, LEASE_NS))
         target += rng.choice((0.0, 0.08))
-        velocity, torque = [rng.choice((0.5, 0.6))] * JOINTS, [rng.choice((0.5, 0.6))] * JOINTS
-        ages, valid = [0] * JOINTS, [True] * JOINTS
-        odd = rng.randrange(JOINTS)
+        velocity = [rng.choice((0.5, 0.6))] * JOINTS
+        torque = [rng.choice((0.5, 0.6))] * JOINTS
+        ages = [0] * JOINTS
+        valid = [True] * JOINTS
+        changed_joint = rng.randrange(JOINTS)
         match rng.choice(
             (
                 "angle",
@@ -513,21 +559,21 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, AppliedS
             )
         ):
             case "angle":
-                angle[odd] += rng.choice((0.05, -0.05, 0.3, -0.3, 2.0))
+                angle[changed_joint] += rng.choice((0.05, -0.05, 0.3, -0.3, 2.0))
             case "mirrored":
-                angle = [-at for at in angle]
+                angle = [-angle_rad for angle_rad in angle]
             case "velocity":
-                velocity[odd] = rng.choice((0.0, math.nan, math.inf))
+                velocity[changed_joint] = rng.choice((0.0, math.nan, math.inf))
             case "torque":
-                torque[odd] = rng.choice((0.0, math.nan, math.inf))
+                torque[changed_joint] = rng.choice((0.0, math.nan, math.inf))
             case "age":
-                ages[odd] = rng.choice((limit_ns, limit_ns + 1))
+                ages[changed_joint] = rng.choice((limit_ns, limit_ns + 1))
             case "valid":
-                valid[odd] = False
+                valid[changed_joint] = False
             case _:
                 pass
         count = 0 if rng.random() < 0.02 else JOINTS
-        seen = make_joint_state(
+        joint_state = make_joint_state(
             ROBOT,
             angle[:count],
             velocity,
@@ -536,33 +582,41 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, AppliedS
             age_ns=ages,
             valid=valid,
         )
-        yield seen, targets(target) if rng.random() < 0.9 else None
+        yield joint_state, make_applied(target) if rng.random() < 0.9 else None
 
 
 @pytest.mark.trials
-def test_ordinary_states_are_judged_as_by_the_whole_check() -> None:
+def test_plausibility_fast_path_equals_the_full_check() -> None:
     rng = random.Random(5)
     for _ in range(choose_trial_count(300)):
-        quick, whole = PlausibilityChecker(LIMITS), Whole(LIMITS)
-        for seen, applied in walk(rng, 24):
-            taken = [
-                one.check(seen, now_ns=seen.timestamp_ns, applied=applied, isolated=NOBODY)
-                for one in (quick, whole)
+        fast = PlausibilityChecker(LIMITS)
+        full = FullChecker(LIMITS)
+        for joint_state, applied in generate_states(rng, 24):
+            results = [
+                checker.check(
+                    joint_state,
+                    now_ns=joint_state.timestamp_ns,
+                    applied=applied,
+                    isolated=NO_JOINTS,
+                )
+                for checker in (fast, full)
             ]
-            assert repr(taken[0]) == repr(taken[1])
-            for good, expected in zip(
-                vars(quick.measured).values(), vars(whole.measured).values(), strict=True
+            assert repr(results[0]) == repr(results[1])
+            for values, expected in zip(
+                vars(fast.measured).values(), vars(full.measured).values(), strict=True
             ):
-                assert good.tolist() == expected.tolist()
+                assert values.tolist() == expected.tolist()
 
 
-@pytest.mark.parametrize("check", [PlausibilityChecker, Whole])
-def test_an_angle_may_differ_by_the_noise_at_once(check: type[PlausibilityChecker]) -> None:
-    watch = check(LIMITS)
+@pytest.mark.parametrize("checker_class", [PlausibilityChecker, FullChecker])
+def test_plausibility_angle_may_change_by_noise_immediately(
+    checker_class: type[PlausibilityChecker],
+) -> None:
+    checker = checker_class(LIMITS)
     for angle in (0.0, 0.05):
         assert (
-            watch.check(
-                make_joint_state(ROBOT, angle), now_ns=0, applied=targets(), isolated=NOBODY
+            checker.check(
+                make_joint_state(ROBOT, angle), now_ns=0, applied=make_applied(), isolated=NO_JOINTS
             )
             is None
         )

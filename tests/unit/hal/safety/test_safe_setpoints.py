@@ -1,16 +1,16 @@
-"""The type checker proves that a backend gets limited setpoints only if nothing else creates that type."""
+"""Only the command limiter creates `SafeSetpoints`, so that the type checker proves that all setpoints are limited."""
 
 import ast
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[4]
-# Simulated robots whose environment was asked for without limits.
-MAY_CREATE = {"snakesim_hal/safety/limiter.py", "snakesim/environments/no_limiter.py"}
+# `no_limiter.py` serves simulated robots whose environment has no limits.
+ALLOWED_FILES = {"snakesim_hal/safety/limiter.py", "snakesim/environments/no_limiter.py"}
 
 
-def files_that_create_safe_setpoints() -> set[str]:
-    """The files with a call of `SafeSetpoints(...)` in all packages that a robot runs."""
-    found: set[str] = set()
+def find_files_that_create_safe_setpoints() -> set[str]:
+    """Return the files with a call of `SafeSetpoints(...)` in all packages that a robot runs."""
+    files: set[str] = set()
     for path in REPOSITORY.glob("snakesim*/**/*.py"):
         if path.is_relative_to(REPOSITORY / "snakesim_testing"):
             continue
@@ -22,9 +22,9 @@ def files_that_create_safe_setpoints() -> set[str]:
                 isinstance(node, ast.Call)
                 and ast.unparse(node.func).split(".")[-1] == "SafeSetpoints"
             ):
-                found.add(str(path.relative_to(REPOSITORY)))
-    return found
+                files.add(str(path.relative_to(REPOSITORY)))
+    return files
 
 
 def test_only_the_limiter_creates_setpoints_for_a_backend() -> None:
-    assert files_that_create_safe_setpoints() <= MAY_CREATE
+    assert find_files_that_create_safe_setpoints() <= ALLOWED_FILES

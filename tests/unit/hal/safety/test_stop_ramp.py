@@ -1,4 +1,4 @@
-"""Decelerate and hold: where the joints come to rest, and that no target jumps on the way."""
+"""The stop ramp decelerates joints and holds them where they come to rest, without jumps of the target."""
 
 import numpy as np
 import pytest
@@ -15,45 +15,51 @@ ROBOT = make_description(motor__damping_nm_s_per_rad=2.0)
 LIMITS = JointLimits.from_description(ROBOT)
 
 
-def beginning(
+def start_ramp(
     angle: float, velocity: float, torque: float, mode: JointMode, target: float
 ) -> StopRamp:
+    """Start a ramp from a measured state and the last setpoint."""
     return StopRamp.start(every(angle, velocity, torque), before(mode, target), LIMITS)
 
 
-def targets(halt: StopRamp, periods: int) -> list[float]:
-    found = [float(halt.target_rad[0])]
+def list_targets(ramp: StopRamp, periods: int) -> list[float]:
+    """Return the targets of the first joint, from the start on."""
+    targets_rad = [float(ramp.target_rad[0])]
     for _ in range(periods):
-        halt = halt.advance(LIMITS)
-        found.append(float(halt.target_rad[0]))
-    return found
+        ramp = ramp.advance(LIMITS)
+        targets_rad.append(float(ramp.target_rad[0]))
+    return targets_rad
 
 
-def test_a_joint_at_rest_is_held_where_it_is() -> None:
-    assert targets(beginning(0.4, 0.0, 0.0, JointMode.PASSIVE, 0.0), 5) == [0.4] * 6
+def test_stop_ramp_of_joint_at_rest_holds_its_angle() -> None:
+    assert list_targets(start_ramp(0.4, 0.0, 0.0, JointMode.PASSIVE, 0.0), 5) == [0.4] * 6
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_moving_joint_slows_down_by_its_acceleration(side: int) -> None:
-    """From 4 rad/s by 100 rad/s² within 40 ms, and 80 mrad further."""
-    way = targets(beginning(0.0, side * 4.0, 0.0, JointMode.POSITION, 0.0), 10)
-    assert way[1:6] == pytest.approx([side * x for x in (0.035, 0.06, 0.075, 0.08, 0.08)])
-    assert way[-1] == pytest.approx(side * 4.0**2 / 200.0)
+def test_stop_ramp_of_moving_joint_decelerates_at_its_limit(side: int) -> None:
+    """Stop from 4 rad/s with 100 rad/s² within 40 ms and 80 mrad."""
+    targets_rad = list_targets(start_ramp(0.0, side * 4.0, 0.0, JointMode.POSITION, 0.0), 10)
+    assert targets_rad[1:6] == pytest.approx(
+        [side * distance_rad for distance_rad in (0.035, 0.06, 0.075, 0.08, 0.08)]
+    )
+    assert targets_rad[-1] == pytest.approx(side * 4.0**2 / 200.0)
 
 
-def test_the_target_goes_on_from_where_it_was() -> None:
-    way = targets(beginning(0.0, 0.0, 0.0, JointMode.POSITION, 0.2), 10)
-    assert way[:6] == pytest.approx([0.2, 0.15, 0.1, 0.05, 0.0, 0.0])
+def test_stop_ramp_in_position_mode_starts_at_the_target() -> None:
+    targets_rad = list_targets(start_ramp(0.0, 0.0, 0.0, JointMode.POSITION, 0.2), 10)
+    assert targets_rad[:6] == pytest.approx([0.2, 0.15, 0.1, 0.05, 0.0, 0.0])
 
 
 def test_stop_ramp_after_another_mode_starts_from_present_torque() -> None:
-    halt = beginning(0.1, 1.0, 2.0, JointMode.VELOCITY, 1.0)
-    assert halt.target_rad == pytest.approx(np.full(JOINTS, 0.1 + (2.0 + 2.0 * 1.0) / 40.0))
+    ramp = start_ramp(0.1, 1.0, 2.0, JointMode.VELOCITY, 1.0)
+    assert ramp.target_rad == pytest.approx(np.full(JOINTS, 0.1 + (2.0 + 2.0 * 1.0) / 40.0))
 
 
-def test_it_begins_near_the_joint() -> None:
-    assert beginning(0.0, 0.0, 100.0, JointMode.TORQUE, 1.0).target_rad.tolist() == [0.3] * JOINTS
-    assert beginning(0.0, 0.0, 0.0, JointMode.POSITION, -1.0).target_rad.tolist() == [-0.3] * JOINTS
+def test_stop_ramp_starts_within_one_step_of_the_joint() -> None:
+    assert start_ramp(0.0, 0.0, 100.0, JointMode.TORQUE, 1.0).target_rad.tolist() == [0.3] * JOINTS
+    assert (
+        start_ramp(0.0, 0.0, 0.0, JointMode.POSITION, -1.0).target_rad.tolist() == [-0.3] * JOINTS
+    )
 
 
 @given(
@@ -66,10 +72,10 @@ def test_it_begins_near_the_joint() -> None:
 def test_stop_ramp_from_any_state_never_jumps_or_leaves_range(
     angle: float, velocity: float, torque: float, mode: JointMode, target: float
 ) -> None:
-    way = np.array(targets(beginning(angle, velocity, torque, mode, target), 60))
-    assert np.abs(way).max() <= 1.5
-    assert np.abs(np.diff(way)).max() <= ANGLE_STEP + TINY
-    assert way[-1] == way[-2] == way[-10]
-    stops_at = np.clip(angle, -1.5, 1.5) + np.sign(velocity) * min(abs(velocity), 5.0) ** 2 / 200.0
-    # It slows down in whole periods.
-    assert abs(way[-1] - np.clip(stops_at, -1.5, 1.5)) <= ANGLE_STEP / 2
+    targets_rad = np.array(list_targets(start_ramp(angle, velocity, torque, mode, target), 60))
+    assert np.abs(targets_rad).max() <= 1.5
+    assert np.abs(np.diff(targets_rad)).max() <= ANGLE_STEP + TINY
+    assert targets_rad[-1] == targets_rad[-2] == targets_rad[-10]
+    rest_rad = np.clip(angle, -1.5, 1.5) + np.sign(velocity) * min(abs(velocity), 5.0) ** 2 / 200.0
+    # The ramp decelerates in whole periods.
+    assert abs(targets_rad[-1] - np.clip(rest_rad, -1.5, 1.5)) <= ANGLE_STEP / 2

@@ -1,4 +1,4 @@
-"""The codec: what is sent is what arrives, and whatever else arrives ends in a WireError and nothing worse."""
+"""The codec decodes what it encodes, and any other bytes cause a WireError."""
 
 from functools import reduce
 from typing import Any
@@ -37,22 +37,22 @@ from snakesim_testing.hal.strategies import (
 from snakesim_testing.hypothesis_profiles import choose_trial_count
 from snakesim_testing.messages import raises_error
 
-ALL = list(VERSIONS)
+MESSAGES = list(VERSIONS)
 DECODERS: dict[type[Message], MessageDecoder[Any]] = {
-    message: MessageDecoder(message) for message in ALL
+    message: MessageDecoder(message) for message in MESSAGES
 }
-each_message = pytest.mark.parametrize("message", ALL, ids=lambda message: message.__name__)
+each_message = pytest.mark.parametrize("message", MESSAGES, ids=lambda message: message.__name__)
 
 
-def take(message: type[Message], payload: bytes) -> Message | None:
-    """What the decoder makes of bytes: a message of the right type, or None for a WireError `malformed`."""
+def decode_or_none(message: type[Message], payload: bytes) -> Message | None:
+    """Decode bytes, and return the message, or None for a WireError `malformed`."""
     try:
-        found = DECODERS[message].decode(payload, format_encoding(message))
+        decoded = DECODERS[message].decode(payload, format_encoding(message))
     except WireError as error:
         assert error.reason == "malformed"
         return None
-    assert type(found) is message
-    return found
+    assert type(decoded) is message
+    return decoded
 
 
 @each_message
@@ -63,44 +63,50 @@ def test_codec_round_trip_returns_an_equal_message(
 ) -> None:
     sent = data.draw(make_strategy(message))
     payload = encode(sent)
-    assert take(message, payload) == sent
-    assert encode(take(message, payload)) == payload
+    assert decode_or_none(message, payload) == sent
+    assert encode(decode_or_none(message, payload)) == payload
 
 
 @each_message
-def test_every_field_refuses_what_is_out_of_its_bounds(message: type[Message]) -> None:
+def test_codec_value_out_of_bounds_is_refused_in_every_field(message: type[Message]) -> None:
     example = make_plain_example(message)
-    assert take(message, encode(example)) is not None
-    for at, info in iter_places(example, inspect.type_info(message)):
-        for poison in list_invalid_values(info):
-            payload = encode(replace_at(example, at, poison))
-            assert take(message, payload) is None, f"{message.__name__} {at} took {poison!r}"
+    assert decode_or_none(message, encode(example)) is not None
+    for place, info in iter_places(example, inspect.type_info(message)):
+        for invalid_value in list_invalid_values(info):
+            payload = encode(replace_at(example, place, invalid_value))
+            assert decode_or_none(message, payload) is None, (
+                f"{message.__name__} {place} took {invalid_value!r}"
+            )
 
 
 @each_message
-def test_no_number_and_no_list_of_the_contract_is_unbounded(message: type[Message]) -> None:
-    for at, info in iter_places(make_plain_example(message), inspect.type_info(message)):
+def test_codec_every_number_and_list_has_bounds(message: type[Message]) -> None:
+    for place, info in iter_places(make_plain_example(message), inspect.type_info(message)):
         if isinstance(info, inspect.FloatType | inspect.IntType):
-            assert info.ge is not None or info.gt is not None, at
-            assert info.le is not None or info.lt is not None, at
+            assert info.ge is not None or info.gt is not None, place
+            assert info.le is not None or info.lt is not None, place
         if isinstance(info, inspect.ListType | inspect.DictType | inspect.StrType):
-            assert info.max_length is not None, at
+            assert info.max_length is not None, place
 
 
 @each_message
-def test_lists_longer_than_allowed_are_refused(message: type[Message]) -> None:
+def test_codec_list_longer_than_allowed_is_refused(message: type[Message]) -> None:
     example: Any = make_plain_example(message)
-    for at, info in iter_places(example, inspect.type_info(message)):
+    for place, info in iter_places(example, inspect.type_info(message)):
         if isinstance(info, inspect.ListType) and info.max_length is not None:
-            entry = reduce(lambda inner, step: inner[step], at, example)[0]
+            entry = reduce(lambda container, step: container[step], place, example)[0]
             assert (
-                take(message, encode(replace_at(example, at, [entry] * info.max_length)))
+                decode_or_none(
+                    message, encode(replace_at(example, place, [entry] * info.max_length))
+                )
                 is not None
-            ), at
+            ), place
             assert (
-                take(message, encode(replace_at(example, at, [entry] * (info.max_length + 1))))
+                decode_or_none(
+                    message, encode(replace_at(example, place, [entry] * (info.max_length + 1)))
+                )
                 is None
-            ), at
+            ), place
 
 
 @each_message
@@ -111,9 +117,12 @@ def test_codec_missing_required_field_is_refused_and_new_one_ignored(
     info = inspect.type_info(message)
     assert isinstance(info, inspect.StructType)
     for field in info.fields:
-        rest = {key: value for key, value in example.items() if key != field.encode_name}
-        assert (take(message, encode(rest)) is None) == field.required, field.name
-    assert take(message, encode({**example, "of_a_later_release": [1, {"a": 2}]})) is not None
+        other_fields = {key: value for key, value in example.items() if key != field.encode_name}
+        assert (decode_or_none(message, encode(other_fields)) is None) == field.required, field.name
+    assert (
+        decode_or_none(message, encode({**example, "of_a_later_release": [1, {"a": 2}]}))
+        is not None
+    )
 
 
 # --- foreign samples -------------------------------------------------------------------------------------------
@@ -133,38 +142,38 @@ def test_codec_missing_required_field_is_refused_and_new_one_ignored(
         ("/" * 10_000, "unknown_message"),
     ],
 )
-def test_a_foreign_encoding_is_refused_with_its_reason(encoding: str, reason: str) -> None:
+def test_codec_foreign_encoding_is_refused_with_its_reason(encoding: str, reason: str) -> None:
     payload = encode(make_plain_example(JointCommand))
-    with pytest.raises(WireError) as caught:
+    with pytest.raises(WireError) as refusal:
         DECODERS[JointCommand].decode(payload, encoding)
-    assert caught.value.reason == reason
-    assert len(str(caught.value)) < 300
+    assert refusal.value.reason == reason
+    assert len(str(refusal.value)) < 300
 
 
 # --- malformed bytes -------------------------------------------------------------------------------------------
 
 
 @each_message
-def test_every_truncation_and_a_byte_too_many_are_refused(message: type[Message]) -> None:
+def test_codec_truncated_or_longer_payload_is_refused(message: type[Message]) -> None:
     payload = encode(make_plain_example(message))
-    assert take(message, payload) is not None
+    assert decode_or_none(message, payload) is not None
     for length in range(len(payload)):
-        assert take(message, payload[:length]) is None, length
-    assert take(message, payload + b"\x00") is None
+        assert decode_or_none(message, payload[:length]) is None, length
+    assert decode_or_none(message, payload + b"\x00") is None
 
 
 @pytest.mark.parametrize("depth", [100, 10_000, 1_000_000])
 @pytest.mark.parametrize("nest", [b"\x91", b"\x81\xa1a", b"\x81\xa8contacts\x91"])
-def test_deep_nesting_is_refused(depth: int, nest: bytes) -> None:
+def test_codec_deep_nesting_is_refused(depth: int, nest: bytes) -> None:
     for message in (JointState, Clock):
-        assert take(message, nest * depth) is None
-        assert take(message, b"\x81\xa5other" + nest * depth) is None
+        assert decode_or_none(message, nest * depth) is None
+        assert decode_or_none(message, b"\x81\xa5other" + nest * depth) is None
 
 
-def test_a_payload_above_the_size_limit_is_refused_unread() -> None:
+def test_codec_payload_above_the_size_limit_is_refused_unread() -> None:
     valid = make_plain_example(JointState)
-    fits = encode({**valid, "other": b"x" * (MAX_PAYLOAD_BYTES - 1000)})
-    assert take(JointState, fits) is not None
+    accepted_payload = encode({**valid, "other": b"x" * (MAX_PAYLOAD_BYTES - 1000)})
+    assert decode_or_none(JointState, accepted_payload) is not None
     too_large = encode({**valid, "other": b"x" * MAX_PAYLOAD_BYTES})
     with raises_error(WireError, code="message/rejected"):
         DECODERS[JointState].decode(too_large, format_encoding(JointState))
@@ -178,20 +187,22 @@ def test_codec_accepts_largest_images_and_no_other_large_message() -> None:
             "height": 960,
             field: pixel * (1280 * 960),
         }
-        taken = take(message, encode(largest))
-        assert taken is not None
-        assert getattr(taken, field) == largest[field]
-        assert take(message, encode({**largest, field: largest[field] + b"\1"})) is None
+        decoded = decode_or_none(message, encode(largest))
+        assert decoded is not None
+        assert getattr(decoded, field) == largest[field]
+        assert decode_or_none(message, encode({**largest, field: largest[field] + b"\1"})) is None
         assert (
-            take(JointState, encode({**make_plain_example(JointState), "other": largest[field]}))
+            decode_or_none(
+                JointState, encode({**make_plain_example(JointState), "other": largest[field]})
+            )
             is None
         )
 
 
-def test_nobody_but_the_contract_can_write_a_mode() -> None:
-    """A mode travels as its number, and only the four numbers of the contract are modes."""
+def test_codec_unknown_mode_number_is_refused() -> None:
+    """Accept only the four numbers of the contract, because a mode is encoded as its number."""
     example = make_plain_example(JointCommand)
     for number in range(-2, 10):
-        found = take(JointCommand, encode({**example, "mode": [number]}))
-        assert (found is not None) == (number in set(JointMode))
+        decoded = decode_or_none(JointCommand, encode({**example, "mode": [number]}))
+        assert (decoded is not None) == (number in set(JointMode))
     assert msgspec.msgpack.decode(encode([JointMode.TORQUE])) == [3]

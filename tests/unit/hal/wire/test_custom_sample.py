@@ -1,4 +1,4 @@
-"""Messages of custom sensors: their schema says what their class does, and what cannot be one is refused."""
+"""Messages of custom sensors have a schema that agrees with their class, and invalid schemas are refused."""
 
 from typing import Annotated, Any
 
@@ -15,10 +15,8 @@ from snakesim_testing.messages import raises_error
 
 
 def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
-    kind, sample = (
-        parse_custom_message(make_message_schema(SkinSample, "skin")),
-        SkinSample(**PLACE, **GOOD),
-    )
+    kind = parse_custom_message(make_message_schema(SkinSample, "skin"))
+    sample = SkinSample(**PLACE, **GOOD)
     decoded = MessageDecoder(kind.message).decode(encode(sample), format_encoding(SkinSample))
     assert msgspec.to_builtins(decoded) == msgspec.to_builtins(sample)
     assert kind.units == {"pressed_n": "N", "flow_m_s": "m/s", "wet": "1", "count": "1"}
@@ -33,7 +31,7 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "invalid",
     [
         {"pressed_n": [1e9]},
         {"pressed_n": [1.0] * 4},
@@ -44,17 +42,17 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
         {"note": "much too long"},
         {"link": -1},
     ],
-    ids=lambda wrong: next(iter(wrong)),
+    ids=lambda invalid: next(iter(invalid)),
 )
-def test_the_schema_refuses_what_the_class_would(wrong: dict[str, Any]) -> None:
-    written = msgspec.msgpack.encode(PLACE | GOOD | wrong)
+def test_custom_sample_schema_refuses_the_same_values_as_class(invalid: dict[str, Any]) -> None:
+    payload = msgspec.msgpack.encode(PLACE | GOOD | invalid)
     for message in (
         SkinSample,
         parse_custom_message(make_message_schema(SkinSample, "skin")).message,
     ):
-        with pytest.raises(WireError) as caught:
-            MessageDecoder(message).decode(written, format_encoding(SkinSample))
-        assert next(iter(wrong)) in str(caught.value)
+        with pytest.raises(WireError) as refusal:
+            MessageDecoder(message).decode(payload, format_encoding(SkinSample))
+        assert next(iter(invalid)) in str(refusal.value)
 
 
 class Unbounded(CustomSample, frozen=True, kw_only=True):
@@ -70,7 +68,7 @@ class Nested(CustomSample, frozen=True, kw_only=True):
 
 
 class Empty(CustomSample, frozen=True, kw_only=True):
-    """Nothing of its own."""
+    """A message without fields of its own."""
 
 
 @pytest.mark.parametrize(
@@ -106,6 +104,6 @@ def test_custom_sample_without_checkable_schema_is_refused_before_start(message:
         "[" * 9000,
     ],
 )
-def test_a_schema_of_a_stranger_does_nothing_but_be_refused(schema: str) -> None:
+def test_custom_sample_invalid_foreign_schema_is_refused(schema: str) -> None:
     with pytest.raises(WireError):
         parse_custom_message(schema)

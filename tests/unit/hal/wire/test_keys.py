@@ -1,4 +1,4 @@
-"""The key space: every key that is built parses back, and strange keys parse to nothing."""
+"""Every key of the key space is parsed to its message, and unknown keys are parsed to None."""
 
 import pytest
 from hypothesis import given
@@ -7,40 +7,41 @@ from hypothesis import strategies as st
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ColorImage, DepthImage, RangeScan, TickDone
 
-CHUNK = st.text(
+KEY_CHUNKS = st.text(
     st.characters(categories=("L", "N"), include_characters="_-"), min_size=1, max_size=12
 )
-NAMESPACE = st.lists(CHUNK, min_size=1, max_size=3).map("/".join)
+NAMESPACES = st.lists(KEY_CHUNKS, min_size=1, max_size=3).map("/".join)
 
 
-def concrete(key: str) -> str:
+def replace_wildcard(key: str) -> str:
+    """Replace the wildcard of a key with a name."""
     return key.replace("*", "control")
 
 
 @pytest.mark.parametrize("row", keys.SPACE, ids=lambda row: row.key)
-def test_every_key_of_the_space_parses_back(row: keys.KeyRow) -> None:
-    key = concrete(row.key)
+def test_keys_of_the_space_are_parsed_to_their_message(row: keys.KeyRow) -> None:
+    key = replace_wildcard(row.key)
     assert keys.find_message(key) is row.message
-    assert keys.split_namespace(key) is None  # without a namespace there is nothing to split off
+    assert keys.split_namespace(key) is None  # this key has no namespace
     assert row.kind in ("stream", "latched", "query", "liveliness")
     assert row.writer
     assert row.description
 
 
 def test_keys_are_unique_without_outer_slashes() -> None:
-    found = [row.key for row in keys.SPACE]
-    assert len(set(found)) == len(found)
-    assert not any(key.startswith("/") or key.endswith("/") or "//" in key for key in found)
+    all_keys = [row.key for row in keys.SPACE]
+    assert len(set(all_keys)) == len(all_keys)
+    assert not any(key.startswith("/") or key.endswith("/") or "//" in key for key in all_keys)
 
 
-def test_every_key_constant_is_in_the_space() -> None:
+def test_keys_in_constants_equal_the_key_space() -> None:
     constants = {
         value for name, value in vars(keys).items() if name[0].isupper() and isinstance(value, str)
     }
     assert constants == {row.key for row in keys.SPACE}
 
 
-@given(name=CHUNK)
+@given(name=KEY_CHUNKS)
 def test_keys_of_a_service_or_sensor_contain_its_name(name: str) -> None:
     assert (
         keys.parse_service(keys.done_key(name)) == keys.parse_service(keys.alive_key(name)) == name
@@ -51,9 +52,9 @@ def test_keys_of_a_service_or_sensor_contain_its_name(name: str) -> None:
     assert keys.find_message(keys.ranges_key(name)) is RangeScan
 
 
-@given(namespace=NAMESPACE, row=st.sampled_from(keys.SPACE))
+@given(namespace=NAMESPACES, row=st.sampled_from(keys.SPACE))
 def test_keys_split_into_namespace_and_key(namespace: str, row: keys.KeyRow) -> None:
-    key = concrete(row.key)
+    key = replace_wildcard(row.key)
     assert keys.split_namespace(f"{namespace}/{key}") == (namespace, key)
 
 
@@ -73,12 +74,12 @@ def test_keys_split_into_namespace_and_key(namespace: str, row: keys.KeyRow) -> 
         "planar13",
     ],
 )
-def test_keys_outside_the_space_parse_to_nothing(key: str) -> None:
+def test_keys_outside_the_space_are_parsed_to_none(key: str) -> None:
     assert keys.find_message(key) is None
     assert keys.split_namespace(key) is None
 
 
 @pytest.mark.parametrize("pattern", ["**", "*", "hal/done/*", "alive/**"])
-def test_keys_with_pattern_from_a_stranger_name_no_service(pattern: str) -> None:
-    """Zenoh lets anybody put on a pattern; the host then sees the pattern as the key."""
+def test_keys_with_pattern_name_no_service(pattern: str) -> None:
+    """Return the wildcard, because any client may put on a pattern, which the host receives as the key."""
     assert keys.parse_service(pattern) in ("**", "*")

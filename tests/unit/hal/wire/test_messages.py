@@ -1,4 +1,4 @@
-"""The message set: complete, frozen, and fit for readers of an older or a newer release."""
+"""The set of messages is complete, and its numbers have units and fixed values."""
 
 import re
 from typing import Any
@@ -16,55 +16,61 @@ each_message = pytest.mark.parametrize(
 )
 
 
-def declared() -> set[type[Message]]:
-    """Every message that the module declares, without what they inherit from."""
-    found = (getattr(messages, name) for name in dir(messages))
+def list_declared_messages() -> set[type[Message]]:
+    """Return every message that the module declares, without base classes."""
+    attributes = (getattr(messages, name) for name in dir(messages))
     return {
-        thing
-        for thing in found
-        if isinstance(thing, type)
-        and issubclass(thing, Message)
-        and not any(one.__module__.startswith(messages.__name__) for one in thing.__subclasses__())
+        attribute
+        for attribute in attributes
+        if isinstance(attribute, type)
+        and issubclass(attribute, Message)
+        and not any(
+            subclass.__module__.startswith(messages.__name__)
+            for subclass in attribute.__subclasses__()
+        )
     }
 
 
-def parts_of(message: type[Message]) -> set[type[Any]]:
-    """Every Struct inside a message."""
-    found = iter_places(make_plain_example(message), inspect.type_info(message))
-    return {info.cls for _, info in found if isinstance(info, inspect.StructType)} - {message}
+def list_inner_structs(message: type[Message]) -> set[type[Any]]:
+    """Return the classes of all Structs inside a message."""
+    places = iter_places(make_plain_example(message), inspect.type_info(message))
+    return {info.cls for _, info in places if isinstance(info, inspect.StructType)} - {message}
 
 
-def test_every_declared_message_stands_alone_or_inside_one_that_does() -> None:
-    inner = set[type[Any]]().union(*(parts_of(message) for message in VERSIONS))
-    assert declared() == set(VERSIONS) | inner
+def test_messages_declared_are_published_or_part_of_one() -> None:
+    inner = set[type[Any]]().union(*(list_inner_structs(message) for message in VERSIONS))
+    assert list_declared_messages() == set(VERSIONS) | inner
 
 
-def test_messages_and_key_space_cover_each_other() -> None:
-    at_a_key = {row.message for row in keys.SPACE if row.message is not None}
-    assert at_a_key | {messages.Answer} == set(VERSIONS)
+def test_messages_equal_those_of_the_key_space() -> None:
+    published = {row.message for row in keys.SPACE if row.message is not None}
+    assert published | {messages.Answer} == set(VERSIONS)
 
 
 @each_message
-def test_numbers_carry_their_unit_in_type_or_name(message: type[Message]) -> None:
-    """A float says its unit in the published schema, or its field's name ends in it."""
+def test_messages_numbers_have_a_unit_in_type_or_name(message: type[Message]) -> None:
+    """Require a unit in the published schema, or at the end of the name of the field."""
     schema = msgspec.json.schema_components([message])[1]
     for name, struct in schema.items():
-        for field, about in struct.get("properties", {}).items():
-            for leaf in floats_of(about):
+        for field, field_schema in struct.get("properties", {}).items():
+            for leaf in list_number_schemas(field_schema):
                 assert "unit" in leaf or re.search(
                     "_(hz|s|m|kg|rad|nm|rad_s2|nm_s|per_rad)$", field
                 ), (name, field)
 
 
-def floats_of(about: Any) -> list[dict[str, Any]]:
-    if isinstance(about, dict):
-        own = [about] if about.get("type") == "number" else []
-        return own + [leaf for value in about.values() for leaf in floats_of(value)]
-    return [leaf for value in about for leaf in floats_of(value)] if isinstance(about, list) else []
+def list_number_schemas(schema: Any) -> list[dict[str, Any]]:
+    """Return all schemas of numbers inside a schema."""
+    if isinstance(schema, dict):
+        numbers = [schema] if schema.get("type") == "number" else []
+        return numbers + [leaf for value in schema.values() for leaf in list_number_schemas(value)]
+    if isinstance(schema, list):
+        return [leaf for value in schema for leaf in list_number_schemas(value)]
+    return []
 
 
-def test_modes_keep_their_numbers() -> None:
-    """The numbers are the contract with other languages and with recordings."""
+def test_joint_modes_have_fixed_numbers() -> None:
+    """Check the numbers, because other languages and recordings use them."""
     assert {mode.name: mode.value for mode in JointMode} == {
         "PASSIVE": 0,
         "POSITION": 1,

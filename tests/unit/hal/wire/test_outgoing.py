@@ -1,4 +1,4 @@
-"""Judged before it is sent: what a reader refuses is refused, and field, value and what is allowed are named."""
+"""A message that a reader would refuse is refused before it is sent, with field, value and allowed values."""
 
 import math
 import re
@@ -23,12 +23,12 @@ from snakesim_testing.hal.strategies import (
     replace_at,
 )
 
-STREAMED = {
+STREAM_KEYS = {
     row.message: row.key
     for row in keys.SPACE
     if row.kind == "stream" and row.message and "*" not in row.key
 }
-each_message = pytest.mark.parametrize("message", STREAMED, ids=lambda message: message.__name__)
+each_message = pytest.mark.parametrize("message", STREAM_KEYS, ids=lambda message: message.__name__)
 
 
 @each_message
@@ -38,7 +38,7 @@ def test_outgoing_valid_message_is_sent_unchanged(
     message: type[Message], data: st.DataObject
 ) -> None:
     sent = data.draw(make_strategy(message))
-    encoded = encode_checked(STREAMED[message], sent)
+    encoded = encode_checked(STREAM_KEYS[message], sent)
     assert encoded.payload == encode(sent)
     assert encoded.decoded == sent
 
@@ -46,60 +46,70 @@ def test_outgoing_valid_message_is_sent_unchanged(
 @each_message
 def test_outgoing_value_out_of_bounds_is_named_by_field(message: type[Message]) -> None:
     example = make_plain_example(message)
-    for at, info in iter_places(example, inspect.type_info(message)):
-        for poison in list_invalid_values(info) if at else ():
-            with pytest.raises(WireError) as caught:
-                encode_checked(STREAMED[message], message(**replace_at(example, at, poison)))
-            assert caught.value.detail.startswith(f"{message.__name__}.{at[0]}"), (at, poison)
-            assert ", must be " in caught.value.detail
+    for place, info in iter_places(example, inspect.type_info(message)):
+        for invalid_value in list_invalid_values(info) if place else ():
+            with pytest.raises(WireError) as refusal:
+                encode_checked(
+                    STREAM_KEYS[message], message(**replace_at(example, place, invalid_value))
+                )
+            assert refusal.value.detail.startswith(f"{message.__name__}.{place[0]}"), (
+                place,
+                invalid_value,
+            )
+            assert ", must be " in refusal.value.detail
 
 
-def contacts(**wrong: Any) -> Contacts:
+def make_contacts(**invalid_fields: Any) -> Contacts:
+    """Return three contacts, the last of them with wrong values."""
     example = make_plain_example(Contacts)
-    one = example["contacts"][0]
-    return Contacts(**{**example, "contacts": [one, one, {**one, **wrong}]})
+    contact = example["contacts"][0]
+    return Contacts(**{**example, "contacts": [contact, contact, {**contact, **invalid_fields}]})
 
 
-def trajectory(*points: Any) -> Trajectory:
+def make_trajectory(*points: Any) -> Trajectory:
     return Trajectory(**{**make_plain_example(Trajectory), "path_w": list(points)})
 
 
-INFINITE, SHORT, ARRAY = (1.0, math.inf), (1.0,), np.ones(2)
+INFINITE = (1.0, math.inf)
+SHORT = (1.0,)
+ARRAY = np.ones(2)
 
 
 @pytest.mark.parametrize(
-    ("key", "message", "words"),
+    ("key", "message", "pattern"),
     [
         (
             keys.TRAJECTORY,
-            trajectory((0.0, 0.0), INFINITE),
+            make_trajectory((0.0, 0.0), INFINITE),
             r"path_w\[1\]\[1\] is inf, must be `float` <= ",
         ),
         (
             keys.TRAJECTORY,
-            trajectory((0.0, 0.0), SHORT),
+            make_trajectory((0.0, 0.0), SHORT),
             r"path_w\[1\] is \(1\.0,\), must be `array` of length 2",
         ),
         (
             keys.TRAJECTORY,
-            trajectory(ARRAY),
+            make_trajectory(ARRAY),
             r"path_w is \[array\(\[1\., 1\.\]\)\], must be plain Python .*\.tolist",
         ),
         (
             keys.TRAJECTORY,
-            trajectory((0.0, 0.0)),
+            make_trajectory((0.0, 0.0)),
             r"path_w is \[\(0\.0, 0\.0\)\], must be `array` of length >= 2",
         ),
         (
             keys.CONTACTS,
-            contacts(link=-1),
+            make_contacts(link=-1),
             r"^Contacts\.contacts\[2\]\.link is -1, must be `int` >= 0$",
         ),
-        (keys.CONTACTS, trajectory(), r"^a Trajectory, must be a Contacts$"),
-        ("sensor/poze", contacts(), r"^there is no such key; did you mean `sensor/pose`\?"),
+        (keys.CONTACTS, make_trajectory(), r"^a Trajectory, must be a Contacts$"),
+        ("sensor/poze", make_contacts(), r"^there is no such key; did you mean `sensor/pose`\?"),
     ],
 )
-def test_the_wrong_value_is_shown_alone(key: str, message: Message, words: str) -> None:
-    with pytest.raises(WireError) as caught:
+def test_outgoing_refusal_shows_only_the_invalid_value(
+    key: str, message: Message, pattern: str
+) -> None:
+    with pytest.raises(WireError) as refusal:
         encode_checked(key, message)
-    assert re.search(words, caught.value.detail), caught.value.detail
+    assert re.search(pattern, refusal.value.detail), refusal.value.detail

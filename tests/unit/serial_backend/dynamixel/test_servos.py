@@ -1,6 +1,6 @@
-"""The Dynamixel driver against emulated servos in lockstep, with the robot's lifecycle as the host would have it.
+"""The Dynamixel driver commands emulated servos in lockstep, through the lifecycle states of a robot.
 
-Hardware errors, restarts and lost joints are in `tests/contract/test_can_driver_types.py`.
+`tests/contract/test_can_driver_types.py` tests hardware errors, restarts and lost joints.
 """
 
 import math
@@ -13,7 +13,7 @@ import pytest
 from snakesim_drivers.emulation.mounted import MountedDrive
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import JointMode
-from snakesim_serial_backend.dynamixel import registers as at
+from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.backend import DynamixelBackend
 from snakesim_serial_backend.dynamixel.emulator import EmulatedDynamixel
 from snakesim_serial_backend.dynamixel.settings import DynamixelSettings
@@ -22,11 +22,13 @@ from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 JOINTS = 4
-NOTICED = 10  # ticks in which a fault shows: each servo says its health every fourth
+FAULT_REPORT_TICKS = (
+    10  # until a fault is reported: each servo reports its health every fourth tick
+)
 
 
-class Robot(DriveRig):
-    """The backend and its servos."""
+class ServoRobot(DriveRig):
+    """A robot with a Dynamixel backend and its emulated servos."""
 
     def __init__(self, settings: DynamixelSettings | None = None, **dotted: Any) -> None:
         config = make_run_config(
@@ -41,72 +43,81 @@ class Robot(DriveRig):
 
 
 @pytest.fixture
-def robot() -> Iterator[Robot]:
-    one = Robot()
-    yield one
-    one.backend.close()
+def robot() -> Iterator[ServoRobot]:
+    opened = ServoRobot()
+    yield opened
+    opened.backend.close()
 
 
-def test_servos_stop_by_watchdog_when_driver_is_gone(robot: Robot) -> None:
+def test_servos_stop_by_watchdog_when_driver_is_gone(robot: ServoRobot) -> None:
     robot.run(40, "armed")
-    robot.mode, robot.target = JointMode.TORQUE, 0.5
+    robot.mode = JointMode.TORQUE
+    robot.target = 0.5
     robot.run(2, "armed")
     robot.backend._clock.robot_time_ns += 190_000_000
     robot.emulator()
-    assert {servo.table[at.WATCHDOG] for servo in robot.emulator.servos} == {at.TRIPPED}
-    found = robot.run(NOTICED, "armed")
-    assert {fault.what for fault in found} == {"drive_fault"}
-    assert "watchdog" in found[0].cause
+    assert {servo.table[registers.WATCHDOG] for servo in robot.emulator.servos} == {
+        registers.TRIPPED
+    }
+    faults = robot.run(FAULT_REPORT_TICKS, "armed")
+    assert {fault.what for fault in faults} == {"drive_fault"}
+    assert "watchdog" in faults[0].cause
     robot.run(5, "fault")
-    robot.mode, robot.target = JointMode.POSITION, 0.1
+    robot.mode = JointMode.POSITION
+    robot.target = 0.1
     assert robot.run(10, "disarmed") == []
     assert robot.run(60, "armed") == []
 
 
 def test_servo_in_torque_mode_stops_just_beyond_its_travel(
-    robot: Robot,
+    robot: ServoRobot,
 ) -> None:
     robot.run(40, "armed")
-    robot.mode, robot.target = JointMode.TORQUE, -0.05
+    robot.mode = JointMode.TORQUE
+    robot.target = -0.05
     robot.run(8, "armed")
     assert robot.joints is not None
     assert robot.joints.torque_nm == pytest.approx([-0.05] * JOINTS, abs=0.004)
-    servo, emulator = drives_of(robot.backend).servos[0], robot.emulator.servos[0]
-    goal_rad = emulator.read_register("i", at.GOAL_POSITION) * at.RAD + servo.turns * 2 * math.pi
+    servo = drives_of(robot.backend).servos[0]
+    emulator = robot.emulator.servos[0]
+    goal_rad = (
+        emulator.read_register("i", registers.GOAL_POSITION) * registers.RAD
+        + servo.turns * 2 * math.pi
+    )
     assert servo.lower_rad - 0.5 < goal_rad < servo.lower_rad
 
 
-def test_servo_angle_after_start_in_any_turn_is_joint_angle(robot: Robot) -> None:
+def test_servo_angle_after_start_in_any_turn_is_joint_angle(robot: ServoRobot) -> None:
     robot.run(1, "disarmed")
     assert robot.joints is not None
-    here = robot.joints.angle_rad
+    start_angles_rad = robot.joints.angle_rad
     for zero_rad in (math.pi, -0.02, 6.0):
-        elsewhere = Robot(robot__drive={"zero_rad": zero_rad})
-        elsewhere.run(40, "armed")
-        said = elsewhere.joints
-        elsewhere.backend.close()
-        assert said is not None
-        assert said.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
-    assert here == pytest.approx([0.0] * JOINTS, abs=0.002)
+        shifted_robot = ServoRobot(robot__drive={"zero_rad": zero_rad})
+        shifted_robot.run(40, "armed")
+        joint_state = shifted_robot.joints
+        shifted_robot.backend.close()
+        assert joint_state is not None
+        assert joint_state.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+    assert start_angles_rad == pytest.approx([0.0] * JOINTS, abs=0.002)
 
 
 def test_servo_id_model_and_setting_mismatches_are_named_at_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = EmulatedDynamixel.__init__
+    create_emulator = EmulatedDynamixel.__init__
 
-    def otherwise(emulator: EmulatedDynamixel, *rest: Any) -> None:
-        made(emulator, *rest)
+    def create_changed_emulator(emulator: EmulatedDynamixel, *arguments: Any) -> None:
+        create_emulator(emulator, *arguments)
         first, second, third, fourth = emulator.servos
         first.table[7] = 9
-        second.write_register("H", at.MODEL, 1060)
-        third.write_register("i", at.HOMING_OFFSET, -100)
-        fourth.write_register("H", at.CURRENT_LIMIT, 10)
+        second.write_register("H", registers.MODEL, 1060)
+        third.write_register("i", registers.HOMING_OFFSET, -100)
+        fourth.write_register("H", registers.CURRENT_LIMIT, 10)
 
-    monkeypatch.setattr(EmulatedDynamixel, "__init__", otherwise)
-    with pytest.raises(BackendError) as raised:
-        Robot()
-    words = str(raised.value)
+    monkeypatch.setattr(EmulatedDynamixel, "__init__", create_changed_emulator)
+    with pytest.raises(BackendError) as refusal:
+        ServoRobot()
+    text = str(refusal.value)
     for expected in (
         "joint_1 (id 1 on /dev/pts/",
         "does not answer: it is off, or has another id or baud rate",
@@ -116,30 +127,30 @@ def test_servo_id_model_and_setting_mismatches_are_named_at_start(
         "id 9 on /dev/pts/",
         "is no joint's: XM540-W270",
     ):
-        assert expected in words, words
+        assert expected in text, text
 
 
 @pytest.mark.parametrize(
     ("register", "value"),
     [
-        (at.SECONDARY_ID, 1),
-        (at.STARTUP, 3),
+        (registers.SECONDARY_ID, 1),
+        (registers.STARTUP, 3),
     ],
 )
 def test_servo_with_settings_that_would_move_it_is_refused(
-    robot: Robot, register: int, value: int
+    robot: ServoRobot, register: int, value: int
 ) -> None:
     robot.emulator.servos[2].table[register] = value
     with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
         drives_of(robot.backend).bring_up()
 
 
-def test_a_servo_outside_of_its_travel_is_refused() -> None:
-    elsewhere = DynamixelSettings(
+def test_servo_outside_of_its_travel_is_refused_at_start() -> None:
+    settings = DynamixelSettings(
         physics_model="inertia", mounted={"joint_1": MountedDrive(zero_rad=2.5)}
     )
     with raises_error(BackendError, code="drive/unsupported-setting", field="joint_1"):
-        Robot(elsewhere)
+        ServoRobot(settings)
 
 
 @pytest.mark.parametrize(
@@ -152,7 +163,9 @@ def test_a_servo_outside_of_its_travel_is_refused() -> None:
         {"robot__joints": {"joint_2": {"gear": 2.0}}},
     ],
 )
-def test_what_servos_cannot_do_is_refused_before_the_start(dotted: dict[str, Any]) -> None:
+def test_configuration_that_servos_do_not_support_is_refused_before_start(
+    dotted: dict[str, Any],
+) -> None:
     config = make_run_config(
         **{"backend": "dynamixel", "robot__chain__modules": JOINTS, "rate_hz": 100, **dotted}
     )
@@ -168,7 +181,9 @@ def test_what_servos_cannot_do_is_refused_before_the_start(dotted: dict[str, Any
         DynamixelBackend.check(config, DynamixelSettings())
 
 
-SAME_DELAY, OTHER_DELAY = 250, 0  # of an answer, us / 2: a servo as delivered has 250
+# Delays of an answer, in units of 2 us. A servo as delivered has 250.
+SAME_DELAY = 250
+OTHER_DELAY = 0
 
 
 @pytest.mark.parametrize(
@@ -179,10 +194,13 @@ SAME_DELAY, OTHER_DELAY = 250, 0  # of an answer, us / 2: a servo as delivered h
     ],
     ids=["one after the other", "at the same time"],
 )
-def test_two_servos_of_one_id_are_refused_at_the_start(robot: Robot, delay: int) -> None:
-    """They have no serial numbers. With one return delay their answers collide, with two they follow each other."""
+def test_servos_with_one_id_are_refused_at_start(robot: ServoRobot, delay: int) -> None:
+    """Detect a second servo although servos have no serial numbers.
+
+    With the same delay, the answers collide. With different delays, they follow each other.
+    """
     robot.go_wrong("duplicate:joint_2@0-9")
-    robot.emulator.servos[1].table[at.DELAY] = delay
+    robot.emulator.servos[1].table[registers.DELAY] = delay
     with raises_error(BackendError, code="drive/not-complete", field="joint_2"):
         drives_of(robot.backend).bring_up()
     robot.go_wrong("duplicate:joint_2@0-9", begins=False)
@@ -190,7 +208,7 @@ def test_two_servos_of_one_id_are_refused_at_the_start(robot: Robot, delay: int)
 
 
 @pytest.mark.parametrize(
-    ("delay", "what", "words"),
+    ("delay", "expected_fault", "pattern"),
     [
         (OTHER_DELAY, "duplicate_node", "joint_2 .* is duplicated: it answers one question twice"),
         (
@@ -202,19 +220,23 @@ def test_two_servos_of_one_id_are_refused_at_the_start(robot: Robot, delay: int)
     ids=["one after the other", "at the same time"],
 )
 def test_servo_with_duplicate_id_stops_the_robot(
-    robot: Robot, delay: int, what: str, words: str
+    robot: ServoRobot, delay: int, expected_fault: str, pattern: str
 ) -> None:
     robot.run(20, "armed")
-    robot.emulator.servos[1].table[at.DELAY] = delay
+    robot.emulator.servos[1].table[registers.DELAY] = delay
     robot.go_wrong("duplicate:joint_2@0-9")
-    fault = robot.run(NOTICED, "armed")[0]
-    assert (fault.what, fault.joint) == (what, "joint_2") and re.search(words, fault.cause), fault
-    assert fault.scope == ("robot" if what == "duplicate_node" else "joint")
+    fault = robot.run(FAULT_REPORT_TICKS, "armed")[0]
+    assert (fault.what, fault.joint) == (expected_fault, "joint_2") and re.search(
+        pattern, fault.cause
+    ), fault
+    assert fault.scope == ("robot" if expected_fault == "duplicate_node" else "joint")
 
 
 @pytest.mark.parametrize("model", ["XM430-W350", "XL330-M288"])
-def test_emulated_servos_are_of_the_model_that_the_settings_name(model: str) -> None:
-    robot = Robot(DynamixelSettings(physics_model="inertia", bring_up_limit_s=0.5, model=model))
+def test_emulated_servos_have_the_model_of_the_settings(model: str) -> None:
+    robot = ServoRobot(
+        DynamixelSettings(physics_model="inertia", bring_up_limit_s=0.5, model=model)
+    )
     robot.run(40, "armed")
     assert robot.joints is not None and robot.joints.angle_rad == pytest.approx(
         [0.1] * JOINTS, abs=0.02
@@ -222,7 +244,7 @@ def test_emulated_servos_are_of_the_model_that_the_settings_name(model: str) -> 
     robot.backend.close()
 
 
-def test_an_emulated_model_that_the_driver_cannot_use_is_refused_by_its_name() -> None:
+def test_emulated_model_without_current_limit_is_refused_by_name() -> None:
     settings = DynamixelSettings(physics_model="inertia", bring_up_limit_s=0.5, model="XL430-W250")
     with pytest.raises(BackendError, match="XL430-W250 neither measures nor limits current"):
-        Robot(settings)
+        ServoRobot(settings)

@@ -1,10 +1,10 @@
-"""Packets of Feetech's protocol: known bytes, every damage found, and signs above magnitudes."""
+"""Packets of the Feetech protocol: known bytes, damaged packets, and the sign-magnitude format."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from snakesim_serial_backend.feetech import registers as at
+from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.packets import (
     FeetechDecoder,
     FeetechInstruction,
@@ -16,13 +16,13 @@ from snakesim_serial_backend.feetech.packets import (
     encode_sync_write,
 )
 
-near_header = st.lists(st.sampled_from([0x00, 0xFE, 0xFF]), max_size=20).map(bytes) | st.binary(
-    max_size=60
-)
+bytes_like_headers = st.lists(st.sampled_from([0x00, 0xFE, 0xFF]), max_size=20).map(
+    bytes
+) | st.binary(max_size=60)
 
 
-def test_packets_are_the_bytes_of_the_protocol() -> None:
-    """Each computed by hand: the checksum is the complement of the sum from the id on."""
+def test_encoded_packets_equal_bytes_of_the_protocol() -> None:
+    """Compare with packets computed by hand: the checksum is the complement of the sum from the id on."""
     assert encode_packet(1, FeetechInstruction.PING).hex(" ") == "ff ff 01 02 01 fb"
     assert (
         encode_packet(1, FeetechInstruction.READ, bytes([56, 2])).hex(" ")
@@ -35,26 +35,33 @@ def test_packets_are_the_bytes_of_the_protocol() -> None:
     )
 
 
-@given(id_=st.integers(0, 253), error=st.integers(0, 0x2F), data=near_header, noise=near_header)
+@given(
+    id_=st.integers(0, 253),
+    error=st.integers(0, 0x2F),
+    data=bytes_like_headers,
+    noise=bytes_like_headers,
+)
 def test_packet_is_found_after_noise_without_header(
     id_: int, error: int, data: bytes, noise: bytes
 ) -> None:
     decoder = FeetechDecoder()
-    quiet = noise.replace(b"\xff", b"\x01")
-    found = list(decoder.feed(quiet + encode_packet(id_, error, data)))
-    assert found == [FeetechPacket(id_, error, data)]
-    assert decoder.garbled == bool(quiet)
+    noise_without_header = noise.replace(b"\xff", b"\x01")
+    packets = list(decoder.feed(noise_without_header + encode_packet(id_, error, data)))
+    assert packets == [FeetechPacket(id_, error, data)]
+    assert decoder.garbled == bool(noise_without_header)
 
 
-@given(data=near_header, cut=st.integers(1, 60))
-def test_packet_in_pieces_is_found_once(data: bytes, cut: int) -> None:
+@given(data=bytes_like_headers, split_at=st.integers(1, 60))
+def test_packet_in_pieces_is_found_once(data: bytes, split_at: int) -> None:
     decoder = FeetechDecoder()
     packet = encode_packet(7, 0, data)
-    assert [*decoder.feed(packet[:cut]), *decoder.feed(packet[cut:])] == [FeetechPacket(7, 0, data)]
+    assert [*decoder.feed(packet[:split_at]), *decoder.feed(packet[split_at:])] == [
+        FeetechPacket(7, 0, data)
+    ]
 
 
-@given(data=near_header, place=st.integers(2, 60), flip=st.integers(1, 255))
-def test_damaged_packet_is_not_taken_for_the_sent_one(data: bytes, place: int, flip: int) -> None:
+@given(data=bytes_like_headers, place=st.integers(2, 60), flip=st.integers(1, 255))
+def test_damaged_packet_is_not_decoded_as_the_sent_one(data: bytes, place: int, flip: int) -> None:
     packet = bytearray(encode_packet(7, 0, data))
     place = min(place, len(packet) - 1)
     packet[place] ^= flip
@@ -65,13 +72,13 @@ def test_damaged_packet_is_not_taken_for_the_sent_one(data: bytes, place: int, f
     ("value", "bit", "word"),
     [(-1, 15, 0x8001), (100, 15, 100), (-2047, 11, 0xFFF), (-5, 10, 0x405)],
 )
-def test_sign_is_a_bit_above_the_magnitude(value: int, bit: int, word: int) -> None:
+def test_sign_magnitude_value_is_encoded_and_decoded(value: int, bit: int, word: int) -> None:
     assert encode_sign_magnitude(value, bit) == word
     assert decode_sign_magnitude(word, bit) == value
 
 
-def test_angle_zero_is_the_middle_of_the_count_and_goals_stay_within_a_revolution() -> None:
-    assert at.to_angle_rad(2048) == 0.0
-    assert at.to_position(0.1) == 2048 + 65
-    assert at.to_position(-9.0) == 0
-    assert at.to_position(9.0) == 4095
+def test_angle_conversion_is_centered_and_limited_to_one_revolution() -> None:
+    assert registers.to_angle_rad(2048) == 0.0
+    assert registers.to_position(0.1) == 2048 + 65
+    assert registers.to_position(-9.0) == 0
+    assert registers.to_position(9.0) == 4095

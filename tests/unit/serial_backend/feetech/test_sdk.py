@@ -1,6 +1,6 @@
-"""Feetech's SDK, by PyPI `feetech-servo-sdk`, talks to emulated servos over a pseudo terminal, as to real ones.
+"""The SDK of Feetech, PyPI `feetech-servo-sdk`, commands emulated servos over a pseudo terminal.
 
-The package exists as source alone, which our lock of built packages cannot hold: without it these tests are skipped.
+The package exists only as source, and our lock file contains only built packages. Without it, these tests are skipped.
 """
 
 from collections.abc import Iterator
@@ -10,7 +10,7 @@ import pytest
 
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.model.fault_kinds import parse_injection
-from snakesim_serial_backend.feetech import registers as at
+from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.backend import FeetechBackend
 from snakesim_serial_backend.feetech.emulator import MODEL
 from snakesim_serial_backend.feetech.packets import ServoError
@@ -23,8 +23,8 @@ JOINTS = 3
 STEP_S = 0.01
 
 
-class Bench:
-    """Emulated servos, and the SDK's port on them. Time is the test's."""
+class ServoRig:
+    """Emulated servos, and a port of the SDK to them. The test advances the time."""
 
     def __init__(self) -> None:
         config = make_run_config(backend="feetech", robot__chain__modules=JOINTS, rate_hz=100)
@@ -38,21 +38,21 @@ class Bench:
         self.packets = sdk.PacketHandler(0)  # little-endian words, as STS servos have them
 
     def _make_port(self) -> Any:
-        bench = self
+        rig = self
 
         class Port(sdk.PortHandler):
-            """The SDK's port; nothing more comes when all is read that the servos have sent."""
+            """The port of the SDK. It times out exactly when it has read all that the servos have sent."""
 
             read_bytes = 0
 
             def clearPort(self) -> None:  # noqa: N802
-                while self.read_bytes < bench.pty.sent_bytes:
+                while self.read_bytes < rig.pty.sent_bytes:
                     self.readPort(1000)
 
             def writePort(self, packet: list[int]) -> int:  # noqa: N802
                 written = super().writePort(packet) or 0
-                bench.pty.expected_bytes = (bench.pty.expected_bytes or 0) + written
-                bench.emulator()
+                rig.pty.expected_bytes = (rig.pty.expected_bytes or 0) + written
+                rig.emulator()
                 return written
 
             def readPort(self, length: int) -> bytes:  # noqa: N802
@@ -61,7 +61,7 @@ class Bench:
                 return data
 
             def isPacketTimeout(self) -> bool:  # noqa: N802
-                return self.read_bytes >= bench.pty.sent_bytes
+                return self.read_bytes >= rig.pty.sent_bytes
 
         port = Port(self.pty.path)
         assert port.setBaudRate(1_000_000)
@@ -72,8 +72,8 @@ class Bench:
             self.clock.robot_time_ns += round(STEP_S * 1e9)
             self.emulator()
 
-    def position(self, servo: int) -> int:
-        value, result, _ = self.packets.read2ByteTxRx(self.port, servo, at.PRESENT)
+    def read_position(self, servo: int) -> int:
+        value, result, _ = self.packets.read2ByteTxRx(self.port, servo, registers.PRESENT)
         assert result == sdk.COMM_SUCCESS
         return value
 
@@ -83,61 +83,61 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
-    one = Bench()
-    yield one
-    one.close()
+def rig() -> Iterator[ServoRig]:
+    opened = ServoRig()
+    yield opened
+    opened.close()
 
 
-def test_sdk_ping_returns_the_model(bench: Bench) -> None:
-    assert bench.packets.ping(bench.port, 2) == (MODEL, sdk.COMM_SUCCESS, 0)
-    assert bench.packets.ping(bench.port, 9)[1] == sdk.COMM_RX_TIMEOUT
+def test_sdk_ping_returns_the_model(rig: ServoRig) -> None:
+    assert rig.packets.ping(rig.port, 2) == (MODEL, sdk.COMM_SUCCESS, 0)
+    assert rig.packets.ping(rig.port, 9)[1] == sdk.COMM_RX_TIMEOUT
 
 
-def test_sdk_goals_move_all_servos_and_sync_reads_return_positions(bench: Bench) -> None:
-    before = [bench.position(servo) for servo in (1, 2, 3)]
-    goals = sdk.GroupSyncWrite(bench.port, bench.packets, at.GOALS, 2)
-    for servo, position in zip((1, 2, 3), before, strict=True):
+def test_sdk_goals_move_all_servos_and_sync_reads_return_positions(rig: ServoRig) -> None:
+    start_positions = [rig.read_position(servo) for servo in (1, 2, 3)]
+    goals = sdk.GroupSyncWrite(rig.port, rig.packets, registers.GOALS, 2)
+    for servo, position in zip((1, 2, 3), start_positions, strict=True):
         assert goals.addParam(servo, list((position + 50 * servo).to_bytes(2, "little")))
     assert goals.txPacket() == sdk.COMM_SUCCESS
-    bench.position(1)  # the answer comes after the goals
-    bench.pass_time(1.0)
-    read = sdk.GroupSyncRead(bench.port, bench.packets, at.PRESENT, 4)
+    rig.read_position(1)  # the servo has received the goals when it answers
+    rig.pass_time(1.0)
+    reading = sdk.GroupSyncRead(rig.port, rig.packets, registers.PRESENT, 4)
     for servo in (1, 2, 3):
-        read.addParam(servo)
-    assert read.txRxPacket() == sdk.COMM_SUCCESS
-    moved = [
-        read.getData(servo, at.PRESENT, 2) - start
-        for servo, start in zip((1, 2, 3), before, strict=True)
+        reading.addParam(servo)
+    assert reading.txRxPacket() == sdk.COMM_SUCCESS
+    distances = [
+        reading.getData(servo, registers.PRESENT, 2) - start
+        for servo, start in zip((1, 2, 3), start_positions, strict=True)
     ]
-    assert moved == pytest.approx([50, 100, 150], abs=15)
+    assert distances == pytest.approx([50, 100, 150], abs=15)
 
 
-def test_servos_hold_their_last_goal_without_the_sdk(bench: Bench) -> None:
-    """They have no watchdog, and the emulator does not invent one."""
-    bench.packets.write2ByteTxRx(bench.port, 1, at.GOALS, bench.position(1) + 100)
-    bench.pass_time(3.0)
-    assert bench.emulator.servos[0].is_torque_on
-    goal = bench.emulator.servos[0].read_word(at.GOALS)
-    assert bench.position(1) == pytest.approx(goal, abs=15)
+def test_servos_hold_their_last_goal_without_the_sdk(rig: ServoRig) -> None:
+    """Hold the goal without end, because these servos have no watchdog."""
+    rig.packets.write2ByteTxRx(rig.port, 1, registers.GOALS, rig.read_position(1) + 100)
+    rig.pass_time(3.0)
+    assert rig.emulator.servos[0].is_torque_on
+    goal = rig.emulator.servos[0].read_word(registers.GOALS)
+    assert rig.read_position(1) == pytest.approx(goal, abs=15)
 
 
-def test_eeprom_changes_only_with_open_lock_and_torque_off(bench: Bench) -> None:
-    write = bench.packets.write1ByteTxRx
-    write(bench.port, 1, at.DELAY, 0)
-    assert bench.emulator.servos[0].table[at.DELAY] == 250, "locked"
-    write(bench.port, 1, at.LOCK, 0)
-    write(bench.port, 1, at.TORQUE_ENABLE, 1)
-    write(bench.port, 1, at.DELAY, 0)
-    assert bench.emulator.servos[0].table[at.DELAY] == 250, "torque is on"
-    write(bench.port, 1, at.TORQUE_ENABLE, 0)
-    write(bench.port, 1, at.DELAY, 0)
-    assert bench.emulator.servos[0].table[at.DELAY] == 0
+def test_eeprom_changes_only_with_open_lock_and_torque_off(rig: ServoRig) -> None:
+    write_byte = rig.packets.write1ByteTxRx
+    write_byte(rig.port, 1, registers.DELAY, 0)
+    assert rig.emulator.servos[0].table[registers.DELAY] == 250, "the EEPROM is locked"
+    write_byte(rig.port, 1, registers.LOCK, 0)
+    write_byte(rig.port, 1, registers.TORQUE_ENABLE, 1)
+    write_byte(rig.port, 1, registers.DELAY, 0)
+    assert rig.emulator.servos[0].table[registers.DELAY] == 250, "torque is on"
+    write_byte(rig.port, 1, registers.TORQUE_ENABLE, 0)
+    write_byte(rig.port, 1, registers.DELAY, 0)
+    assert rig.emulator.servos[0].table[registers.DELAY] == 0
 
 
-def test_sdk_reads_overheating_in_every_answer_and_torque_is_off(bench: Bench) -> None:
-    bench.packets.write1ByteTxRx(bench.port, 1, at.TORQUE_ENABLE, 1)
-    bench.emulator.inject(parse_injection("overheat:joint_1@0-9"), begins=True)
-    bench.pass_time(0.1)
-    value, result, error = bench.packets.read1ByteTxRx(bench.port, 1, at.TORQUE_ENABLE)
+def test_sdk_answer_of_overheated_servo_has_error_and_no_torque(rig: ServoRig) -> None:
+    rig.packets.write1ByteTxRx(rig.port, 1, registers.TORQUE_ENABLE, 1)
+    rig.emulator.inject(parse_injection("overheat:joint_1@0-9"), begins=True)
+    rig.pass_time(0.1)
+    value, result, error = rig.packets.read1ByteTxRx(rig.port, 1, registers.TORQUE_ENABLE)
     assert (value, result, error) == (0, sdk.COMM_SUCCESS, ServoError.OVERHEATING)

@@ -1,6 +1,6 @@
-"""The Feetech driver against emulated servos in lockstep, with the robot's lifecycle as the host would have it.
+"""The Feetech driver commands emulated servos in lockstep, through the lifecycle states of a robot.
 
-Errors, restarts and lost joints are in `tests/contract/test_can_driver_types.py`.
+`tests/contract/test_can_driver_types.py` tests errors, restarts and lost joints.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,7 +13,7 @@ from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.programs.preflight import apply_backend_modes
 from snakesim_hal.wire.messages import JointMode
-from snakesim_serial_backend.feetech import registers as at
+from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.backend import FeetechBackend
 from snakesim_serial_backend.feetech.emulator import EmulatedFeetech, EmulatedFeetechServo
 from snakesim_serial_backend.feetech.settings import FeetechSettings
@@ -22,12 +22,12 @@ from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 JOINTS = 4
-NOTICED = 10  # ticks in which a fault shows: each servo reports its state every fourth
-REAL = ["/dev/ttyACM0"]
+FAULT_REPORT_TICKS = 10  # until a fault is reported: each servo reports its state every fourth tick
+REAL_PORTS = ["/dev/ttyACM0"]  # such a port may have real servos
 
 
-class Robot(DriveRig):
-    """The backend and its servos."""
+class ServoRobot(DriveRig):
+    """A robot with a Feetech backend and its emulated servos."""
 
     def __init__(self, settings: FeetechSettings | None = None, **dotted: Any) -> None:
         config = make_run_config(
@@ -41,36 +41,38 @@ class Robot(DriveRig):
     def emulator(self) -> EmulatedFeetech:
         return drives_of(self.backend)._emulator
 
-    def torques_on(self) -> list[bool]:
+    def list_torque_states(self) -> list[bool]:
+        """Return for each servo whether its torque is on."""
         return [servo.is_torque_on for servo in self.emulator.servos]
 
 
 @pytest.fixture
-def robot() -> Iterator[Robot]:
-    one = Robot()
-    yield one
-    one.backend.close()
+def robot() -> Iterator[ServoRobot]:
+    opened = ServoRobot()
+    yield opened
+    opened.backend.close()
 
 
 @pytest.fixture
-def delivered(
+def change_delivered_servos(
     monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[[Callable[[list[EmulatedFeetechServo]], None]], None]:
-    """Change servos before the driver finds them."""
+    """Return a function that changes the servos of later robots, before the driver finds them."""
 
-    def change(servos: Callable[[list[EmulatedFeetechServo]], None]) -> None:
-        made = EmulatedFeetech.__init__
+    create_emulator = EmulatedFeetech.__init__
 
-        def otherwise(emulator: EmulatedFeetech, *rest: Any) -> None:
-            made(emulator, *rest)
-            servos(emulator.servos)
+    def change_servos(change: Callable[[list[EmulatedFeetechServo]], None]) -> None:
+        def create_changed_emulator(emulator: EmulatedFeetech, *arguments: Any) -> None:
+            create_emulator(emulator, *arguments)
+            change(emulator.servos)
 
-        monkeypatch.setattr(EmulatedFeetech, "__init__", otherwise)
+        monkeypatch.setattr(EmulatedFeetech, "__init__", create_changed_emulator)
 
-    return change
+    return change_servos
 
 
-def check(**settings: Any) -> None:
+def check_settings(**settings: Any) -> None:
+    """Check the configuration of a robot with these settings of its servos."""
     config = apply_backend_modes(
         make_run_config(backend="feetech", robot__chain__modules=JOINTS), FeetechBackend
     )
@@ -79,14 +81,14 @@ def check(**settings: Any) -> None:
 
 def test_real_servos_are_refused_until_the_missing_watchdog_is_accepted() -> None:
     with raises_error(ConfigError, code="drive/no-watchdog", field="accept_no_watchdog"):
-        check(ports=REAL, stall_torque_nm=2.0)
+        check_settings(ports=REAL_PORTS, stall_torque_nm=2.0)
     with raises_error(ConfigError, code="drive/unsupported-setting", field="stall_torque_nm"):
-        check(ports=REAL, accept_no_watchdog=True)
-    check(ports=REAL, accept_no_watchdog=True, stall_torque_nm=2.0)
-    check(ports=["/dev/pts/7"])
+        check_settings(ports=REAL_PORTS, accept_no_watchdog=True)
+    check_settings(ports=REAL_PORTS, accept_no_watchdog=True, stall_torque_nm=2.0)
+    check_settings(ports=["/dev/pts/7"])
 
 
-def test_every_joint_is_described_without_watchdog_and_without_torque(robot: Robot) -> None:
+def test_servos_are_described_without_watchdog_and_torque(robot: ServoRobot) -> None:
     description = robot.backend.describe()
     assert [joint.watchdog for joint in description.joints] == [False] * JOINTS
     assert all("torque" not in joint.measures for joint in description.joints)
@@ -117,145 +119,155 @@ def test_mixed_robot_names_the_joints_without_watchdog() -> None:
     assert "; no watchdog: joint_2: it holds" in describe_what_moves(description)
 
 
-def test_servos_hold_while_driver_is_away_and_are_off_once_it_runs(robot: Robot) -> None:
+def test_servos_hold_without_driver_and_are_off_once_it_runs(robot: ServoRobot) -> None:
     robot.run(20, "armed")
     robot.tick += 100
     robot.backend._clock.robot_time_ns += 1_000_000_000
     robot.emulator()
-    assert robot.torques_on() == [True] * JOINTS, "nothing stops a servo whose driver is away"
-    faults = robot.run(NOTICED, "armed")
+    assert robot.list_torque_states() == [True] * JOINTS, (
+        "servos without a watchdog hold while their driver is paused"
+    )
+    faults = robot.run(FAULT_REPORT_TICKS, "armed")
     assert {(fault.what, fault.joint) for fault in faults} == {
         ("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)
     }
     assert all("held its last angle for 1.0" in fault.cause for fault in faults), faults
-    assert robot.torques_on() == [False] * JOINTS
+    assert robot.list_torque_states() == [False] * JOINTS
     assert robot.run(5, "fault") == []
     assert robot.run(20, "disarmed") == []
-    assert robot.torques_on() == [False] * JOINTS
+    assert robot.list_torque_states() == [False] * JOINTS
     assert robot.run(30, "armed") == []
-    assert robot.torques_on() == [True] * JOINTS
+    assert robot.list_torque_states() == [True] * JOINTS
 
 
-def test_short_pause_of_the_driver_is_no_fault(robot: Robot) -> None:
+def test_short_pause_of_the_driver_is_no_fault(robot: ServoRobot) -> None:
     robot.run(20, "armed")
     robot.tick += 7
     robot.backend._clock.robot_time_ns += 70_000_000
-    assert robot.run(NOTICED, "armed") == []
-    assert robot.torques_on() == [True] * JOINTS
+    assert robot.run(FAULT_REPORT_TICKS, "armed") == []
+    assert robot.list_torque_states() == [True] * JOINTS
 
 
-def test_servos_behind_a_cut_bus_hold_and_are_off_once_it_is_back(robot: Robot) -> None:
+def test_servos_hold_on_cut_bus_and_are_off_after_it(robot: ServoRobot) -> None:
     robot.run(20, "armed")
     robot.go_wrong("cut:bus_1@0-9")
     assert "interface_down" in {fault.what for fault in robot.run(30, "armed")}
-    assert robot.torques_on() == [True] * JOINTS
+    assert robot.list_torque_states() == [True] * JOINTS
     robot.go_wrong("cut:bus_1@0-9", begins=False)
     robot.run(20, "fault")
-    assert robot.torques_on() == [False] * JOINTS
+    assert robot.list_torque_states() == [False] * JOINTS
 
 
 @pytest.mark.parametrize("lifecycle", ["disarmed", "estop"])
-def test_torque_is_off_whenever_the_robot_is_not_armed(robot: Robot, lifecycle: Any) -> None:
+def test_torque_is_off_whenever_the_robot_is_not_armed(robot: ServoRobot, lifecycle: Any) -> None:
     robot.run(20, "armed")
     robot.run(3, lifecycle)
-    assert robot.torques_on() == [False] * JOINTS
+    assert robot.list_torque_states() == [False] * JOINTS
 
 
-def test_closing_switches_the_torque_off() -> None:
-    robot = Robot()
+def test_closing_the_backend_switches_torque_off() -> None:
+    robot = ServoRobot()
     robot.run(20, "armed")
     servos = robot.emulator.servos
     robot.backend.close()
     assert [servo.is_torque_on for servo in servos] == [False] * JOINTS
 
 
-def test_joint_that_becomes_passive_has_no_torque(robot: Robot) -> None:
+def test_joint_that_becomes_passive_has_no_torque(robot: ServoRobot) -> None:
     robot.run(20, "armed")
     robot.mode = JointMode.PASSIVE
     robot.run(3, "armed")
-    assert robot.torques_on() == [False] * JOINTS
+    assert robot.list_torque_states() == [False] * JOINTS
     robot.mode = JointMode.POSITION
     assert robot.run(30, "armed") == []
-    assert robot.torques_on() == [True] * JOINTS
+    assert robot.list_torque_states() == [True] * JOINTS
 
 
-def test_silent_servo_gets_no_goal_before_it_has_reported_its_state(robot: Robot) -> None:
+def test_silent_servo_gets_no_goal_until_it_reports_its_state(robot: ServoRobot) -> None:
     robot.run(20, "armed")
     robot.go_wrong("mute:joint_2@0-9")
     robot.run(2, "armed")
     robot.target = 0.3
-    goal = robot.emulator.servos[1].read_word(at.GOALS)
+    goal = robot.emulator.servos[1].read_word(registers.GOALS)
     robot.run(1, "armed")
-    assert robot.emulator.servos[1].read_word(at.GOALS) == goal
-    assert robot.emulator.servos[2].read_word(at.GOALS) == at.to_position(0.3)
+    assert robot.emulator.servos[1].read_word(registers.GOALS) == goal
+    assert robot.emulator.servos[2].read_word(registers.GOALS) == registers.to_position(0.3)
 
 
-def test_torque_limit_is_a_part_of_the_stall_torque() -> None:
+def test_torque_limit_register_is_a_fraction_of_stall_torque() -> None:
     settings = FeetechSettings(physics_model="inertia", stall_torque_nm=8.0)
-    robot = Robot(settings)
+    robot = ServoRobot(settings)
     robot.limit_nm = 2.0
     robot.run(5, "armed")
-    assert {servo.read_word(at.TORQUE_LIMIT) for servo in robot.emulator.servos} == {250}
+    assert {servo.read_word(registers.TORQUE_LIMIT) for servo in robot.emulator.servos} == {250}
     robot.backend.close()
 
 
-def test_registers_are_written_only_where_they_differ(robot: Robot, delivered: Any) -> None:
+def test_registers_are_written_only_where_they_differ(
+    robot: ServoRobot, change_delivered_servos: Any
+) -> None:
     servo = robot.emulator.servos[0]
-    assert servo.table[at.DELAY] == 0
-    assert servo.table[at.LOCK] == at.LOCKED
-    delivered(lambda servos: servos[0].table.__setitem__(at.PHASE, 12 | at.MULTI_TURN_FEEDBACK))
-    other = Robot()
-    assert other.emulator.servos[0].table[at.PHASE] == 12
-    other.backend.close()
+    assert servo.table[registers.DELAY] == 0
+    assert servo.table[registers.LOCK] == registers.LOCKED
+    change_delivered_servos(
+        lambda servos: servos[0].table.__setitem__(
+            registers.PHASE, 12 | registers.MULTI_TURN_FEEDBACK
+        )
+    )
+    changed_robot = ServoRobot()
+    assert changed_robot.emulator.servos[0].table[registers.PHASE] == 12
+    changed_robot.backend.close()
 
 
 @pytest.mark.parametrize(
     ("address", "value", "reason"),
     [
-        (at.ID, 9, "does not answer: it is off, or has another id or baud rate"),
-        (at.MODEL, 5, "is of another model: model 773; the driver knows STS3215, STS3250"),
+        (registers.ID, 9, "does not answer: it is off, or has another id or baud rate"),
+        (registers.MODEL, 5, "is of another model: model 773; the driver knows STS3215, STS3250"),
         (
-            at.MAX_POSITION,
+            registers.MAX_POSITION,
             100,
             "has position limits of 0 to 2148 (registers 9 and 11), and its joint travels from",
         ),
         (
-            at.UNLOADING,
+            registers.UNLOADING,
             0,
             "keeps its torque on in spite of overheating, overload (register 19 is 0)",
         ),
-        (at.MAX_TEMPERATURE, 95, "allows itself 95 °C (register 13)"),
-        (at.OVERLOAD_TORQUE, 0, "has the overload torque 0 (register 36)"),
-        (at.PROTECTIVE_TORQUE, 90, "keeps a protective torque of 90 %"),
-        (at.MIN_VOLTAGE, 250, "allows 25.0 to"),
-        (at.MAX_TORQUE, 0, "has a torque limit of 768 per mille (register 16)"),
+        (registers.MAX_TEMPERATURE, 95, "allows itself 95 °C (register 13)"),
+        (registers.OVERLOAD_TORQUE, 0, "has the overload torque 0 (register 36)"),
+        (registers.PROTECTIVE_TORQUE, 90, "keeps a protective torque of 90 %"),
+        (registers.MIN_VOLTAGE, 250, "allows 25.0 to"),
+        (registers.MAX_TORQUE, 0, "has a torque limit of 768 per mille (register 16)"),
     ],
 )
 def test_unsafe_register_is_named_at_start(
-    delivered: Any, address: int, value: int, reason: str
+    change_delivered_servos: Any, address: int, value: int, reason: str
 ) -> None:
-    def change(servos: list[EmulatedFeetechServo]) -> None:
+    def change_register(servos: list[EmulatedFeetechServo]) -> None:
         servos[1].table[address] = value
-        if address == at.MAX_POSITION:
-            servos[1].write_word(address, at.MIDDLE + value)
+        if address == registers.MAX_POSITION:
+            servos[1].write_word(address, registers.MIDDLE + value)
 
-    delivered(change)
-    with pytest.raises(BackendError) as raised:
-        Robot()
-    assert "joint_2 (id 2 on /dev/pts/" in str(raised.value)
-    assert reason in str(raised.value)
+    change_delivered_servos(change_register)
+    with pytest.raises(BackendError) as refusal:
+        ServoRobot()
+    assert "joint_2 (id 2 on /dev/pts/" in str(refusal.value)
+    assert reason in str(refusal.value)
 
 
-def test_homing_offset_is_kept_and_another_one_is_refused(delivered: Any) -> None:
-    delivered(lambda servos: servos[0].write_word(at.HOMING_OFFSET, 100 | 1 << 11))
-    robot = Robot()
+def test_homing_offset_is_kept_and_another_one_is_refused(change_delivered_servos: Any) -> None:
+    change_delivered_servos(
+        lambda servos: servos[0].write_word(registers.HOMING_OFFSET, 100 | 1 << 11)
+    )
+    robot = ServoRobot()
     robot.run(1, "disarmed")
     assert robot.joints is not None
-    assert robot.joints.angle_rad[0] == pytest.approx(100 * at.RAD, abs=0.002)
-    assert robot.emulator.servos[0].read_word(at.HOMING_OFFSET) == 100 | 1 << 11
+    assert robot.joints.angle_rad[0] == pytest.approx(100 * registers.RAD, abs=0.002)
+    assert robot.emulator.servos[0].read_word(registers.HOMING_OFFSET) == 100 | 1 << 11
     robot.backend.close()
     with raises_error(BackendError, code="drive/not-complete", field="homing_offsets"):
-        Robot(FeetechSettings(physics_model="inertia", homing_offsets={"joint_1": 7}))
+        ServoRobot(FeetechSettings(physics_model="inertia", homing_offsets={"joint_1": 7}))
 
 
 @pytest.mark.parametrize(
@@ -268,16 +280,16 @@ def test_travel_across_the_end_of_the_count_is_refused(drive: dict[str, Any]) ->
 
 
 @pytest.mark.parametrize("answers", ["collide", "follow each other"])
-def test_second_servo_with_the_same_id_stops_the_robot_and_blocks_start(
-    robot: Robot, answers: str
+def test_second_servo_with_same_id_stops_robot_and_blocks_start(
+    robot: ServoRobot, answers: str
 ) -> None:
     if answers == "collide":
         robot.emulator._second_servo_delays[1] = 0
     robot.run(20, "armed")
     robot.go_wrong("duplicate:joint_2@0-9")
-    faults = robot.run(NOTICED, "armed")
+    faults = robot.run(FAULT_REPORT_TICKS, "armed")
     assert faults[0].joint == "joint_2"
     assert faults[0].what in ("duplicate_node", "drive_silent")
-    assert robot.torques_on() == [False] * JOINTS
+    assert robot.list_torque_states() == [False] * JOINTS
     with raises_error(BackendError, code="drive/not-complete", field="joint_2"):
         robot.backend._drives.bring_up()
