@@ -68,12 +68,12 @@ def main() -> None:
     if given.commission:
         shown = commissioning(given.run, given.commission)
     with shown as address, open_chromium() as browser:
-        tab = browser.open(address, width, height)
+        tab = browser.open_page(address, width, height)
         if given.phone:
-            tab.size(width, height, scale=2.0, mobile=True)
+            tab.set_window_size(width, height, scale=2.0, mobile=True)
         tab.wait_for("RECORDING" if recorded else "DISARMED" if given.commission else "armed by")
         time.sleep(given.after)
-        tab.value(
+        tab.evaluate(
             "document.querySelectorAll('[class*=Notification-closeButton]').forEach(e => e.click())"
         )
         if given.dark:
@@ -83,16 +83,18 @@ def main() -> None:
             tab.click(label)
             time.sleep(1.0)
         if given.signals:
-            tab.value(
+            tab.evaluate(
                 f"document.querySelector('iframe').src = 'signals?within&with#{given.signals}'"
             )
-        tab.value(
+        tab.evaluate(
             f"document.querySelectorAll('[class*=viewport]').forEach(e => {{ e.scrollTop += {given.scroll}; }})"
         )
         time.sleep(given.after if recorded or given.scroll else 0.0)
         if not recorded:
-            wait_until(lambda: not any(late in tab.text() for late in LATE_ANSWERS), "an answer")
-        taken = tab.picture()
+            wait_until(
+                lambda: not any(late in tab.read_text() for late in LATE_ANSWERS), "an answer"
+            )
+        taken = tab.capture_screenshot()
         save_picture(taken, given.out)
 
 

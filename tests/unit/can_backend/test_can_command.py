@@ -22,9 +22,9 @@ from snakesim_hal.model.scenario import load_scenario as load_scenario
 from snakesim_hal.model.scenario import parse_set_option
 from snakesim_testing.can.frames import health, heartbeat
 from snakesim_testing.messages import raises_error
-from snakesim_testing.operator.registered import run_registered
+from snakesim_testing.operator.registered_command import run_registered_command
 
-run = partial(run_registered, COMMANDS)
+run = partial(run_registered_command, COMMANDS)
 TRIPLET = load_scenario("triplet").config
 
 # --- load --------------------------------------------------------------------------------------------------
