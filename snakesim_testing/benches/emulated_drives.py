@@ -4,7 +4,7 @@ from typing import Any
 
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_drivers.template.minimal_driver import MinimalDrives
-from snakesim_testing.can.driver_loop import chain_of
+from snakesim_testing.can.driver_loop import find_chain
 from snakesim_testing.contract.bench import TorqueSwitch
 from snakesim_testing.contract.kit_drives import KitDrives
 
@@ -28,7 +28,7 @@ class ModuleDrives:
 
     def __init__(self, backend: Any) -> None:
         """Begin to log, whenever modules have been polled, which of them are driven."""
-        self._chain = chain_of(backend)
+        self._chain = find_chain(backend)
         self._is_on = self.list_enabled()
         self._log: list[TorqueSwitch] = []
         follow_module = self._chain._apply_module_outputs

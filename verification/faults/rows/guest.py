@@ -20,18 +20,25 @@ from snakesim_hal.model.scenario import KeyOverride, load_scenario
 from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.programs import host_program as host_process
 from snakesim_testing.can.listened_bus import (
-    JOINTS,
+    JOINT_COUNT,
     NODES,
     RATE_HZ,
     SCENARIO,
     ReceivedFrame,
     RobotOnBus,
-    bench,
-    first_in,
-    passed_for_module_ms,
-    stop_commands,
+    find_first_reports,
+    measure_module_duration_ms,
+    open_robot_on_bus,
+    select_stop_commands,
 )
-from snakesim_testing.can.module_rig import BOOTED, MS, QUIET, ModuleFirmware, armed, setpoint
+from snakesim_testing.can.module_rig import (
+    BOOTED_AT_US,
+    RESTING_READINGS,
+    US_PER_MS,
+    ModuleFirmware,
+    arm_module,
+    make_setpoint,
+)
 from snakesim_testing.hal.small_robots import write_scenario_files
 from verification.faults.observer import Observer, TrialError
 from verification.faults.robot import START_LIMIT_S, ProcessRobot, robot
@@ -52,14 +59,14 @@ ATTEMPTS = 3
 def host_gone(number: signal.Signals, request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """SIGKILL or SIGSTOP for the host. The value: from the last setpoint to the fault, in the module's own time."""
     rng, by_kernel_ms, done = random.Random(7), list[float](), 0
-    with bench(request.folder, CHANNEL) as robot:
-        robot.modules()
-        robot.control()
+    with open_robot_on_bus(request.folder, CHANNEL) as robot:
+        robot.start_modules()
+        robot.start_control()
         while done < request.trials:
             trial: InjectionTrial | None = None
             try:
                 with _armed_host(request, robot) as pid:
-                    robot.listener.forget()
+                    robot.listener.discard_frames()
                     time.sleep(LIVE_S + rng.random() / RATE_HZ)
                     trial = _left_alone(robot, pid, number, by_kernel_ms)
             except TrialError as error:  # it could not be armed: with a new host, perhaps
@@ -74,7 +81,7 @@ def host_gone(number: signal.Signals, request: MeasurementRequest) -> Iterator[I
                     f"this machine is too busy: the robot stopped by itself {request.retried} times"
                 )
     request.note(
-        f"the real host process and control, {JOINTS} modules in a process of their own, at {RATE_HZ:g} Hz on "
+        f"the real host process and control, {JOINT_COUNT} modules in a process of their own, at {RATE_HZ:g} Hz on "
         f"{CHANNEL}; from the signal to the last module's fault by the kernel's clock: at most "
         f"{max(by_kernel_ms, default=0):.0f} ms. Each trial begins with a new host that is armed by an operator"
     )
@@ -94,11 +101,11 @@ def _left_alone(
     os.kill(pid, number)
     # Also for the heartbeats after it, from which the modules' own time is known.
     time.sleep(LEFT_S)
-    received = listener.listen()
+    received = listener.receive_frames()
     if not _went_well_until(received, now_ns):
         return None
-    stopped = first_in(received, fault, now_ns)
-    if len(stopped) < JOINTS:
+    stopped = find_first_reports(received, fault, now_ns)
+    if len(stopped) < JOINT_COUNT:
         return InjectionTrial(
             value=None,
             failure=f"not all in fault {LEFT_S:g} s after the signal: {listener.states()}",
@@ -115,7 +122,7 @@ def _left_alone(
             for h in received
             if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node
         ]
-        own_ms.append(passed_for_module_ms(received, node, max(points), stopped[node].at_ns))
+        own_ms.append(measure_module_duration_ms(received, node, max(points), stopped[node].at_ns))
     return InjectionTrial(value=max(own_ms), failure="; ".join(failures), recovered=True)
 
 
@@ -127,7 +134,9 @@ def _went_well_until(received: Sequence[ReceivedFrame], now_ns: int) -> bool:
         for h in received
         if h.opcode == Opcode.SET_POINT and recent_ns < h.at_ns
     }
-    return driven == set(NODES) and not stop_commands([h for h in received if h.at_ns > recent_ns])
+    return driven == set(NODES) and not select_stop_commands(
+        [h for h in received if h.at_ns > recent_ns]
+    )
 
 
 @contextlib.contextmanager
@@ -151,13 +160,13 @@ def _armed_host(request: MeasurementRequest, robot: RobotOnBus) -> Iterator[int]
 def _arm(request: MeasurementRequest, robot: RobotOnBus, observer: Observer) -> None:
     """Until every module says that it is armed. Looks rarely: this machine is slow, and modules and host need it."""
     deadline = time.monotonic() + ARM_LIMIT_S
-    while robot.listener.states() != [ModuleState.ARMED] * JOINTS:
+    while robot.listener.states() != [ModuleState.ARMED] * JOINT_COUNT:
         if time.monotonic() > deadline:
             log = robot.read_log("host")[-300:]
             raise TrialError(f"not armed within {ARM_LIMIT_S:g} s: {observer.in_words()}; {log}")
         if observer.state() != "armed":
             observer.arm(ARM_LIMIT_S)
-        robot.listener.forget()
+        robot.listener.discard_frames()
         observer.watch(LOOK_S)
     request.retry(observer.stumbles)
 
@@ -175,20 +184,20 @@ def watchdog(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     """A module whose host is silent from some instant on. The value: until it is passive, in its own exact time."""
     rng = random.Random(8)
     for _ in range(request.trials):
-        module: ModuleFirmware = armed()
-        now_us = BOOTED
+        module: ModuleFirmware = arm_module()
+        now_us = BOOTED_AT_US
         for count in range(rng.randrange(5, 40)):
-            now_us += 10 * MS
-            module.handle_sync(count, QUIET)
+            now_us += 10 * US_PER_MS
+            module.handle_sync(count, RESTING_READINGS)
             module.poll(now_us)
-            module.receive_setpoint(setpoint(count), now_us)
+            module.receive_setpoint(make_setpoint(count), now_us)
         assert module.state == ModuleState.ARMED, module.state
         last_us = now_us
-        while module.state == ModuleState.ARMED and now_us - last_us < 1000 * MS:
-            now_us += MS / 10
+        while module.state == ModuleState.ARMED and now_us - last_us < 1000 * US_PER_MS:
+            now_us += US_PER_MS / 10
             module.poll(now_us)
         failure = "" if module.state == ModuleState.FAULT else f"it is {module.state.name}"
-        yield InjectionTrial(value=(now_us - last_us) / MS, failure=failure)
+        yield InjectionTrial(value=(now_us - last_us) / US_PER_MS, failure=failure)
 
 
 def clock_step(request: MeasurementRequest) -> Iterator[InjectionTrial]:
@@ -196,7 +205,11 @@ def clock_step(request: MeasurementRequest) -> Iterator[InjectionTrial]:
     scenario = write_scenario_files(
         request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', "")
     )
-    settings = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
+    settings = {
+        "robot.chain.modules": JOINT_COUNT,
+        "backend": request.backend,
+        "duration_s": 3600.0,
+    }
     config = load_scenario(
         scenario, [KeyOverride(key, value, "the fault table") for key, value in settings.items()]
     ).config
@@ -214,8 +227,9 @@ def clock_step(request: MeasurementRequest) -> Iterator[InjectionTrial]:
         if request.trials % 2:
             _step_clock(-STEP_S)
     request.note(
-        f"{JOINTS} joints at {RATE_HZ:g} Hz, holding; the clock goes {STEP_S:g} s ahead and back by turns. A step that "
-        f"met a stop, as an emulated machine brings about by itself, was tried again, at most {ATTEMPTS} times"
+        f"{JOINT_COUNT} joints at {RATE_HZ:g} Hz, holding; the clock goes {STEP_S:g} s ahead and back by turns. A "
+        "step that met a stop, as an emulated machine brings about by itself, was tried again, at most "
+        f"{ATTEMPTS} times"
     )
 
 
@@ -223,7 +237,7 @@ def _stepped(started_robot: ProcessRobot, observer: Observer, by_s: float) -> In
     while observer.state() != "armed":
         observer.arm(START_LIMIT_S)
     observer.watch(LIVE_S + started_robot.random.random() / RATE_HZ)
-    observer.forget()
+    observer.discard_frames()
     _step_clock(by_s)
     observer.watch(AFTER_STEP_S)
     faults = len(observer.status.faults) if observer.status is not None else 1

@@ -36,9 +36,9 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import FaultInjection
-from snakesim_testing.can.driver_loop import config
-from snakesim_testing.can.frames import heartbeat, read
-from snakesim_testing.can.module_rig import chain
+from snakesim_testing.can.driver_loop import make_can_config
+from snakesim_testing.can.frames import decode_signals, make_heartbeat_frame
+from snakesim_testing.can.module_rig import make_chain
 from snakesim_testing.messages import raises_error
 
 NAMES = [f"joint_{i}" for i in range(1, 5)]
@@ -53,7 +53,7 @@ class Modules:
     """Four stepped emulators at the other end of a bus. to_modules, to_host: what becomes of each frame."""
 
     def __init__(self) -> None:
-        self.chain = chain()
+        self.chain = make_chain()
         self.channel = f"bring-up-{uuid.uuid4().hex[:8]}"
         self.far = VirtualWire(self.channel)
         self.near = VirtualWire(self.channel, self)
@@ -95,7 +95,7 @@ def losing(number: int, which: Callable[[CanFrame], bool] = lambda _frame: True)
 
 
 def actions(frames: list[CanFrame]) -> list[float]:
-    return [read(f)["action"] for f in frames if parse_opcode(f.id) == Opcode.COMMAND]
+    return [decode_signals(f)["action"] for f in frames if parse_opcode(f.id) == Opcode.COMMAND]
 
 
 # --- who is there ------------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def test_bring_up_lost_identity_answer_is_requested_again(modules: Modules) -> N
 
 
 def test_bring_up_foreign_frames_are_forwarded_and_truncated_ones_ignored(modules: Modules) -> None:
-    beat = heartbeat(3, 1.0)
+    beat = make_heartbeat_frame(3, 1.0)
     cut = CanFrame(load_layouts()[Opcode.IDENTITY].encode(9).id, b"\x01\x02")
     for frame in (beat, cut):
         modules.far.send(frame)
@@ -253,7 +253,7 @@ def test_bring_up_lists_all_problems_in_one_error() -> None:
 
 
 def wanted(**changed: float) -> dict[int, dict[ModuleParameter, float]]:
-    run = config()
+    run = make_can_config()
     given = plan_parameters(run.robot, CanSettings(), plan_reports(run, CanSettings()))
     given[2] |= {ModuleParameter[name.upper()]: value for name, value in changed.items()}
     return given
@@ -269,7 +269,7 @@ def test_every_parameter_is_written_and_the_others_are_read(modules: Modules) ->
     assert in_force[1][ModuleParameter.STIFFNESS] == 40.0
     assert [in_force[node][ModuleParameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
     assert in_force[1][ModuleParameter.RATED_TORQUE] == pytest.approx(4.0)
-    requests = [read(f) for f in modules.heard]
+    requests = [decode_signals(f) for f in modules.heard]
     assert {parse_opcode(f.id) for f in modules.heard} == {Opcode.PARAMETER_REQUEST}
     read_only = [r["index"] for r in requests if r["operation"] == ParameterOperation.READ]
     assert set(read_only) == {ModuleParameter.RATED_TORQUE, ModuleParameter.RATED_SPEED}
@@ -301,7 +301,7 @@ def test_bring_up_repeated_truncated_or_foreign_answers_are_ignored(modules: Mod
 
 
 def test_other_frames_are_not_lost_while_it_waits(modules: Modules) -> None:
-    beat = heartbeat(3, 9.0)
+    beat = make_heartbeat_frame(3, 9.0)
     modules.far.send(beat)
     handed_on: list[CanFrame] = []
     configure_modules([modules.bus], wanted(), 5.0, handed_on.append)

@@ -16,7 +16,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointMode, Power
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_testing.can.driver_loop import chain_of
+from snakesim_testing.can.driver_loop import find_chain
 from snakesim_testing.contract.rig import BackendRig
 from snakesim_testing.hal.small_robots import make_run_config
 
@@ -52,7 +52,7 @@ def hot_robot(backend: str, curve: str, celsius: float) -> Iterator[BackendRig]:
 def windings(backend: SimBackend | CanBackend) -> ThermalModel:
     if isinstance(backend, SimBackend):
         return backend._windings
-    return chain_of(backend).thermal
+    return find_chain(backend).thermal
 
 
 def until_told(rig: BackendRig, celsius: float) -> None:

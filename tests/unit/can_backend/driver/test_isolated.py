@@ -23,12 +23,12 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire.messages import JointMode, LifecycleRequest
-from snakesim_testing.can.driver_loop import JOINTS, chain_of, config
+from snakesim_testing.can.driver_loop import JOINT_COUNT, find_chain, make_can_config
 from snakesim_testing.can.module_faults import MODULE_FAULTS
 from snakesim_testing.contract.rig import BackendRig
 
 FAILS = 2  # joint_3
-OTHERS = [i for i in range(JOINTS) if i != FAILS]
+OTHERS = [i for i in range(JOINT_COUNT) if i != FAILS]
 DEADLINE = 5  # periods: 50 ms
 
 
@@ -65,7 +65,7 @@ class Lame(BackendRig):
 @contextmanager
 def lame_robot(max_isolated: int = 1) -> Iterator[Lame]:
     """Armed, and its other joints swing."""
-    run = config(robot__safety__max_isolated_joints=max_isolated)
+    run = make_can_config(robot__safety__max_isolated_joints=max_isolated)
     backend = CanBackend(run, CanSettings(physics_model="inertia"))
     try:
         robot = Lame(backend, "lockstep", run.period_ns)
@@ -81,7 +81,7 @@ def lame_robot(max_isolated: int = 1) -> Iterator[Lame]:
 )
 def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within: int) -> None:
     with lame_robot() as robot:
-        assert robot.states() == [ModuleState.ARMED] * JOINTS
+        assert robot.states() == [ModuleState.ARMED] * JOINT_COUNT
         assert all(robot.turning())
         robot.inject(f"{kind}:joint_{FAILS + 1}")
         robot.wave(within + 1)
@@ -94,7 +94,7 @@ def test_a_module_that_fails_stops_alone_if_it_can(kind: str, what: str, within:
         robot.assert_armed()
         assert all(robot.turning())
         assert {fault.joint for fault in robot.faults} == {f"joint_{FAILS + 1}"}
-        assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINTS - 1)
+        assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINT_COUNT - 1)
 
 
 @pytest.mark.parametrize("kind", ["mute", "reboot", "checksum"])
@@ -115,7 +115,7 @@ def test_the_joint_is_taken_back_by_a_clear(kind: str) -> None:
         robot.arm()
         robot.wave(30)
         robot.assert_armed()
-        assert robot.states() == [ModuleState.ARMED] * JOINTS
+        assert robot.states() == [ModuleState.ARMED] * JOINT_COUNT
         assert robot.authority.isolated_joints == []
         assert len(robot.faults) == reported, robot.faults[reported:]
 
@@ -131,7 +131,7 @@ def test_it_may_be_armed_again_without_the_joint() -> None:
         robot.assert_armed()
         assert all(robot.turning())
         assert robot.states()[FAILS] == ModuleState.DISARMED
-        assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINTS - 1)
+        assert [robot.states()[i] for i in OTHERS] == [ModuleState.ARMED] * (JOINT_COUNT - 1)
 
 
 def test_one_joint_too_many_stops_all() -> None:
@@ -148,7 +148,7 @@ def test_one_joint_too_many_stops_all() -> None:
 
 def swallowed(robot: Lame, *joints: int) -> None:
     """Modules fail with a fault that lasts until they are reset, and a person resets before a period has passed."""
-    chain = chain_of(robot.can)
+    chain = find_chain(robot.can)
     for joint in joints:
         chain.slots[joint].module._fail(ModuleFault.SENSOR, chain.now_us)
     for _ in range(20):
@@ -174,11 +174,11 @@ def test_isolated_joint_reset_within_one_period_still_clears(
             robot.wait_periods(20)
         swallowed(robot, *joints)
         assert robot.authority.state == "disarmed"
-        assert robot.states() == [ModuleState.DISARMED] * JOINTS
+        assert robot.states() == [ModuleState.DISARMED] * JOINT_COUNT
         robot.arm()
         robot.wave(30)
         robot.assert_armed()
-        assert robot.states() == [ModuleState.ARMED] * JOINTS
+        assert robot.states() == [ModuleState.ARMED] * JOINT_COUNT
         assert robot.authority.isolated_joints == []
 
 
@@ -223,4 +223,4 @@ def test_a_lost_module_is_switched_off_at_once() -> None:
         robot.wave(3)
         robot.assert_armed()
         assert robot.states()[FAILS] == ModuleState.DISARMED
-        assert chain_of(robot.can).slots[FAILS].module.demand == PASSIVE
+        assert find_chain(robot.can).slots[FAILS].module.demand == PASSIVE

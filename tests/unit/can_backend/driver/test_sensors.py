@@ -27,8 +27,16 @@ from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Imu, Power
 from snakesim_hal.wire.quantities import Vector
-from snakesim_testing.can.driver_loop import config
-from snakesim_testing.can.frames import accelerometer, answer, begin, contact, gyro, health, syncs
+from snakesim_testing.can.driver_loop import make_can_config
+from snakesim_testing.can.frames import (
+    answer_sync,
+    make_accelerometer_frame,
+    make_contact_frame,
+    make_gyro_frame,
+    make_health_frame,
+    run_syncs,
+    start_sync,
+)
 
 JOINTS = 4
 PERIOD_NS = 10_000_000
@@ -56,8 +64,8 @@ def contacts_of(samples: Samples) -> Contacts:
 
 
 def test_joint_state_of_newest_sync_has_its_values_and_age_zero() -> None:
-    reading, sensors = sensors_of(config())
-    syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
+    reading, sensors = sensors_of(make_can_config())
+    run_syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
     joints = sensors.make_samples(tick=7, timestamp_ns=70_000_000).joints
     assert joints.tick == 7
     assert joints.timestamp_ns == 70_000_000
@@ -70,10 +78,10 @@ def test_joint_state_of_newest_sync_has_its_values_and_age_zero() -> None:
 
 def test_joint_state_of_silent_module_is_valid_for_the_lease() -> None:
     lease_periods = 5
-    reading, sensors = sensors_of(config())
-    syncs(reading, 1, angle=0.5)
+    reading, sensors = sensors_of(make_can_config())
+    run_syncs(reading, 1, angle=0.5)
     for missed in range(1, 9):
-        syncs(reading, 1, [1, 2, 4], angle=0.6)  # node 3 is silent
+        run_syncs(reading, 1, [1, 2, 4], angle=0.6)  # node 3 is silent
         joints = sensors.make_samples(7 + missed, 0).joints
         assert joints.age_ns == [0, 0, missed * PERIOD_NS, 0]
         assert joints.valid == [True, True, missed <= lease_periods, True]
@@ -81,8 +89,8 @@ def test_joint_state_of_silent_module_is_valid_for_the_lease() -> None:
 
 
 def test_joint_state_never_received_is_invalid() -> None:
-    reading, sensors = sensors_of(config())
-    syncs(reading, 1, [1, 2, 4])
+    reading, sensors = sensors_of(make_can_config())
+    run_syncs(reading, 1, [1, 2, 4])
     joints = sensors.make_samples(0, 0).joints
     assert joints.valid == [True, True, False, True]
     assert joints.age_ns[2] == NEVER_RECEIVED_AGE_NS
@@ -93,12 +101,12 @@ def test_joint_state_never_received_is_invalid() -> None:
 
 
 def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
-    run = config(**EVERYTHING)
+    run = make_can_config(**EVERYTHING)
     reports = ReportSchedule(100.0, contact_every=3)
     reading, sensors = sensors_of(run, reports)
     for tick in range(300):
-        sync = begin(reading, contacts=are_contacts_due(reports, reading.sync + 1))
-        answer(reading)
+        sync = start_sync(reading, contacts=are_contacts_due(reports, reading.sync + 1))
+        answer_sync(reading)
         assert are_contacts_due(reports, sync) is (sync % 256 % 3 == 0)
         assert (keys.CONTACTS in sensors.make_samples(tick, 0).by_key) is are_contacts_due(
             reports, sync
@@ -109,20 +117,22 @@ def test_forces_are_told_at_the_syncs_that_ask_for_them() -> None:
 
 
 def test_contacts_without_touch_are_an_empty_list() -> None:
-    reading, sensors = sensors_of(config(**EVERYTHING))
-    begin(reading, contacts=True)
-    reading.process_frame(contact(2, reading.sync, touched=False, force_x=9.0))
+    reading, sensors = sensors_of(make_can_config(**EVERYTHING))
+    start_sync(reading, contacts=True)
+    reading.process_frame(make_contact_frame(2, reading.sync, touched=False, force_x=9.0))
     assert contacts_of(sensors.make_samples(3, 30)) == Contacts(
         tick=3, timestamp_ns=30, contacts=[], measured_force_n=0.0
     )
 
 
 def test_contact_is_in_the_frame_of_its_link() -> None:
-    run = config(**EVERYTHING)
+    run = make_can_config(**EVERYTHING)
     reading, sensors = sensors_of(run)
-    begin(reading, contacts=True)
+    start_sync(reading, contacts=True)
     reading.process_frame(
-        contact(2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2)
+        make_contact_frame(
+            2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2
+        )
     )
     (found,) = contacts_of(sensors.make_samples(3, 30)).contacts
     radius_m = run.robot.module.radius_m
@@ -138,10 +148,12 @@ def test_contact_is_in_the_frame_of_its_link() -> None:
 
 
 def test_contact_below_threshold_of_robot_is_omitted() -> None:
-    reading, sensors = sensors_of(config(**EVERYTHING, robot__sensors__contacts__threshold_n=1.0))
-    begin(reading, contacts=True)
+    reading, sensors = sensors_of(
+        make_can_config(**EVERYTHING, robot__sensors__contacts__threshold_n=1.0)
+    )
+    start_sync(reading, contacts=True)
     for node, force in ((1, 0.9), (2, 1.0), (3, -1.05)):
-        reading.process_frame(contact(node, reading.sync, force_z=force))
+        reading.process_frame(make_contact_frame(node, reading.sync, force_z=force))
     assert [found.link for found in contacts_of(sensors.make_samples(0, 0)).contacts] == [2, 3]
 
 
@@ -170,11 +182,11 @@ def capsule_point(
 def test_contact_anywhere_on_a_capsule_is_reported_within_bus_resolution(
     link: int, share: float, polar: float, bearing: float
 ) -> None:
-    run = config(**EVERYTHING)
+    run = make_can_config(**EVERYTHING)
     length_m, radius_m = run.robot.link_lengths_m[link], run.robot.module.radius_m
     point = capsule_point(share * length_m, polar, bearing, length_m, radius_m)
     reading, sensors = sensors_of(run)
-    sync = begin(reading, contacts=True)
+    sync = start_sync(reading, contacts=True)
     numbers = (*encode_contact(LinkLoad(link, point, (1.0, 2.0, 3.0))), sync)
     reading.process_frame(
         write_tail_contact(1, numbers) if link == 0 else write_contact(link, numbers)
@@ -210,12 +222,12 @@ def test_contact_position_is_on_the_capsule(
 
 
 def test_imu_sample_has_only_new_and_complete_reports() -> None:
-    reading, sensors = sensors_of(config(**EVERYTHING))
-    syncs(reading, 1)
+    reading, sensors = sensors_of(make_can_config(**EVERYTHING))
+    run_syncs(reading, 1)
     assert keys.IMU not in sensors.make_samples(0, 0).by_key
-    reading.process_frame(gyro(3, 0, 0.5))
-    reading.process_frame(accelerometer(3, 0, 9.81))
-    reading.process_frame(gyro(1, 0, 0.5))  # incomplete: without its acceleration
+    reading.process_frame(make_gyro_frame(3, 0, 0.5))
+    reading.process_frame(make_accelerometer_frame(3, 0, 9.81))
+    reading.process_frame(make_gyro_frame(1, 0, 0.5))  # incomplete: without its acceleration
     imu = sensors.make_samples(1, 10).by_key[keys.IMU]
     assert isinstance(imu, Imu)
     assert imu.tick == 1
@@ -227,8 +239,8 @@ def test_imu_sample_has_only_new_and_complete_reports() -> None:
 
 
 def test_power_sample_is_made_every_half_second() -> None:
-    reading, sensors = sensors_of(config())
-    syncs(reading, 1)
+    reading, sensors = sensors_of(make_can_config())
+    run_syncs(reading, 1)
     ticks_with_power = [
         tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).by_key
     ]
@@ -236,12 +248,14 @@ def test_power_sample_is_made_every_half_second() -> None:
 
 
 def test_power_sample_of_modules_without_report_is_invalid() -> None:
-    reading, sensors = sensors_of(config())
-    syncs(reading, 1)
+    reading, sensors = sensors_of(make_can_config())
+    run_syncs(reading, 1)
     reading.process_frame(
-        health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1)
+        make_health_frame(
+            2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1
+        )
     )
-    reading.process_frame(health(4, voltage=24.0))
+    reading.process_frame(make_health_frame(4, voltage=24.0))
     power = sensors.make_samples(50, 7).by_key[keys.POWER]
     assert isinstance(power, Power)
     assert power.tick == 50
@@ -256,20 +270,20 @@ def test_power_sample_of_modules_without_report_is_invalid() -> None:
 
 
 def test_power_values_of_a_module_expire() -> None:
-    reading, sensors = sensors_of(config())
-    syncs(reading, 1)
-    reading.process_frame(health(2, voltage=23.5))
+    reading, sensors = sensors_of(make_can_config())
+    run_syncs(reading, 1)
+    reading.process_frame(make_health_frame(2, voltage=23.5))
 
     def valid(tick: int) -> list[bool]:
         power = sensors.make_samples(tick, 0).by_key[keys.POWER]
         assert isinstance(power, Power)
         return power.valid
 
-    syncs(reading, 125)  # of 100 Hz: two reports and a half
+    run_syncs(reading, 125)  # of 100 Hz: two reports and a half
     assert valid(50) == [False, True, False, False]
-    syncs(reading, 1)
+    run_syncs(reading, 1)
     assert valid(100) == [False] * JOINTS
-    reading.process_frame(health(2, voltage=23.5))
+    reading.process_frame(make_health_frame(2, voltage=23.5))
     assert valid(150) == [False, True, False, False]
 
 
@@ -277,7 +291,7 @@ def test_power_values_of_a_module_expire() -> None:
 
 
 def test_sensors_are_described_with_their_rates() -> None:
-    run = config(**EVERYTHING)
+    run = make_can_config(**EVERYTHING)
     sensors = describe_sensors(run, ReportSchedule(100.0, 4, 20), pose_delay_s=0.02)
     found = {s.key: s.rate_hz for s in sensors}
     assert found == {

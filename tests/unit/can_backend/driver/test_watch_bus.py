@@ -14,8 +14,8 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
     frame_id,
 )
-from snakesim_testing.can.frames import answer, joint_state
-from snakesim_testing.can.monitor_rig import MonitorRig, answering, list_findings, quiet
+from snakesim_testing.can.frames import answer_sync, make_joint_state_frame
+from snakesim_testing.can.monitor_rig import MonitorRig, list_findings, make_reply, send_nothing
 
 # --- the bus -----------------------------------------------------------------------------------------------
 
@@ -33,17 +33,17 @@ from snakesim_testing.can.monitor_rig import MonitorRig, answering, list_finding
 def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> None:
     bench = MonitorRig()
     error = BusError(kind, "can0", "transmit errors 200, receive errors 3")
-    (found,) = bench.tick(errors=[error])
+    (found,) = bench.run_tick(errors=[error])
     assert found.what == kind
     assert found.joint is None
     assert found.cause.startswith("can0: transmit errors 200, receive errors 3; ")
     assert advice in found.cause
-    assert bench.tick(errors=[error]) == []
-    assert [f.cause[:5] for f in bench.tick(errors=[BusError(kind, "can1", "")])] == ["can1:"], (
-        "the other bus is new"
-    )
+    assert bench.run_tick(errors=[error]) == []
+    assert [f.cause[:5] for f in bench.run_tick(errors=[BusError(kind, "can1", "")])] == [
+        "can1:"
+    ], "the other bus is new"
     bench.reset()
-    assert list_findings(bench.tick(errors=[error])) == [(kind, None)]
+    assert list_findings(bench.run_tick(errors=[error])) == [(kind, None)]
 
 
 @pytest.mark.parametrize(
@@ -52,15 +52,15 @@ def test_a_bus_that_fails_is_a_fault_of_no_joint(kind: Kind, advice: str) -> Non
 def test_lesser_errors_are_only_counted(kind: Kind) -> None:
     bench = MonitorRig()
     for _ in range(2):
-        assert bench.tick(errors=[BusError(kind, "can0", "")]) == []
-    assert bench.watch.minor_error_counts == {kind: 2}
+        assert bench.run_tick(errors=[BusError(kind, "can0", "")]) == []
+    assert bench.monitor.minor_error_counts == {kind: 2}
 
 
 def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
     bench = MonitorRig()
     for unsent in ("can1", "can1", "", "can1", "can1"):
-        assert bench.tick(unsent=unsent) == [], "full for a moment"
-    (found,) = bench.tick(unsent="can1")
+        assert bench.run_tick(unsent=unsent) == [], "full for a moment"
+    (found,) = bench.run_tick(unsent="can1")
     assert found.what == "bus_stuck"
     assert found.joint is None
     for words in (
@@ -70,25 +70,25 @@ def test_a_bus_that_takes_nothing_for_three_periods_is_stuck() -> None:
         "txqueuelen is below 64",
     ):
         assert words in found.cause
-    assert bench.tick(unsent="can1") == []
+    assert bench.run_tick(unsent="can1") == []
 
 
 # --- who should not be there -------------------------------------------------------------------------------
 
 
 def stranger(reading: ModuleReports) -> None:
-    answer(reading, [2])
-    reading.process_frame(joint_state(9, reading.sync))
+    answer_sync(reading, [2])
+    reading.process_frame(make_joint_state_frame(9, reading.sync))
 
 
 def test_a_stranger_that_answers_every_sync_is_found() -> None:
     bench = MonitorRig()
-    assert bench.ticks(2, stranger) == []
-    (found,) = bench.tick(stranger)
+    assert bench.run_ticks(2, stranger) == []
+    (found,) = bench.run_tick(stranger)
     assert found == FaultFinding(
         "unknown_node", "node 9 is on the bus, but is not a joint of this robot"
     )
-    assert bench.ticks(5, stranger) == []
+    assert bench.run_ticks(5, stranger) == []
 
 
 @pytest.mark.parametrize(
@@ -114,49 +114,49 @@ def test_a_stranger_that_answers_every_sync_is_found() -> None:
     ],
 )
 def test_bus_watch_reports_a_second_host(frame: CanFrame, what: str, words: str) -> None:
-    bench, speak = MonitorRig(), answering(ModuleState.DISARMED, frame)
-    (found,) = bench.tick(speak)
+    bench, speak = MonitorRig(), make_reply(ModuleState.DISARMED, frame)
+    (found,) = bench.run_tick(speak)
     assert found.what == what
     assert found.joint is None
     assert words in found.cause
-    assert bench.tick(speak) == []
+    assert bench.run_tick(speak) == []
     bench.reset()
-    assert bench.tick() == [], "it was there once and is no more"
-    assert list_findings(bench.tick(speak)) == [(what, None)]
+    assert bench.run_tick() == [], "it was there once and is no more"
+    assert list_findings(bench.run_tick(speak)) == [(what, None)]
 
 
 def test_what_another_host_may_have_changed_is_written_anew() -> None:
     bench = MonitorRig()
-    bench.reading.process_frame(
+    bench.reports.process_frame(
         load_layouts()[Opcode.PARAMETER_REQUEST].encode(2, index=1, operation=1)
     )
-    assert list_findings(bench.tick()) == [("second_host", None)]
-    assert bench.watch.pop_changed_joints() == {0, 1, 2}
+    assert list_findings(bench.run_tick()) == [("second_host", None)]
+    assert bench.monitor.pop_changed_joints() == {0, 1, 2}
 
 
 def test_bus_watch_identity_request_is_no_second_host() -> None:
     bench = MonitorRig()
-    bench.reading.process_frame(make_command(CommandAction.IDENTIFY))
-    assert bench.tick() == []
-    assert bench.watch.pop_changed_joints() == set()
+    bench.reports.process_frame(make_command(CommandAction.IDENTIFY))
+    assert bench.run_tick() == []
+    assert bench.monitor.pop_changed_joints() == set()
 
 
 def test_a_module_is_not_silent_that_was_not_asked() -> None:
     bench = MonitorRig()
     for i in range(10):
-        assert list_findings(bench.tick(quiet, unsent="can0")) == (
+        assert list_findings(bench.run_tick(send_nothing, unsent="can0")) == (
             [("bus_stuck", None)] if i == 2 else []
         )
-    assert bench.ticks(2, quiet) == []
-    assert list_findings(bench.tick(quiet)) == [("module_silent", 1)]
+    assert bench.run_ticks(2, send_nothing) == []
+    assert list_findings(bench.run_tick(send_nothing)) == [("module_silent", 1)]
 
 
 def test_bus_watch_interface_down_is_not_also_reported_stuck() -> None:
     bench = MonitorRig()
     down, up = (BusError(kind, "can1", "") for kind in ("interface_down", "interface_up"))
-    assert list_findings(bench.tick(errors=[down], unsent="can1")) == [("interface_down", None)]
+    assert list_findings(bench.run_tick(errors=[down], unsent="can1")) == [("interface_down", None)]
     for _ in range(10):
-        assert bench.tick(unsent="can1") == []
-    bench.tick(errors=[up], unsent="can1")
-    found = [f for _ in range(3) for f in bench.tick(unsent="can1")]
+        assert bench.run_tick(unsent="can1") == []
+    bench.run_tick(errors=[up], unsent="can1")
+    found = [f for _ in range(3) for f in bench.run_tick(unsent="can1")]
     assert list_findings(found) == [("bus_stuck", None)]

@@ -18,8 +18,8 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_drivers.motion_capture.mocap_sample import MocapSample
 from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire.messages import Imu, JointMode
-from snakesim_testing.can.driver_loop import config
-from snakesim_testing.can.module_rig import RigHost, chain, only, setpoint
+from snakesim_testing.can.driver_loop import make_can_config
+from snakesim_testing.can.module_rig import RigHost, decode_frames_of, make_chain, make_setpoint
 from snakesim_testing.hal.small_robots import make_pose
 
 G = 9.81
@@ -99,7 +99,7 @@ SYNCS = {  # times of Syncs in us, and steps of 1 ms that have passed by then
 @pytest.mark.parametrize("syncs", SYNCS.values(), ids=list(SYNCS))
 def test_time_passes_only_from_sync_to_later_sync(syncs: list[tuple[int, int]]):
     physics_model = Pushed(4)
-    made = chain(physics_model=physics_model)
+    made = make_chain(physics_model=physics_model)
     for time_us, steps in syncs:
         made.receive(0, make_sync(0, time_us))
         made.receive(0, make_command(CommandAction.IDENTIFY))
@@ -108,55 +108,65 @@ def test_time_passes_only_from_sync_to_later_sync(syncs: list[tuple[int, int]]):
 
 def test_chain_two_buses_with_same_sync_share_one_step():
     physics_model = Pushed(5)
-    made = chain(config(5), physics_model=physics_model, channels=["vcan0", "vcan1"])
+    made = make_chain(make_can_config(5), physics_model=physics_model, channels=["vcan0", "vcan1"])
     for tick in range(3):
         for channel in (0, 1):
             made.receive(channel, make_sync(tick, tick * 10_000))
     assert physics_model.steps == 20
     assert made.modules_per_bus == [3, 2]
-    assert [s["count"] for s in only(made.pop_frames(1), Opcode.JOINT_STATE)] == [0, 0, 1, 1, 2, 2]
+    assert [s["count"] for s in decode_frames_of(made.pop_frames(1), Opcode.JOINT_STATE)] == [
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+    ]
     made.receive(1, make_command(CommandAction.ARM))
     assert [s.module.state for s in made.slots] == [1, 1, 1, 2, 2]
-    made.receive(0, setpoint(0, node_id=4))
+    made.receive(0, make_setpoint(0, node_id=4))
     assert made.slots[3].module._pending_demand is None, "node 4 is on the other bus"
 
 
 def test_chain_contact_force_is_measured_by_neighbor_links():
-    made = chain(config(**SENSORS), physics_model=Pushed(4))
+    made = make_chain(make_can_config(**SENSORS), physics_model=Pushed(4))
     made.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
     made.receive(0, make_sync(0, 0))
     frames = made.pop_frames(0)
-    contacts = only(frames, Opcode.CONTACT)
+    contacts = decode_frames_of(frames, Opcode.CONTACT)
     assert [c["touched"] for c in contacts] == [0, 1, 0, 0]
     assert contacts[1]["force_y"] == pytest.approx(12.0)
     assert contacts[1]["force_z"] == pytest.approx(204.75)
     assert contacts[1]["along"] == pytest.approx(0.05) and contacts[1]["bearing"] == pytest.approx(
         -np.pi
     ), "half a turn"
-    [tail] = only(frames, Opcode.TAIL_CONTACT)
+    [tail] = decode_frames_of(frames, Opcode.TAIL_CONTACT)
     assert tail["force_y"] == pytest.approx(-5.0)
     assert tail["bearing"] == 0.0
 
 
 def test_neighbours_take_turns_with_their_imus():
-    made = chain(config(**SENSORS), physics_model=Pushed(4))
+    made = make_chain(make_can_config(**SENSORS), physics_model=Pushed(4))
     for slot in made.slots:
         slot.module.parameters.values[ModuleParameter.IMU_EVERY] = 4.0
     for tick in range(4):
         made.receive(0, make_sync(tick, 0))
-        gyros = only(made.pop_frames(0), Opcode.GYRO)
+        gyros = decode_frames_of(made.pop_frames(0), Opcode.GYRO)
         assert len(gyros) == 1
         assert gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
     made.receive(0, make_sync(4, 0))
     frames = made.pop_frames(0)
-    assert only(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(G)
-    assert only(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
+    assert decode_frames_of(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(G)
+    assert decode_frames_of(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
 
 
 def test_the_pose_is_sent_once_a_sync_before_the_answers():
     sent: list[bytes] = []
-    made = chain(
-        config(6, **SENSORS), physics_model=Pushed(6), channels=["a", "b"], send_pose=sent.append
+    made = make_chain(
+        make_can_config(6, **SENSORS),
+        physics_model=Pushed(6),
+        channels=["a", "b"],
+        send_pose=sent.append,
     )
     for tick in range(3):
         for channel in (0, 1):
@@ -169,9 +179,9 @@ def test_the_pose_is_sent_once_a_sync_before_the_answers():
 
 def run_of(seed: int) -> tuple[list, list]:
     noisy: dict[str, Any] = {"robot__sensors": {"joints": {"angle_noise_rad": 1e-3}}, "seed": seed}
-    host = RigHost(chain(config(**noisy)))
+    host = RigHost(make_chain(make_can_config(**noisy)))
     host.arm()
-    return [host.tick(0.3 if k < 50 else -0.3) for k in range(100)], host.states()
+    return [host.run_tick(0.3 if k < 50 else -0.3) for k in range(100)], host.states()
 
 
 def test_the_same_commands_give_the_same_frames():
@@ -179,24 +189,26 @@ def test_the_same_commands_give_the_same_frames():
     assert (frames, states) == run_of(1)
     assert states == [ModuleState.ARMED] * 4
     assert frames != run_of(2)[0]
-    angles = [s["angle"] for s in only(frames[49], Opcode.JOINT_STATE)]
+    angles = [s["angle"] for s in decode_frames_of(frames[49], Opcode.JOINT_STATE)]
     assert angles == pytest.approx([0.3] * 4, abs=0.01)
 
 
 def test_the_watchdog_ends_within_the_step_in_stepped_time_too():
-    host = RigHost(chain())
+    host = RigHost(make_chain())
     host.arm()
     for _ in range(5):
-        host.tick(2.0, JointMode.TORQUE)
-    frames = [f for _ in range(12) for f in host.tick()]
+        host.run_tick(2.0, JointMode.TORQUE)
+    frames = [f for _ in range(12) for f in host.run_tick()]
     assert host.states() == [ModuleState.FAULT] * 4
-    ups = [b["uptime"] for b in only(frames, Opcode.HEARTBEAT, 1) if b["last_stop"] == 3]
+    ups = [
+        b["uptime"] for b in decode_frames_of(frames, Opcode.HEARTBEAT, 1) if b["last_stop"] == 3
+    ]
     assert ups[0] == pytest.approx(0.1 + 0.05 + 0.1, abs=0.0011)
 
 
 def test_chain_in_real_time_catches_up_only_short_pauses():
     physics_model = Pushed(4)
-    made = chain(physics_model=physics_model, is_stepped=False)
+    made = make_chain(physics_model=physics_model, is_stepped=False)
     made.advance_to(150_000.0)
     assert physics_model.steps == 150
     made.advance_to(1_150_000.0)
@@ -207,11 +219,11 @@ def test_chain_in_real_time_catches_up_only_short_pauses():
 
 
 def test_overheating_fades_torque_before_it_stops():
-    host = RigHost(chain(physics_model=Pushed(4)))
+    host = RigHost(make_chain(physics_model=Pushed(4)))
     host.arm()
     host.chain.thermal.winding_temperature_c[1] = 95.0
-    frames = host.ticks(10, 4.0, JointMode.TORQUE)
-    states = only(frames, Opcode.JOINT_STATE)
+    frames = host.run_ticks(10, 4.0, JointMode.TORQUE)
+    states = decode_frames_of(frames, Opcode.JOINT_STATE)
     assert [s["derated"] for s in states] == [0, 1, 0, 0]
     assert states[1]["torque"] / 4.0 == pytest.approx(1.0 - 0.8 * 15 / 25, abs=0.01)
     assert states[0]["torque"] > 3.9

@@ -11,14 +11,14 @@ from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 
 STEP_S, RESPONSE_S, RATED_NM, SPEED = 1e-3, 0.01, 4.0, 5.0
 REST = np.zeros(1)
 
 
 def motor(**robot):
-    run = config(1, **{f"robot__{key}": value for key, value in robot.items()})
+    run = make_can_config(1, **{f"robot__{key}": value for key, value in robot.items()})
     return PowerStages(run.robot, STEP_S), run
 
 

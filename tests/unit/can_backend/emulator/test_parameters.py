@@ -12,19 +12,25 @@ from snakesim_can_backend.protocol.definitions import (
     ParameterOperation,
     ParameterResult,
 )
-from snakesim_testing.can.module_rig import BOOTED, armed, booted, only, parameter
+from snakesim_testing.can.module_rig import (
+    BOOTED_AT_US,
+    arm_module,
+    boot_module,
+    decode_frames_of,
+    make_parameter_request,
+)
 
 
 def ask(module, *request, **given):
     module.frames.clear()
-    module.receive(parameter(*request, **given), BOOTED)
-    [answer] = only(module.frames, Opcode.PARAMETER_ANSWER)
+    module.receive(make_parameter_request(*request, **given), BOOTED_AT_US)
+    [answer] = decode_frames_of(module.frames, Opcode.PARAMETER_ANSWER)
     return ParameterResult(int(answer["result"])), answer["value"]
 
 
 @pytest.mark.parametrize("index", [p for p, r in PARAMETERS.items() if r.writable])
 def test_parameter_range_ends_can_be_written_in_single_precision(index):
-    module = booted()
+    module = boot_module()
     for end in (PARAMETERS[index].low, PARAMETERS[index].high):
         result, value = ask(module, index, end)
         assert result == ParameterResult.DONE
@@ -43,21 +49,24 @@ def test_parameter_range_ends_can_be_written_in_single_precision(index):
     ],
 )
 def test_what_is_wrong_is_refused_and_changes_nothing(index, value, result):
-    module = booted()
+    module = boot_module()
     before = dict(module.parameters.values)
     assert ask(module, index, value)[0] == result
     assert module.parameters.values == before
 
 
 def test_nan_is_refused():
-    module = booted()
-    good = parameter(ModuleParameter.DAMPING, 1.0)
-    module.receive(CanFrame(good.id, good.data[:2] + struct.pack("<f", float("nan"))), BOOTED)
-    assert only(module.frames, Opcode.PARAMETER_ANSWER)[0]["result"] == ParameterResult.OUT_OF_RANGE
+    module = boot_module()
+    good = make_parameter_request(ModuleParameter.DAMPING, 1.0)
+    module.receive(CanFrame(good.id, good.data[:2] + struct.pack("<f", float("nan"))), BOOTED_AT_US)
+    assert (
+        decode_frames_of(module.frames, Opcode.PARAMETER_ANSWER)[0]["result"]
+        == ParameterResult.OUT_OF_RANGE
+    )
 
 
 def test_an_armed_module_may_be_read_and_not_written():
-    module = armed()
+    module = arm_module()
     assert ask(module, ModuleParameter.DAMPING, 1.0)[0] == ParameterResult.NOT_WHILE_ARMED
     assert (
         ask(module, ModuleParameter.DAMPING, operation=ParameterOperation.SAVE)[0]

@@ -15,7 +15,7 @@ from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, M
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.can.module_rig import chain, only, setpoint
+from snakesim_testing.can.module_rig import decode_frames_of, make_chain, make_setpoint
 from snakesim_testing.messages import raises_error
 
 Wall = tuple[VirtualWire, EmulatorServer, Callable[[float], list[CanFrame]]]
@@ -50,20 +50,20 @@ def served(made: ModuleChain) -> Iterator[Wall]:
 def send_tick(near: VirtualWire, tick: int) -> None:
     near.send(make_sync(tick, 0))
     for node in range(1, JOINTS + 1):
-        near.send(setpoint(tick, JointMode.POSITION, 0.2, node_id=node))
+        near.send(make_setpoint(tick, JointMode.POSITION, 0.2, node_id=node))
 
 
 def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():
-    made = chain(is_stepped=False)
+    made = make_chain(is_stepped=False)
     with served(made) as (near, _, until):
         assert until(0.09) == []
-        assert len(only(until(0.11), Opcode.HEARTBEAT)) == JOINTS
+        assert len(decode_frames_of(until(0.11), Opcode.HEARTBEAT)) == JOINTS
         near.send(make_command(CommandAction.ARM))
         answers = []
         for tick in range(50):
             send_tick(near, tick)
             answers += until(0.11 + 0.01 * (tick + 1))
-        states = only(answers, Opcode.JOINT_STATE, 1)
+        states = decode_frames_of(answers, Opcode.JOINT_STATE, 1)
         assert [s["count"] for s in states] == [tick % 16 for tick in range(50)]
         assert states[-1]["angle"] == pytest.approx(0.2, abs=0.01)
         until(0.69)
@@ -73,7 +73,7 @@ def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():
 
 
 def test_server_pause_does_not_look_like_a_host_pause():
-    made = chain(is_stepped=False)
+    made = make_chain(is_stepped=False)
     with served(made) as (near, server, until):
         until(0.11)
         near.send(make_command(CommandAction.ARM))
@@ -87,7 +87,7 @@ def test_server_pause_does_not_look_like_a_host_pause():
 
 
 def test_stepped_twins_run_when_the_host_has_nothing_to_do():
-    made = chain()
+    made = make_chain()
     name = f"test-{uuid.uuid4().hex[:8]}"
     far = VirtualWire(name)
     server = EmulatorServer([far], made)
@@ -98,7 +98,7 @@ def test_stepped_twins_run_when_the_host_has_nothing_to_do():
         assert not wait([near], 1.0), "nothing can come before something is sent"
         near.send(make_sync(0, 0))
         assert wait([near], 1.0)
-        assert len(only(near.receive(), Opcode.JOINT_STATE)) == JOINTS
+        assert len(decode_frames_of(near.receive(), Opcode.JOINT_STATE)) == JOINTS
     finally:
         near.close()
 

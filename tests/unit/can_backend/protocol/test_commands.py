@@ -17,7 +17,7 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
 )
 from snakesim_hal.wire.messages import JointMode, LifecycleState
-from snakesim_testing.can.frames import read
+from snakesim_testing.can.frames import decode_signals
 
 LIFECYCLES: tuple[LifecycleState, ...] = get_args(LifecycleState)
 TARGET = {
@@ -39,7 +39,7 @@ def one(mode: JointMode, target: float, limit_nm: float = 4.0) -> CanFrame:
 def test_targets_and_limits_are_rounded_to_the_nearest_step(
     mode: JointMode, target: float, limit_nm: float
 ) -> None:
-    said = read(one(mode, target, limit_nm))
+    said = decode_signals(one(mode, target, limit_nm))
     step = load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
     assert abs(said[TARGET[mode]] - target) <= step / 2 * (1 + 1e-9)
     assert abs(said["torque_limit"] - limit_nm) <= 0.0005 * (1 + 1e-9)
@@ -49,11 +49,11 @@ def test_targets_and_limits_are_rounded_to_the_nearest_step(
 def test_what_is_beyond_the_range_is_sent_as_its_end(
     mode: JointMode, beyond: float, negative: bool
 ) -> None:
-    said = read(one(mode, -beyond if negative else beyond, 65.6 + beyond))
+    said = decode_signals(one(mode, -beyond if negative else beyond, 65.6 + beyond))
     most = 32767 * load_layouts()[Opcode.SET_POINT].signals[TARGET[mode]].scale
     assert said[TARGET[mode]] == pytest.approx(-most if negative else most)
     assert said["torque_limit"] == pytest.approx(65.535)
-    assert read(one(mode, 0.0, -1.0))["torque_limit"] == 0.0
+    assert decode_signals(one(mode, 0.0, -1.0))["torque_limit"] == 0.0
 
 
 @given(st.floats(-1e6, 1e6))
@@ -121,4 +121,4 @@ def test_commands_repeat_state_to_a_module_that_differs(
 def test_a_sync_carries_count_and_time_modulo_their_ranges(count: int, time_us: int) -> None:
     frame = commands.make_sync(count, time_us)
     assert frame.id == 0x080
-    assert read(frame) == {"count": count % 256, "time": time_us % 2**32}
+    assert decode_signals(frame) == {"count": count % 256, "time": time_us % 2**32}
