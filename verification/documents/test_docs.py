@@ -98,7 +98,7 @@ def typed(script: str, cwd: Path, prefix: list[str]) -> str:
 )
 def test_a_section_as_printed(section: DocumentSection, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
-    documents.clone(folder)
+    documents.copy_repository(folder)
     for name, content in section.files.items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(content, encoding="utf-8")
@@ -113,7 +113,7 @@ def test_the_readme_as_printed(tmp_path: Path) -> None:
     """
     origin = tmp_path / "origin"
     git = ["git", "-c", "user.name=x", "-c", "user.email=x@example.org"]
-    shutil.copytree(REPOSITORY, origin, ignore=documents.leave_out, symlinks=True)
+    shutil.copytree(REPOSITORY, origin, ignore=documents.list_excluded_names, symlinks=True)
     for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "As it is"]):
         subprocess.run([*git, "-C", str(origin), *arguments], check=True)
     clone = tmp_path / "snakesim"

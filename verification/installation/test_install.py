@@ -24,7 +24,7 @@ from snakesim_testing.benches.workbench import read_example_from_docs
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import CompletedRun, make_environment, run_program
-from snakesim_testing.runs.documents import REPOSITORY, UV, leave_out, needs_uv
+from snakesim_testing.runs.documents import REPOSITORY, UV, list_excluded_names, needs_uv
 from verification.installation.distributions import required
 
 pytestmark = pytest.mark.e2e
@@ -54,7 +54,7 @@ def ended(*command: object, cwd: Path, **more: str) -> CompletedRun:
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy, so that the build leaves nothing in the repository. Links stay links, as in a clone."""
     folder = tmp_path_factory.mktemp("sources") / "snakesim"
-    shutil.copytree(REPOSITORY, folder, ignore=leave_out, symlinks=True)
+    shutil.copytree(REPOSITORY, folder, ignore=list_excluded_names, symlinks=True)
     return folder
 
 

@@ -11,11 +11,16 @@ import pytest
 from snakesim_testing.harness.stalling_relay import StallingRelay
 from snakesim_testing.operator.console_wait import LIMIT_S, wait_for_condition
 from snakesim_testing.operator.viewer import ConsoleViewer, connect_viewer
-from snakesim_testing.runs.bench import host
+from snakesim_testing.runs.bench_host import running_bench_host
 from snakesim_testing.runs.checked_robot import make_checked_folder
 from snakesim_testing.runs.command import run_in_background, running_snakesim
-from snakesim_testing.runs.hand_turned_robot import robot
-from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, read_setpoints, stopped
+from snakesim_testing.runs.hand_turned_robot import read_robot_file
+from snakesim_testing.runs.jogged_robot import (
+    BACKEND,
+    is_at_fault,
+    make_jogged_folder,
+    read_setpoints,
+)
 
 pytestmark = pytest.mark.e2e
 REAL = ("bench.toml", "--backend", "./real.py:Real", "--unchecked")
@@ -79,7 +84,7 @@ def console(home: Path, endpoint: str) -> Iterator[str]:
 
 @pytest.mark.quiet
 def test_console_sets_zeros_and_jogs_while_button_is_held(bench: Path) -> None:
-    with host(bench, BACKEND) as endpoint, console(bench, endpoint) as address:
+    with running_bench_host(bench, BACKEND) as endpoint, console(bench, endpoint) as address:
         asyncio.run(asyncio.wait_for(commission(address, bench, endpoint), 3 * LIMIT_S))
 
 
@@ -116,7 +121,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
             lambda: viewer.shows_text("4 joints changed; restart the host with it"), "its end"
         )
         assert "straight pose, " in (home / "snake.toml").read_text()
-        assert robot(home).joint_table[0].drive.zero_rad == pytest.approx(0.0, abs=1e-3)
+        assert read_robot_file(home).joint_table[0].drive.zero_rad == pytest.approx(0.0, abs=1e-3)
 
         await viewer.choose("Step", "jog")
         assert await moved_and_stood(viewer, relay, home)
@@ -146,7 +151,7 @@ async def moved_and_stood(viewer: ConsoleViewer, relay: StallingRelay, home: Pat
     """Hold the button, let it go, also while the network stalls; False when the robot was stopped meanwhile."""
     await armed(viewer, home)
     await wait_for_condition(
-        lambda: stopped(home) or read_setpoints(home)["mode"] == [0, 1, 0, 0],
+        lambda: is_at_fault(home) or read_setpoints(home)["mode"] == [0, 1, 0, 0],
         "one joint with current",
     )
     before = read_setpoints(home)["target"][1]
@@ -155,13 +160,13 @@ async def moved_and_stood(viewer: ConsoleViewer, relay: StallingRelay, home: Pat
         "uuid": await viewer.wait_for_uuid(FORWARDS),
         "frequency": HOLD_HZ,
     }
-    while not stopped(home) and read_setpoints(home)["target"][1] < before + 0.04:
+    while not is_at_fault(home) and read_setpoints(home)["target"][1] < before + 0.04:
         await viewer.send_message(held)
         await asyncio.sleep(1 / HOLD_HZ)
     await ticks(home, 25)
     half = read_setpoints(home)
     await ticks(home, 25)
-    if stopped(home):
+    if is_at_fault(home):
         return False
     assert read_setpoints(home)["target"][1] == half["target"][1]
     relay.stall()
@@ -171,7 +176,7 @@ async def moved_and_stood(viewer: ConsoleViewer, relay: StallingRelay, home: Pat
     await asyncio.sleep(LIFTED_S)  # the finger is lifted, and only then does the network recover
     relay.go_on()
     await ticks(home, 50)
-    if stopped(home):
+    if is_at_fault(home):
         return False
     assert read_setpoints(home)["target"][1] == half["target"][1], (
         "moved by what was held before the finger was lifted"

@@ -237,7 +237,7 @@ def _stepped(started_robot: ProcessRobot, observer: Observer, by_s: float) -> In
     while observer.state() != "armed":
         observer.arm(START_LIMIT_S)
     observer.watch(LIVE_S + started_robot.random.random() / RATE_HZ)
-    observer.discard_frames()
+    observer.forget()
     _step_clock(by_s)
     observer.watch(AFTER_STEP_S)
     faults = len(observer.status.faults) if observer.status is not None else 1

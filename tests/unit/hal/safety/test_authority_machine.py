@@ -26,19 +26,19 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
 )
 from snakesim_testing.hal.authority_model import (
-    ALL,
+    ALL_JOINTS,
     ANGLE_LIMIT_RAD,
-    DERATE_FROM,
+    ANY_MOTION_TIME_NS,
+    DERATE_FROM_C,
+    HEALTH_FAULTS,
     INF,
-    JOINTS,
-    KNOWN_FOR_NS,
-    LONG_NS,
+    JOINT_COUNT,
+    MAX_HEALTH_AGE_NS,
     MAX_STEP_RAD,
-    MIN_V,
+    MIN_VOLTAGE_V,
     NAN,
     PERIOD_S,
-    STOP_AT,
-    WORDS,
+    STOP_AT_C,
     AuthorityModel,
     clamp,
 )
@@ -71,12 +71,12 @@ REASONS = {
     "finite": "not_finite",
 }
 TIMES_NS = st.sampled_from(
-    [0, 1, PERIOD_NS, LEASE_NS - 1, LEASE_NS, LEASE_NS + 1, KNOWN_FOR_NS + 1]
+    [0, 1, PERIOD_NS, LEASE_NS - 1, LEASE_NS, LEASE_NS + 1, MAX_HEALTH_AGE_NS + 1]
 ) | st.integers(0, 3 * LEASE_NS)
 
 
 def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
-    return st.lists(values, min_size=JOINTS, max_size=JOINTS)
+    return st.lists(values, min_size=JOINT_COUNT, max_size=JOINT_COUNT)
 
 
 def often(usual: Any, *others: Any) -> st.SearchStrategy[Any]:
@@ -129,9 +129,9 @@ class Everything(AuthorityModel):
         velocity=per_joint(st.floats(-6, 6)),
         torque=per_joint(st.floats(-5, 5)),
         failure=often(None, "valid", "age", "nan", "inf", "short", "long", "no_valid", "no_age"),
-        joint=st.integers(0, JOINTS - 1),
+        joint=st.integers(0, JOINT_COUNT - 1),
         column=st.sampled_from([0, 0, 1, 2]),
-        later_ns=often(LONG_NS, PERIOD_NS, 0),
+        later_ns=often(ANY_MOTION_TIME_NS, PERIOD_NS, 0),
     )
     def observe(
         self,
@@ -144,7 +144,7 @@ class Everything(AuthorityModel):
         later_ns: int,
     ) -> None:
         """A joint state, perhaps with a failure. `column`: of the angles, velocities or torques."""
-        valid, age_ns = [True] * JOINTS, [FRESH_NS] * JOINTS
+        valid, age_ns = [True] * JOINT_COUNT, [FRESH_NS] * JOINT_COUNT
         columns = [list(angle), list(velocity), list(torque)]
         self.timestamp_ns += later_ns
         match failure:
@@ -167,7 +167,7 @@ class Everything(AuthorityModel):
             return
         measured = (list(self.measured[0]), list(self.measured[1]), list(self.measured[2]))
         unknown, strayed, stuck = set[int](), set[int](), set[int]()
-        for i in range(JOINTS):
+        for i in range(JOINT_COUNT):
             taken_s = (self.timestamp_ns - age_ns[i]) * 1e-9
             frozen = self.is_frozen(i, (columns[0][i], columns[1][i], columns[2][i]), taken_s)
             sound = failure is None or i != joint
@@ -188,8 +188,8 @@ class Everything(AuthorityModel):
     @rule(
         celsius=per_joint(often(20.0, 80.0, 81.0, 104.9, 105.0, 300.0)),
         volts=per_joint(often(24.0, 18.0, 17.9)),
-        leak=st.none() | st.integers(0, 3 * JOINTS),
-        silent=st.none() | st.integers(0, JOINTS - 1),
+        leak=st.none() | st.integers(0, 3 * JOINT_COUNT),
+        silent=st.none() | st.integers(0, JOINT_COUNT - 1),
         failure=often(None, "nan", "short"),
     )
     def hear_of_power(
@@ -200,7 +200,10 @@ class Everything(AuthorityModel):
         silent: int | None,
         failure: str | None,
     ) -> None:
-        leaks, valid = [i == leak for i in range(JOINTS)], [i != silent for i in range(JOINTS)]
+        leaks, valid = (
+            [i == leak for i in range(JOINT_COUNT)],
+            [i != silent for i in range(JOINT_COUNT)],
+        )
         reported = (
             [NAN, *celsius[1:]]
             if failure == "nan"
@@ -212,14 +215,16 @@ class Everything(AuthorityModel):
         for i, health in enumerate(self.healths if failure != "short" else ()):
             if i == silent or not math.isfinite(reported[i]):
                 continue
-            health.received_ns, health.celsius, health.volts, health.leak = (
+            health.received_ns, health.winding_c, health.voltage_v, health.leak = (
                 self.now_ns,
                 celsius[i],
                 volts[i],
                 leaks[i],
             )
-            health.hot = celsius[i] >= (DERATE_FROM if health.hot else STOP_AT)
-            if volts[i] >= MIN_V:
+            health.is_overheated = celsius[i] >= (
+                DERATE_FROM_C if health.is_overheated else STOP_AT_C
+            )
+            if volts[i] >= MIN_VOLTAGE_V:
                 health.low_since_ns = None
             elif health.low_since_ns is None:
                 health.low_since_ns = self.now_ns
@@ -228,19 +233,21 @@ class Everything(AuthorityModel):
         """At the end of a tick: what the modules said, and what they have not said for long."""
         before, self.health_faults = self.health_faults, set()
         for i, health in enumerate(self.healths):
-            self.health_faults |= {(word, i) for word in health.wrong(self.now_ns)}
+            self.health_faults |= {(word, i) for word in health.find_faults(self.now_ns)}
         for word, i in sorted(
-            self.health_faults - before, key=lambda found: (found[1], WORDS.index(found[0]))
+            self.health_faults - before, key=lambda found: (found[1], HEALTH_FAULTS.index(found[0]))
         ):
-            self.lose_or_fail({i} if word == "overheated" else None)
+            self.isolate_or_fail({i} if word == "overheated" else None)
         quiet_before, self.silent = self.silent, set()
         for i, health in enumerate(self.healths):
-            if health.received_ns is not None and not health.known(self.now_ns):
+            if health.received_ns is not None and not health.is_known(self.now_ns):
                 self.silent.add(i)
         fresh = self.silent - quiet_before
         if fresh and not (len(fresh) == 1 and fresh <= self.isolated):
-            self.note_fault()
-        self.torque_fractions = [health.share(self.now_ns) for health in self.healths]
+            self.count_fault()
+        self.torque_fractions = [
+            health.compute_torque_fraction(self.now_ns) for health in self.healths
+        ]
 
     @rule(
         who=HOLDERS,
@@ -257,13 +264,13 @@ class Everything(AuthorityModel):
         if ok and action == "renew" and self.state != "armed":
             self.expires_ns = self.now_ns + LEASE_NS
         elif ok and action != "renew":
-            self.drop_lease()
+            self.release_lease()
             if self.state == "armed":
                 self.change_state("disarmed")
             if action == "acquire":
                 self.holder, self.priority, self.expires_ns = who, priority, self.now_ns + LEASE_NS
                 self.epoch += 1
-        self.check(answer, ok)
+        self.check_answer(answer, ok)
         if not ok:
             assert answer.refusal == ("lease_held" if action == "acquire" else "not_holder")
 
@@ -293,7 +300,7 @@ class Everything(AuthorityModel):
         """One command, or a flood of them; `back`: ticks between the state that it answers and now."""
         defects = defects if broken else set()
         if near:
-            wanted, mode = list(self.measured[0]), [JointMode.POSITION] * JOINTS
+            wanted, mode = list(self.measured[0]), [JointMode.POSITION] * JOINT_COUNT
         if "length" in defects:
             wanted = wanted[1:]
         if "finite" in defects:
@@ -357,7 +364,7 @@ class Everything(AuthorityModel):
     def arm(self, robot: str | None, backend: str | None, config_hash: str | None) -> None:
         ready = (
             self.state == "disarmed"
-            and self.known
+            and self.has_valid_joint_state
             and self.is_lease_held
             and self.newest_command is not None
         )
@@ -367,7 +374,8 @@ class Everything(AuthorityModel):
             if word == "leak" or (word == "overheated" and i not in self.isolated)
         }
         weak = any(
-            health.low_since_ns is not None and health.known(self.now_ns) for health in self.healths
+            health.low_since_ns is not None and health.is_known(self.now_ns)
+            for health in self.healths
         )
         ready = ready and not wrong and not weak and (self.is_stop_sent or self.arm_session == 0)
         if ready and self.newest_command is not None:
@@ -377,7 +385,7 @@ class Everything(AuthorityModel):
                 or mode == JointMode.PASSIVE
                 or (mode == JointMode.POSITION and abs(target - angle) <= MAX_STEP_RAD)
                 for i, mode, target, angle in zip(
-                    ALL, asked.mode, asked.target, self.measured[0], strict=True
+                    ALL_JOINTS, asked.mode, asked.target, self.measured[0], strict=True
                 )
             )
         assert (not self.authority.list_unmet_conditions(self.now_ns)) == ready
@@ -399,7 +407,7 @@ class Everything(AuthorityModel):
             self.newest_command = None
             self.commands_since_arming, self.active_command = [], None
             self.expires_ns = self.now_ns + LEASE_NS
-        self.check(answer, ready)
+        self.check_answer(answer, ready)
         assert answer.refusal == next((word for word, right in reported.items() if not right), None)
 
     @rule(action=st.sampled_from(["disarm", "finish", "reset"]))
@@ -418,7 +426,7 @@ class Everything(AuthorityModel):
             self.faults = 0
             if self.isolated:
                 self.isolated, self.doubtful_joints = set(), None
-        self.check(answer, ok)
+        self.check_answer(answer, ok)
         if not ok:
             assert answer.refusal == "wrong_state"
 
@@ -426,8 +434,8 @@ class Everything(AuthorityModel):
     def estop(self, who: str) -> None:
         answer = self.authority.handle_estop_request(EstopRequest(requester=who), self.tick)
         self.change_state("estop")
-        self.note_fault()
-        self.check(answer, True)
+        self.count_fault()
+        self.check_answer(answer, True)
         assert self.authority.faults[-1] == Fault(
             tick=self.tick, what="estop", cause=f"emergency stop by {who}"
         )
@@ -435,7 +443,7 @@ class Everything(AuthorityModel):
     @rule(
         cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]),
         scope=often("robot", "joint", "none"),
-        joint=st.none() | st.integers(0, JOINTS),
+        joint=st.none() | st.integers(0, JOINT_COUNT),
     )
     def backend_fault(self, cause: str, scope: Any, joint: int | None) -> None:
         name = None if joint is None else f"joint_{joint + 1}"
@@ -443,9 +451,9 @@ class Everything(AuthorityModel):
             Fault(tick=self.tick, what="hot", cause=cause, joint=name, scope=scope)
         )
         if scope == "none":
-            self.note_fault()
+            self.count_fault()
             return
-        self.lose_or_fail({joint} if scope == "joint" and joint in ALL else None)
+        self.isolate_or_fail({joint} if scope == "joint" and joint in ALL_JOINTS else None)
 
     @rule(precedes_stop=st.booleans())
     def record_fault(self, precedes_stop: bool) -> None:
@@ -455,27 +463,35 @@ class Everything(AuthorityModel):
             self.authority.log_fault(fault, precedes_stop=True)
         else:
             self.authority.log_fault(fault)
-        self.note_fault()
+        self.count_fault()
         assert self.authority.faults[-1].scope == ("robot" if precedes_stop else "none")
 
     @rule()
     def holder_gone(self) -> None:
         self.authority.handle_lease_holder_exit("the holder is gone")
         if self.state != "armed":
-            self.drop_lease()
+            self.release_lease()
 
     # --- what a run does when all is well: chance alone would hardly ever arm -----------------------------------
 
     def stay(self) -> None:
         """A good command to stay where the joints are."""
         near = [clamp(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in self.measured[0]]
-        still = [JointMode.POSITION] * JOINTS
+        still = [JointMode.POSITION] * JOINT_COUNT
         self.send_commands(near, still, None, False, set(), False, 0, 0, 1)
 
     @precondition(lambda self: self.state != "armed")
     @rule(angle=st.floats(-1.6, 1.6))
     def set_up_and_arm(self, angle: float) -> None:
-        self.observe([angle] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS, None, 0, 0, LONG_NS)
+        self.observe(
+            [angle] * JOINT_COUNT,
+            [0.0] * JOINT_COUNT,
+            [0.0] * JOINT_COUNT,
+            None,
+            0,
+            0,
+            ANY_MOTION_TIME_NS,
+        )
         if self.state in ("fault", "estop"):
             self.ask_for_less("reset")
         if not self.is_lease_held:
@@ -493,7 +509,7 @@ class Everything(AuthorityModel):
         moves=per_joint(st.floats(-0.1, 0.1) | st.floats(-1, 1)),
         torque=per_joint(st.floats(-5, 5)),
         ticks=st.integers(1, 8),
-        later_ns=often(PERIOD_NS, LONG_NS),
+        later_ns=often(PERIOD_NS, ANY_MOTION_TIME_NS),
     )
     def go_on_for_some_ticks(
         self,
@@ -536,8 +552,8 @@ class Everything(AuthorityModel):
         """Only a command that answers a state after the arming counts as rejected."""
         back = self.tick - self.armed_tick - later
         self.send_commands(
-            [0.0] * JOINTS,
-            [JointMode.POSITION] * JOINTS,
+            [0.0] * JOINT_COUNT,
+            [JointMode.POSITION] * JOINT_COUNT,
             None,
             False,
             set(),
@@ -559,14 +575,14 @@ class Everything(AuthorityModel):
         """What a host does at the end of a tick."""
         self.now_ns += late_ns
         self.tick += 1
-        if self.state == "armed" and not self.known:
-            self.lose_or_fail(self.doubtful_joints)
+        if self.state == "armed" and not self.has_valid_joint_state:
+            self.isolate_or_fail(self.doubtful_joints)
         self.draw_conclusions()
         if self.holder is not None and not self.is_lease_held:
             if self.state == "armed":
                 self.fail()
             else:
-                self.drop_lease()
+                self.release_lease()
         self.authority.latch_faults_and_expire_lease(self.now_ns, self.tick)
         up_to = None if self.lag is None else self.tick - self.lag
         limited = self.authority.limited_counts.total()

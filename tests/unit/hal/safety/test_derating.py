@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.safety.derating import REPORT_TIMEOUT_NS, WHERE_TO_SET_MIN_VOLTAGE, HealthMonitor
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, SensorDescription
-from snakesim_testing.hal.limiter_rig import JOINTS
+from snakesim_testing.hal.limiter_rig import JOINT_COUNT
 from snakesim_testing.hal.small_robots import make_description, make_power
 
 MS = 1_000_000
@@ -53,10 +53,10 @@ class Bench:
 
 def test_nothing_is_derated_before_anything_is_known() -> None:
     bench = Bench()
-    assert bench.shares == [1.0] * JOINTS
+    assert bench.shares == [1.0] * JOINT_COUNT
     assert bench.derating.current_faults == []
     assert bench.look(0) == []
-    assert bench.shares == [1.0] * JOINTS
+    assert bench.shares == [1.0] * JOINT_COUNT
     assert bench.derating.find_derated_joints() == {}
 
 
@@ -66,7 +66,7 @@ def test_derating_joint_without_heat_or_voltage_sensor_never_stops() -> None:
     )
     assert bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 24.0]) == []
     assert bench.look(100 * MS) == []
-    assert bench.shares == [1.0] * JOINTS
+    assert bench.shares == [1.0] * JOINT_COUNT
     assert bench.against_arming == []
     low = bench.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 12.0]) + bench.look(
         100 * MS
@@ -90,8 +90,8 @@ def test_torque_fades_linearly(celsius: float, share: float) -> None:
 def test_the_robot_file_says_from_where_to_where() -> None:
     bench = Bench(limits__derate_from_c=50.0, limits__stop_at_c=60.0)
     assert bench.receive(55.0) == []
-    assert bench.shares == pytest.approx([0.6] * JOINTS)
-    assert len(bench.receive(60.0)) == JOINTS
+    assert bench.shares == pytest.approx([0.6] * JOINT_COUNT)
+    assert len(bench.receive(60.0)) == JOINT_COUNT
 
 
 STOP_AT_C = 105.0
@@ -132,7 +132,7 @@ def test_heat_that_was_too_much_is_not_forgotten_in_silence() -> None:
     bench.receive([20.0, 110.0, 20.0])
     assert bench.look(10 * S) == []
     assert [fault.what for fault in bench.derating.current_faults] == ["overheated"]
-    assert bench.shares == [1.0] * JOINTS
+    assert bench.shares == [1.0] * JOINT_COUNT
 
 
 def test_water_stops_the_robot() -> None:
@@ -207,7 +207,9 @@ def test_a_dip_of_the_supply_is_forgiven() -> None:
         assert bench.receive(voltage_v=12.0, after_ns=20 * MS) == []
         assert bench.receive(voltage_v=24.0, after_ns=20 * MS) == []
     assert bench.receive(voltage_v=12.0, after_ns=30 * MS) == []
-    assert len(bench.receive(voltage_v=12.0, after_ns=50 * MS)) == JOINTS  # since it was low first
+    assert (
+        len(bench.receive(voltage_v=12.0, after_ns=50 * MS)) == JOINT_COUNT
+    )  # since it was low first
 
 
 def test_what_is_not_valid_or_no_number_says_nothing() -> None:
@@ -218,13 +220,13 @@ def test_what_is_not_valid_or_no_number_says_nothing() -> None:
         == []
     )
     assert bench.look(1 * S) == []
-    assert bench.shares == [1.0] * JOINTS
+    assert bench.shares == [1.0] * JOINT_COUNT
 
 
 @pytest.mark.parametrize("column", ["motor_c", "voltage_v", "leak", "valid"])
 def test_a_sample_of_another_number_of_joints_says_nothing(column: str) -> None:
     bench = Bench()
-    values: dict[str, Any] = {"motor_c": 300.0, column: [1.0] * (JOINTS + 1)}
+    values: dict[str, Any] = {"motor_c": 300.0, column: [1.0] * (JOINT_COUNT + 1)}
     assert bench.receive(**values) == []
 
 
@@ -256,7 +258,7 @@ def test_derating_leak_and_voltage_of_silent_module_are_ignored(reported: dict[s
     bench = Bench()
     bench.receive(**reported)
     bench.look(50 * MS)
-    assert len(bench.derating.current_faults) == JOINTS
+    assert len(bench.derating.current_faults) == JOINT_COUNT
     bench.look(3 * S)
     assert bench.derating.current_faults == []
 
@@ -297,4 +299,4 @@ def test_heat_concerns_a_joint_and_water_and_voltage_the_robot(
     bench = Bench()
     bench.receive(**reported)
     bench.look(50 * MS)
-    assert [fault.scope for fault in bench.derating.current_faults] == [scope] * JOINTS
+    assert [fault.scope for fault in bench.derating.current_faults] == [scope] * JOINT_COUNT

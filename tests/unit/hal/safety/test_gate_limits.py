@@ -20,20 +20,20 @@ from snakesim_hal.safety.limiter import (
 )
 from snakesim_hal.wire.messages import JointCommand, JointMode
 from snakesim_testing.hal.limiter_rig import (
-    ANGLE_STEP,
-    COOL,
-    JOINTS,
+    ANGLE_STEP_RAD,
+    FULL_TORQUE,
+    JOINT_COUNT,
     LIMITS,
     ROBOT,
-    SPEED_STEP,
+    SPEED_STEP_RAD_S,
     TINY,
-    TORQUE_STEP,
-    applied_for,
-    before,
-    bumpless,
-    every,
-    limited,
-    words,
+    TORQUE_STEP_NM,
+    compute_bumpless_targets,
+    find_limit_names,
+    limit_in_equal_states,
+    limit_setpoints,
+    make_last_setpoints,
+    make_measured_state,
 )
 from snakesim_testing.hal.small_robots import make_description, make_joint_command
 from snakesim_testing.hypothesis_profiles import choose_trial_count
@@ -56,7 +56,7 @@ ANY_ANGLE = st.floats(-3, 3) | st.floats(-1e4, 1e4)
 
 
 def per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
-    return st.lists(values, min_size=JOINTS, max_size=JOINTS)
+    return st.lists(values, min_size=JOINT_COUNT, max_size=JOINT_COUNT)
 
 
 @st.composite
@@ -89,15 +89,17 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(
     case: tuple[JointCommand, MeasuredState, AppliedSetpoints],
 ) -> None:
     asked, measured, last = case
-    applied = limited(asked, measured, last)
+    applied = limit_setpoints(asked, measured, last)
     assert np.isfinite(applied.target).all()
     assert np.isfinite(applied.torque_limit_nm).all()
     assert (applied.torque_limit_nm >= 0).all()
     assert (applied.torque_limit_nm <= LIMITS.torque_nm).all()
     if asked.torque_limit_nm is not None:
         assert (applied.torque_limit_nm <= np.array(asked.torque_limit_nm)).all()
-    start = np.where(applied.mode == last.mode, last.target, bumpless(asked.mode, measured))
-    for i in range(JOINTS):
+    start = np.where(
+        applied.mode == last.mode, last.target, compute_bumpless_targets(asked.mode, measured)
+    )
+    for i in range(JOINT_COUNT):
         target, moved = applied.target[i], abs(applied.target[i] - start[i])
         assert applied.mode[i] == asked.mode[i]
         match asked.mode[i]:
@@ -113,14 +115,14 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(
                 # Only where staying near the measured angle, or inside the limits, leaves no choice:
                 edges = np.clip(measured.angle_rad[i] + np.array([-0.3, 0.3]), -1.5, 1.5)
                 assert (
-                    moved <= ANGLE_STEP + TINY * abs(start[i]) + TINY
+                    moved <= ANGLE_STEP_RAD + TINY * abs(start[i]) + TINY
                     or np.abs(edges - target).min() < TINY
                 )
             case JointMode.VELOCITY:
                 low, high = ends(asked.mode[i], measured, i)
                 assert abs(target) <= 5.0
                 assert low - TINY <= target <= high + TINY
-                assert moved <= SPEED_STEP + TINY * abs(start[i]) + TINY or at_a_bound(
+                assert moved <= SPEED_STEP_RAD_S + TINY * abs(start[i]) + TINY or at_a_bound(
                     target, 5.0, low, high
                 )
             case JointMode.TORQUE:
@@ -129,7 +131,7 @@ def test_whatever_is_asked_what_is_applied_is_inside_every_limit(
                 assert abs(target) <= most
                 assert target <= max(high, -most)
                 assert target >= min(low, most)
-                assert moved <= TORQUE_STEP + TINY * abs(start[i]) + TINY or at_a_bound(
+                assert moved <= TORQUE_STEP_NM + TINY * abs(start[i]) + TINY or at_a_bound(
                     target, most, low, high
                 )
 
@@ -139,14 +141,14 @@ def test_gate_names_exactly_the_targets_it_changes(
     case: tuple[JointCommand, MeasuredState, AppliedSetpoints],
 ) -> None:
     asked, measured, last = case
-    applied = limited(asked, measured, last)
+    applied = limit_setpoints(asked, measured, last)
     changed = {
         i
-        for i in range(JOINTS)
+        for i in range(JOINT_COUNT)
         if asked.mode[i] != JointMode.PASSIVE and applied.target[i] != asked.target[i]
     }
-    assert set(words(asked, applied, measured)) == changed
-    again = limited(
+    assert set(find_limit_names(asked, applied, measured)) == changed
+    again = limit_setpoints(
         msgspec.structs.replace(asked, target=applied.target.tolist()), measured, applied
     )
     assert (again.target == applied.target).all()  # what came out once passes unchanged
@@ -155,25 +157,27 @@ def test_gate_names_exactly_the_targets_it_changes(
 @given(st.lists(per_joint(st.floats(-1.5, 1.5)), min_size=2, max_size=30))
 def test_gate_random_targets_never_exceed_speed_limit(stream: list[list[float]]) -> None:
     """A joint that follows at once, so that nearness to the measured angle never overrides the rate."""
-    zero, last = np.zeros(JOINTS), before(JointMode.POSITION)
+    zero, last = np.zeros(JOINT_COUNT), make_last_setpoints(JointMode.POSITION)
     for target in stream:
-        applied = limited(
+        applied = limit_setpoints(
             make_joint_command(ROBOT, target), MeasuredState(last.target, zero, zero), last
         )
-        assert np.abs(applied.target - last.target).max() <= ANGLE_STEP + TINY
+        assert np.abs(applied.target - last.target).max() <= ANGLE_STEP_RAD + TINY
         last = applied
 
 
 def test_a_target_that_waits_is_reached() -> None:
     for mode, wanted, step in (
-        (JointMode.POSITION, 0.2, ANGLE_STEP),
-        (JointMode.VELOCITY, 4.0, SPEED_STEP),
-        (JointMode.TORQUE, 3.0, TORQUE_STEP),
+        (JointMode.POSITION, 0.2, ANGLE_STEP_RAD),
+        (JointMode.VELOCITY, 4.0, SPEED_STEP_RAD_S),
+        (JointMode.TORQUE, 3.0, TORQUE_STEP_NM),
     ):
-        last = before(mode)
+        last = make_last_setpoints(mode)
         steps = int(np.ceil(wanted / step - 1e-9))
         for k in range(1, steps + 1):
-            last = limited(make_joint_command(ROBOT, wanted, mode), every(), last)
+            last = limit_setpoints(
+                make_joint_command(ROBOT, wanted, mode), make_measured_state(), last
+            )
             assert last.target[0] == pytest.approx(min(k * step, wanted))
 
 
@@ -181,20 +185,20 @@ def test_a_target_that_waits_is_reached() -> None:
 @pytest.mark.parametrize("side", [1, -1])
 def test_gate_joint_beyond_its_end_is_only_commanded_back(angle: float, side: int) -> None:
     for wanted in (-1e4, -1.5, 0.0, 1.5, 1e4):
-        target = applied_for(make_joint_command(ROBOT, wanted), angle=side * angle).target
+        target = limit_in_equal_states(make_joint_command(ROBOT, wanted), angle=side * angle).target
         assert (np.abs(target) <= 1.5).all()
         assert (side * target >= min(angle - 0.3, 1.5) - TINY).all()  # and not past what is near
 
 
 def test_with_no_torque_allowed_there_is_none() -> None:
-    none = [0.0] * JOINTS
+    none = [0.0] * JOINT_COUNT
     for mode in JointMode:
-        applied = applied_for(
+        applied = limit_in_equal_states(
             make_joint_command(ROBOT, 1.0, mode, torque_limit_nm=none), torque=3.0
         )
         assert (applied.torque_limit_nm == 0).all()
     assert (
-        applied_for(
+        limit_in_equal_states(
             make_joint_command(ROBOT, 1.0, JointMode.TORQUE, torque_limit_nm=none), torque=3.0
         ).target
         == 0
@@ -203,10 +207,10 @@ def test_with_no_torque_allowed_there_is_none() -> None:
 
 def test_a_negative_torque_limit_is_none_at_all() -> None:
     assert (
-        applied_for(
-            make_joint_command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINTS)
+        limit_in_equal_states(
+            make_joint_command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINT_COUNT)
         ).torque_limit_nm.tolist()
-        == [0.0] * JOINTS
+        == [0.0] * JOINT_COUNT
     )
 
 
@@ -224,16 +228,21 @@ def test_what_was_decided_stays(held: Any) -> None:
 
 
 def test_a_torque_limit_never_raises_the_robots_own() -> None:
-    applied = applied_for(make_joint_command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
+    applied = limit_in_equal_states(make_joint_command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
     assert applied.torque_limit_nm.tolist() == [4.0, 4.0, 1.0]
-    assert applied_for(make_joint_command(ROBOT, 0.0)).torque_limit_nm.tolist() == [4.0] * JOINTS
+    assert (
+        limit_in_equal_states(make_joint_command(ROBOT, 0.0)).torque_limit_nm.tolist()
+        == [4.0] * JOINT_COUNT
+    )
 
 
 def test_modes_may_differ_from_joint_to_joint() -> None:
     mixed = make_joint_command(
         ROBOT, 9.0, [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE]
     )
-    assert applied_for(mixed).target == pytest.approx([ANGLE_STEP, SPEED_STEP, TORQUE_STEP])
+    assert limit_in_equal_states(mixed).target == pytest.approx(
+        [ANGLE_STEP_RAD, SPEED_STEP_RAD_S, TORQUE_STEP_NM]
+    )
 
 
 # --- bumpless --------------------------------------------------------------------------------------------------
@@ -254,9 +263,11 @@ def motor_torque(target: float, angle: float, velocity: float) -> float:
 def test_gate_switch_to_position_mode_keeps_present_torque(
     angle: float, velocity: float, torque: float, wanted: float, mode: JointMode
 ) -> None:
-    applied = applied_for(make_joint_command(ROBOT, wanted), angle, velocity, torque, mode)
+    applied = limit_in_equal_states(
+        make_joint_command(ROBOT, wanted), angle, velocity, torque, mode
+    )
     implied = motor_torque(applied.target[0], angle, velocity)
-    assert abs(implied - torque) <= 40.0 * ANGLE_STEP + 1e-6
+    assert abs(implied - torque) <= 40.0 * ANGLE_STEP_RAD + 1e-6
 
 
 @given(
@@ -267,15 +278,15 @@ def test_gate_switch_to_position_mode_keeps_present_torque(
 def test_gate_switch_to_torque_mode_keeps_present_torque(
     torque: float, wanted: float, mode: JointMode
 ) -> None:
-    applied = applied_for(
+    applied = limit_in_equal_states(
         make_joint_command(ROBOT, wanted, JointMode.TORQUE), 0.3, 1.0, torque, mode
     )
-    assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
+    assert abs(applied.target[0] - torque) <= TORQUE_STEP_NM + TINY
 
 
 @given(velocity=st.floats(-5, 5), wanted=st.floats(-10, 10))
 def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, wanted: float) -> None:
-    applied = applied_for(
+    applied = limit_in_equal_states(
         make_joint_command(ROBOT, wanted, JointMode.VELOCITY),
         0.3,
         velocity,
@@ -285,27 +296,34 @@ def test_gate_switch_to_velocity_mode_keeps_present_torque(velocity: float, want
     joint = ROBOT.joints[0]
     bumpless_rad_s = velocity + 1.0 / joint.velocity_gain_nm_s_per_rad
     top = joint.speed_limit_rad_s
-    assert min(max(bumpless_rad_s - SPEED_STEP, -top), top) - TINY <= applied.target[0]
-    assert applied.target[0] <= max(min(bumpless_rad_s + SPEED_STEP, top), -top) + TINY
+    assert min(max(bumpless_rad_s - SPEED_STEP_RAD_S, -top), top) - TINY <= applied.target[0]
+    assert applied.target[0] <= max(min(bumpless_rad_s + SPEED_STEP_RAD_S, top), -top) + TINY
 
 
 def test_a_torque_limit_rises_no_faster_than_a_torque() -> None:
-    none = AppliedSetpoints(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
-    applied = limited(make_joint_command(ROBOT, 0.3, JointMode.POSITION), every(), none)
-    assert applied.torque_limit_nm == pytest.approx(np.full(JOINTS, TORQUE_STEP))
+    none = AppliedSetpoints(
+        np.zeros(JOINT_COUNT, dtype=np.int64), np.zeros(JOINT_COUNT), np.zeros(JOINT_COUNT)
+    )
+    applied = limit_setpoints(
+        make_joint_command(ROBOT, 0.3, JointMode.POSITION), make_measured_state(), none
+    )
+    assert applied.torque_limit_nm == pytest.approx(np.full(JOINT_COUNT, TORQUE_STEP_NM))
 
 
 def test_a_switch_asked_to_stay_changes_nothing_at_all() -> None:
     measured = MeasuredState(
         np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0])
     )
-    hold = bumpless([JointMode.POSITION] * JOINTS, measured)
+    hold = compute_bumpless_targets([JointMode.POSITION] * JOINT_COUNT, measured)
     implied = [
         motor_torque(*row)
         for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)
     ]
     assert implied == pytest.approx(measured.torque_nm.tolist())
-    assert bumpless([JointMode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
+    assert (
+        compute_bumpless_targets([JointMode.TORQUE] * JOINT_COUNT, measured)
+        == measured.torque_nm.tolist()
+    )
 
 
 def test_a_switch_to_velocity_mode_reckons_with_the_gain() -> None:
@@ -319,13 +337,13 @@ def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
     assert compute_bumpless_target(limp, JointMode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
     soft = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
-    measured, last = every(torque=4.0), before(JointMode.PASSIVE)
+    measured, last = make_measured_state(torque=4.0), make_last_setpoints(JointMode.PASSIVE)
     applied = limit_command(
         make_joint_command(ROBOT, 0.0),
         measured=measured,
         last=last,
         limits=soft,
-        torque_fraction=COOL,
+        torque_fraction=FULL_TORQUE,
     )
     assert np.abs(applied.target).max() <= 0.3
 
@@ -351,12 +369,12 @@ def test_a_joint_can_stop_before_its_end() -> None:
 def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) -> None:
     """A joint that turns as it is told, one or two periods later."""
     angle, reported = 0.0, [0.0] * delay
-    last = before(JointMode.VELOCITY)
+    last = make_last_setpoints(JointMode.VELOCITY)
     speeds: list[float] = []
     for _ in range(400):
-        last = limited(
+        last = limit_setpoints(
             make_joint_command(ROBOT, side * 5.0, JointMode.VELOCITY),
-            every(angle, reported[0]),
+            make_measured_state(angle, reported[0]),
             last,
         )
         reported = [*reported[1:], float(last.target[0])]
@@ -366,7 +384,7 @@ def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) 
     assert max(speeds) == 5.0
     assert abs(angle) > 1.49
     # What outranks the rate limit hardly needs to.
-    assert max(np.abs(np.diff(speeds))) <= SPEED_STEP + TINY
+    assert max(np.abs(np.diff(speeds))) <= SPEED_STEP_RAD_S + TINY
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -374,11 +392,14 @@ def test_gate_velocity_towards_joint_end_stops_before_it(side: int, delay: int) 
 @pytest.mark.parametrize("beyond", [0.0, 0.2])
 def test_at_the_end_nothing_drives_outwards(side: int, mode: JointMode, beyond: float) -> None:
     for velocity in (-50.0, -1.0, 0.0, 1.0, 50.0):
-        for last in (before(mode, side * 3.0), before(JointMode.POSITION, side * 3.0)):
+        for last in (
+            make_last_setpoints(mode, side * 3.0),
+            make_last_setpoints(JointMode.POSITION, side * 3.0),
+        ):
             for wanted in (-9.0, 9.0):
-                applied = limited(
+                applied = limit_setpoints(
                     make_joint_command(ROBOT, wanted, mode),
-                    every(side * (1.5 + beyond), velocity),
+                    make_measured_state(side * (1.5 + beyond), velocity),
                     last,
                 )
                 assert (side * applied.target <= 0.0).all()
@@ -387,14 +408,14 @@ def test_at_the_end_nothing_drives_outwards(side: int, mode: JointMode, beyond: 
 @pytest.mark.parametrize("side", [1, -1])
 def test_gate_torque_mode_brakes_a_fast_joint(side: int) -> None:
     measured, asked = (
-        every(side * 1.4, side * 5.0),
+        make_measured_state(side * 1.4, side * 5.0),
         make_joint_command(ROBOT, side * 4.0, JointMode.TORQUE),
     )
-    applied = limited(asked, measured, before(JointMode.TORQUE, side * 4.0))
+    applied = limit_setpoints(asked, measured, make_last_setpoints(JointMode.TORQUE, side * 4.0))
     allowed = compute_stoppable_speed(0.1, 100.0, 0.01)
     # Gain 1 N·m·s/rad.
-    assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed - 5.0)))
-    assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "angle")
+    assert applied.target == pytest.approx(np.full(JOINT_COUNT, side * (allowed - 5.0)))
+    assert find_limit_names(asked, applied, measured) == dict.fromkeys(range(JOINT_COUNT), "angle")
 
 
 def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
@@ -412,16 +433,22 @@ def test_a_weak_velocity_mode_leaves_torque_mode_its_torque() -> None:
 
 def test_gate_joint_near_its_end_is_named_angle_limited() -> None:
     asked = make_joint_command(ROBOT, 5.0, JointMode.VELOCITY)
-    applied = limited(asked, every(1.45), before(JointMode.VELOCITY, 5.0))
-    assert words(asked, applied, every(1.45)) == dict.fromkeys(range(JOINTS), "angle")
-    assert words(asked, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
+    applied = limit_setpoints(
+        asked, make_measured_state(1.45), make_last_setpoints(JointMode.VELOCITY, 5.0)
+    )
+    assert find_limit_names(asked, applied, make_measured_state(1.45)) == dict.fromkeys(
+        range(JOINT_COUNT), "angle"
+    )
+    assert find_limit_names(asked, applied, make_measured_state(0.0, 1.45)) == dict.fromkeys(
+        range(JOINT_COUNT), "acceleration"
+    )
 
 
 def test_gate_torque_far_from_ends_is_not_named_angle_limited() -> None:
     asked = make_joint_command(ROBOT, 5.0, JointMode.TORQUE)
-    measured = every(0.0, 1.45)
-    applied = limited(asked, measured, before(JointMode.TORQUE, 4.0))
-    assert words(asked, applied, measured) == dict.fromkeys(range(JOINTS), "torque")
+    measured = make_measured_state(0.0, 1.45)
+    applied = limit_setpoints(asked, measured, make_last_setpoints(JointMode.TORQUE, 4.0))
+    assert find_limit_names(asked, applied, measured) == dict.fromkeys(range(JOINT_COUNT), "torque")
 
 
 # The maximum speed there: below the speed limit of 5 rad/s.
@@ -449,12 +476,12 @@ def test_the_tightest_limit_is_the_one_that_is_named(
     )
     named = find_active_limits(
         asked,
-        before(JointMode.VELOCITY),
-        measured=every(side * angle),
+        make_last_setpoints(JointMode.VELOCITY),
+        measured=make_measured_state(side * angle),
         limits=limits,
-        torque_fraction=COOL,
+        torque_fraction=FULL_TORQUE,
     )
-    assert named == dict.fromkeys(range(JOINTS), word)
+    assert named == dict.fromkeys(range(JOINT_COUNT), word)
 
 
 @pytest.mark.parametrize("velocity", [-3.0, 0.0, 3.0])

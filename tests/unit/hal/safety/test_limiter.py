@@ -12,15 +12,15 @@ from snakesim_hal.safety.limiter import RejectionReason, find_rejection_reason, 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointCommand, JointMode, SensorDescription
 from snakesim_testing.hal.limiter_rig import (
-    JOINTS,
+    JOINT_COUNT,
     LEASE,
     LIMITS,
     ROBOT,
-    applied_for,
-    before,
-    every,
-    limited,
-    words,
+    find_limit_names,
+    limit_in_equal_states,
+    limit_setpoints,
+    make_last_setpoints,
+    make_measured_state,
 )
 from snakesim_testing.hal.small_robots import LEASE_NS, make_description, make_joint_command
 
@@ -60,23 +60,23 @@ REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
     ],
     "wrong_layout": [({"layout": "of another robot"}, {})],
     "wrong_length": [
-        ({"target": [0.0] * (JOINTS - 1)}, {}),
-        ({"target": [0.0] * (JOINTS + 1)}, {}),
+        ({"target": [0.0] * (JOINT_COUNT - 1)}, {}),
+        ({"target": [0.0] * (JOINT_COUNT + 1)}, {}),
         ({"target": []}, {}),
-        ({"mode": [JointMode.POSITION] * (JOINTS + 1)}, {}),
+        ({"mode": [JointMode.POSITION] * (JOINT_COUNT + 1)}, {}),
         ({"mode": [], "target": []}, {}),
         ({"torque_limit_nm": [1.0]}, {}),
         ({"torque_limit_nm": []}, {}),
     ],
     "wrong_mode": [
         ({"mode": [JointMode.POSITION, JointMode.TORQUE, JointMode.POSITION]}, {"limits": SERVOS}),
-        ({"mode": [JointMode.VELOCITY] * JOINTS}, {"limits": SERVOS}),
+        ({"mode": [JointMode.VELOCITY] * JOINT_COUNT}, {"limits": SERVOS}),
     ],
     "not_finite": [
         ({"target": [0.0, NAN, 0.0]}, {}),
         ({"target": [INF, 0.0, 0.0]}, {}),
         ({"target": [0.0, 0.0, -INF]}, {}),
-        ({"target": [NAN] * JOINTS, "mode": [JointMode.PASSIVE] * JOINTS}, {}),
+        ({"target": [NAN] * JOINT_COUNT, "mode": [JointMode.PASSIVE] * JOINT_COUNT}, {}),
         ({"torque_limit_nm": [1.0, NAN, 1.0]}, {}),
         ({"torque_limit_nm": [1.0, INF, 1.0]}, {}),
     ],
@@ -85,7 +85,7 @@ REFUSED: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any]]]] = {
 
 def test_a_good_command_passes() -> None:
     assert judge(make_joint_command(ROBOT)) is None
-    assert judge(make_joint_command(ROBOT, torque_limit_nm=[0.0] * JOINTS)) is None
+    assert judge(make_joint_command(ROBOT, torque_limit_nm=[0.0] * JOINT_COUNT)) is None
     assert judge(make_joint_command(ROBOT, tick=5), now_ns=1000) is None
     assert judge(make_joint_command(ROBOT, valid_for_ns=10), age_ns=10) is None
     assert judge(make_joint_command(ROBOT, valid_for_ns=0), age_ns=0) is None
@@ -116,7 +116,7 @@ def test_every_reason_is_tried() -> None:
 
 def test_what_is_checked_first_is_told_first() -> None:
     worse: list[tuple[RejectionReason, dict[str, Any], dict[str, Any]]] = [
-        ("not_finite", {"target": [NAN] * JOINTS}, {}),
+        ("not_finite", {"target": [NAN] * JOINT_COUNT}, {}),
         ("wrong_length", {"torque_limit_nm": [1.0]}, {}),
         ("wrong_layout", {"layout": "other"}, {}),
         ("stale", {"valid_for_ns": 10}, {"age_ns": 11}),
@@ -141,8 +141,12 @@ TORQUE_FRACTIONS = np.array([1.0, 0.5, 0.25])  # of the 4 N·m of each joint, wh
 
 def limit_hot_joints(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
     """Limit a command to joints that are cool, warm and hot; return torque limits, and reasons by joint."""
-    applied = limited(asked, every(), before(JointMode.TORQUE, 2.0), TORQUE_FRACTIONS)
-    return applied.torque_limit_nm.tolist(), words(asked, applied, every(), TORQUE_FRACTIONS)
+    applied = limit_setpoints(
+        asked, make_measured_state(), make_last_setpoints(JointMode.TORQUE, 2.0), TORQUE_FRACTIONS
+    )
+    return applied.torque_limit_nm.tolist(), find_limit_names(
+        asked, applied, make_measured_state(), TORQUE_FRACTIONS
+    )
 
 
 @pytest.mark.parametrize(
@@ -160,7 +164,7 @@ def limit_hot_joints(asked: JointCommand) -> tuple[list[float], dict[int, str]]:
 def test_limiter_hot_joint_has_lower_torque_limit(
     commanded_limit_nm: float | None, applied_limit_nm: list[float], reasons: dict[int, str]
 ) -> None:
-    limits_nm = None if commanded_limit_nm is None else [commanded_limit_nm] * JOINTS
+    limits_nm = None if commanded_limit_nm is None else [commanded_limit_nm] * JOINT_COUNT
     asked = make_joint_command(ROBOT, 2.0, JointMode.TORQUE, torque_limit_nm=limits_nm)
     assert limit_hot_joints(asked) == (applied_limit_nm, reasons)
 
@@ -172,7 +176,7 @@ def test_limiter_cool_joint_with_excessive_torque_is_limited_by_rating() -> None
 
 def test_limiter_changed_target_of_hot_joint_names_target_limit() -> None:
     _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, JointMode.POSITION))
-    assert reasons == dict.fromkeys(range(JOINTS), "angle")
+    assert reasons == dict.fromkeys(range(JOINT_COUNT), "angle")
 
 
 def test_limiter_passive_hot_joint_is_not_limited() -> None:
@@ -207,15 +211,17 @@ def test_a_changed_target_is_named_by_its_limit(
     mode: JointMode, wanted: float, word: str | None
 ) -> None:
     asked = make_joint_command(ROBOT, [0.0, wanted, 0.0], mode)
-    applied = limited(asked, every(), before(mode))
-    assert words(asked, applied, every()) == ({} if word is None else {1: word})
+    applied = limit_setpoints(asked, make_measured_state(), make_last_setpoints(mode))
+    assert find_limit_names(asked, applied, make_measured_state()) == (
+        {} if word is None else {1: word}
+    )
 
 
 def test_set_points_for_the_backend_are_plain_python() -> None:
-    applied = applied_for(make_joint_command(ROBOT, 0.01))
+    applied = limit_in_equal_states(make_joint_command(ROBOT, 0.01))
     points = make_safe_setpoints(applied, frozenset({1}))
     assert points.isolated == {1}
-    assert points.mode == [JointMode.POSITION] * JOINTS
+    assert points.mode == [JointMode.POSITION] * JOINT_COUNT
     assert all(type(m) is JointMode for m in points.mode)
     assert all(type(value) is float for value in points.target + points.torque_limit_nm)
 

@@ -13,7 +13,7 @@ from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, Join
 from snakesim_hal.safety.plausibility import PlausibilityChecker, replace_non_finite_values
 from snakesim_hal.wire.freshness import FRESH_PERIODS
 from snakesim_hal.wire.messages import Fault, JointMode, JointState
-from snakesim_testing.hal.limiter_rig import JOINTS, LIMITS, ROBOT
+from snakesim_testing.hal.limiter_rig import JOINT_COUNT, LIMITS, ROBOT
 from snakesim_testing.hal.small_robots import (
     LEASE_NS,
     PERIOD_NS,
@@ -24,14 +24,16 @@ from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 REACH = 0.05 + 2 * 5.0 * 0.01  # rad in a period
 WORD = "state_invalid"
-NOBODY: JointMask = np.zeros(JOINTS, dtype=np.bool_)
+NOBODY: JointMask = np.zeros(JOINT_COUNT, dtype=np.bool_)
 
 
 def targets(
     target: Any = 0.0, mode: JointMode = JointMode.POSITION, torque_limit: float = 4.0
 ) -> AppliedSetpoints:
     return AppliedSetpoints(
-        np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit)
+        np.full(JOINT_COUNT, int(mode)),
+        np.full(JOINT_COUNT, target),
+        np.full(JOINT_COUNT, torque_limit),
     )
 
 
@@ -72,7 +74,7 @@ class Bench:
 
 
 def test_the_first_angle_is_believed_wherever_it_is() -> None:
-    assert Bench(angle=1.4).angles == [1.4] * JOINTS
+    assert Bench(angle=1.4).angles == [1.4] * JOINT_COUNT
 
 
 @pytest.mark.parametrize("applied", [None, targets()])
@@ -126,10 +128,10 @@ def test_after_lost_samples_a_joint_may_be_further_away(periods: int) -> None:
 def test_age_counts_as_time() -> None:
     """A sample that says again what was taken before may not differ from it; one that was old has time to make good."""
     bench = Bench()
-    assert bench.see(0.1, age_ns=[PERIOD_NS] * JOINTS) is not None
-    assert bench.see(0.04, age_ns=[2 * PERIOD_NS] * JOINTS) is None
-    bench = Bench(age_ns=[3 * PERIOD_NS] * JOINTS)
-    assert bench.see(0.4, age_ns=[0] * JOINTS) is None
+    assert bench.see(0.1, age_ns=[PERIOD_NS] * JOINT_COUNT) is not None
+    assert bench.see(0.04, age_ns=[2 * PERIOD_NS] * JOINT_COUNT) is None
+    bench = Bench(age_ns=[3 * PERIOD_NS] * JOINT_COUNT)
+    assert bench.see(0.4, age_ns=[0] * JOINT_COUNT) is None
 
 
 def test_plausibility_host_pause_extends_the_reachable_angle() -> None:
@@ -145,7 +147,7 @@ def test_plausibility_new_place_is_accepted_after_repeats_unless_armed() -> None
             bench.see(1.25, periods=0.5)
         ]
         assert [fault is None for fault in found].index(True) == seen - 1
-        assert bench.angles == pytest.approx([1.24 if seen == 5 else 1.25] * JOINTS, abs=0.011)
+        assert bench.angles == pytest.approx([1.24 if seen == 5 else 1.25] * JOINT_COUNT, abs=0.011)
 
 
 def test_places_that_do_not_agree_are_not_believed() -> None:
@@ -244,7 +246,7 @@ def test_a_long_story_fits_into_a_message() -> None:
 def test_who_is_set_aside_is_not_looked_at(at: int) -> None:
     bench, aside = Bench(), NOBODY.copy()
     aside[1] = True
-    valid = [i != at for i in range(JOINTS)]
+    valid = [i != at for i in range(JOINT_COUNT)]
     found = bench.see(valid=valid, aside=aside)
     assert (found is None) == (at == 1)
     assert bench.doubted == [2] * (at == 2)
@@ -472,7 +474,7 @@ def test_a_sample_that_is_only_old_is_not_frozen() -> None:
     bench = Bench(torque=0.5)
     for k in range(1, FRESH_PERIODS + 1):
         assert (
-            bench.see(0.0, 0.0, 0.5, applied=targets(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS)
+            bench.see(0.0, 0.0, 0.5, applied=targets(0.1 * k), age_ns=[k * PERIOD_NS] * JOINT_COUNT)
             is None
         )
 
@@ -490,14 +492,17 @@ class Whole(PlausibilityChecker):
 
 def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, AppliedSetpoints | None]]:
     """States at the edges of every check, in which at most one joint is not like the others; and what was applied."""
-    timestamp_ns, target, angle = 0, 0.0, [0.4] * JOINTS
+    timestamp_ns, target, angle = 0, 0.0, [0.4] * JOINT_COUNT
     limit_ns = LIMITS.max_state_age_ns
     for _ in range(length):
         timestamp_ns += rng.choice((0, PERIOD_NS, PERIOD_NS, PERIOD_NS, LEASE_NS))
         target += rng.choice((0.0, 0.08))
-        velocity, torque = [rng.choice((0.5, 0.6))] * JOINTS, [rng.choice((0.5, 0.6))] * JOINTS
-        ages, valid = [0] * JOINTS, [True] * JOINTS
-        odd = rng.randrange(JOINTS)
+        velocity, torque = (
+            [rng.choice((0.5, 0.6))] * JOINT_COUNT,
+            [rng.choice((0.5, 0.6))] * JOINT_COUNT,
+        )
+        ages, valid = [0] * JOINT_COUNT, [True] * JOINT_COUNT
+        odd = rng.randrange(JOINT_COUNT)
         match rng.choice(
             (
                 "angle",
@@ -526,7 +531,7 @@ def walk(rng: random.Random, length: int) -> Iterator[tuple[JointState, AppliedS
                 valid[odd] = False
             case _:
                 pass
-        count = 0 if rng.random() < 0.02 else JOINTS
+        count = 0 if rng.random() < 0.02 else JOINT_COUNT
         seen = make_joint_state(
             ROBOT,
             angle[:count],

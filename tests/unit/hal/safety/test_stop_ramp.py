@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from snakesim_hal.safety.joint_limits import JointLimits
 from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.hal.limiter_rig import ANGLE_STEP, JOINTS, TINY, before, every
+from snakesim_testing.hal.limiter_rig import (
+    ANGLE_STEP_RAD,
+    JOINT_COUNT,
+    TINY,
+    make_last_setpoints,
+    make_measured_state,
+)
 from snakesim_testing.hal.small_robots import make_description
 
 ROBOT = make_description(motor__damping_nm_s_per_rad=2.0)
@@ -18,7 +24,9 @@ LIMITS = JointLimits.from_description(ROBOT)
 def beginning(
     angle: float, velocity: float, torque: float, mode: JointMode, target: float
 ) -> StopRamp:
-    return StopRamp.start(every(angle, velocity, torque), before(mode, target), LIMITS)
+    return StopRamp.start(
+        make_measured_state(angle, velocity, torque), make_last_setpoints(mode, target), LIMITS
+    )
 
 
 def targets(halt: StopRamp, periods: int) -> list[float]:
@@ -48,12 +56,17 @@ def test_the_target_goes_on_from_where_it_was() -> None:
 
 def test_stop_ramp_after_another_mode_starts_from_present_torque() -> None:
     halt = beginning(0.1, 1.0, 2.0, JointMode.VELOCITY, 1.0)
-    assert halt.target_rad == pytest.approx(np.full(JOINTS, 0.1 + (2.0 + 2.0 * 1.0) / 40.0))
+    assert halt.target_rad == pytest.approx(np.full(JOINT_COUNT, 0.1 + (2.0 + 2.0 * 1.0) / 40.0))
 
 
 def test_it_begins_near_the_joint() -> None:
-    assert beginning(0.0, 0.0, 100.0, JointMode.TORQUE, 1.0).target_rad.tolist() == [0.3] * JOINTS
-    assert beginning(0.0, 0.0, 0.0, JointMode.POSITION, -1.0).target_rad.tolist() == [-0.3] * JOINTS
+    assert (
+        beginning(0.0, 0.0, 100.0, JointMode.TORQUE, 1.0).target_rad.tolist() == [0.3] * JOINT_COUNT
+    )
+    assert (
+        beginning(0.0, 0.0, 0.0, JointMode.POSITION, -1.0).target_rad.tolist()
+        == [-0.3] * JOINT_COUNT
+    )
 
 
 @given(
@@ -68,8 +81,8 @@ def test_stop_ramp_from_any_state_never_jumps_or_leaves_range(
 ) -> None:
     way = np.array(targets(beginning(angle, velocity, torque, mode, target), 60))
     assert np.abs(way).max() <= 1.5
-    assert np.abs(np.diff(way)).max() <= ANGLE_STEP + TINY
+    assert np.abs(np.diff(way)).max() <= ANGLE_STEP_RAD + TINY
     assert way[-1] == way[-2] == way[-10]
     stops_at = np.clip(angle, -1.5, 1.5) + np.sign(velocity) * min(abs(velocity), 5.0) ** 2 / 200.0
     # It slows down in whole periods.
-    assert abs(way[-1] - np.clip(stops_at, -1.5, 1.5)) <= ANGLE_STEP / 2
+    assert abs(way[-1] - np.clip(stops_at, -1.5, 1.5)) <= ANGLE_STEP_RAD / 2

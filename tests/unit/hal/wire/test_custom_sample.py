@@ -10,14 +10,14 @@ from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.custom_sample import make_message_schema, parse_custom_message
 from snakesim_hal.wire.messages import CustomSample
-from snakesim_testing.hal.custom_sample import GOOD, PLACE, SkinSample
+from snakesim_testing.hal.custom_sample import MOUNTING, VALID_VALUES, SkinSample
 from snakesim_testing.messages import raises_error
 
 
 def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
     kind, sample = (
         parse_custom_message(make_message_schema(SkinSample, "skin")),
-        SkinSample(**PLACE, **GOOD),
+        SkinSample(**MOUNTING, **VALID_VALUES),
     )
     decoded = MessageDecoder(kind.message).decode(encode(sample), format_encoding(SkinSample))
     assert msgspec.to_builtins(decoded) == msgspec.to_builtins(sample)
@@ -29,7 +29,7 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
     )
     assert MessageDecoder(CustomSample).decode(
         encode(sample), format_encoding(SkinSample)
-    ) == CustomSample(**PLACE)
+    ) == CustomSample(**MOUNTING)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
     ids=lambda wrong: next(iter(wrong)),
 )
 def test_the_schema_refuses_what_the_class_would(wrong: dict[str, Any]) -> None:
-    written = msgspec.msgpack.encode(PLACE | GOOD | wrong)
+    written = msgspec.msgpack.encode(MOUNTING | VALID_VALUES | wrong)
     for message in (
         SkinSample,
         parse_custom_message(make_message_schema(SkinSample, "skin")).message,
