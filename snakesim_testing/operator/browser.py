@@ -192,7 +192,7 @@ class BrowserTab:
         """Return a picture of the page as a PNG file.
 
         Args:
-            **parameters: Further parameters of `Page.captureScreenshot`, such as `clip`.
+            **parameters: Further parameters of the command captureScreenshot of DevTools, such as `clip`.
         """
         answer = self.send("Page.captureScreenshot", format="png", **parameters)
         return base64.b64decode(answer["data"])
