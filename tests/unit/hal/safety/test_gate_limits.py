@@ -337,7 +337,7 @@ def test_a_joint_without_stiffness_gives_a_finite_target() -> None:
     assert compute_bumpless_target(limp, JointMode.POSITION, 0.0, 0.0, 1.0) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
     soft = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
-    measured, last = make_measured_state(torque=4.0), make_last_setpoints(JointMode.PASSIVE)
+    measured, last = make_measured_state(torque_nm=4.0), make_last_setpoints(JointMode.PASSIVE)
     applied = limit_command(
         make_joint_command(ROBOT, 0.0),
         measured=measured,
