@@ -2,7 +2,7 @@
 
 import sys
 
-from snakesim_testing.runs.solved_and_measured import main
+from snakesim_testing.runs.desired_and_measured_forces import main
 
 if __name__ == "__main__":
     sys.exit(main())

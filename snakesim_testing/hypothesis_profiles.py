@@ -1,6 +1,6 @@
-"""Profiles of Hypothesis, and how many random trials a test makes.
+"""Defines the profiles of Hypothesis, and the number of random trials of a test.
 
-Each change makes a tenth of the trials, always the same ones. The campaign (`python -m verification trials`) makes all.
+The tests of a change run a tenth of the trials, always the same ones. `python -m verification trials` runs all.
 """
 
 import math
@@ -8,7 +8,7 @@ import os
 
 from hypothesis import HealthCheck, Phase, settings
 
-ALL_EXAMPLES = 100  # of a property whose test asks for no other number
+ALL_EXAMPLES = 100  # of a property whose test sets no other number
 CHANGE_FRACTION = 0.1  # of all examples, which are tried with each change
 
 

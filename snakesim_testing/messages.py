@@ -1,4 +1,4 @@
-"""Texts of messages that tests compare are in one file, tests/messages.json, with the messages of each test.
+"""Compares the texts of messages with tests/messages.json, which contains the messages of each test.
 
 A test asserts what is stable about an error: its class, its code, and the field and value that the message names. The
 text is compared with the file. After a sentence was corrected, `pytest --update-messages TESTS` writes the file again,
@@ -42,7 +42,7 @@ class StoredMessages:
     """The messages of one test. Each is compared with the stored one, in order."""
 
     def __init__(self, item: pytest.Item, stored: Sequence[str], *, updating: bool) -> None:
-        """Begin a test.
+        """Start to compare the messages of a test.
 
         Args:
             item: The test.
@@ -95,7 +95,7 @@ class StoredMessages:
 
 
 class MessagesPlugin:
-    """Hands out the messages of each test, and writes the file at the end if that is requested."""
+    """Provides the stored messages of each test, and writes the file at the end if the option requests it."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._path = config.rootpath / FILE
@@ -121,7 +121,7 @@ class MessagesPlugin:
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
         """Begin with the messages of a test."""
-        # It runs many examples, with as many texts.
+        # A test with Hypothesis has a text for each of its many examples.
         if item.get_closest_marker("hypothesis") is not None:
             return
         stored = self.read_stored().get(make_key(item.nodeid), [])
@@ -149,7 +149,7 @@ class MessagesPlugin:
             self._new |= {value[0]: value[1] for name, value in properties if name == PROPERTY}
 
     def pytest_sessionfinish(self) -> None:
-        """Write the file."""
+        """Write the file with the messages of all tests that passed, if the option requests it."""
         if not self._updating or self._is_worker:
             return
         stored = self.read_stored()
@@ -172,7 +172,7 @@ def make_key(nodeid: str) -> str:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option."""
+    """Add the option that writes the messages into the file."""
     parser.addoption(
         OPTION, action="store_true", help=f"write the messages of the tests that run into {FILE}"
     )
@@ -189,7 +189,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_unconfigure() -> None:
-    """Forget the plugin of this session."""
+    """Discard the plugin of this session."""
     _plugins.pop()
 
 

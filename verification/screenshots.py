@@ -123,7 +123,7 @@ def choose_first_text(options: argparse.Namespace) -> str:
 
 def prepare_page(tab: BrowserTab, options: argparse.Namespace) -> None:
     """Close notifications, then select colors, tabs, signals and the scroll position."""
-    tab.value(CLOSE_NOTIFICATIONS)
+    tab.evaluate(CLOSE_NOTIFICATIONS)
     if options.dark:
         tab.click("Dark page")
     labels = list(options.click)
@@ -135,8 +135,8 @@ def prepare_page(tab: BrowserTab, options: argparse.Namespace) -> None:
         time.sleep(CLICK_S)
     if options.signals:
         source = f"signals?within&with#{options.signals}"
-        tab.value(f"document.querySelector('iframe').src = '{source}'")
-    tab.value(
+        tab.evaluate(f"document.querySelector('iframe').src = '{source}'")
+    tab.evaluate(
         "document.querySelectorAll('[class*=viewport]')"
         f".forEach(e => {{ e.scrollTop += {options.scroll}; }})"
     )

@@ -117,7 +117,7 @@ def check(pages: list[Path], arguments: argparse.Namespace) -> Iterator[str]:
     views = EVERY_VIEW if arguments.every else USUAL_VIEWS
     sheets = {each: Sheets(*each) for each in views}
     with open_chromium(with_webgl=False) as browser:
-        tab = browser.open("about:blank")
+        tab = browser.open_page("about:blank")
         tab.send("Network.enable")
         tab.send("Network.setBlockedURLs", urls=["*search_index.js*"])  # large, and not needed here
         for page in pages:
@@ -160,14 +160,14 @@ def view(
     open_page(tab, page)
     for (width, scheme), sheet in sheets.items():
         set_view(tab, width, scheme)
-        for problem in json.loads(tab.value(CHECK) or "[]"):
+        for problem in json.loads(tab.evaluate(CHECK) or "[]"):
             yield f"{page} ({width}, {scheme}): {problem}"
         tiles = 1
         if max_tiles > 1:
-            page_height = int(tab.value("document.documentElement.scrollHeight"))
+            page_height = int(tab.evaluate("document.documentElement.scrollHeight"))
             tiles = min(-(-page_height // WIDTHS_PX[width]), max_tiles)
             set_view(tab, width, scheme, tiles)
-        sheet.add(page, tab.picture(), tiles)
+        sheet.add(page, tab.capture_screenshot(), tiles)
     yield from (f"{page}: {error}" for error in tab.errors if "search_index" not in error)
     tab.errors.clear()
 
@@ -181,10 +181,12 @@ def set_view(tab: BrowserTab, width: int, scheme: str, tiles: int = 1) -> None:
         scheme: Color scheme, `light` or `dark`.
         tiles: Height of the window, in tiles of a contact sheet.
     """
-    tab.size(width, tiles * WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600)
+    tab.set_window_size(
+        width, tiles * WIDTHS_PX[width], scale=TILE_PX[width] / width, mobile=width < 600
+    )
     attribute = json.dumps("slate" if scheme == "dark" else "default")
     # The button of the theme does the same.
-    tab.value(f"document.body.setAttribute('data-md-color-scheme', {attribute})")
+    tab.evaluate(f"document.body.setAttribute('data-md-color-scheme', {attribute})")
     time.sleep(0.2)  # until the browser has laid out the page
 
 
@@ -194,13 +196,13 @@ def open_page(tab: BrowserTab, page: Path) -> None:
     deadline = time.monotonic() + LOAD_LIMIT_S
     name = json.dumps(page.name)
     while (
-        tab.value(f"document.readyState === 'complete' && location.pathname.endsWith({name})")
+        tab.evaluate(f"document.readyState === 'complete' && location.pathname.endsWith({name})")
         is not True
     ):
         if time.monotonic() > deadline:
             raise TimeoutError(f"{page} does not load")
         time.sleep(0.02)
-    tab.value(
+    tab.evaluate(
         "document.head.insertAdjacentHTML('beforeend', '<style>* { transition: none !important }</style>')"
     )
     time.sleep(0.15)  # the theme wraps tables and colors code

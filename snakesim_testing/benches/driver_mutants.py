@@ -1,4 +1,4 @@
-"""Minimal drivers that break the contract, each in one way, and the clauses that have to notice."""
+"""Minimal drivers that break the contract, each in one way, with the contract tests that must fail on them."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -79,8 +79,8 @@ def register_driver_mutant(*clauses: str, declares_watchdog: bool = True) -> Cal
 
 
 @register_driver_mutant(SUPPLY)
-class VoltsInTensOfMillivolts(MinimalDrives):
-    """The supply has another unit than the driver believes."""
+class VoltageInWrongUnit(MinimalDrives):
+    """Stores the supply voltage in a wrong unit."""
 
     def _store_report(self, i: int, report: Report) -> None:
         super()._store_report(i, report._replace(voltage_v=report.voltage_v * 1.5))
@@ -88,7 +88,7 @@ class VoltsInTensOfMillivolts(MinimalDrives):
 
 @register_driver_mutant(SUPPLY)
 class FahrenheitTemperatures(MinimalDrives):
-    """The temperatures are in another unit."""
+    """Stores the temperatures in degrees Fahrenheit."""
 
     def _store_report(self, i: int, report: Report) -> None:
         super()._store_report(i, report._replace(motor_c=report.motor_c * 1.8 + 64.0))
@@ -96,7 +96,7 @@ class FahrenheitTemperatures(MinimalDrives):
 
 @register_driver_mutant(SAGGING)
 class SupplyReadOnce(MinimalDrives):
-    """The supply is read in bring-up alone."""
+    """Reads the supply voltage only once."""
 
     first_v: float | None = None
 
@@ -108,7 +108,7 @@ class SupplyReadOnce(MinimalDrives):
 
 @register_driver_mutant(IN_TIME)
 class SwitchesOffLate(MinimalDrives):
-    """Drives are switched off some cycles after the command."""
+    """Switches drives off some cycles after the command."""
 
     late_cycles = 0
 
@@ -126,7 +126,7 @@ class SwitchesOffLate(MinimalDrives):
 
 @register_driver_mutant(AFTER_WATCHDOG, BUS_LOST)
 class HasNoWatchdogAtAll(MinimalEmulator):
-    """Drives follow their last setpoint for ever."""
+    """Emulates drives that follow their last setpoint forever."""
 
     def on_step(self, now_us: float) -> None:
         for drive in self.drives:
@@ -135,13 +135,13 @@ class HasNoWatchdogAtAll(MinimalEmulator):
 
 
 @register_driver_mutant(UNGUARDED, declares_watchdog=False)
-class HoldsAfterAPause(HasNoWatchdogAtAll):
-    """Drives without a watchdog, whose driver does not notice that its host has done nothing for a while."""
+class ContinuesAfterPause(HasNoWatchdogAtAll):
+    """Emulates drives without a watchdog. Their driver does not detect that its host was frozen."""
 
 
 @register_driver_mutant(AFTER_WATCHDOG)
 class HasASlowWatchdog(MinimalEmulator):
-    """Drives switch off, but later than after their watchdog's time."""
+    """Emulates drives that switch off later than the time of their watchdog."""
 
     def __init__(self, *parts: Any) -> None:
         super().__init__(*parts)
@@ -149,7 +149,7 @@ class HasASlowWatchdog(MinimalEmulator):
 
 
 class AnswersForSilentDrives(MinimalDrives):
-    """The last values of a silent drive count as new, so that its silence goes unnoticed."""
+    """Reports the last values of a silent drive as new, so that its silence is not detected."""
 
     def read(self) -> None:
         super().read()
@@ -162,7 +162,7 @@ class AnswersForSilentDrives(MinimalDrives):
 
 @register_driver_mutant(RESTARTED)
 class EnablesRestartedDrives(AnswersForSilentDrives):
-    """A drive that should follow is enabled in every cycle."""
+    """Enables each drive that should follow again in every cycle."""
 
     def send_setpoints(self, command: BusCommand) -> None:
         super().send_setpoints(command)
@@ -174,16 +174,16 @@ class EnablesRestartedDrives(AnswersForSilentDrives):
 
 
 @register_driver_mutant(DUPLICATE)
-class TakesTheLastAnswer(MinimalDrives):
-    """A second drive with one id goes unnoticed."""
+class IgnoresSecondDriveWithSameId(MinimalDrives):
+    """Does not report a second drive with the same id."""
 
     def list_findings(self) -> list[FaultFinding]:
         return [finding for finding in super().list_findings() if finding.what != "duplicate_node"]
 
 
 @register_driver_mutant(DUPLICATE)
-class ForgetsTheSecondDrive(MinimalDrives):
-    """A reset ends the fault for good, although the second drive is still there."""
+class ForgetsSecondDriveAfterReset(MinimalDrives):
+    """Does not report a second drive with the same id again after a reset, although it still exists."""
 
     is_forgotten = False
 
@@ -201,8 +201,8 @@ class ForgetsTheSecondDrive(MinimalDrives):
 
 
 @register_driver_mutant(BUS_LOST)
-class EnablesWhatTheBusHasLost(MinimalDrives):
-    """After the bus is back, the driver clears errors and continues, whatever the robot's state."""
+class EnablesDrivesOfRestoredBus(MinimalDrives):
+    """Clears errors and enables all drives after the bus is restored, in every lifecycle state."""
 
     was_cut = False
 

@@ -1,16 +1,16 @@
-"""The emulated drives of a backend under test, for clauses about what drives do without their driver."""
+"""Observes the emulated drives of a backend under test, for contract tests of what drives do without their driver."""
 
 from typing import Any
 
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_drivers.template.minimal_driver import MinimalDrives
-from snakesim_testing.can.driver_loop import chain_of
+from snakesim_testing.can.driver_loop import find_chain
 from snakesim_testing.contract.bench import TorqueSwitch
 from snakesim_testing.contract.kit_drives import KitDrives
 
 
 class DrivesOfAnyType(KitDrives):
-    """Drives of the driver types that are part of SnakeSIM."""
+    """The emulated drives of any driver type that is part of SnakeSIM."""
 
     def find_emulator(self, drives: Any) -> Any:
         if isinstance(drives, MinimalDrives):
@@ -22,13 +22,13 @@ class DrivesOfAnyType(KitDrives):
 
 
 class ModuleDrives:
-    """Joint modules on a virtual bus."""
+    """The emulated joint modules on a virtual bus."""
 
     DRIVEN = (ModuleState.ARMED, ModuleState.STOPPING)
 
     def __init__(self, backend: Any) -> None:
-        """Begin to log, whenever modules have been polled, which of them are driven."""
-        self._chain = chain_of(backend)
+        """Log from now on which modules drive their motors, after each poll of a module."""
+        self._chain = find_chain(backend)
         self._is_on = self.list_enabled()
         self._log: list[TorqueSwitch] = []
         follow_module = self._chain._apply_module_outputs
@@ -58,5 +58,5 @@ class ModuleDrives:
 
 
 def list_enabled_drives(emulator: Any) -> list[bool]:
-    """Of the emulated drives of one driver type, those that would follow a setpoint."""
+    """Return whether each emulated drive of a driver type would follow a setpoint."""
     return emulator.list_enabled()

@@ -1,4 +1,4 @@
-"""The joint modules of the reference firmware in C, which runs as a child of the driver, by what the program prints."""
+"""Observes the joint modules of the reference firmware in C by the output of its program, a child of the driver."""
 
 import re
 from typing import Any
@@ -12,7 +12,7 @@ TIME_PATTERN = re.compile(r"^([0-9.]+) time$", re.MULTILINE)
 
 
 class FirmwareDrives:
-    """The modules of an open backend in lockstep."""
+    """The modules of an open backend whose clock mode is lockstep."""
 
     def __init__(self, backend: Any) -> None:
         self._child: EmulatorChild = backend.modules._emulator_process._child
@@ -39,7 +39,7 @@ class FirmwareDrives:
         ]
 
     def _advance(self, seconds: float) -> float:
-        """Let time pass at the modules, and return their time in s. All that they did before has been printed then."""
+        """Advance the time of the modules, and return it in s. The program has printed all earlier switches by then."""
         known_count = len(TIME_PATTERN.findall(self._child.read_output()))
         self._child.write_line(f"advance {seconds:g}")
         wait_until(

@@ -1,7 +1,7 @@
-"""Emulated drives that home, with holding brakes, limit switches and a safe-torque-off input; and their driver.
+"""Emulated drives with homing, holding brakes, limit switches and a safe-torque-off input, and their driver.
 
-They extend the minimal driver, and have its protocol with some messages more. A drive does not know its position after
-a restart: it reports 0 until it has moved slowly to its index.
+They extend the minimal driver and add messages to its protocol. A drive does not know its position after a restart: it
+reports 0 rad until it has moved slowly to its index.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,13 +27,13 @@ from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 HOMING_RAD_S = 0.05
-HOMING_MARGIN_S = 1.6  # until homing has failed
-RELEASE_S = 0.04
-ENGAGE_S = 0.02
+HOMING_MARGIN_S = 1.6  # homing has failed if it takes longer than its usual time by this margin
+RELEASE_S = 0.04  # of a holding brake
+ENGAGE_S = 0.02  # of a holding brake
 
 
 class HomingSettings(DriveSettings, frozen=True, kw_only=True):
-    """The settings of these drives."""
+    """The settings of the driver type."""
 
     home_at_start: bool = True
     """Whether the drives may move their joints at the start, to find their zeros."""
@@ -54,16 +54,16 @@ class HomingInputs(NamedTuple):
 
 @dataclass
 class HomingState:
-    """State of a drive that a minimal drive does not have: homing and holding brake."""
+    """The homing and the holding brake of a drive. A minimal drive has neither."""
 
     is_homed: bool = False
-    homing_until_us: float | None = None  # None: it does not home
+    homing_until_us: float | None = None  # None: the drive is not homing
     is_brake_open: bool = False
     brake_closed_us: float = -1e9  # time of the last command to close
 
 
 class HomingEmulator(MinimalEmulator):
-    """The emulated drives.
+    """Emulates drives with homing and holding brakes.
 
     Attributes:
         homing_states: Homing and brake of each drive, tail to head.
@@ -74,7 +74,7 @@ class HomingEmulator(MinimalEmulator):
         self.homing_states: list[HomingState] = []
         self.dropped_drives: list[int] = []
         self.homing_us = 0.0  # set by the driver type
-        # Set by tests.
+        # Indices of the drives that have no index, or whose input is active. Tests change these sets.
         self.without_index: set[int] = set()
         self.torque_off: set[int] = set()
         self.at_lower: set[int] = set()
@@ -83,7 +83,7 @@ class HomingEmulator(MinimalEmulator):
         self.homing_states = [HomingState() for _ in self.drives]
 
     def request_inputs(self, i: int) -> HomingInputs | None:
-        """Return the inputs of a drive; None if it is silent."""
+        """Return the inputs of a drive, or None if it is silent."""
         if self.is_cut or self.body.is_silent(i):
             return None
         failed = i in self.without_index and self.homing_states[i].homing_until_us is None
@@ -112,28 +112,28 @@ class HomingEmulator(MinimalEmulator):
         """
         if self.is_cut or self.body.is_booting(i):
             return
-        extras = self.homing_states[i]
+        state = self.homing_states[i]
         match message:
             case "home":
-                extras.homing_until_us = self.body.now_us + self.homing_us
+                state.homing_until_us = self.body.now_us + self.homing_us
                 self._drive_motor(i)
             case "stop_homing":
-                extras.homing_until_us = None
+                state.homing_until_us = None
                 self._drive_motor(i)
             case "open_brake":
-                extras.is_brake_open = True
+                state.is_brake_open = True
             case "close_brake":
-                if extras.is_brake_open:
-                    extras.brake_closed_us = self.body.now_us
-                extras.is_brake_open = False
+                if state.is_brake_open:
+                    state.brake_closed_us = self.body.now_us
+                state.is_brake_open = False
 
     def on_step(self, now_us: float) -> None:
         """End the homing of drives that have reached their index, and keep drives off by their input."""
         super().on_step(now_us)
-        for i, extras in enumerate(self.homing_states):
-            if extras.homing_until_us is not None and now_us > extras.homing_until_us:
-                extras.homing_until_us = None
-                extras.is_homed = i not in self.without_index
+        for i, state in enumerate(self.homing_states):
+            if state.homing_until_us is not None and now_us > state.homing_until_us:
+                state.homing_until_us = None
+                state.is_homed = i not in self.without_index
                 self._drive_motor(i)
             if i in self.torque_off and self.drives[i].enabled:
                 self._latch_error(i, "")
@@ -144,7 +144,7 @@ class HomingEmulator(MinimalEmulator):
 
     def _drive_motor(self, i: int) -> None:
         if not self.drives[i].enabled:
-            self._note_drop(i)
+            self._record_dropped_drive(i)
         if self.homing_states and self.homing_states[i].homing_until_us is not None:
             joint = self.body.joints[i]
             damping = joint.motor.velocity_gain_nm_s_per_rad / joint.drive.gear**2
@@ -155,17 +155,18 @@ class HomingEmulator(MinimalEmulator):
             return
         super()._drive_motor(i)
 
-    def _note_drop(self, i: int) -> None:
+    def _record_dropped_drive(self, i: int) -> None:
+        """Record a drive whose torque is off while its brake is open or not closed completely."""
         if not self.homing_states:
             return
-        extras = self.homing_states[i]
-        is_closing = self.body.now_us - extras.brake_closed_us < ENGAGE_S * 1e6
-        if extras.is_brake_open or is_closing:
+        state = self.homing_states[i]
+        is_closing = self.body.now_us - state.brake_closed_us < ENGAGE_S * 1e6
+        if state.is_brake_open or is_closing:
             self.dropped_drives.append(i)
 
 
 class HomingDrives(MinimalDrives):
-    """The driver of these drives."""
+    """The driver of drives with homing and holding brakes."""
 
     emulator: HomingEmulator
 
@@ -187,7 +188,7 @@ class HomingDrives(MinimalDrives):
             readings: Object that stores the values that the drives report.
             clock_ns: Function that returns the driver's time in ns.
             period_ns: Control period in ns.
-            settings: Settings of the driver type: whether and how long the drives home.
+            settings: Settings of the driver type.
         """
         super().__init__(emulator, joints, readings, clock_ns, period_ns)
         # The inputs that each drive reported last, tail to head; None for a drive that is silent.
@@ -236,9 +237,8 @@ class HomingDrives(MinimalDrives):
         restricted = self.switches.restrict_command(command, self.readings.angle_rad)
         plan = self.brakes.update_brakes(restricted, enabled, self.readings.angle_rad)
         for i in self.all_drives:
-            self.emulator.handle_extra_message(
-                i, "open_brake" if i in plan.released else "close_brake"
-            )
+            message = "open_brake" if i in plan.released else "close_brake"
+            self.emulator.handle_extra_message(i, message)
         super().send_setpoints(plan.command)
 
     def list_findings(self) -> list[FaultFinding]:
@@ -250,7 +250,7 @@ class HomingDrives(MinimalDrives):
 
 
 class HomingBackend(MinimalBackend):
-    """The driver type."""
+    """The driver type of drives with homing and holding brakes."""
 
     Settings = HomingSettings
     name = "homing"

@@ -1,4 +1,4 @@
-"""One backend that breaks the contract in one way."""
+"""Describes a backend that breaks the contract in one way, for tests of the contract suite itself."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from snakesim_testing.contract.bench import MakeEmulatedDrives, MuteJoint
 
 @dataclass(frozen=True, kw_only=True)
 class Mutant:
-    """A broken backend, and the clauses that have to notice it."""
+    """A broken backend, and the contract tests that must fail on it."""
 
     name: str
     backend: Any

@@ -1,6 +1,6 @@
-"""Backends that break the contract, each in one way, and the clauses that have to notice.
+"""Backends that break the contract, each in one way, with the contract tests that must fail on them.
 
-As a pytest plugin (`-p snakesim_testing.benches.mutants`) it runs each mutant against those clauses only.
+As a pytest plugin (`-p snakesim_testing.benches.mutants`), this module runs each mutant against these tests only.
 """
 
 import dataclasses
@@ -32,49 +32,53 @@ from snakesim_testing.contract.bench import Bench
 from snakesim_testing.hal.small_robots import make_pose
 
 MUTANTS: list[Mutant] = [*DRIVER_MUTANTS]
+TORQUE_LIMIT_NM = 4.0  # of every joint of the test robot
+REVOLUTIONS_PER_RAD = 0.16
 
 
 class FaultyWorkbench(Workbench):
     """A correct backend with one error, in its description, its measurements or its setpoints.
 
-    A mutant replaces one of the methods `describes`, `reads` and `alters`.
+    A mutant replaces one of the methods `change_description`, `change_joint_state` and `change_setpoints`.
     """
 
     def __init__(self, config: Any, settings: Any) -> None:
         super().__init__(config, settings)
-        self.description = self.describes(self.description)
+        self.description = self.change_description(self.description)
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        return Samples(self.reads(super().sample(tick, timestamp_ns).joints))
+        return Samples(self.change_joint_state(super().sample(tick, timestamp_ns).joints))
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: Any) -> None:
-        super().enact(self.alters(setpoints), lifecycle)
+        super().enact(self.change_setpoints(setpoints), lifecycle)
 
-    def describes(self, robot: RobotDescription) -> RobotDescription:
+    def change_description(self, robot: RobotDescription) -> RobotDescription:
+        """Return the description that the backend reports."""
         return robot
 
-    def reads(self, joints: JointState) -> JointState:
+    def change_joint_state(self, joints: JointState) -> JointState:
+        """Return the joint state that the backend reports."""
         return joints
 
-    def alters(self, points: SafeSetpoints) -> SafeSetpoints:
-        return points
+    def change_setpoints(self, setpoints: SafeSetpoints) -> SafeSetpoints:
+        """Return the setpoints that the joints follow."""
+        return setpoints
 
 
-def register_mutant(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
+def register_mutant(*clauses: str, replaced_method: str = "") -> Callable[[Any], Any]:
     """Return a decorator that registers a broken backend with the contract tests that must fail on it.
 
     Args:
         clauses: Names of the contract tests that must fail, without `test_`.
-        lie: Name of a method of `FaultyWorkbench`. The decorated object is then not a backend, but the function that
-            replaces this method. If empty, the decorated object is the backend itself.
+        replaced_method: Name of a method of `FaultyWorkbench`. The decorated object is then not a backend, but the
+            function that replaces this method. If empty, the decorated object is the backend itself.
     """
 
     def register(broken: Any) -> Any:
-        backend = (
-            type(broken.__name__, (FaultyWorkbench,), {lie: staticmethod(broken)})
-            if lie
-            else broken
-        )
+        backend = broken
+        if replaced_method:
+            methods = {replaced_method: staticmethod(broken)}
+            backend = type(broken.__name__, (FaultyWorkbench,), methods)
         MUTANTS.append(
             Mutant(
                 name=backend.__name__,
@@ -89,55 +93,63 @@ def register_mutant(*clauses: str, lie: str = "") -> Callable[[Any], Any]:
     return register
 
 
-describes, reads, alters = (
-    partial(register_mutant, lie=lie) for lie in ("describes", "reads", "alters")
-)
+breaks_description = partial(register_mutant, replaced_method="change_description")
+breaks_joint_state = partial(register_mutant, replaced_method="change_joint_state")
+breaks_setpoints = partial(register_mutant, replaced_method="change_setpoints")
 
 
 # --- the description -------------------------------------------------------------------------------------------
 
 
-def listing(robot: RobotDescription, key: str, rate_hz: float = 50.0) -> RobotDescription:
-    """Return a description that lists one more sensor."""
+def add_sensor(robot: RobotDescription, key: str, rate_hz: float = 50.0) -> RobotDescription:
+    """Return a description with one more sensor."""
     return replace(
         robot, sensors=[*robot.sensors, SensorDescription(key=key, rate_hz=rate_hz, delay_s=0.0)]
     )
 
 
-@describes("the_description_matches_the_robot_file")
-def named_from_the_head(robot):
+@breaks_description("the_description_matches_the_robot_file")
+def lists_joints_from_the_head(robot):
+    """List the joints from the head to the tail."""
     return replace(robot, joints=robot.joints[::-1])
 
 
-@describes("the_description_matches_the_robot_file")
+@breaks_description("the_description_matches_the_robot_file")
 def limits_in_degrees(robot):
+    """Describe the angle limits in degrees."""
     return replace(
         robot, joints=[replace(j, angle_max_rad=np.degrees(j.angle_max_rad)) for j in robot.joints]
     )
 
 
-@describes("the_layout_is_the_hash_of_the_joints")
-def layout_of_another(robot):
+@breaks_description("the_layout_is_the_hash_of_the_joints")
+def layout_of_another_robot(robot):
+    """Describe the layout of another robot."""
     return replace(robot, layout="0" * 16)
 
 
-@describes("the_description_survives_the_wire")
-def beyond_bounds(robot):
+@breaks_description("the_description_survives_the_wire")
+def max_step_out_of_range(robot):
+    """Describe a step that no message may contain."""
     return replace(robot, max_step_rad=20.0)
 
 
-@describes("every_sensor_listed_is_a_key_of_the_hal_once")
-def lists_a_sonar(robot):
-    return listing(robot, "sensor/sonar", rate_hz=10.0)
+@breaks_description("every_sensor_listed_is_a_key_of_the_hal_once")
+def lists_unknown_sensor(robot):
+    """List a sensor whose key the HAL does not have."""
+    return add_sensor(robot, "sensor/sonar", rate_hz=10.0)
 
 
-@describes("every_sensor_listed_delivers_at_about_its_rate")
-def lists_what_it_lacks(robot):
-    return listing(robot, keys.IMU, rate_hz=25.0)
+@breaks_description("every_sensor_listed_delivers_at_about_its_rate")
+def lists_missing_sensor(robot):
+    """List a sensor that never sends a sample."""
+    return add_sensor(robot, keys.IMU, rate_hz=25.0)
 
 
 @register_mutant("the_description_is_readable_at_once_and_stays")
-class NoisyDescription(Workbench):
+class ChangingDescription(Workbench):
+    """Describes the robot differently at each call."""
+
     calls = 0
 
     def describe(self):
@@ -150,36 +162,44 @@ class NoisyDescription(Workbench):
 # --- samples ---------------------------------------------------------------------------------------------------
 
 
-@reads("joints_carry_the_tick_and_stamp_that_were_asked_for")
-def stamped_by_itself(joints):
+@breaks_joint_state("joints_carry_the_tick_and_stamp_that_were_asked_for")
+def uses_its_own_timestamp(joints):
+    """Report another time than the host requested."""
     return replace(joints, timestamp_ns=joints.timestamp_ns + 1_000_000)
 
 
-@reads("every_vector_has_one_entry_a_joint")
-def one_too_many(joints):
+@breaks_joint_state("every_vector_has_one_entry_a_joint")
+def reports_one_joint_too_many(joints):
+    """Report one entry more than there are joints."""
     return replace(joints, valid=[*joints.valid, True])
 
 
-@reads("every_sample_survives_the_wire")
-def absurd_torque(joints):
+@breaks_joint_state("every_sample_survives_the_wire")
+def reports_torque_out_of_range(joints):
+    """Report a torque that no message may contain."""
     return replace(joints, torque_nm=[*joints.torque_nm[:-1], 1e6])
 
 
 @register_mutant("every_joint_is_valid_and_fresh_at_every_tick")
 class ReadsEveryThirdTick(FaultyWorkbench):
-    def reads(self, joints):
+    """Reports measurements that are up to two periods old."""
+
+    def change_joint_state(self, joints):
         return replace(
             joints, age_ns=[joints.tick % 3 * self.description.period_ns] * len(joints.age_ns)
         )
 
 
-@reads("what_is_not_known_yet_is_not_reported_as_valid")
-def zero_for_unknown(joints):
+@breaks_joint_state("what_is_not_known_yet_is_not_reported_as_valid")
+def reports_unknown_angle_as_zero(joints):
+    """Report an angle of 0 rad before the first measurement."""
     return joints if joints.tick else replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
 
 
 @register_mutant("readings_follow_the_motion")
-class OldReadingsAsNew(Workbench):
+class ReportsOldReadingsAsNew(Workbench):
+    """Reads the joints in every eighth tick, and reports the same values as new in between."""
+
     held: Any = None
 
     def sample(self, tick, timestamp_ns):
@@ -189,35 +209,38 @@ class OldReadingsAsNew(Workbench):
 
 
 class WithPose(FaultyWorkbench):
-    """Sends a pose every tick."""
+    """Sends a pose in every tick."""
 
     ahead_ns = 0
 
     def sample(self, tick, timestamp_ns):
-        seen = make_pose(tick, timestamp_ns + self.ahead_ns)
-        return Samples(super().sample(tick, timestamp_ns).joints, {keys.POSE: seen})
+        pose = make_pose(tick, timestamp_ns + self.ahead_ns)
+        return Samples(super().sample(tick, timestamp_ns).joints, {keys.POSE: pose})
 
 
 @register_mutant("nothing_comes_that_is_not_listed")
-class Unlisted(WithPose):
-    pass
+class SendsUnlistedPose(WithPose):
+    """Sends a pose that the description does not list."""
 
 
 @register_mutant("other_sensors_are_stamped_when_they_were_read")
-class FromTheFuture(WithPose):
+class TimestampsInTheFuture(WithPose):
+    """Sends a pose with a timestamp in the future."""
+
     ahead_ns = 5_000_000
 
-    def describes(self, robot):
-        return listing(robot, keys.POSE)
+    def change_description(self, robot):
+        return add_sensor(robot, keys.POSE)
 
 
 class WithSonar(FaultyWorkbench):
-    """Sends a range every tick."""
+    """Sends a range scan in every tick."""
 
-    link, found_m = 0, 1.0
+    link = 0
+    measured_m = 1.0
 
-    def describes(self, robot):
-        return listing(robot, keys.ranges_key("sonar"))
+    def change_description(self, robot):
+        return add_sensor(robot, keys.ranges_key("sonar"))
 
     def sample(self, tick, timestamp_ns):
         sonar = RangeScan(
@@ -230,161 +253,192 @@ class WithSonar(FaultyWorkbench):
             angle_step_rad=0.0,
             range_min_m=0.1,
             range_max_m=2.0,
-            range_m=[self.found_m],
+            range_m=[self.measured_m],
         )
         return Samples(super().sample(tick, timestamp_ns).joints, {keys.ranges_key("sonar"): sonar})
 
 
 @register_mutant("every_sample_fits_the_robot")
-class OnNoLink(WithSonar):
+class SonarOnMissingLink(WithSonar):
+    """Sends a sample of a link that the robot does not have."""
+
     link = 99
 
 
 @register_mutant("no_sample_contradicts_itself")
-class SaysTheFurthestForNothing(WithSonar):
-    found_m = 65.535
+class ReportsMaximumForNoEcho(WithSonar):
+    """Reports a distance beyond the range of the sensor if nothing is near."""
+
+    measured_m = 65.535
 
 
 # --- modes and units -------------------------------------------------------------------------------------------
 
 
-def let_go(points: SafeSetpoints) -> SafeSetpoints:
+def make_passive(setpoints: SafeSetpoints) -> SafeSetpoints:
     """Return the setpoints with all joints passive."""
     return dataclasses.replace(
-        points, mode=[JointMode.PASSIVE] * len(points.mode), target=[0.0] * len(points.mode)
+        setpoints,
+        mode=[JointMode.PASSIVE] * len(setpoints.mode),
+        target=[0.0] * len(setpoints.mode),
     )
 
 
-@alters("position_mode_turns_only_the_requested_joint")
-def targets_in_degrees(points):
-    return dataclasses.replace(points, target=np.radians(points.target).tolist())
+@breaks_setpoints("position_mode_turns_only_the_requested_joint")
+def targets_in_degrees(setpoints):
+    """Interpret the targets as degrees."""
+    return dataclasses.replace(setpoints, target=np.radians(setpoints.target).tolist())
 
 
-@alters("position_mode_turns_only_the_requested_joint")
-def head_to_tail(points):
-    return SafeSetpoints(points.mode[::-1], points.target[::-1], points.torque_limit_nm[::-1])
+@breaks_setpoints("position_mode_turns_only_the_requested_joint")
+def setpoints_from_head_to_tail(setpoints):
+    """Apply the setpoints from the head to the tail."""
+    return SafeSetpoints(
+        setpoints.mode[::-1], setpoints.target[::-1], setpoints.torque_limit_nm[::-1]
+    )
 
 
-@alters(
+@breaks_setpoints(
     "position_mode_turns_only_the_requested_joint",
     "torque_mode_pushes_with_the_torque_that_is_asked",
 )
-def wrong_way_round(points):
-    return dataclasses.replace(points, target=[-target for target in points.target])
+def moves_in_the_wrong_direction(setpoints):
+    """Apply the targets with the wrong sign."""
+    return dataclasses.replace(setpoints, target=[-target for target in setpoints.target])
 
 
-@alters(
+@breaks_setpoints(
     "velocity_mode_turns_at_the_speed_that_is_asked", "joints_may_be_in_different_modes_at_once"
 )
-def speed_in_turns(points):
-    scale = [0.16 if mode == JointMode.VELOCITY else 1.0 for mode in points.mode]
-    return dataclasses.replace(points, target=np.multiply(points.target, scale).tolist())
+def speed_in_revolutions(setpoints):
+    """Interpret the target speeds as revolutions per second."""
+    scale = [REVOLUTIONS_PER_RAD if mode == JointMode.VELOCITY else 1.0 for mode in setpoints.mode]
+    return dataclasses.replace(setpoints, target=np.multiply(setpoints.target, scale).tolist())
 
 
-@alters("joints_may_be_in_different_modes_at_once")
-def one_mode_for_all(points):
-    return dataclasses.replace(points, mode=[points.mode[1]] * len(points.mode))
+@breaks_setpoints("joints_may_be_in_different_modes_at_once")
+def one_mode_for_all_joints(setpoints):
+    """Apply the mode of one joint to all joints."""
+    return dataclasses.replace(setpoints, mode=[setpoints.mode[1]] * len(setpoints.mode))
 
 
-@alters("an_isolated_joint_is_passive_while_others_continue")
-def holds_what_is_lost(points):
+@breaks_setpoints("an_isolated_joint_is_passive_while_others_continue")
+def holds_isolated_joints(setpoints):
+    """Let isolated joints hold an angle."""
     held = [
-        JointMode.POSITION if i in points.isolated else mode for i, mode in enumerate(points.mode)
+        JointMode.POSITION if i in setpoints.isolated else mode
+        for i, mode in enumerate(setpoints.mode)
     ]
-    target = [0.3 if i in points.isolated else target for i, target in enumerate(points.target)]
-    return SafeSetpoints(held, target, [limit or 4.0 for limit in points.torque_limit_nm])
+    target = [
+        0.3 if i in setpoints.isolated else target for i, target in enumerate(setpoints.target)
+    ]
+    return SafeSetpoints(
+        held, target, [limit or TORQUE_LIMIT_NM for limit in setpoints.torque_limit_nm]
+    )
 
 
-@alters("an_isolated_joint_is_passive_while_others_continue")
-def one_for_all(points):
-    return let_go(points) if points.isolated else points
+@breaks_setpoints("an_isolated_joint_is_passive_while_others_continue")
+def isolates_all_joints(setpoints):
+    """Make all joints passive if one is isolated."""
+    return make_passive(setpoints) if setpoints.isolated else setpoints
 
 
 @register_mutant("an_isolated_joint_is_passive_while_others_continue")
-class TakesNothingBack(FaultyWorkbench):
-    lost: frozenset[int] = frozenset()
+class KeepsJointsIsolated(FaultyWorkbench):
+    """Leaves a joint passive after it is no longer isolated."""
 
-    def alters(self, points):
-        self.lost |= points.isolated
+    once_isolated: frozenset[int] = frozenset()
+
+    def change_setpoints(self, setpoints):
+        self.once_isolated |= setpoints.isolated
         modes = [
-            JointMode.PASSIVE if i in self.lost else mode for i, mode in enumerate(points.mode)
+            JointMode.PASSIVE if i in self.once_isolated else mode
+            for i, mode in enumerate(setpoints.mode)
         ]
-        return dataclasses.replace(points, mode=modes)
+        return dataclasses.replace(setpoints, mode=modes)
 
 
-@reads(
+@breaks_joint_state(
     "the_reported_velocity_is_the_change_of_the_reported_angle",
     "velocity_mode_turns_at_the_speed_that_is_asked",
 )
-def no_speedometer(joints):
+def reports_no_velocity(joints):
+    """Report a velocity of 0 rad/s."""
     return replace(joints, velocity_rad_s=[0.0] * len(joints.velocity_rad_s))
 
 
-@reads("the_reported_velocity_is_the_change_of_the_reported_angle")
-def angle_in_degrees(joints):
+@breaks_joint_state("the_reported_velocity_is_the_change_of_the_reported_angle")
+def velocity_in_degrees(joints):
+    """Report the velocity in degrees per second."""
     return replace(
         joints, velocity_rad_s=[float(np.degrees(speed)) for speed in joints.velocity_rad_s]
     )
 
 
-@reads(
+@breaks_joint_state(
     "torque_mode_pushes_with_the_torque_that_is_asked", "the_torque_limit_of_the_setpoints_is_kept"
 )
-def no_torque_sensor(joints):
+def reports_no_torque(joints):
+    """Report a torque of 0 N·m."""
     return replace(joints, torque_nm=[0.0] * len(joints.torque_nm))
 
 
 @register_mutant(
     "a_passive_joint_has_no_torque_and_stays", "nothing_moves_while_disarmed_whatever_is_commanded"
 )
-class PassiveGoesToZero(Workbench):
+class PassiveMovesToZero(Workbench):
+    """Moves passive joints to 0 rad."""
+
     def step(self):
         passive = self.mode == JointMode.PASSIVE
-        self.mode[passive], self.target[passive], self.limit[passive] = (
-            int(JointMode.POSITION),
-            0.0,
-            4.0,
-        )
+        self.mode[passive] = int(JointMode.POSITION)
+        self.target[passive] = 0.0
+        self.limit[passive] = TORQUE_LIMIT_NM
         super().step()
 
 
 @register_mutant("disarmed_joints_have_no_torque", "a_passive_joint_has_no_torque_and_stays")
 class PassivePushes(Workbench):
+    """Applies a torque to passive joints."""
+
     def step(self):
         passive = self.mode == JointMode.PASSIVE
-        self.mode[passive], self.target[passive], self.limit[passive] = (
-            int(JointMode.TORQUE),
-            0.3,
-            4.0,
-        )
+        self.mode[passive] = int(JointMode.TORQUE)
+        self.target[passive] = 0.3
+        self.limit[passive] = TORQUE_LIMIT_NM
         super().step()
 
 
 @register_mutant("setpoints_hold_until_the_next_ones")
-class ForgetsWhatIsRepeated(FaultyWorkbench):
+class StopsAtRepeatedSetpoints(FaultyWorkbench):
+    """Makes the joints passive if the setpoints are the same as before."""
+
     last: Any = None
 
-    def alters(self, points):
-        repeated, self.last = points == self.last, points
-        return let_go(points) if repeated else points
+    def change_setpoints(self, setpoints):
+        is_repeated = setpoints == self.last
+        self.last = setpoints
+        return make_passive(setpoints) if is_repeated else setpoints
 
     def step(self):
-        self.limit = np.full(len(self.angle), 4.0)
+        self.limit = np.full(len(self.angle), TORQUE_LIMIT_NM)
         super().step()
 
 
 @register_mutant("setpoints_hold_without_being_handed_over_again")
-class ForgetsAfterAPeriod(Workbench):
+class PassiveAfterOnePeriod(Workbench):
+    """Makes the joints passive after each period."""
+
     def advance(self):
         super().advance()
         self.mode[:] = JointMode.PASSIVE
 
 
 @register_mutant("a_mode_that_a_joint_lacks_is_refused")
-class MovesAfterAll(FaultyWorkbench):
-    """Has no torque mode, and moves without a setpoint."""
+class MovesInMissingMode(FaultyWorkbench):
+    """Has a joint without a torque mode, which moves without a setpoint."""
 
-    def describes(self, robot):
+    def change_description(self, robot):
         first = replace(
             robot.joints[0], modes=[JointMode.PASSIVE, JointMode.POSITION, JointMode.VELOCITY]
         )
@@ -398,31 +452,35 @@ class MovesAfterAll(FaultyWorkbench):
 # --- limits and switching --------------------------------------------------------------------------------------
 
 
-@alters("the_torque_limit_of_the_setpoints_is_kept", "a_torque_limit_of_zero_lets_nothing_move")
-def ignores_torque_limit(points):
-    return dataclasses.replace(points, torque_limit_nm=[4.0] * len(points.mode))
+@breaks_setpoints(
+    "the_torque_limit_of_the_setpoints_is_kept", "a_torque_limit_of_zero_lets_nothing_move"
+)
+def ignores_torque_limit(setpoints):
+    """Apply the full torque limit."""
+    return dataclasses.replace(setpoints, torque_limit_nm=[TORQUE_LIMIT_NM] * len(setpoints.mode))
 
 
-@alters("a_torque_limit_of_zero_lets_nothing_move")
-def zero_is_no_limit(points):
+@breaks_setpoints("a_torque_limit_of_zero_lets_nothing_move")
+def zero_means_no_torque_limit(setpoints):
+    """Interpret a torque limit of 0 as no limit."""
     return dataclasses.replace(
-        points, torque_limit_nm=[limit or 4.0 for limit in points.torque_limit_nm]
+        setpoints, torque_limit_nm=[limit or TORQUE_LIMIT_NM for limit in setpoints.torque_limit_nm]
     )
 
 
 @register_mutant("no_joint_goes_beyond_its_limits")
-class NoStops(Workbench):
+class NoEndStops(Workbench):
+    """Has end stops far beyond the limits of the joints."""
+
     def __init__(self, config, settings):
         super().__init__(config, settings)
-        self.lower_rad, self.upper_rad = (
-            np.full_like(self.angle, -3.0),
-            np.full_like(self.angle, 3.0),
-        )
+        self.lower_rad = np.full_like(self.angle, -3.0)
+        self.upper_rad = np.full_like(self.angle, 3.0)
 
 
 @register_mutant("a_mode_switch_makes_no_jump")
 class JumpsOnSwitch(Workbench):
-    """A change of mode starts with full torque."""
+    """Starts with full torque when a joint changes its mode."""
 
     def enact(self, setpoints, lifecycle):
         before = self.mode
@@ -439,7 +497,9 @@ class JumpsOnSwitch(Workbench):
 
 
 @register_mutant("a_robot_with_modules_stops_them_itself_when_not_armed")
-class RobotThatTrustsTheHost(Workbench):
+class RealRobotIgnoresLifecycle(Workbench):
+    """Follows setpoints in every lifecycle state, although it is a real robot."""
+
     @staticmethod
     def check(config, settings):
         return ("realtime",)
@@ -453,14 +513,18 @@ class RobotThatTrustsTheHost(Workbench):
     "a_fault_of_the_backend_latches_and_stops_the_joints",
     "a_controller_that_falls_silent_stops_joints_within_lease",
 )
-class GoesOnAfterArmed(Workbench):
+class MovesAfterLeavingArmed(Workbench):
+    """Ignores setpoints that arrive when the robot is no longer armed."""
+
     def enact(self, setpoints, lifecycle):
         if lifecycle == "armed" or (self.mode == JointMode.PASSIVE).all():
             super().enact(setpoints, lifecycle)
 
 
 @register_mutant("arming_again_goes_on_from_where_the_robot_is")
-class TakesUpTheOldTarget(Workbench):
+class ResumesOldTarget(Workbench):
+    """Resumes the setpoints of the last arm session when it is armed again."""
+
     old: Any = None
     armed_for = 0
     was_armed = False
@@ -476,7 +540,9 @@ class TakesUpTheOldTarget(Workbench):
 
 
 @register_mutant("after_reset_and_arm_it_moves_again")
-class NeverWakesAgain(Workbench):
+class NeverMovesAgain(Workbench):
+    """Does not move any more after its first fault."""
+
     stopped = False
 
     def enact(self, setpoints, lifecycle):
@@ -485,21 +551,28 @@ class NeverWakesAgain(Workbench):
 
 
 @register_mutant("a_healthy_robot_reports_no_fault")
-class CriesWolf(Workbench):
+class ReportsFaultWithoutCause(Workbench):
+    """Reports a fault although nothing is wrong."""
+
     reported = False
 
     def faults(self):
-        reported, self.reported = self.reported, True
-        return [] if reported else [Fault(tick=0, what="wolf", cause="none to be seen")]
+        if self.reported:
+            return []
+        self.reported = True
+        return [Fault(tick=0, what="wolf", cause="none to be seen")]
 
 
-@reads("a_silent_joint_grows_old_and_the_robot_stops")
-def never_old(joints):
+@breaks_joint_state("a_silent_joint_grows_old_and_the_robot_stops")
+def reports_age_of_zero(joints):
+    """Report every measurement as new."""
     return replace(joints, age_ns=[0] * len(joints.age_ns))
 
 
 @register_mutant("a_silent_joint_grows_old_and_the_robot_stops")
 class RepeatsItsFaults(Workbench):
+    """Reports the same fault again in every tick."""
+
     def faults(self):
         return [Fault(tick=0, what="silent", cause=f"joint {i} is silent") for i in self.silent]
 
@@ -508,8 +581,8 @@ FROZEN = "drives_that_stop_during_host_freeze_stay_off_until_reset"
 
 
 @register_mutant(FROZEN)
-class EnablesWhatHasTripped(DrivesWorkbench):
-    """Whatever it sends enables drives again."""
+class EnablesTrippedDrives(DrivesWorkbench):
+    """Enables drives again whose watchdog has tripped."""
 
     def enact(self, setpoints, lifecycle):
         super().enact(setpoints, lifecycle)
@@ -517,8 +590,8 @@ class EnablesWhatHasTripped(DrivesWorkbench):
 
 
 @register_mutant(FROZEN)
-class ClearsATripBeforeItIsRead(DrivesWorkbench):
-    """Any command that lets a drive go ends what its watchdog has latched."""
+class ResetsTripsWhenDisabling(DrivesWorkbench):
+    """Resets a tripped watchdog with every command that disables a drive."""
 
     def enact(self, setpoints, lifecycle):
         super().enact(setpoints, lifecycle)
@@ -528,29 +601,37 @@ class ClearsATripBeforeItIsRead(DrivesWorkbench):
 
 @register_mutant(FROZEN)
 class HasNoWatchdog(DrivesWorkbench):
+    """Has drives that follow their last setpoint for an hour."""
+
     WATCHDOG_S = 3600.0
 
 
 @register_mutant("drives_brake_after_fault_and_are_off_after_watchdog")
-class BrakesForEver(DrivesWorkbench):
+class BrakesForever(DrivesWorkbench):
+    """Has drives that brake without a time limit after a fault."""
+
     def still_brakes(self):
         return self.enabled
 
 
 @register_mutant("drives_brake_after_fault_and_are_off_after_watchdog")
-class LetsGoAtOnce(DrivesWorkbench):
+class DoesNotBrake(DrivesWorkbench):
+    """Has drives that do not brake after a fault."""
+
     def still_brakes(self):
         return self.enabled & False
 
 
 @register_mutant("bad_commands_are_refused_and_counted_and_move_nothing")
 class Creeps(Workbench):
-    crept = 0.0
+    """Adds a growing offset to all targets."""
+
+    offset_rad = 0.0
 
     def enact(self, setpoints, lifecycle):
-        self.crept += 0.004 * (lifecycle == "armed")
-        beyond = [target + self.crept for target in setpoints.target]
-        super().enact(dataclasses.replace(setpoints, target=beyond), lifecycle)
+        self.offset_rad += 0.004 * (lifecycle == "armed")
+        shifted = [target + self.offset_rad for target in setpoints.target]
+        super().enact(dataclasses.replace(setpoints, target=shifted), lifecycle)
 
 
 # --- closing ---------------------------------------------------------------------------------------------------
@@ -558,12 +639,16 @@ class Creeps(Workbench):
 
 @register_mutant("a_closed_backend_drives_nothing")
 class DrivesAfterClose(Workbench):
+    """Follows setpoints after it was closed."""
+
     def close(self):
-        """Forgotten."""
+        """Do nothing."""
 
 
 @register_mutant("closing_twice_does_no_harm")
 class ClosesOnce(Workbench):
+    """Raises an error if it is closed a second time."""
+
     def close(self):
         if not self.open:
             raise ValueError("closed already")
@@ -572,6 +657,8 @@ class ClosesOnce(Workbench):
 
 @register_mutant("a_backend_opens_again_after_it_was_closed")
 class KeepsItsBus(Workbench):
+    """Does not release its bus when it is closed."""
+
     taken: ClassVar[bool] = False
 
     def __init__(self, config, settings):
@@ -581,20 +668,21 @@ class KeepsItsBus(Workbench):
         super().__init__(config, settings)
 
 
-@reads("in_lockstep_same_seed_and_commands_give_same_samples")
-def own_dice(joints):
+@breaks_joint_state("in_lockstep_same_seed_and_commands_give_same_samples")
+def unseeded_noise(joints):
+    """Add noise that does not depend on the seed."""
     return replace(
         joints, torque_nm=[torque + random.gauss(0, 1e-4) for torque in joints.torque_nm]
     )
 
 
 @register_mutant("a_simulator_stands_still_on_request_and_a_robot_refuses")
-class ModulesThatTellThemselvesASimulator(FaultyWorkbench):
-    """Their watchdog counts wall time."""
+class SimulatorWithWallTimeWatchdog(FaultyWorkbench):
+    """Claims to be a simulator, but has a watchdog that measures wall time."""
 
     stepped_s = 0.0
 
-    def describes(self, robot):
+    def change_description(self, robot):
         return replace(robot, simulated_time=True)
 
     def advance(self):
@@ -611,7 +699,7 @@ class ModulesThatTellThemselvesASimulator(FaultyWorkbench):
 
 
 def pytest_snakesim_benches() -> list[Bench]:
-    """Every mutant on a bench of its own."""
+    """Return a bench for every mutant."""
     return [
         Bench(
             mutant.name,
@@ -624,7 +712,7 @@ def pytest_snakesim_benches() -> list[Bench]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave only the clauses that a mutant has to fail."""
+    """Run only the contract tests that a mutant must fail."""
     wanted = {(mutant.name, clause) for mutant in MUTANTS for clause in mutant.breaks}
 
     def is_wanted(item: Any) -> bool:

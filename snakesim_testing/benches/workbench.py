@@ -1,4 +1,4 @@
-"""The backend that docs/hardware/write-a-backend.md shows, and one that behaves like a robot on a bus."""
+"""Loads the backend of docs/hardware/write-a-backend.md, and extends it by drives and by a simulated bus."""
 
 import dataclasses
 import re
@@ -16,7 +16,7 @@ from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.wire.messages import Fault, JointMode, LifecycleState
 from snakesim_testing.contract.bench import TorqueSwitch
 
-# Resolution of what `BusWorkbench` sends and measures.
+# Resolution of the setpoints and measurements of `BusWorkbench`.
 ANGLE_DECIMALS = 4  # of rad
 VELOCITY_DECIMALS = 3  # of rad/s
 TORQUE_DECIMALS = 3  # of N·m
@@ -27,20 +27,20 @@ DOCS = Path(__file__).parents[2] / "docs" / "hardware" / "write-a-backend.md"
 
 def read_example_from_docs() -> str:
     """Return the text of the Python file in the documentation."""
-    found = re.search(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
-    assert found is not None
-    return found[1]
+    example_block = re.search(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
+    assert example_block is not None
+    return example_block[1]
 
 
 example: Any = ModuleType("workbench_of_the_docs")
-sys.modules[example.__name__] = example  # where its annotations are looked up
+sys.modules[example.__name__] = example  # msgspec looks up the annotations of the example here
 exec(compile(read_example_from_docs(), str(DOCS), "exec"), example.__dict__)
 Workbench: Any = example.Workbench
 mute: Any = example.mute
 
 
 class DrivesWorkbench(Workbench):
-    """With drives that stop by a watchdog of their own, and are enabled by an arming alone."""
+    """A workbench whose drives have a watchdog, and are enabled only by arming."""
 
     WATCHDOG_S = 0.1
 
@@ -48,9 +48,11 @@ class DrivesWorkbench(Workbench):
         super().__init__(config, settings)
         joints = len(self.angle)
         self.enabled = np.zeros(joints, dtype=bool)
-        self.tripped = np.zeros(joints, dtype=bool)  # by the watchdog, until a reset
+        self.tripped = np.zeros(
+            joints, dtype=bool
+        )  # the watchdog has stopped the drive, until a reset
         self.reported = np.zeros(joints, dtype=bool)
-        self.braked_s = 0.0
+        self.braked_s = 0.0  # time since the last armed period
         self.previous_lifecycle: LifecycleState = "disarmed"
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
@@ -74,9 +76,11 @@ class DrivesWorkbench(Workbench):
         super().enact(dataclasses.replace(setpoints, mode=modes), lifecycle)
 
     def may_be_enabled(self) -> Any:
+        """Return (joints,) whether each drive may be enabled."""
         return ~self.tripped
 
     def still_brakes(self) -> Any:
+        """Return (joints,) whether each drive still brakes its joint after a fault."""
         moves = np.abs(self.velocity) > AT_REST_SPEED_RAD_S
         return self.enabled & moves & (self.braked_s < self.WATCHDOG_S)
 
@@ -85,12 +89,12 @@ class DrivesWorkbench(Workbench):
         self.braked_s += self.steps * example.STEP_S
 
     def faults(self) -> list[Fault]:
-        fresh = self.tripped & ~self.reported
-        self.reported |= fresh
+        newly_tripped = self.tripped & ~self.reported
+        self.reported |= newly_tripped
         names = [
             joint.name
-            for joint, is_fresh in zip(self.description.joints, fresh, strict=True)
-            if is_fresh
+            for joint, is_new in zip(self.description.joints, newly_tripped, strict=True)
+            if is_new
         ]
         return [
             Fault(tick=0, what="drive_fault", cause=f"{name}: its watchdog", joint=name)
@@ -99,7 +103,7 @@ class DrivesWorkbench(Workbench):
 
 
 class WorkbenchDrives:
-    """The drives of a `DrivesWorkbench`."""
+    """The drives of a `DrivesWorkbench`, and a log of their torque switches."""
 
     def __init__(self, backend: Any) -> None:
         self._backend = backend
@@ -139,15 +143,17 @@ class WorkbenchDrives:
 
 
 class BusWorkbench(DrivesWorkbench):
-    """A robot whose commands and measurements go over a simulated bus.
+    """A robot whose commands and measurements pass a simulated bus.
 
     Setpoints are applied one period late, and odd joints report their measurements one period late. Numbers are rounded
-    as in frames. After an arming, the joints begin to follow one after another.
+    as in frames. After arming, the joints start to follow one after another.
     """
 
-    WAKE_UP_PERIODS = 4  # after an arming until joint 0 follows; each further joint takes one more
-    # Whether the first sample has values of the odd joints, too. In lockstep it must: time is paused until the arming,
-    # and the arming needs the state of every joint.
+    WAKE_UP_PERIODS = (
+        4  # from arming until joint 0 follows; each further joint needs one period more
+    )
+    # Whether the first sample has values of the odd joints, too. In lockstep it must: time is paused until the robot is
+    # armed, and arming needs the state of every joint.
     KNOWS_LATE_JOINTS_AT_FIRST = True
 
     def __init__(self, config: Any, settings: Any) -> None:
@@ -201,14 +207,14 @@ class BusWorkbench(DrivesWorkbench):
         return Samples(joints)
 
     def _apply_commands_on_bus(self) -> None:
-        """Apply the newest setpoints; a joint that was armed only just now stays passive."""
+        """Apply the newest setpoints. A joint stays passive until its wake-up time after arming has passed."""
         if self.setpoints_on_bus is None:
             return
         if self.lifecycle == "armed":
             self.armed_periods += 1
         else:
             self.armed_periods = 0
-        # Periods, of every joint.
+        # (joints,) periods from arming until each joint follows.
         wake_up_periods = self.WAKE_UP_PERIODS + np.arange(len(self.angle))
         super().enact(self.setpoints_on_bus, self.lifecycle)
         self.mode = np.where(
@@ -225,7 +231,7 @@ class BusWorkbench(DrivesWorkbench):
 
 
 class RealTimeWorkbench(BusWorkbench):
-    """A robot on a bus in real time: its time does not wait, and its first sample is without the odd joints."""
+    """A robot on a bus in real time, whose first sample has no valid values of the odd joints."""
 
     KNOWS_LATE_JOINTS_AT_FIRST = False
 

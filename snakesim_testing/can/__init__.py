@@ -1,1 +1,1 @@
-"""CAN frames, joint modules and drivers on buses, for tests."""
+"""CAN frames, joint modules and drivers on buses for tests."""

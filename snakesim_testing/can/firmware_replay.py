@@ -1,11 +1,11 @@
-"""The emulator of a joint module and the reference firmware in C, on the same events: do they answer alike?
+"""Compares the emulator of a joint module with the reference firmware in C on the same events.
 
-An event is a line of text, which `snakesim_native/joint_module/replay/replay.c` explains. `Answer` is what a module
-does in response.
+An event is a line of text, which `snakesim_native/joint_module/replay/replay.c` explains. An `Answer` is what a module
+does in response. `find_difference` returns the first event that the two answer differently.
 """
 
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,8 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_hal.physics.thermal import HeatLimits
 
 DEMAND_TOLERANCE = 1e-5  # rad, rad/s or N·m; a step on the bus is ten times as long
-LAST_ID = 0x7FF
+LAST_ID = 0x7FF  # of a standard CAN frame
+ANSWERED_EVENTS = ("frame", "poll")
 
 
 @dataclass(frozen=True)
@@ -39,18 +40,18 @@ class Answer:
     target: float
     torque_limit_nm: float
     rejected_frames: int
-    due_us: int | None  # when the next poll is due; only of polls
+    due_us: int | None  # when the next poll is due; None unless the event is a poll
 
     def agrees_with(self, other: "Answer") -> bool:
-        """Return whether two answers are the same, to the bit on the bus and to rounding in the demand."""
+        """Return whether two answers are the same: exactly, but for rounding errors in the demand."""
         own_demand = (self.target, self.torque_limit_nm)
         other_demand = (other.target, other.torque_limit_nm)
         is_same_demand = all(
             abs(a - b) <= DEMAND_TOLERANCE for a, b in zip(own_demand, other_demand, strict=True)
         )
-        return is_same_demand and self._exact() == other._exact()
+        return is_same_demand and self._exact_fields() == other._exact_fields()
 
-    def _exact(self) -> tuple[object, ...]:
+    def _exact_fields(self) -> tuple[object, ...]:
         return (
             self.frames,
             self.state,
@@ -76,7 +77,7 @@ def run_reference(program: Path, events: Sequence[str]) -> list[Answer]:
         check=False,
     )
     assert completed.returncode == 0, completed.stderr
-    answering_events = [event for event in events if event.startswith(("frame", "poll"))]
+    answering_events = [event for event in events if event.startswith(ANSWERED_EVENTS)]
     lines = completed.stdout.splitlines()
     return [_parse_answer(event, line) for event, line in zip(answering_events, lines, strict=True)]
 
@@ -104,7 +105,7 @@ def _parse_answer(event: str, line: str) -> Answer:
 
 
 class EmulatedReplay:
-    """The emulator of one module, which is given events as text."""
+    """The emulator of one module, which processes events in the form of text."""
 
     def __init__(self) -> None:
         self.module: ModuleFirmware
@@ -131,11 +132,14 @@ class EmulatedReplay:
         return answers
 
     def _init(self, values: Sequence[str]) -> None:
-        node, serial, derate, stop, min_mv, now_us = (int(values[i]) for i in (0, 1, 4, 5, 6, 7))
         flash = make_factory_defaults(float(values[2]), float(values[3]))
-        heat = HeatLimits(derate / 10, stop / 10)
         self.module = ModuleFirmware(
-            node, serial, ParameterStore(flash), heat, min_voltage_v=min_mv / 1000, now_us=now_us
+            int(values[0]),
+            int(values[1]),
+            ParameterStore(flash),
+            HeatLimits(derate_from_c=int(values[4]) / 10, stop_at_c=int(values[5]) / 10),
+            min_voltage_v=int(values[6]) / 1000,
+            now_us=int(values[7]),
         )
 
     def _set_sensors(self, values: Sequence[int]) -> None:
@@ -167,17 +171,17 @@ class EmulatedReplay:
         """Deliver a frame as `ModuleChain` does, if it is for this module."""
         opcode = parse_opcode(frame.id)
         node = parse_node(frame.id)
-        is_for_one = node == self.module.node_id
+        is_for_this_module = node == self.module.node_id
         if frame.id > LAST_ID:
             return
         match opcode:
             case Opcode.SYNC if node == BROADCAST:
                 self._receive_sync(frame)
-            case Opcode.SET_POINT if is_for_one:
+            case Opcode.SET_POINT if is_for_this_module:
                 self.module.receive_setpoint(frame, now_us)
-            case Opcode.PARAMETER_REQUEST if is_for_one:
+            case Opcode.PARAMETER_REQUEST if is_for_this_module:
                 self.module.receive(frame, now_us)
-            case Opcode.COMMAND | Opcode.EMERGENCY if is_for_one or node == BROADCAST:
+            case Opcode.COMMAND | Opcode.EMERGENCY if is_for_this_module or node == BROADCAST:
                 self.module.receive(frame, now_us)
             case _:
                 pass
@@ -186,7 +190,8 @@ class EmulatedReplay:
         if len(frame.data) == LENGTHS[Opcode.SYNC]:
             count, _time_us = read_sync(frame.data)
             self.module.handle_sync(count, self._readings)
-        elif self.module.state != ModuleState.BOOT:  # `ModuleChain` counts it otherwise
+        elif self.module.state != ModuleState.BOOT:
+            # `ModuleChain` counts a rejected Sync, but this replay has no chain.
             self.module.rejected_frame_count += 1
 
     def _make_answer(self, due_us: int | None) -> Answer:
@@ -225,7 +230,7 @@ def _make_contact(values: Sequence[int]) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class Difference:
-    """The first event that the two answer differently, and all events up to it."""
+    """The first event that emulator and reference answer differently, and all events up to it."""
 
     events: list[str]
     emulator: Answer
@@ -246,33 +251,31 @@ def find_difference(program: Path, events: Sequence[str]) -> Difference | None:
     """Return the first difference between the emulator and the reference firmware; None if they agree."""
     from_emulator = EmulatedReplay().run(events)
     from_reference = run_reference(program, events)
-    answering = [i for i, event in enumerate(events) if event.startswith(("frame", "poll"))]
-    for i, emulator, reference in zip(answering, from_emulator, from_reference, strict=True):
+    answered_positions = [i for i, event in enumerate(events) if event.startswith(ANSWERED_EVENTS)]
+    for i, emulator, reference in zip(
+        answered_positions, from_emulator, from_reference, strict=True
+    ):
         if not emulator.agrees_with(reference):
             return Difference(list(events[: i + 1]), emulator, reference)
     return None
 
 
 def shrink_difference(program: Path, difference: Difference) -> Difference:
-    """Return a difference with as few events as removing parts of them can reach. The first event stays."""
+    """Remove events from a difference as long as a difference remains, and return the shortest one.
 
-    def differs(events: list[str]) -> Difference | None:
-        return find_difference(program, events)
-
-    return _remove_parts(difference, differs)
-
-
-def _remove_parts(
-    difference: Difference, differs: Callable[[list[str]], Difference | None]
-) -> Difference:
-    part = len(difference.events) // 2
-    while part >= 1:
+    Longer parts are removed first. The first event, `init`, stays.
+    """
+    part_length = len(difference.events) // 2
+    while part_length >= 1:
         start = 1  # after `init`
         while start < len(difference.events):
-            shorter = differs(difference.events[:start] + difference.events[start + part :])
+            events_without_part = (
+                difference.events[:start] + difference.events[start + part_length :]
+            )
+            shorter = find_difference(program, events_without_part)
             if shorter is None:
-                start += part
+                start += part_length
             else:
                 difference = shorter
-        part //= 2
+        part_length //= 2
     return difference

@@ -1,7 +1,7 @@
-"""Random traffic for one joint module: right and wrong frames, sensor values and pauses, the same for the same seed.
+"""Generates random traffic for one joint module: valid and invalid frames, sensor values and pauses.
 
-The traffic is made of scenes, such as a run of some periods or a series of parameter requests, so that a module
-reaches every state. Lines are events of `firmware_replay`.
+The same seed gives the same traffic. It consists of scenes, such as a run of some periods or a series of parameter
+requests, so that a module reaches every state. Each line is an event of `firmware_replay`.
 """
 
 import random
@@ -36,7 +36,7 @@ NOT_FINITE = (float("nan"), float("inf"), float("-inf"), 3e38, -3e38)
 
 
 class Traffic:
-    """Makes the events of one seed."""
+    """Generates the events of one seed."""
 
     def __init__(self, seed: int) -> None:
         self.events: list[str] = []
@@ -73,7 +73,7 @@ class Traffic:
     # --- scenes -------------------------------------------------------------------------------------------------
 
     def _run_periods(self) -> None:
-        """A host arms, and sends setpoints and Syncs."""
+        """Arm the module, and send setpoints and Syncs."""
         self._command(CommandAction.CLEAR)
         self._command(CommandAction.ARM)
         for _ in range(self._random.randrange(1, 40)):
@@ -86,13 +86,14 @@ class Traffic:
                 self._set_sensors()
 
     def _request_parameters(self) -> None:
+        """Read and write random parameters, mostly while the module is disarmed."""
         if self._random.random() < 0.7:
             self._command(CommandAction.DISARM)
         for _ in range(self._random.randrange(1, 12)):
             self._send(self._make_parameter_request())
 
     def _send_wrong_frames(self) -> None:
-        """Setpoints, commands and others with one error each."""
+        """Send setpoints, commands and parameter requests with one error each."""
         self._command(CommandAction.ARM)
         for _ in range(self._random.randrange(1, 12)):
             frame = self._random.choice(
@@ -103,6 +104,7 @@ class Traffic:
                 self._sync()
 
     def _send_random_frames(self) -> None:
+        """Send frames with random data, half of them with an id that the module receives."""
         for _ in range(self._random.randrange(1, 20)):
             identifier = self._random.choice(
                 (self._random.randrange(0x800), self._random.randrange(0x10000))
@@ -115,7 +117,7 @@ class Traffic:
             self._send(CanFrame(identifier, data))
 
     def _break_sensors(self) -> None:
-        """A fault appears, and later goes away; commands come meanwhile."""
+        """Let a sensor report a fault, send commands, and then let the fault go away."""
         self._command(CommandAction.ARM)
         self._set_sensors(self._random.choice(("sensor", "leak", "voltage", "heat", "several")))
         for _ in range(self._random.randrange(1, 8)):
@@ -128,6 +130,7 @@ class Traffic:
         self._command(CommandAction.CLEAR)
 
     def _stop_in_motion(self) -> None:
+        """Command a stop while the joint moves at a speed near the limit of "at rest"."""
         self._command(CommandAction.CLEAR)
         self._command(CommandAction.ARM)
         self._set_sensors(speed_mrad_s=self._random.choice((-1000, -50, -49, 49, 50, 51, 900)))
@@ -140,7 +143,7 @@ class Traffic:
         self._set_sensors()
 
     def _repeat_setpoints(self) -> None:
-        """A host that hangs sends one setpoint again and again."""
+        """Send one setpoint again and again, as a host that hangs."""
         self._command(CommandAction.CLEAR)
         self._command(CommandAction.ARM)
         repeated = self._make_setpoint()
@@ -149,6 +152,7 @@ class Traffic:
             self._sync()
 
     def _stop_by_emergency(self) -> None:
+        """Send an emergency stop with random data, and then a random command."""
         self._send(CanFrame(make_emergency().id, self._random.randbytes(self._random.randrange(9))))
         if self._random.random() < 0.5:
             self._set_sensors("several")
@@ -158,6 +162,7 @@ class Traffic:
         self._command(CommandAction.CLEAR)
 
     def _reboot(self) -> None:
+        """Reboot the module, and send frames while it boots."""
         self._command(CommandAction.REBOOT)
         for _ in range(self._random.randrange(1, 6)):
             self._pause()
@@ -167,6 +172,7 @@ class Traffic:
         self._pause(100_000)
 
     def _be_silent(self) -> None:
+        """Send nothing to an armed module for longer than its watchdog allows."""
         self._command(CommandAction.ARM)
         self._pause(self._random.choice((100_000, 100_000, 300_000, 2_000_000, FIFTY_DAYS_US)))
         for _ in range(self._random.randrange(12)):
@@ -178,12 +184,12 @@ class Traffic:
         self.events.append(event)
 
     def _pause(self, duration_us: int | None = None) -> None:
-        """Let time pass, and poll."""
+        """Let time pass, and poll the module."""
         self._now_us += self._random.choice(PAUSES_US) if duration_us is None else duration_us
         self._append(f"poll {self._now_us}")
 
     def _send(self, frame: CanFrame) -> None:
-        """Send a frame, and mostly poll after it."""
+        """Send a frame, and mostly poll the module after it."""
         self._now_us += self._random.choice((0, 1, 130))
         self._append(f"frame {self._now_us} {frame.id:x} {frame.data.hex() or '-'}")
         if self._random.random() < 0.8:
@@ -261,7 +267,7 @@ class Traffic:
     # --- frames -------------------------------------------------------------------------------------------------
 
     def _make_setpoint(self) -> CanFrame:
-        """A setpoint whose counter is mostly right."""
+        """Return a random setpoint whose counter is mostly right."""
         step = self._random.choice((1,) * 12 + (2, 3, 4, 0, 9))
         self._setpoint_count = (self._setpoint_count + step) % 16
         mode = self._random.choice((0, 1, 1, 2, 3, 3, self._random.randrange(16)))
@@ -287,7 +293,7 @@ class Traffic:
         )
 
     def _choose_value(self, index: int) -> float:
-        """A value within the range of a parameter, at its ends, beyond them, or no number."""
+        """Return a value in the range of a parameter, at its ends, outside of them, or one that is not a number."""
         if index not in PARAMETERS or self._random.random() < 0.3:
             return self._random.choice(BOUNDARY_VALUES + NOT_FINITE)
         if index == ModuleParameter.WATCHDOG and self._random.random() < 0.5:

@@ -1,4 +1,4 @@
-"""Frames as modules send them, and modules that answer Syncs with them."""
+"""Makes CAN frames as joint modules send them, and lets modules answer the Syncs of a driver with these frames."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -8,67 +8,83 @@ from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import CanFrame, ModuleState, Opcode, parse_opcode
 
 
-def joint_state(node_id: int, count: int, angle: float = 0.1, **other: float) -> CanFrame:
-    values: dict[str, float] = {"state": ModuleState.DISARMED, **other}
-    return load_layouts()[Opcode.JOINT_STATE].encode(
-        node_id, angle=angle, count=count % 16, **values
-    )
-
-
-def heartbeat(
-    node_id: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **other: float
+def make_joint_state_frame(
+    node_id: int, count: int, angle: float = 0.1, **signals: float
 ) -> CanFrame:
-    return load_layouts()[Opcode.HEARTBEAT].encode(node_id, uptime=uptime_s, state=state, **other)
+    """Return a joint state of a disarmed module in answer to the Sync with number `count`. The angle is in rad."""
+    values: dict[str, float] = {"state": ModuleState.DISARMED, **signals}
+    layout = load_layouts()[Opcode.JOINT_STATE]
+    return layout.encode(node_id, angle=angle, count=count % 16, **values)
 
 
-def contact(
-    node_id: int, count: int, *, tail: bool = False, touched: bool = True, **other: float
+def make_heartbeat_frame(
+    node_id: int, uptime_s: float, state: ModuleState = ModuleState.DISARMED, **signals: float
 ) -> CanFrame:
+    """Return a heartbeat of a module that booted `uptime_s` ago."""
+    layout = load_layouts()[Opcode.HEARTBEAT]
+    return layout.encode(node_id, uptime=uptime_s, state=state, **signals)
+
+
+def make_contact_frame(
+    node_id: int, count: int, *, tail: bool = False, touched: bool = True, **signals: float
+) -> CanFrame:
+    """Return a contact of the link, or of the tail, in answer to the Sync with number `count`."""
     layout = load_layouts()[Opcode.TAIL_CONTACT if tail else Opcode.CONTACT]
-    return layout.encode(node_id, count=count % 16, touched=touched, **other)
+    return layout.encode(node_id, count=count % 16, touched=touched, **signals)
 
 
-def gyro(node_id: int, count: int, rate_x: float) -> CanFrame:
-    return load_layouts()[Opcode.GYRO].encode(node_id, rate_x=rate_x, count=count % 256)
+def make_gyro_frame(node_id: int, count: int, rate_x_rad_s: float) -> CanFrame:
+    """Return a measurement of the gyroscope in answer to the Sync with number `count`."""
+    return load_layouts()[Opcode.GYRO].encode(node_id, rate_x=rate_x_rad_s, count=count % 256)
 
 
-def accelerometer(node_id: int, count: int, acceleration_z: float) -> CanFrame:
-    return load_layouts()[Opcode.ACCELEROMETER].encode(
-        node_id, acceleration_z=acceleration_z, count=count % 256
-    )
+def make_accelerometer_frame(node_id: int, count: int, acceleration_z_m_s2: float) -> CanFrame:
+    """Return a measurement of the accelerometer in answer to the Sync with number `count`."""
+    layout = load_layouts()[Opcode.ACCELEROMETER]
+    return layout.encode(node_id, acceleration_z=acceleration_z_m_s2, count=count % 256)
 
 
-def health(node_id: int, **values: float) -> CanFrame:
-    return load_layouts()[Opcode.HEALTH].encode(node_id, **values)
+def make_health_frame(node_id: int, **signals: float) -> CanFrame:
+    """Return a health report with these signals."""
+    return load_layouts()[Opcode.HEALTH].encode(node_id, **signals)
 
 
-def read(frame: CanFrame) -> dict[str, float]:
-    """The values of its signals."""
+def decode_signals(frame: CanFrame) -> dict[str, float]:
+    """Return the values of the signals in a frame, by their names."""
     return dict(load_layouts()[Opcode(parse_opcode(frame.id))].decode(frame.data))
 
 
-def corrupted(frame: CanFrame) -> CanFrame:
-    """With a wrong checksum."""
-    return CanFrame(frame.id, frame.data[:-1] + bytes((frame.data[-1] ^ 0x5A,)))
+def corrupt_checksum(frame: CanFrame) -> CanFrame:
+    """Return a copy of a frame whose checksum, its last byte, is wrong."""
+    wrong_checksum = frame.data[-1] ^ 0x5A
+    return CanFrame(frame.id, frame.data[:-1] + bytes((wrong_checksum,)))
 
 
-def begin(reading: ModuleReports, *, contacts: bool = False, tail: bool = False) -> int:
-    """The next Sync goes out; its number."""
-    reading.start_sync(reading.sync + 1, has_contacts=contacts, has_tail_contact=tail)
-    return reading.sync
+def start_sync(reports: ModuleReports, *, contacts: bool = False, tail: bool = False) -> int:
+    """Let the driver start its next Sync, and return the number of this Sync."""
+    reports.start_sync(reports.sync + 1, has_contacts=contacts, has_tail_contact=tail)
+    return reports.sync
 
 
-def answer(reading: ModuleReports, nodes: Iterable[int] | None = None, **values: Any) -> None:
-    """Modules answer the newest Sync; all of them unless configured otherwise."""
-    for node in range(1, len(reading.modules) + 1) if nodes is None else nodes:
-        reading.process_frame(joint_state(node, reading.sync, **values))
+def answer_sync(reports: ModuleReports, nodes: Iterable[int] | None = None, **signals: Any) -> None:
+    """Let modules answer the newest Sync with their joint states.
+
+    Args:
+        reports: What the driver has received.
+        nodes: Ids of the modules that answer. None for all modules.
+        **signals: Values of the joint states.
+    """
+    if nodes is None:
+        nodes = range(1, len(reports.modules) + 1)
+    for node in nodes:
+        reports.process_frame(make_joint_state_frame(node, reports.sync, **signals))
 
 
-def syncs(
-    reading: ModuleReports, count: int, nodes: Iterable[int] | None = None, **values: Any
+def run_syncs(
+    reports: ModuleReports, count: int, nodes: Iterable[int] | None = None, **signals: Any
 ) -> None:
-    """So many Syncs, answered by these nodes."""
-    nodes = None if nodes is None else list(nodes)
+    """Start several Syncs, and let modules answer each of them. See `answer_sync`."""
+    answering_nodes = None if nodes is None else list(nodes)
     for _ in range(count):
-        begin(reading)
-        answer(reading, nodes, **values)
+        start_sync(reports)
+        answer_sync(reports, answering_nodes, **signals)

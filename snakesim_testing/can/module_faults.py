@@ -1,7 +1,7 @@
-"""Faults that modules report."""
+"""Lists the faults of joint modules that tests inject."""
 
+# Each row has the injected fault, the driver's name for it, and the maximum number of periods until it is detected.
 MODULE_FAULTS = [
-    # asked for, what the driver calls it, seen within so many periods
     ("mute", "module_silent", 4),
     ("freeze", "module_frozen", 5),
     ("reboot", "module_restarted", 14),

@@ -1,4 +1,4 @@
-"""One module, and whole chains, for the tests of the emulators."""
+"""Makes emulated joint modules, chains of them, and the frames that a host sends to them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -25,128 +25,173 @@ from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.thermal import HeatLimits
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.can.driver_loop import config
-from snakesim_testing.can.frames import read
+from snakesim_testing.can.driver_loop import make_can_config
+from snakesim_testing.can.frames import decode_signals
 
 NODE = 3
 SERIAL = 0xC0FFEE
-MS = 1000.0
-BOOTED = 100 * MS
-ARMED_AT_US = 110 * MS  # after all modules have booted
+US_PER_MS = 1000.0
+BOOTED_AT_US = 100 * US_PER_MS
+TORQUE_LIMIT_NM = 4.0
+PERIOD_US = 10_000
+ARMED_AT_US = 110 * US_PER_MS  # after all modules have booted
 HEAT = HeatLimits(derate_from_c=80.0, stop_at_c=105.0)
-QUIET = ModuleReadings(0, 0, 0)
+RESTING_READINGS = ModuleReadings(0, 0, 0)
 
 
-def setpoint(
+def make_setpoint(
     count: int,
     mode: JointMode = JointMode.TORQUE,
     target: float = 1.0,
     limit: float = 3.0,
     node_id: int = NODE,
 ) -> CanFrame:
-    signal = {
+    """Return a setpoint for one module.
+
+    Args:
+        count: Number of the setpoint.
+        mode: Mode of the joint.
+        target: Angle in rad, speed in rad/s or torque in N·m, as the mode needs it.
+        limit: Torque limit in N·m.
+        node_id: The module.
+    """
+    target_signal = {
         JointMode.POSITION: "position",
         JointMode.VELOCITY: "velocity",
         JointMode.TORQUE: "torque",
         JointMode.PASSIVE: "torque",
     }[mode]
-    values: dict[str, float] = {
+    signals: dict[str, float] = {
         "mode": mode,
         "count": count % 16,
-        signal: target,
+        target_signal: target,
         "torque_limit": limit,
     }
-    return load_layouts()[Opcode.SET_POINT].encode(node_id, **values)
+    return load_layouts()[Opcode.SET_POINT].encode(node_id, **signals)
 
 
-def parameter(
+def make_parameter_request(
     index: int, value: float = 0.0, operation: int = ParameterOperation.WRITE, node_id: int = NODE
 ) -> CanFrame:
+    """Return a request to read or write a parameter. The operation may be an unknown number."""
     frame = load_layouts()[Opcode.PARAMETER_REQUEST].encode(node_id, index=index, value=value)
-    # Also operations that there are not.
+    # The layout would reject unknown operations, therefore this byte is replaced after encoding.
     return CanFrame(frame.id, frame.data[:1] + bytes((operation,)) + frame.data[2:])
 
 
-def only(
+def decode_frames_of(
     frames: Sequence[CanFrame], opcode: Opcode, node_id: int | None = None
 ) -> list[dict[str, float]]:
+    """Return the signals of all frames with an opcode, from one module or, with None, from all modules."""
     return [
-        read(f)
-        for f in frames
-        if parse_opcode(f.id) == opcode and node_id in (None, parse_node(f.id))
+        decode_signals(frame)
+        for frame in frames
+        if parse_opcode(frame.id) == opcode and node_id in (None, parse_node(frame.id))
     ]
 
 
-def new_module(**flash: float) -> ModuleFirmware:
-    values = make_factory_defaults(5.0, 6.0) | {
-        ModuleParameter[name.upper()]: value for name, value in flash.items()
-    }
+def make_module(**flash: float) -> ModuleFirmware:
+    """Return a module that is not powered yet.
+
+    Args:
+        **flash: Values of parameters in the flash memory that differ from the factory defaults.
+    """
+    values = make_factory_defaults(5.0, 6.0)
+    values |= {ModuleParameter[name.upper()]: value for name, value in flash.items()}
     return ModuleFirmware(NODE, SERIAL, ParameterStore(values), HEAT)
 
 
-def booted(**flash: float) -> ModuleFirmware:
-    module = new_module(**flash)
-    module.poll(BOOTED)
+def boot_module(**flash: float) -> ModuleFirmware:
+    """Return a disarmed module that has booted, without the frames that it sent. See `make_module`."""
+    module = make_module(**flash)
+    module.poll(BOOTED_AT_US)
     module.frames.clear()
     assert module.state == ModuleState.DISARMED
     return module
 
 
-def armed(**flash: float) -> ModuleFirmware:
-    module = booted(**flash)
-    module.receive(make_command(CommandAction.ARM), BOOTED)
+def arm_module(**flash: float) -> ModuleFirmware:
+    """Return an armed module, without the frames that it sent. See `make_module`."""
+    module = boot_module(**flash)
+    module.receive(make_command(CommandAction.ARM), BOOTED_AT_US)
     module.frames.clear()
     assert module.state == ModuleState.ARMED
     return module
 
 
-def chain(run: RunConfig | None = None, *, is_stepped: bool = True, **given: Any) -> ModuleChain:
-    """On the inertia physics model, with the robot's gains in every flash."""
-    run = run or config()
-    physics_model = given.pop("physics_model", None) or InertiaModel(run, InertiaSettings())
-    settings = CanSettings(
-        **{k: given.pop(k) for k in list(given) if k in CanSettings.__struct_fields__}
-    )
-    made = ModuleChain(run, settings, physics_model, is_stepped=is_stepped, **given)
-    motor = run.robot.motor
-    for slot in made.slots:
+def make_chain(
+    run_config: RunConfig | None = None, *, is_stepped: bool = True, **options: Any
+) -> ModuleChain:
+    """Return a chain of modules whose flash memories contain the gains of the robot.
+
+    Args:
+        run_config: Configuration of the run. None for that of `make_can_config`.
+        is_stepped: Whether the chain runs in steps with the driver.
+        **options: Fields of `CanSettings`, a `physics_model`, and arguments of `ModuleChain`. Without a physics
+            model, the chain moves an inertia for each joint.
+    """
+    run_config = run_config or make_can_config()
+    physics_model = options.pop("physics_model", None)
+    if physics_model is None:
+        physics_model = InertiaModel(run_config, InertiaSettings())
+    setting_names = [name for name in options if name in CanSettings.__struct_fields__]
+    settings = CanSettings(**{name: options.pop(name) for name in setting_names})
+    chain = ModuleChain(run_config, settings, physics_model, is_stepped=is_stepped, **options)
+    motor = run_config.robot.motor
+    for slot in chain.slots:
         slot.module.parameters.values |= {
             ModuleParameter.STIFFNESS: motor.stiffness_nm_per_rad,
             ModuleParameter.DAMPING: motor.damping_nm_s_per_rad,
             ModuleParameter.VELOCITY_GAIN: motor.velocity_gain_nm_s_per_rad,
         }
-    return made
+    return chain
 
 
 class RigHost:
-    """Ticks of a stepped chain with one bus: Sync, answers, setpoints."""
+    """The host of a stepped chain on one bus, which sends Syncs and setpoints at 100 Hz."""
 
-    def __init__(self, made: ModuleChain) -> None:
-        self.chain, self.count = made, -1
-        made.pop_frames(0)
+    def __init__(self, chain: ModuleChain) -> None:
+        self.chain = chain
+        self.count = -1  # number of the newest Sync
+        chain.pop_frames(0)
 
     def arm(self) -> None:
-        self.tick()
+        """Send a Sync, then arm all modules."""
+        self.run_tick()
         self.chain.receive(0, make_command(CommandAction.ARM))
 
-    def tick(
+    def run_tick(
         self, target: float | None = None, mode: JointMode = JointMode.POSITION
     ) -> list[CanFrame]:
+        """Send a Sync, and then setpoints to all modules.
+
+        Args:
+            target: Target of all modules, in the unit of the mode. None: no setpoints.
+            mode: Mode of all modules.
+
+        Returns:
+            The frames that the modules have sent in response to the Sync.
+        """
         self.count += 1
-        self.chain.receive(0, make_sync(self.count, self.count * 10_000))
+        self.chain.receive(0, make_sync(self.count, self.count * PERIOD_US))
         frames = self.chain.pop_frames(0)
         if target is not None:
             for node in range(1, self.chain.module_count + 1):
-                self.chain.receive(0, setpoint(self.count, mode, target, 4.0, node))
+                frame = make_setpoint(self.count, mode, target, TORQUE_LIMIT_NM, node)
+                self.chain.receive(0, frame)
         return frames
 
-    def ticks(
+    def run_ticks(
         self, count: int, target: float | None = None, mode: JointMode = JointMode.POSITION
     ) -> list[CanFrame]:
-        """So many; the frames of the last."""
-        return [self.tick(target, mode) for _ in range(count)][-1]
+        """Run several ticks, and return the frames that the modules have sent in the last one."""
+        frames = list[CanFrame]()
+        for _ in range(count):
+            frames = self.run_tick(target, mode)
+        return frames
 
     def states(self) -> list[ModuleState]:
+        """Return the states of all modules."""
         return [slot.module.state for slot in self.chain.slots[: self.chain.module_count]]
 
 
@@ -164,7 +209,7 @@ def measure_bus_traffic(
         The lateness of each joint state in periods, the traffic counts before and after the run, and the maximum
         number of frames that waited for the bus.
     """
-    emulators = chain(config(joint_count, rate_hz=rate_hz), is_stepped=False)
+    emulators = make_chain(make_can_config(joint_count, rate_hz=rate_hz), is_stepped=False)
     emulators.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
     for slot in emulators.slots:
         slot.module.parameters.values |= {
@@ -185,7 +230,7 @@ def measure_bus_traffic(
                 lateness_periods.append(((tick - 1) - sync_count) % 16)
         emulators.receive(0, make_sync(tick, 0))
         for node in range(1, joint_count + 1):
-            emulators.receive(0, setpoint(tick, node_id=node, target=0.0))
+            emulators.receive(0, make_setpoint(tick, node_id=node, target=0.0))
         waiting_frames = sum(
             map(len, emulators.buses[0]._waiting_frame_by_mailbox_by_sender.values())
         )

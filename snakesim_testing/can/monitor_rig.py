@@ -1,4 +1,4 @@
-"""A watch over three modules, and what one of them can do wrong."""
+"""Runs the fault monitor of the driver on three modules, the second of which can fail in a chosen way."""
 
 from collections.abc import Callable
 
@@ -7,73 +7,84 @@ from snakesim_can_backend.driver.module_monitor import FaultFinding, ModuleMonit
 from snakesim_can_backend.driver.reports import ModuleReports
 from snakesim_can_backend.protocol.definitions import CanFrame, LastStop, ModuleState
 from snakesim_hal.wire.messages import LifecycleState
-from snakesim_testing.can.frames import answer, begin, heartbeat
+from snakesim_testing.can.frames import answer_sync, make_heartbeat_frame, start_sync
 
-JOINTS = 3
-EVERYBODY = (1, 2, 3)
+JOINT_COUNT = 3
+ALL_NODES = (1, 2, 3)
 PERIOD_S = 0.01
-WHO = "joint_2 (node 2 on can0) "
-Speak = Callable[[ModuleReports], None]
+JOINT_2_LABEL = "joint_2 (node 2 on can0) "
+Reply = Callable[[ModuleReports], None]
 
 
-def quiet(_reading: ModuleReports) -> None:
-    """Nothing comes of node 2."""
+def send_nothing(_reports: ModuleReports) -> None:
+    """Let node 2 be silent."""
 
 
 class MonitorRig:
-    """Ticks of a robot whose joint_2 does what a test wants; the others are well."""
+    """A robot whose joint_2 replies as a test wants, while the other joints answer every Sync."""
 
     def __init__(self) -> None:
-        self.reading = ModuleReports(JOINTS)
-        self.watch = ModuleMonitor(
+        self.reports = ModuleReports(JOINT_COUNT)
+        self.monitor = ModuleMonitor(
             ["joint_1", "joint_2", "joint_3"], ["can0", "can0", "can1"], PERIOD_S
         )
         self.lifecycle: LifecycleState = "disarmed"
         self.state = ModuleState.DISARMED
         self.isolated: set[int] = set()
-        self.ticks(3)
+        self.run_ticks(3)
 
-    def tick(
-        self, speak: Speak | None = None, errors: list[BusError] | None = None, unsent: str = ""
+    def run_tick(
+        self, reply: Reply | None = None, errors: list[BusError] | None = None, unsent: str = ""
     ) -> list[FaultFinding]:
-        """One Sync and its look. speak: what comes of node 2, instead of an answer."""
-        begin(self.reading)
-        answer(self.reading, EVERYBODY if speak is None else (1, 3), state=self.state)
-        if speak is not None:
-            speak(self.reading)
+        """Start a Sync, let the modules answer it, and return what the monitor finds.
+
+        Args:
+            reply: Sends what node 2 sends instead of its answer. None: node 2 answers as the others.
+            errors: Errors that the buses report.
+            unsent: The bus that did not accept a frame. Empty for no bus.
+        """
+        start_sync(self.reports)
+        if reply is None:
+            answer_sync(self.reports, ALL_NODES, state=self.state)
+        else:
+            answer_sync(self.reports, (1, 3), state=self.state)
+            reply(self.reports)
         unsent_on = [unsent] if unsent else []
-        return self.watch.find_faults(
-            self.reading, self.lifecycle, errors or (), unsent_on, isolated_joints=self.isolated
+        return self.monitor.find_faults(
+            self.reports, self.lifecycle, errors or (), unsent_on, isolated_joints=self.isolated
         )
 
-    def ticks(self, count: int, speak: Speak | None = None) -> list[FaultFinding]:
-        return [found for _ in range(count) for found in self.tick(speak)]
+    def run_ticks(self, count: int, reply: Reply | None = None) -> list[FaultFinding]:
+        """Run several ticks with the same reply of node 2, and return all findings."""
+        return [finding for _ in range(count) for finding in self.run_tick(reply)]
 
     def reset(self) -> None:
-        self.watch.reset(self.reading.sync)
+        """Reset the faults that the monitor has reported."""
+        self.monitor.reset(self.reports.sync)
 
 
-def answering(state: ModuleState = ModuleState.DISARMED, *frames: CanFrame) -> Speak:
-    """Node 2 answers in this state, and these frames come, too."""
+def make_reply(state: ModuleState = ModuleState.DISARMED, *frames: CanFrame) -> Reply:
+    """Return a reply in which node 2 answers in this state, and further frames arrive."""
 
-    def speak(reading: ModuleReports) -> None:
-        answer(reading, [2], state=state)
+    def reply(reports: ModuleReports) -> None:
+        answer_sync(reports, [2], state=state)
         for frame in frames:
-            reading.process_frame(frame)
+            reports.process_frame(frame)
 
-    return speak
-
-
-def reporting(state: ModuleState = ModuleState.DISARMED, **values: float) -> Speak:
-    """Node 2 answers in this state, and sends a heartbeat with more values."""
-    return answering(state, heartbeat(2, 1.0, state, **values))
+    return reply
 
 
-HOT = reporting(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1)
-HOT_AND_WET = reporting(
+def make_heartbeat_reply(state: ModuleState = ModuleState.DISARMED, **signals: float) -> Reply:
+    """Return a reply in which node 2 answers in this state, and sends a heartbeat with these signals."""
+    return make_reply(state, make_heartbeat_frame(2, 1.0, state, **signals))
+
+
+OVERHEATED = make_heartbeat_reply(ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1)
+OVERHEATED_WITH_LEAK = make_heartbeat_reply(
     ModuleState.FAULT, last_stop=LastStop.OVERHEAT, fault_overheat=1, fault_leak=1
 )
 
 
 def list_findings(findings: list[FaultFinding]) -> list[tuple[str, int | None]]:
+    """Return the kind and the joint of each finding."""
     return [(finding.what, finding.joint) for finding in findings]

@@ -1,7 +1,7 @@
-"""Driver and modules on one kernel interface and in one process, on a clock that passes while the driver waits.
+"""Runs the CAN driver and emulated joint modules in one process on one kernel interface.
 
-Every frame goes through the kernel. Time is the modules': while the driver waits within a period, their clock goes on
-to the period's end, and then it is paused. So it does not matter how slow this machine is, or how long `ip` takes.
+Every frame passes through the kernel. The modules have a clock of their own, which advances only while the driver
+waits. It stops at the end of each period. Thus neither a slow machine nor a slow `ip` command changes a test.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,25 +21,27 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.shared_physics import make_physics_model
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.physics.physics_model import PhysicsModel
-from snakesim_testing.can.driver_loop import DriverLoop, armed, config
+from snakesim_testing.can.driver_loop import DriverLoop, arm_and_wave, make_can_config
 
-ANSWER_LIMIT_S = 2.0  # of this machine's time; the modules' ends the wait before
+ANSWER_LIMIT_S = 2.0  # wall time; the clock of the modules ends the wait earlier
+MAX_REST_SPEED_RAD_S = 0.05
 
 
 class SharedWire(SocketCanWire):
-    """The driver's end. Whenever it waits, the modules at the other end live on."""
+    """The driver's connection to the bus. The modules run whenever the driver waits for frames."""
 
     def __init__(self, channel: str, server: EmulatorServer) -> None:
         super().__init__(channel)
         self.server = server
         self.now_ns = 0
-        self.until_ns = inf  # the modules' clock stops here
+        self.until_ns = inf  # the clock of the modules stops here
         self.sent: list[CanFrame] = []
 
     def send(self, frame: CanFrame) -> bool:
-        taken = super().send(frame)
-        self.sent += [frame] * taken
-        return taken
+        was_sent = super().send(frame)
+        if was_sent:
+            self.sent.append(frame)
+        return was_sent
 
     def idle(self) -> float | None:
         if self.now_ns >= self.until_ns:
@@ -52,22 +54,26 @@ class SharedWire(SocketCanWire):
 
 @dataclass
 class SharedBus(DriverLoop):
-    """A loop whose modules have time until the end of each period."""
+    """A driver loop whose modules run until the end of each period."""
 
-    # At ends of ticks.
-    true_state_at: dict[int, set[ModuleState]] = field(default_factory=dict[int, set[ModuleState]])
+    # The states of the modules at the end of each tick.
+    true_states_by_tick: dict[int, set[ModuleState]] = field(
+        default_factory=dict[int, set[ModuleState]]
+    )
 
-    def run(self, ticks: int, wish: Callable[[int], SafeSetpoints] | None = None) -> None:
-        """So many periods, each as long for the modules as for the driver."""
+    def run(
+        self, ticks: int, compute_setpoints: Callable[[int], SafeSetpoints] | None = None
+    ) -> None:
+        """Run control cycles that last one period for the driver and for the modules."""
         for _ in range(ticks):
             self.wire.until_ns = self.wire.now_ns + self.config.period_ns
-            super().run(1, wish)
+            super().run(1, compute_setpoints)
             while self.wire.idle() is not None:
                 pass
-            self.true_state_at[self.tick] = set(self.true_states())
+            self.true_states_by_tick[self.tick] = set(self.read_true_states())
 
-    def watch_seen(self, kind: str) -> int:
-        """How often a error that is no fault was counted."""
+    def count_minor_errors(self, kind: str) -> int:
+        """Return how often the driver counted an error of this kind that is no fault."""
         return self.backend.modules.monitor.minor_error_counts.get(kind, 0)
 
     @property
@@ -80,12 +86,14 @@ class SharedBus(DriverLoop):
     def physics_model(self) -> PhysicsModel:
         return self.wire.server.chain.physics_model
 
-    def true_states(self) -> list[ModuleState]:
-        """What the modules are, whether or not they can tell."""
+    def read_true_states(self) -> list[ModuleState]:
+        """Return the states of the modules, whether or not the driver has received them."""
         return [slot.module.state for slot in self.wire.server.chain.slots]
 
-    def at_rest(self) -> bool:
-        return bool((abs(self.physics_model.velocity_rad_s) < 0.05).all())
+    def is_at_rest(self) -> bool:
+        """Return whether no joint moves."""
+        speed_rad_s = abs(self.physics_model.velocity_rad_s)
+        return bool((speed_rad_s < MAX_REST_SPEED_RAD_S).all())
 
 
 @contextmanager
@@ -95,15 +103,12 @@ def open_shared_bus(channel: str) -> Iterator[SharedBus]:
     Args:
         channel: Name of the CAN interface.
     """
-    run_config = config(clock_mode="realtime")
+    run_config = make_can_config(clock_mode="realtime")
     settings = CanSettings(channels=[channel], physics_model="inertia")
+    physics_model = make_physics_model(run_config, settings, "can")
+    chain = ModuleChain(run_config, settings, physics_model, is_stepped=False)
     module_wire = SocketCanWire(channel, FROM_HOST)
-    server = EmulatorServer(
-        [module_wire],
-        ModuleChain(
-            run_config, settings, make_physics_model(run_config, settings, "can"), is_stepped=False
-        ),
-    )
+    server = EmulatorServer([module_wire], chain)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "open_wire", lambda name, bit_rate: SharedWire(name, server))
         patch.setattr(driver, "compute_response_timeout_s", lambda *_: ANSWER_LIMIT_S)
@@ -111,7 +116,7 @@ def open_shared_bus(channel: str) -> Iterator[SharedBus]:
         try:
             backend = CanBackend(run_config, settings)
             try:
-                yield armed(SharedBus(backend, run_config))
+                yield arm_and_wave(SharedBus(backend, run_config))
             finally:
                 backend.close()
         finally:

@@ -41,16 +41,16 @@ class TorqueSwitch(NamedTuple):
 
 
 class EmulatedDrives(Protocol):
-    """The emulated drives of an open backend, for clauses about what drives do while their driver does nothing."""
+    """The emulated drives of an open backend, for clauses about drives whose driver does nothing."""
 
     def list_enabled(self) -> list[bool]:
-        """Return for each joint whether its drive would follow a setpoint now: in truth, not as the driver has it."""
+        """Return for each joint whether its drive would follow a setpoint now, whatever the driver has received."""
         ...
 
     def freeze_driver(self, seconds: float, sleep: Callable[[float], None]) -> None:
         """Let time pass at the drives while nothing of the driver runs, as when its process is stopped.
 
-        A driver with threads holds them meanwhile. `sleep` waits where the drives' time is that of a clock.
+        A driver with threads stops them for this time. `sleep` waits if the time of the drives is that of a clock.
         """
         ...
 
@@ -59,7 +59,7 @@ class EmulatedDrives(Protocol):
         ...
 
     def list_torque_switches(self) -> list[TorqueSwitch]:
-        """Return when drives have switched their torque on and off since this object was made, by `now_s`."""
+        """Return when drives have switched their torque on and off since this object was made, by `read_time_s`."""
         ...
 
 
@@ -106,7 +106,7 @@ class Bench:
         self._overrides = overrides
         # The open backend: in a rig without a network, or in a host; None if it is closed.
         self._rig: BackendRig | None = None
-        # The pair that belongs together.
+        # An open backend and its emulated drives.
         self._open_backend_and_drives: tuple[Backend, EmulatedDrives] | None = None
         self.was_opened = False  # whether the backend was ever opened
         self._hosted_backend: HostedBackend | None = None
@@ -117,7 +117,7 @@ class Bench:
 
     @cached_property
     def backend_type(self) -> type[Backend]:
-        """The backend's class. Raises ConfigError when there is no such backend."""
+        """The class of the backend. Raises ConfigError if there is no such backend."""
         if isinstance(self._backend, str):
             return load_backend_class(self._backend)
         return self._backend
@@ -137,7 +137,7 @@ class Bench:
         clock_modes = self.backend_type.check(
             config, decode_backend_settings(config, self.backend_type)
         )
-        # Lockstep is preferred: it is quick, and the same on every machine.
+        # Lockstep is preferred, because it is faster and repeatable on every machine.
         clock_mode = "lockstep" if "lockstep" in clock_modes else "realtime"
         return msgspec.structs.replace(
             config, clock_mode=clock_mode, services={LEASE_HOLDER: ServiceSchedule()}

@@ -1,4 +1,4 @@
-"""Injected faults for clauses about what a backend does in them."""
+"""Injects faults into emulated drives for clauses about the reaction of a backend."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from snakesim_testing.contract.rig import BackendRig
 
 
 def inject_or_skip(rig: BackendRig, text: str) -> None:
-    """Begin a fault of the emulated drives; skip the clause if the backend cannot."""
+    """Begin a fault of the emulated drives, or skip the clause if the backend cannot inject it."""
     try:
         is_possible = rig.backend.inject(parse_injection(text), begins=True)
     except ConfigError as error:

@@ -1,4 +1,4 @@
-"""The emulated drives of a backend on the driver kit, as the contract suite looks at them.
+"""Gives the contract suite access to the emulated drives of a backend on the driver kit.
 
 Pass `KitDrives` to `--snakesim-drives` or to a `Bench`, and `mute_joint` as `mute`, if the drives of each bus have an
 attribute `emulator`, a `DriveEmulator` that implements `list_enabled`.
@@ -19,10 +19,10 @@ def mute_joint(backend: Any, joint_index: int) -> None:
 
 
 class KitDrives:
-    """Emulated drives on one bus or on several: a `snakesim_testing.contract.bench.EmulatedDrives`."""
+    """The emulated drives on all buses of a backend, as `snakesim_testing.contract.bench.EmulatedDrives`."""
 
     def __init__(self, backend: Any) -> None:
-        """Begin to log, at every step of the drives' physics, which drives are enabled."""
+        """Log from now on which drives are enabled, in every step of their physics."""
         self._backend = backend
         self._buses = backend._drives.buses
         self._log: list[TorqueSwitch] = []
@@ -43,23 +43,18 @@ class KitDrives:
 
     def list_enabled(self) -> list[bool]:
         """Return for each joint whether its drive would follow a setpoint now."""
-        enabled: dict[int, bool] = {}
+        enabled_by_joint: dict[int, bool] = {}
         for bus in self._buses:
-            enabled |= dict(
-                zip(
-                    bus.spec.joints,
-                    self.list_enabled_of_bus(self.find_emulator(bus.drives)),
-                    strict=True,
-                )
-            )
-        return [enabled[joint] for joint in range(len(enabled))]
+            enabled_on_bus = self.list_enabled_of_bus(self.find_emulator(bus.drives))
+            enabled_by_joint |= dict(zip(bus.spec.joints, enabled_on_bus, strict=True))
+        return [enabled_by_joint[joint] for joint in range(len(enabled_by_joint))]
 
     def freeze_driver(self, seconds: float, sleep: Callable[[float], None]) -> None:
         """Let time pass at the drives while nothing of the driver runs."""
-        with ExitStack() as held:
+        with ExitStack() as held_locks:
             for bus in self._buses:
-                if hasattr(bus, "_condition"):  # a bus in a thread: it can do nothing without this
-                    held.enter_context(bus._condition)
+                if hasattr(bus, "_condition"):  # the thread of a bus waits for this lock
+                    held_locks.enter_context(bus._condition)
             self._backend._clock.robot_time_ns += round(seconds * 1e9)
             sleep(seconds)
             for bus in self._buses:

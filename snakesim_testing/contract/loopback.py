@@ -1,4 +1,4 @@
-"""A backend behind the real host, with a real client that commands it and an observer, over Zenoh on loopback."""
+"""Runs a backend behind the real HAL host, with a real client that commands it, over Zenoh on loopback."""
 
 import contextlib
 import sys
@@ -31,12 +31,12 @@ from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_testing.contract.rig import LEASE_HOLDER, JointTargets
 
 TIMEOUT_S = 60.0  # for operations of a tenth of a second; a slow machine is not a failure
-# Ticks since arming -> commanded joints; None: send nothing.
+# Returns the commanded joints for a number of ticks since arming, or None to send nothing.
 Plan = Callable[[int], "JointTargets | None"]
 
 
 def hold_all_joints(_ticks: int) -> JointTargets:
-    """Plan that commands no joint, so that all hold their position."""
+    """Return a plan without commands, so that all joints hold their position."""
     return {}
 
 
@@ -122,9 +122,9 @@ class PlannedController:
             joint_state_subscription = client.subscribe(keys.JOINTS, JointState)
             commander = Commander(client, robot)
             client.announce()
-            current_arm_session = -1  # the session that `armed_tick` is about
+            current_arm_session = -1  # the session that `armed_tick` belongs to
             armed_tick = -1  # first tick of that session
-            # That hold the newest positions from before the arming.
+            # Setpoints that hold the newest positions before arming.
             held_setpoints: RequestedSetpoints | None = None
             for clock in client.iterate_ticks(silence_timeout_s=0.05):
                 if self.stop_event.is_set():
@@ -205,8 +205,8 @@ class HostedBackend:
             self._command_publisher = self.session.declare_publisher(
                 keys.JOINT_COMMAND, JointCommand
             )
-            # Earlier ones are lost.
-            wait_until(self._command_publisher.has_subscriber, "the host receives our commands")
+            # Commands that are sent earlier are lost.
+            wait_until(self._command_publisher.has_subscriber, "the host subscribes to commands")
             self._start_thread("host", self.host.run, self.host.request_stop)
             self._start_thread(
                 "controller", lambda: self.controller.run(link), self.controller.stop_event.set

@@ -1,4 +1,6 @@
-"""The pytest plugin: options, fixtures and the table at the end. It does nothing until a contract test runs.
+"""Adds the options, the fixtures and the table of results of the contract suite to pytest.
+
+This plugin does nothing until a contract test runs.
 
 A bench is the fixture around one backend under test: the backend with its settings, and a column of the table. A clause
 is one contract test, and a row of the table. The clauses of one test module are a section of the table.
@@ -57,7 +59,7 @@ class ContractHooks:
 
 
 def pytest_addhooks(pluginmanager: pytest.PytestPluginManager) -> None:
-    """Register the hook."""
+    """Register the hooks that a conftest.py may implement."""
     pluginmanager.add_hookspecs(ContractHooks)
 
 
@@ -227,7 +229,9 @@ def rig(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[BackendRig]
     rig.return_home()
     yield rig
     if rig.late_periods > 1:
-        warning = f"{bench.name}: this machine fell {rig.late_periods:.1f} periods behind real time"
+        warning = (
+            f"{bench.name}: this machine was up to {rig.late_periods:.1f} periods behind real time"
+        )
         request.node.add_report_section("call", "clock_mode", warning)
         rig.late_periods = 0.0
     if request.node.stash.get(_failed, False):
@@ -239,7 +243,7 @@ def drives(bench: "Bench", rig: "BackendRig") -> "EmulatedDrives":
     """Return the emulated drives of the open backend."""
     drives = bench.find_emulated_drives(rig.backend)
     if drives is None:
-        pytest.skip("this bench has no emulated drives to look at; give --snakesim-drives")
+        pytest.skip("this bench has no access to emulated drives; give --snakesim-drives")
     return drives
 
 
@@ -253,7 +257,7 @@ def hosted(bench: "Bench", request: pytest.FixtureRequest) -> "Iterator[HostedBa
 
 @pytest.fixture
 def healthy(bench: "Bench", request: pytest.FixtureRequest) -> "RigRecord":
-    """Return a second of normal operation, in which every joint sways; recorded once for all tests."""
+    """Return the record of 1 s of normal operation, in which every joint swings. It is recorded once for all tests."""
     from snakesim_testing.contract.recordings import record_sway
 
     return bench.record_once("healthy", lambda: record_sway(request.getfixturevalue("rig")))
@@ -261,7 +265,7 @@ def healthy(bench: "Bench", request: pytest.FixtureRequest) -> "RigRecord":
 
 @pytest.fixture
 def pushing(bench: "Bench", request: pytest.FixtureRequest) -> "PushRecording":
-    """Return two joints that push against their stops; recorded once for all tests."""
+    """Return the record of two joints that push against their end stops. It is recorded once for all tests."""
     from snakesim_testing.contract.recordings import record_push
 
     return bench.record_once("pushing", lambda: record_push(request.getfixturevalue("rig")))
@@ -271,7 +275,7 @@ def pushing(bench: "Bench", request: pytest.FixtureRequest) -> "PushRecording":
 def switching(
     bench: "Bench", request: pytest.FixtureRequest
 ) -> "dict[tuple[JointMode, JointMode], Floats]":
-    """Return one joint through every change of mode; recorded once for all tests."""
+    """Return the record of a joint in every change of mode. It is recorded once for all tests."""
     from snakesim_testing.contract.recordings import record_mode_switches
 
     return bench.record_once(
@@ -431,7 +435,7 @@ def format_markdown_table(
 def _get_outcome(report: pytest.TestReport) -> tuple[str, str]:
     """Return the outcome of a test, and the reason if it was skipped."""
     if report.skipped:
-        # (file, line, reason) of a skip; something else of an expected failure.
+        # A skip has a tuple of file, line and reason. An expected failure has another object.
         details: Any = report.longrepr
         if isinstance(details, tuple):
             return "skip", details[2].removeprefix("Skipped: ")
@@ -442,7 +446,7 @@ def _get_outcome(report: pytest.TestReport) -> tuple[str, str]:
 
 
 def _find_worst_outcome(outcomes: list[tuple[str, str]]) -> str:
-    """Return the worst of some outcomes; a dash if there is none."""
+    """Return the worst outcome, or a dash if there is none."""
     words = [word for word, _ in outcomes]
     return next((word for word in OUTCOMES_WORST_FIRST if word in words), "-")
 

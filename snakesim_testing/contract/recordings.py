@@ -1,4 +1,4 @@
-"""Motions that several tests share: opening and waiting take most of the time on a real bus."""
+"""Records motions that several tests share, because opening and waiting need most of the time on a real bus."""
 
 import math
 from collections.abc import Callable
@@ -21,7 +21,7 @@ MODE_DURATION_S = 0.16  # of a mode before the next change
 class PushRecording:
     """Records of joint 0 pushing against its upper end stop, and joint 1 against its lower one."""
 
-    # End of the push in torque mode; None if a joint has no torque mode.
+    # The end of the push in torque mode. None if a joint has no torque mode.
     torque_mode: RigRecord | None
     requested_nm: float
     torque_limited: RigRecord
@@ -52,7 +52,8 @@ def record_push(rig: BackendRig) -> PushRecording:
     """
     rig.arm()
     first_tick = rig.tick
-    upper_stop_joint, lower_stop_joint = rig.robot.joints[0], rig.robot.joints[1]
+    upper_stop_joint = rig.robot.joints[0]
+    lower_stop_joint = rig.robot.joints[1]
 
     def make_targets(mode: JointMode, up: float, down: float) -> JointTargets:
         return {0: (mode, up), 1: (mode, down)}

@@ -1,4 +1,4 @@
-"""An open backend, driven tick by tick as the host does it, through the real authority and its command limiter."""
+"""Drives an open backend tick by tick as the HAL host does, through the real authority and its command limiter."""
 
 import contextlib
 import time
@@ -34,11 +34,11 @@ MAX_LATE_PERIODS = 10
 
 
 def _no_sleep(_seconds: float) -> None:
-    """Do not wait: in lockstep the time of drives does not pass by a clock."""
+    """Do not wait, because the time of the drives does not depend on a clock in lockstep."""
 
 
 def skip_limiter(requested: RequestedSetpoints) -> SafeSetpoints:
-    """Return setpoints as safe ones without limiting them, for clauses about the ends of joints."""
+    """Return setpoints as safe ones without limiting them, for clauses about the end stops of joints."""
     return SafeSetpoints(requested.mode, requested.target, requested.torque_limit_nm)
 
 
@@ -57,17 +57,17 @@ class RigRecord:
 
     @property
     def angle_rad(self) -> Floats:
-        """Measured angles."""
+        """The measured angles."""
         return np.array([joints.angle_rad for joints in self.joints])
 
     @property
     def velocity_rad_s(self) -> Floats:
-        """Measured velocities."""
+        """The measured velocities."""
         return np.array([joints.velocity_rad_s for joints in self.joints])
 
     @property
     def torque_nm(self) -> Floats:
-        """Measured torques."""
+        """The measured torques."""
         return np.array([joints.torque_nm for joints in self.joints])
 
 
@@ -81,8 +81,8 @@ class BackendRig:
     must_reopen: bool = False  # unusable for further tests: closed, or a joint is silent
     is_closed: bool = False
     tick: int = 0
-    late_periods: float = 0.0  # how far this machine fell behind real time at worst
-    # By joint: last position of a joint without velocity mode, which follows a speed.
+    late_periods: float = 0.0  # maximum delay of this machine behind real time
+    # The last position target of each joint without velocity mode that follows a speed, by joint index.
     _position_targets_rad: dict[int, float] = field(default_factory=dict[int, float])
     _faults_by_tick: list[tuple[int, Fault]] = field(default_factory=list[tuple[int, Fault]])
 
@@ -152,7 +152,7 @@ class BackendRig:
 
     @property
     def faults(self) -> list[Fault]:
-        """All faults that the backend reported since it was opened."""
+        """The faults that the backend has reported since it was opened."""
         return [fault for _, fault in self._faults_by_tick]
 
     @property
@@ -270,9 +270,8 @@ class BackendRig:
         for joint in self._position_targets_rad.keys() - targets.keys():
             del self._position_targets_rad[joint]
         for joint, (joint_mode, joint_target) in targets.items():
-            if joint_mode is JointMode.VELOCITY and not self.supports_mode(
-                joint, JointMode.VELOCITY
-            ):
+            has_velocity_mode = self.supports_mode(joint, JointMode.VELOCITY)
+            if joint_mode is JointMode.VELOCITY and not has_velocity_mode:
                 joint_mode = JointMode.POSITION
                 joint_target = self._next_position_rad(joint, joint_target)
             mode[joint] = joint_mode
@@ -313,7 +312,9 @@ class BackendRig:
 
     def assert_armed(self) -> None:
         """Fail with the reason if the robot is not armed any more."""
-        assert self.authority.state == "armed", f"no longer armed: {self.authority.reason}"
+        assert self.authority.state == "armed", (
+            f"the robot is no longer armed: {self.authority.reason}"
+        )
 
     def disarm(self) -> None:
         """Disarm an armed robot; reset a robot that was stopped."""
@@ -397,8 +398,9 @@ class BackendRig:
             self.wait_periods()
 
     def close(self) -> None:
-        """Close the backend; safe to call again."""
-        self.must_reopen = self.is_closed = True
+        """Close the backend. A second call is safe."""
+        self.must_reopen = True
+        self.is_closed = True
         self.backend.close()
 
     # --- inside --------------------------------------------------------------------------------------------
@@ -415,7 +417,7 @@ class BackendRig:
         )
 
     def _send(self, setpoints: RequestedSetpoints) -> None:
-        """Send a command to the authority; the clause sees a rejection in the joint states."""
+        """Send a command to the authority. The joint states show the clause whether it was rejected."""
         if self.authority.state == "disarmed" and not self.authority.lease.is_held(self._now_ns):
             self.authority.handle_lease_request(
                 LeaseRequest(action="acquire", holder=LEASE_HOLDER), self._now_ns

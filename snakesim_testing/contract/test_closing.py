@@ -34,7 +34,7 @@ def use_closed_backend(rig: BackendRig) -> list[JointState]:
 
 
 def test_a_closed_backend_drives_nothing(bench: Bench, rig: BackendRig) -> None:
-    """A backend that is closed while a joint moves drives no joint any more, even if it gets setpoints."""
+    """A backend that was closed while a joint moved does not drive any joint, even if it gets setpoints."""
     rig.arm_and_move_joint()
     start_angle_rad = rig.newest_joints.angle_rad[0]
     rig.close()
@@ -45,7 +45,9 @@ def test_a_closed_backend_drives_nothing(bench: Bench, rig: BackendRig) -> None:
     max_coasting_rad = (
         0.5 * tolerances.MOTION_SPEED_RAD_S * tolerances.CLOSING_PERIODS * rig.period_ns * 1e-9
     )
-    assert moved_rad < max_coasting_rad, f"it went on by {moved_rad:.3f} rad"
+    assert moved_rad < max_coasting_rad, (
+        f"a joint moved by {moved_rad:.3f} rad after the backend was closed; at most {max_coasting_rad:.3f} rad"
+    )
 
 
 def test_closing_twice_does_no_harm(bench: Bench) -> None:
@@ -83,7 +85,10 @@ def test_in_lockstep_same_seed_and_commands_give_same_samples(bench: Bench) -> N
         rig.wait_periods(tolerances.ARMING_PERIODS)
         return rig.record_since(1).samples
 
-    first, second = run_once(), run_once()
-    for a, b in zip(first, second, strict=True):
-        assert a.joints == b.joints, f"tick {a.joints.tick}"
-        assert encode(dict(a.by_key)) == encode(dict(b.by_key)), f"tick {a.joints.tick}"
+    first_run = run_once()
+    second_run = run_once()
+    for a, b in zip(first_run, second_run, strict=True):
+        assert a.joints == b.joints, f"the joint states of tick {a.joints.tick} differ"
+        assert encode(dict(a.by_key)) == encode(dict(b.by_key)), (
+            f"the samples of other sensors differ in tick {a.joints.tick}"
+        )

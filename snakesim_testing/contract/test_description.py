@@ -70,15 +70,17 @@ def test_the_description_survives_the_wire(rig: BackendRig) -> None:
 def test_every_sensor_listed_is_a_key_of_the_hal_once(rig: BackendRig) -> None:
     """Every sensor is listed once, at a sensor key, with a rate up to the control rate; the joints are listed."""
     listed_keys = [sensor.key for sensor in rig.robot.sensors]
-    assert len(set(listed_keys)) == len(listed_keys), f"listed twice: {listed_keys}"
+    assert len(set(listed_keys)) == len(listed_keys), (
+        f"the description lists a sensor twice: {listed_keys}"
+    )
     assert find_custom_messages(rig.robot).keys() == rig.robot.custom.keys(), (
-        "a schema of `custom` fits no message"
+        "the description has a schema in `custom` that fits no message"
     )
     assert keys.JOINTS in listed_keys
     for sensor in rig.robot.sensors:
         assert sensor.key.startswith("sensor/") and keys.find_message(sensor.key), sensor.key
         assert sensor.rate_hz <= 1.001e9 / rig.period_ns, (
-            f"{sensor.key}: faster than the control rate"
+            f"the rate of {sensor.key} is higher than the control rate"
         )
 
 
@@ -97,7 +99,7 @@ def test_every_sensor_listed_delivers_at_about_its_rate(
             f"{sensor.key} is listed but never published"
         )
         assert abs(sample_count - expected_count) <= tolerance, (
-            f"{sensor.key}: {sample_count} in {duration_s} s, stated are {sensor.rate_hz} Hz"
+            f"{sensor.key}: {sample_count} samples in {duration_s} s, but the description has {sensor.rate_hz} Hz"
         )
 
 
@@ -120,5 +122,5 @@ def test_nothing_comes_that_is_not_listed(rig: BackendRig, healthy: RigRecord) -
         for key, message in sample.by_key.items():
             assert key in listed_keys, f"{key} is published but not listed"
             assert isinstance(message, keys.find_message(key) or ()), (
-                f"{key}: {type(message).__name__}"
+                f"{key} has messages of the wrong type {type(message).__name__}"
             )

@@ -23,7 +23,7 @@ def do_nothing(_rig: BackendRig) -> None:
 def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     rig: BackendRig, drives: EmulatedDrives, act_after_freeze: Callable[[BackendRig], None]
 ) -> None:
-    """A host that does nothing for 1 s while a joint moves: every drive switches off by its own watchdog.
+    """If the host does nothing for 1 s while a joint moves, every drive switches off by its own watchdog.
 
     Once the host resumes, the backend reports each of those stops as a fault of its joint, whatever the operator asks
     for first. No drive is enabled again before the fault is reset and the robot armed.
@@ -31,15 +31,17 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
     joints_without_watchdog = rig.joints_without_watchdog
     if joints_without_watchdog:
         pytest.skip(
-            f"described without a watchdog, so they hold while the host is frozen: {joints_without_watchdog}"
+            f"these joints have no watchdog, so they hold while the host is frozen: {joints_without_watchdog}"
         )
     rig.arm_and_move_joint()
     rig.must_reopen = True
-    assert all(drives.list_enabled()), f"armed, and enabled are {drives.list_enabled()}"
+    assert all(drives.list_enabled()), (
+        f"the robot is armed, but not all drives are enabled: {drives.list_enabled()}"
+    )
     start_tick = rig.tick
     rig.freeze_host(tolerances.FREEZE_DURATION_S, drives.freeze_driver)
     assert not any(drives.list_enabled()), (
-        f"{tolerances.FREEZE_DURATION_S} s without the driver, and still enabled are {drives.list_enabled()}"
+        f"drives are enabled after {tolerances.FREEZE_DURATION_S} s without their driver: {drives.list_enabled()}"
     )
     act_after_freeze(rig)
     assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
@@ -49,14 +51,16 @@ def test_drives_that_stop_during_host_freeze_stay_off_until_reset(
         joint.name for joint in rig.robot.joints if joint.name not in reported_joints
     ]
     assert not unreported_joints, (
-        f"their stop was never reported: {unreported_joints}; reported were {record.faults}"
+        f"the backend did not report the stop of {unreported_joints}; it reported {record.faults}"
     )
     assert rig.authority.state in ("fault", "estop"), rig.authority.state
     rig.reset()
     assert_drives_stay_off(rig, drives, tolerances.ARMING_PERIODS)
     reset_tick = rig.tick
     rig.arm_and_move_joint()
-    assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
+    assert all(drives.list_enabled()), (
+        f"not all drives are enabled after reset and arming: {drives.list_enabled()}"
+    )
     assert not rig.record_since(reset_tick).faults, rig.record_since(reset_tick).faults
 
 
@@ -79,12 +83,16 @@ def test_drives_without_watchdog_are_off_once_frozen_host_resumes(
     assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
     record = rig.record_since(start_tick)
     reported_joints = {fault.joint for fault in record.faults if fault.cause}
-    assert reported_joints >= {*joints_without_watchdog}, f"reported were {record.faults}"
+    assert reported_joints >= {*joints_without_watchdog}, (
+        f"the backend did not report all joints without a watchdog, but {record.faults}"
+    )
     assert rig.authority.state in ("fault", "estop"), rig.authority.state
     rig.reset()
     assert_drives_stay_off(rig, drives, tolerances.ARMING_PERIODS)
     rig.arm_and_move_joint()
-    assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
+    assert all(drives.list_enabled()), (
+        f"not all drives are enabled after reset and arming: {drives.list_enabled()}"
+    )
 
 
 def assert_drives_stay_off(rig: BackendRig, drives: EmulatedDrives, period_count: int) -> None:
@@ -92,14 +100,14 @@ def assert_drives_stay_off(rig: BackendRig, drives: EmulatedDrives, period_count
     for _ in range(period_count):
         rig.wait_periods()
         assert not any(drives.list_enabled()), (
-            f"enabled again, in state {rig.authority.state}: {drives.list_enabled()}"
+            f"drives are enabled again in state {rig.authority.state}: {drives.list_enabled()}"
         )
 
 
 def test_drives_brake_after_fault_and_are_off_after_watchdog(
     rig: BackendRig, drives: EmulatedDrives
 ) -> None:
-    """A fault while a joint moves: its drive brakes the joint, but no longer than the drive's watchdog lasts."""
+    """After a fault, the drive of a moving joint brakes it, but not for longer than the time of its watchdog."""
     rig.arm_and_move_joint()
     rig.report_fault()
     rig.wait_periods()
@@ -110,5 +118,5 @@ def test_drives_brake_after_fault_and_are_off_after_watchdog(
     rig.wait_periods(rig.count_periods(tolerances.MAX_BRAKING_S) + tolerances.TRANSPORT_PERIODS)
     assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.SETTLING_TIME_S))
     assert np.abs(rig.newest_joints.velocity_rad_s).max() < tolerances.STANDSTILL_RAD_S, (
-        f"still moving: {rig.newest_joints.velocity_rad_s} rad/s"
+        f"the joints still move: {rig.newest_joints.velocity_rad_s} rad/s"
     )

@@ -37,14 +37,16 @@ def test_an_isolated_joint_is_passive_while_others_continue(rig: BackendRig) -> 
         record = rig.command_joints(targets, rig.count_periods(tolerances.MOTION_DURATION_S))
         rig.assert_armed()
         assert abs(record.torque_nm[-1, ISOLATED_JOINT]) < tolerances.TORQUE_TOLERANCE_NM, (
-            f"{record.torque_nm[-1, ISOLATED_JOINT]:.3f} N·m"
+            f"the isolated joint has a torque of {record.torque_nm[-1, ISOLATED_JOINT]:.3f} N·m"
         )
         moved_rad = np.ptp(record.angle_rad[tolerances.TRANSPORT_PERIODS :, ISOLATED_JOINT])
-        assert moved_rad < tolerances.POSITION_TOLERANCE_RAD, f"it was moved by {moved_rad:.3f} rad"
+        assert moved_rad < tolerances.POSITION_TOLERANCE_RAD, (
+            f"the isolated joint moved by {moved_rad:.3f} rad"
+        )
         assert (
             record.velocity_rad_s[-1, 0]
             > (1 - tolerances.SPEED_TOLERANCE_FRACTION) * tolerances.MOTION_SPEED_RAD_S
-        ), "the others stop, too"
+        ), "the other joints do not continue"
         rig.disarm()
         rig.wait_periods(tolerances.TRANSPORT_PERIODS)
         rig.reset()
@@ -55,13 +57,13 @@ def test_an_isolated_joint_is_passive_while_others_continue(rig: BackendRig) -> 
         )
         deviation_rad = record.angle_rad[-1, ISOLATED_JOINT] - targets[ISOLATED_JOINT][1]
         assert abs(deviation_rad) < tolerances.POSITION_TOLERANCE_RAD, (
-            f"after the reset it stops {deviation_rad:.3f} rad from its target"
+            f"after the reset, the joint stops {deviation_rad:.3f} rad from its target"
         )
         assert not rig.record_since(start_tick).faults, rig.record_since(start_tick).faults
 
 
 def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: BackendRig) -> None:
-    """A joint that falls silent is reported as invalid or as aging, until the robot is at fault.
+    """A joint that sends nothing is reported as invalid or with a growing age, until the robot is at fault.
 
     The readings of the other joints stay fresh. Faults that the backend itself reports have a kind and a cause, and
     each of them is reported once.
@@ -81,18 +83,20 @@ def test_a_silent_joint_grows_old_and_the_robot_stops(bench: Bench, rig: Backend
         silent_ns = (joints.tick - mute_tick - tolerances.TRANSPORT_PERIODS) * rig.period_ns
         is_reported_as_known = joints.valid[MUTED_JOINT] and joints.age_ns[MUTED_JOINT] < silent_ns
         assert not is_reported_as_known, (
-            f"silent for {silent_ns * 1e-6} ms, reported as {joints.age_ns[MUTED_JOINT] * 1e-6} ms old"
+            f"the joint is silent for {silent_ns * 1e-6} ms, but its age is {joints.age_ns[MUTED_JOINT] * 1e-6} ms"
         )
         others = [i for i in range(rig.joint_count) if i != MUTED_JOINT]
         assert all(joints.valid[i] and joints.age_ns[i] <= rig.period_ns for i in others), (
-            "the others are fresh"
+            "the other joints are not fresh"
         )
     assert rig.authority.state == "fault", "the robot goes on with a joint of unknown state"
     assert_others_at_rest(rig)
     fault_count = len(rig.faults)
     assert all(fault.what and fault.cause for fault in rig.faults)
     rig.wait_periods(tolerances.TRANSPORT_PERIODS)
-    assert len(rig.faults) == fault_count, f"reported again: {rig.faults[fault_count:]}"
+    assert len(rig.faults) == fault_count, (
+        f"the backend reported faults again: {rig.faults[fault_count:]}"
+    )
     rig.close()
 
 

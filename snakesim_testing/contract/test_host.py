@@ -75,11 +75,11 @@ def assert_rest_after(fault: Fault, hosted: HostedBackend) -> None:
         state for state in hosted.backend.joint_states if fault.tick < state.tick <= settled_tick
     ]
     assert np.abs(states[-1].velocity_rad_s).max() < tolerances.STANDSTILL_RAD_S, (
-        f"still moving: {states[-1].velocity_rad_s} rad/s"
+        f"the joints still move: {states[-1].velocity_rad_s} rad/s"
     )
     last_angles_rad = np.array([state.angle_rad for state in states[-len(states) // 3 :]])
     assert np.ptp(last_angles_rad, axis=0).max() < tolerances.STANDSTILL_RAD, (
-        f"still moving: {np.ptp(last_angles_rad, axis=0)} rad"
+        f"the joints still move: {np.ptp(last_angles_rad, axis=0)} rad"
     )
 
 
@@ -120,12 +120,12 @@ def test_bad_commands_are_refused_and_counted_and_move_nothing(hosted: HostedBac
     assert hosted.host.authority.state == "armed", hosted.host.authority.reason
     moved_rad = np.array([state.angle_rad for state in states_after]) - start_angles_rad
     assert np.abs(moved_rad).max() < tolerances.STANDSTILL_RAD, (
-        f"it moved by {np.abs(moved_rad).max():.3f} rad"
+        f"a joint moved by {np.abs(moved_rad).max():.3f} rad"
     )
 
 
 def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: HostedBackend) -> None:
-    """A fault of the backend stops the joints, whatever the controller sends, and only a reset ends the fault."""
+    """A fault of the backend stops the joints with any command of the controller, and only a reset ends the fault."""
     motion_ticks = arm_and_move_by_controller(falls_silent=False, hosted=hosted)
     fault_tick = hosted.armed_tick + motion_ticks
     hosted.backend.planted_fault = lambda tick: (
@@ -144,7 +144,7 @@ def test_a_fault_of_the_backend_latches_and_stops_the_joints(hosted: HostedBacke
 def test_a_controller_that_falls_silent_stops_joints_within_lease(
     bench: Bench, hosted: HostedBackend
 ) -> None:
-    """When the controller falls silent, its command lease expires, which is a fault, and the joints come to rest."""
+    """If the controller sends nothing, its command lease expires. This is a fault, and the joints come to rest."""
     try:
         let_lease_expire_and_check_time(hosted)
         assert_rest_after(hosted.host.authority.faults[0], hosted)
@@ -161,12 +161,12 @@ def let_lease_expire_and_check_time(hosted: HostedBackend) -> None:
     assert_moved_before(expired, hosted)
     late_periods = expired.tick - hosted.controller.last_sent_tick - lease_periods
     assert late_periods <= tolerances.TRANSPORT_PERIODS, (
-        f"{late_periods} periods after the end of the lease"
+        f"the robot stopped {late_periods} periods after the end of the lease"
     )
 
 
 def test_a_simulator_stands_still_on_request_and_a_robot_refuses(hosted: HostedBackend) -> None:
-    """In a pause of a simulator no tick passes and no lease expires; a robot that cannot pause refuses the pause."""
+    """While a simulator is paused, no tick passes and no lease expires. A robot that cannot pause refuses."""
     hosted.arm(hold_all_joints)
     hosted.wait_for_ticks(tolerances.ARMING_PERIODS)
     answer = hosted.session.send_request(

@@ -17,16 +17,16 @@ def assert_at_rest(record: RigRecord, rig: BackendRig) -> None:
     """Fail if a joint moves at the end of a record."""
     last_velocities_rad_s = record.velocity_rad_s[-1]
     assert np.abs(last_velocities_rad_s).max() < tolerances.STANDSTILL_RAD_S, (
-        f"still moving: {last_velocities_rad_s} rad/s"
+        f"the joints still move: {last_velocities_rad_s} rad/s"
     )
     last_angles_rad = record.angle_rad[-rig.count_periods(tolerances.SETTLING_TIME_S / 3) :]
     assert np.ptp(last_angles_rad, axis=0).max() < tolerances.STANDSTILL_RAD, (
-        f"still moving: {np.ptp(last_angles_rad, axis=0)} rad"
+        f"the joints still move: {np.ptp(last_angles_rad, axis=0)} rad"
     )
 
 
 def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: BackendRig) -> None:
-    """A disarmed robot that receives commands: no joint moves or has torque."""
+    """No joint of a disarmed robot moves or has torque, even if the robot receives commands."""
     targets = {
         i: (JointMode.POSITION, rig.home_rad[i] + tolerances.STEP_RAD)
         for i in range(rig.joint_count)
@@ -34,7 +34,9 @@ def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: BackendRig) -> 
     start_angles_rad = np.array(rig.newest_joints.angle_rad)
     record = rig.command_joints(targets, rig.count_periods(tolerances.MOTION_DURATION_S))
     moved_rad = np.abs(record.angle_rad - start_angles_rad).max()
-    assert moved_rad < tolerances.STANDSTILL_RAD, f"it moved by {moved_rad:.3f} rad"
+    assert moved_rad < tolerances.STANDSTILL_RAD, (
+        f"a joint of the disarmed robot moved by {moved_rad:.3f} rad"
+    )
     assert np.abs(record.torque_nm).max() < tolerances.TORQUE_TOLERANCE_NM
 
 
@@ -42,9 +44,9 @@ def test_nothing_moves_while_disarmed_whatever_is_commanded(rig: BackendRig) -> 
 def test_a_robot_with_modules_stops_them_itself_when_not_armed(
     bench: Bench, rig: BackendRig, state: LifecycleState
 ) -> None:
-    """A robot that is not armed does not follow setpoints that move, even if the host hands it such by mistake.
+    """A robot that is not armed does not follow moving setpoints, even if the host passes them by mistake.
 
-    This is a second line of defense. A simulator need not do this (see `Backend.enact`): the host hands it none.
+    This is a second line of defense. A simulator need not do this (see `Backend.enact`): the host passes it none.
     """
     targets = {
         i: (JointMode.POSITION, rig.home_rad[i] + 0.5 * tolerances.STEP_RAD)
@@ -58,9 +60,11 @@ def test_a_robot_with_modules_stops_them_itself_when_not_armed(
     moved_rad = float(np.abs(rig.record_since(first_tick).angle_rad - start_angles_rad).max())
     if moved_rad >= tolerances.STANDSTILL_RAD and bench.clock_mode == "lockstep":
         pytest.skip(
-            "a simulator may follow setpoints in every state; the host hands it safe ones only"
+            "a simulator may follow setpoints in every state, because the host passes it only safe ones"
         )
-    assert moved_rad < tolerances.STANDSTILL_RAD, f"{state}, and it moved by {moved_rad:.3f} rad"
+    assert moved_rad < tolerances.STANDSTILL_RAD, (
+        f"a joint moved by {moved_rad:.3f} rad in lifecycle state {state}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,7 +75,7 @@ def test_a_robot_with_modules_stops_them_itself_when_not_armed(
 def test_leaving_armed_brings_a_moving_joint_to_rest(
     rig: BackendRig, stop: Callable[[BackendRig], None]
 ) -> None:
-    """A robot that is disarmed, stopped or at fault in motion: its joints come to rest, and commands move none."""
+    """If a moving robot is disarmed, stopped or at fault, its joints come to rest, and commands do not move them."""
     rig.arm_and_move_joint()
     stop(rig)
     assert_at_rest(
@@ -89,7 +93,7 @@ def test_disarmed_joints_have_no_torque(rig: BackendRig) -> None:
     rig.disarm()
     record = rig.command_joints(MOVE_JOINT_0, rig.count_periods(tolerances.SETTLING_TIME_S))
     assert np.abs(record.torque_nm[-1]).max() < tolerances.TORQUE_TOLERANCE_NM, (
-        f"{record.torque_nm[-1]} N·m"
+        f"the disarmed joints have torques of {record.torque_nm[-1]} N·m"
     )
     assert_at_rest(record, rig)
 
@@ -106,7 +110,7 @@ def test_arming_again_goes_on_from_where_the_robot_is(rig: BackendRig) -> None:
     rig.arm()
     record = rig.record_since(first_tick)
     assert np.abs(record.angle_rad - angles_before_arming_rad).max() < tolerances.STANDSTILL_RAD, (
-        f"{record.angle_rad[-1] - angles_before_arming_rad} rad"
+        f"the joints moved by {record.angle_rad[-1] - angles_before_arming_rad} rad during arming"
     )
     assert (
         np.abs(np.diff(record.torque_nm, axis=0)).max()

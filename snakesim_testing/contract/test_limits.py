@@ -16,11 +16,11 @@ def test_the_torque_limit_of_the_setpoints_is_kept(rig: BackendRig, pushing: Pus
     assert (
         max(measured_nm)
         < (1 + tolerances.TORQUE_TOLERANCE_FRACTION) * limit_nm + tolerances.TORQUE_TOLERANCE_NM
-    ), f"{measured_nm} N·m, limit is {limit_nm:.2f} N·m"
+    ), f"the measured torque {measured_nm} N·m exceeds the limit of {limit_nm:.2f} N·m"
     assert (
         min(measured_nm)
         > (1 - tolerances.TORQUE_TOLERANCE_FRACTION) * limit_nm - tolerances.TORQUE_TOLERANCE_NM
-    ), f"{measured_nm} N·m does not use the limit of {limit_nm:.2f}"
+    ), f"the measured torque {measured_nm} N·m does not reach the limit of {limit_nm:.2f} N·m"
 
 
 def test_a_torque_limit_of_zero_lets_nothing_move(rig: BackendRig) -> None:
@@ -37,7 +37,9 @@ def test_a_torque_limit_of_zero_lets_nothing_move(rig: BackendRig) -> None:
         torque_limit_nm=[0.0] * rig.joint_count,
     )
     moved_rad = np.abs(record.angle_rad - start_angles_rad).max()
-    assert moved_rad < tolerances.STANDSTILL_RAD, f"it moved by {moved_rad:.3f} rad"
+    assert moved_rad < tolerances.STANDSTILL_RAD, (
+        f"a joint without torque moved by {moved_rad:.3f} rad"
+    )
 
 
 def test_no_joint_goes_beyond_its_limits(rig: BackendRig, pushing: PushRecording) -> None:
@@ -45,8 +47,8 @@ def test_no_joint_goes_beyond_its_limits(rig: BackendRig, pushing: PushRecording
     for i, joint in enumerate(rig.robot.joints):
         angles = pushing.whole_record.angle_rad[:, i]
         assert angles.max() < joint.angle_max_rad + tolerances.MAX_OVERSHOOT_RAD, (
-            f"{joint.name}: {angles.max():.3f} rad"
+            f"{joint.name} was at {angles.max():.3f} rad, beyond its upper limit"
         )
         assert angles.min() > joint.angle_min_rad - tolerances.MAX_OVERSHOOT_RAD, (
-            f"{joint.name}: {angles.min():.3f} rad"
+            f"{joint.name} was at {angles.min():.3f} rad, beyond its lower limit"
         )

@@ -19,16 +19,16 @@ def test_position_mode_turns_only_the_requested_joint(rig: BackendRig) -> None:
         )
         moved_rad = record.angle_rad[-1] - rig.home_rad
         assert abs(moved_rad[joint] - tolerances.STEP_RAD) < tolerances.POSITION_TOLERANCE_RAD, (
-            f"joint {joint} asked for {tolerances.STEP_RAD} rad: {moved_rad} rad"
+            f"joint {joint} was commanded to move by {tolerances.STEP_RAD} rad; the joints moved by {moved_rad} rad"
         )
         others_moved_rad = np.delete(moved_rad, joint)
         assert np.abs(others_moved_rad).max() < tolerances.POSITION_TOLERANCE_RAD, (
-            f"only joint {joint} was asked to move: {moved_rad} rad"
+            f"only joint {joint} was commanded to move; the joints moved by {moved_rad} rad"
         )
 
 
 def test_velocity_mode_turns_at_the_speed_that_is_asked(rig: BackendRig) -> None:
-    """A joint in velocity mode moves at the requested speed in rad/s, in both directions, less some for friction."""
+    """A joint in velocity mode moves at the requested speed in rad/s, in both directions, apart from friction."""
     rig.skip_without(JointMode.VELOCITY)
     rig.arm()
     for speed_rad_s in (tolerances.MOTION_SPEED_RAD_S, -tolerances.MOTION_SPEED_RAD_S):
@@ -40,7 +40,7 @@ def test_velocity_mode_turns_at_the_speed_that_is_asked(rig: BackendRig) -> None
         ].mean()
         assert abs(mean_speed_rad_s - speed_rad_s) < tolerances.SPEED_TOLERANCE_FRACTION * abs(
             speed_rad_s
-        ), f"asked for {speed_rad_s} rad/s: {mean_speed_rad_s:.3f} rad/s"
+        ), f"the joint moved at {mean_speed_rad_s:.3f} rad/s; commanded were {speed_rad_s} rad/s"
 
 
 def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: BackendRig) -> None:
@@ -59,7 +59,7 @@ def test_the_reported_velocity_is_the_change_of_the_reported_angle(rig: BackendR
         "the joint did not move, so nothing can be compared"
     )
     assert np.abs(integral - turned).max() < tolerances.INTEGRATION_TOLERANCE_RAD, (
-        f"turned {integral} rad by velocity, {turned} by angle"
+        f"the joints moved by {integral} rad by their velocity, but by {turned} rad by their angle"
     )
 
 
@@ -75,10 +75,10 @@ def test_torque_mode_pushes_with_the_torque_that_is_asked(
         tolerances.TORQUE_TOLERANCE_FRACTION * requested_nm + tolerances.TORQUE_TOLERANCE_NM
     )
     assert abs(measured_nm[0] - requested_nm) < tolerance_nm, (
-        f"asked for {requested_nm:.2f} N·m: {measured_nm[0]:.3f} N·m"
+        f"joint 0 pushes with {measured_nm[0]:.3f} N·m; commanded were {requested_nm:.2f} N·m"
     )
     assert abs(measured_nm[1] + requested_nm) < tolerance_nm, (
-        f"asked for {-requested_nm:.2f} N·m: {measured_nm[1]:.3f} N·m"
+        f"joint 1 pushes with {measured_nm[1]:.3f} N·m; commanded were {-requested_nm:.2f} N·m"
     )
 
 
@@ -93,11 +93,11 @@ def test_a_passive_joint_has_no_torque_and_stays(rig: BackendRig) -> None:
         {0: (JointMode.PASSIVE, 0.0)}, rig.count_periods(tolerances.SETTLING_TIME_S)
     )
     assert abs(record.torque_nm[-1, 0]) < tolerances.TORQUE_TOLERANCE_NM, (
-        f"{record.torque_nm[-1, 0]:.3f} N·m"
+        f"the passive joint has a torque of {record.torque_nm[-1, 0]:.3f} N·m"
     )
     settled = record.angle_rad[tolerances.TRANSPORT_PERIODS :, 0]
     assert np.ptp(settled) < tolerances.POSITION_TOLERANCE_RAD, (
-        f"it moved by {np.ptp(settled):.3f} rad"
+        f"the passive joint moved by {np.ptp(settled):.3f} rad"
     )
 
 
@@ -150,13 +150,14 @@ def test_a_mode_that_a_joint_lacks_is_refused(rig: BackendRig) -> None:
     for mode in missing_modes:
         rejected_count = rig.authority.rejected_counts["wrong_mode"]
         setpoints = rig.make_setpoints({})
-        setpoints.mode[0], setpoints.target[0] = mode, tolerances.MOTION_SPEED_RAD_S
+        setpoints.mode[0] = mode
+        setpoints.target[0] = tolerances.MOTION_SPEED_RAD_S
         record = rig.send_command(setpoints)
         assert rig.authority.rejected_counts["wrong_mode"] == rejected_count + 1, (
             f"{mode.name.lower()} mode was accepted"
         )
         assert np.abs(record.angle_rad - rig.home_rad).max() < tolerances.POSITION_TOLERANCE_RAD, (
-            "it moved"
+            "a joint moved after a rejected command"
         )
         assert all(mode not in points.mode for points in record.setpoints)
 
@@ -165,5 +166,5 @@ def assert_joint_0_keeps_speed(rig: BackendRig) -> None:
     """Fail if joint 0 no longer moves at the commanded speed."""
     speed = rig.newest_joints.velocity_rad_s[0]
     assert speed > (1 - tolerances.SPEED_TOLERANCE_FRACTION) * tolerances.MOTION_SPEED_RAD_S, (
-        f"{speed:.3f} rad/s, commanded were {tolerances.MOTION_SPEED_RAD_S} rad/s"
+        f"joint 0 moves at {speed:.3f} rad/s; commanded were {tolerances.MOTION_SPEED_RAD_S} rad/s"
     )

@@ -28,7 +28,7 @@ JOINT_2_DUPLICATED = "duplicate:joint_2@0-9"
 def test_torque_is_off_in_time_by_the_drives_own_log(
     rig: BackendRig, drives: EmulatedDrives, stop: Callable[[BackendRig], None]
 ) -> None:
-    """A robot that is disarmed or stopped in motion: every drive has switched its torque off a few periods later."""
+    """If a moving robot is disarmed or stopped, every drive switches its torque off within a few periods."""
     rig.arm_and_move_joint()
     start_s = drives.read_time_s()
     stop(rig)
@@ -39,11 +39,11 @@ def test_torque_is_off_in_time_by_the_drives_own_log(
 def test_torque_is_off_after_watchdog_by_the_drives_own_log(
     rig: BackendRig, drives: EmulatedDrives
 ) -> None:
-    """A host that does nothing while a joint moves: every drive switches its torque off by its watchdog, in time."""
+    """If the host does nothing while a joint moves, every drive switches its torque off in time, by its watchdog."""
     joints_without_watchdog = rig.joints_without_watchdog
     if joints_without_watchdog:
         pytest.skip(
-            f"described without a watchdog, so they hold while the host does nothing: {joints_without_watchdog}"
+            f"these joints have no watchdog, so they hold while the host is frozen: {joints_without_watchdog}"
         )
     rig.arm_and_move_joint()
     rig.must_reopen = True
@@ -79,7 +79,7 @@ def test_two_drives_with_one_id_stop_the_robot(rig: BackendRig, drives: Emulated
     rig.reset()
     rig.wait_periods(rig.count_periods(tolerances.SETTLING_TIME_S))
     assert rig.authority.state == "fault", (
-        "reset while the second drive is still there, and the robot may be armed"
+        "after a reset the robot may be armed, although the second drive still exists"
     )
     rig.backend.inject(parse_injection(JOINT_2_DUPLICATED), begins=False)  # ends the fault
     assert_recovers_by_reset_alone(rig, drives)
@@ -88,7 +88,7 @@ def test_two_drives_with_one_id_stop_the_robot(rig: BackendRig, drives: Emulated
 def test_a_bus_that_is_lost_and_restored_enables_no_drive(
     rig: BackendRig, drives: EmulatedDrives
 ) -> None:
-    """A bus loses all frames in motion: the drives on it are disabled, and stay disabled once frames pass again.
+    """If a bus loses all frames in motion, its drives are disabled, and stay disabled once frames pass again.
 
     Drives with a watchdog switch their torque off by themselves while the bus is lost. Drives that are described
     without a watchdog hold their joints until the bus works again, and are then switched off by the driver. In both
@@ -121,10 +121,12 @@ def test_a_bus_that_is_lost_and_restored_enables_no_drive(
 
 def assert_fault_names_joint(rig: BackendRig, since_tick: int, joint_index: int) -> None:
     """Fail if the robot is not at fault, or if no fault since a tick names the joint."""
-    assert rig.authority.state == "fault", f"the robot continues: {rig.authority.state}"
+    assert rig.authority.state == "fault", f"the robot continues in state {rig.authority.state}"
     faults = rig.record_since(since_tick).faults
     name = rig.robot.joints[joint_index].name
-    assert name in {fault.joint for fault in faults}, f"no fault of {name}: {faults}"
+    assert name in {fault.joint for fault in faults}, (
+        f"the backend reported no fault of {name}, but {faults}"
+    )
 
 
 def assert_recovers_by_reset_alone(rig: BackendRig, drives: EmulatedDrives) -> None:
@@ -137,7 +139,9 @@ def assert_recovers_by_reset_alone(rig: BackendRig, drives: EmulatedDrives) -> N
         rig.reset()
         assert_drives_stay_off(rig, drives, rig.count_periods(tolerances.DRIVE_RESTART_TIME_S))
     rig.arm_and_move_joint()
-    assert all(drives.list_enabled()), f"reset and armed, and enabled are {drives.list_enabled()}"
+    assert all(drives.list_enabled()), (
+        f"not all drives are enabled after reset and arming: {drives.list_enabled()}"
+    )
 
 
 def assert_switched_off(
@@ -151,7 +155,7 @@ def assert_switched_off(
         start_s: Time of the stop, by the drives' own clock.
         max_duration_s: Maximum time from the stop until the torque is off.
     """
-    assert not any(drives.list_enabled()), f"still enabled are {drives.list_enabled()}"
+    assert not any(drives.list_enabled()), f"drives are still enabled: {drives.list_enabled()}"
     for i, joint in enumerate(rig.robot.joints):
         off_times_s = [
             entry.time_s
@@ -163,5 +167,5 @@ def assert_switched_off(
         )
         duration_s = off_times_s[-1] - start_s
         assert duration_s <= max_duration_s, (
-            f"{joint.name} had torque for {duration_s:.3f} s; at most {max_duration_s:.3f} s"
+            f"{joint.name} had torque for {duration_s:.3f} s; allowed are {max_duration_s:.3f} s"
         )

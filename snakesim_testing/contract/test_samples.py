@@ -46,9 +46,11 @@ def test_other_sensors_are_stamped_when_they_were_read(rig: BackendRig, healthy:
                 timestamp_ns: int = message.timestamp_ns  # pyright: ignore[reportAttributeAccessIssue]
                 timestamps_ns.append(timestamp_ns)
                 age_ns = sample.joints.timestamp_ns - timestamp_ns
-                assert 0 <= age_ns <= max_age_ns, f"{sensor.key}: {age_ns * 1e-6} ms old"
+                assert 0 <= age_ns <= max_age_ns, (
+                    f"a sample of {sensor.key} is {age_ns * 1e-6} ms old; allowed are {max_age_ns * 1e-6} ms"
+                )
         assert all(before < after for before, after in pairwise(timestamps_ns)), (
-            f"{sensor.key}: out of order"
+            f"the samples of {sensor.key} are out of order"
         )
 
 
@@ -104,8 +106,10 @@ def test_every_joint_is_valid_and_fresh_at_every_tick(rig: BackendRig, healthy: 
     delay_s = next(sensor.delay_s for sensor in rig.robot.sensors if sensor.key == keys.JOINTS)
     max_age_ns = tolerances.MAX_READING_AGE_PERIODS * rig.period_ns + delay_s * 1e9
     for joints in healthy.joints:
-        assert all(joints.valid), f"tick {joints.tick}: {joints.valid}"
-        assert max(joints.age_ns) <= max_age_ns, f"tick {joints.tick}: {joints.age_ns} ns"
+        assert all(joints.valid), f"not all joints are valid in tick {joints.tick}: {joints.valid}"
+        assert max(joints.age_ns) <= max_age_ns, (
+            f"the joint state is too old in tick {joints.tick}: {joints.age_ns} ns"
+        )
 
 
 def test_what_is_not_known_yet_is_not_reported_as_valid(rig: BackendRig) -> None:
@@ -113,7 +117,7 @@ def test_what_is_not_known_yet_is_not_reported_as_valid(rig: BackendRig) -> None
     for i, valid in enumerate(rig.first_sample.joints.valid):
         deviation_rad = rig.first_sample.joints.angle_rad[i] - rig.home_rad[i]
         assert not valid or abs(deviation_rad) < tolerances.STANDSTILL_RAD, (
-            f"joint {i} was {deviation_rad:+.3f} rad off and called valid"
+            f"the first angle of joint {i} is valid, but has an error of {deviation_rad:+.3f} rad"
         )
 
 
@@ -136,13 +140,13 @@ def test_supply_and_temperatures_are_in_volts_and_degrees(bench: Bench, rig: Bac
             assert power.valid[i], f"{name} has not reported its supply"
             relative_difference = abs(power.voltage_v[i] / joint.supply.voltage_v - 1)
             assert relative_difference <= tolerances.SUPPLY_TOLERANCE_FRACTION, (
-                f"{name}: {power.voltage_v[i]} V, on {joint.supply.voltage_v:g} V"
+                f"{name} reports {power.voltage_v[i]} V with a supply of {joint.supply.voltage_v:g} V"
             )
         if "temperature" in rig.robot.joints[i].measures:
             for temperature_c in (power.motor_c[i], power.board_c[i]):
                 limit_c = rig.robot.joints[i].derate_from_c
                 assert tolerances.MIN_TEMPERATURE_C < temperature_c < limit_c, (
-                    f"{name}: {temperature_c} °C, and it has not worked yet"
+                    f"{name} reports {temperature_c} °C, although it has not worked yet"
                 )
 
 
@@ -155,10 +159,10 @@ def test_a_sagging_supply_is_reported_at_its_joint(rig: BackendRig) -> None:
     rig.must_reopen = True
     sagging_v = wait_for_power_sample(rig).voltage_v
     assert before_v[1] - sagging_v[1] > tolerances.MIN_SUPPLY_SAG_V, (
-        f"it sags from {before_v[1]} V, and is reported as {sagging_v[1]} V"
+        f"the supply sags from {before_v[1]} V, but the report is {sagging_v[1]} V"
     )
     assert rig.authority.state == "fault", (
-        "a supply below `min_voltage_v`, and the robot may be armed"
+        "the robot may be armed, although a supply is below `min_voltage_v`"
     )
 
 
@@ -173,7 +177,7 @@ def wait_for_power_sample(rig: BackendRig) -> Power:
     samples = [
         sample.by_key[keys.POWER] for sample in record.samples if keys.POWER in sample.by_key
     ]
-    assert samples, f"no power sample in {tolerances.POWER_REPORT_TIME_S} s"
+    assert samples, f"the backend sent no power sample in {tolerances.POWER_REPORT_TIME_S} s"
     newest = samples[-1]
     assert isinstance(newest, Power)
     return newest

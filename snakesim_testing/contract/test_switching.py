@@ -26,5 +26,5 @@ def test_a_mode_switch_makes_no_jump(
     max_step_nm = tolerances.MAX_TORQUE_STEP_FRACTION * rig.full_torque_nm[0]
     torque_steps_nm = np.abs(np.diff(switching[before, after]))
     assert torque_steps_nm.max() < max_step_nm, (
-        f"torque changed by {torque_steps_nm.max():.2f} N·m in a tick; at most {max_step_nm:.2f} N·m"
+        f"the torque changed by {torque_steps_nm.max():.2f} N·m in one tick; allowed are {max_step_nm:.2f} N·m"
     )

@@ -1,1 +1,1 @@
-"""Drivers and emulated drives, one tick after the other."""
+"""Runs drivers with emulated drives tick by tick for tests."""

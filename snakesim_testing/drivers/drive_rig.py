@@ -1,4 +1,4 @@
-"""A driver and emulated drives, tick by tick in lockstep, with the robot's lifecycle as the host has it."""
+"""Runs a driver and emulated drives tick by tick in lockstep, and controls the lifecycle as the HAL host does."""
 
 from typing import Any
 
@@ -10,12 +10,12 @@ from snakesim_hal.wire.messages import Fault, JointMode, JointState, LifecycleSt
 
 
 def drives_of(backend: Any, bus_index: int = 0) -> Any:
-    """The drives of one of its buses."""
+    """Return the drives on one bus of a backend."""
     return backend._drives.buses[bus_index].drives
 
 
 class DriveRig:
-    """While armed, every joint has the same setpoint; otherwise all are passive, unless they damp in a fault."""
+    """A driver whose joints all get the same setpoint while armed. Otherwise they are passive, or damp in a fault."""
 
     def __init__(self, config: RunConfig, backend: DriveBackend) -> None:
         """Start at tick 0, with a position setpoint of 0.1 rad for every joint.

@@ -1,6 +1,8 @@
-"""`snakesim` with emulated drives that have a fault of their own, for tests that must find it.
+"""Runs `snakesim` with emulated drives that have an error, for tests that must detect it.
 
-`python -m snakesim_testing.drivers.mutant_drive_program MUTANT drive emulate moteus ...`
+Run it with
+
+    python -m snakesim_testing.drivers.mutant_drive_program MUTANT drive emulate moteus ...
 """
 
 import sys
@@ -12,7 +14,7 @@ from snakesim_operator.cli import main as run_command
 
 
 def disable_watchdog() -> None:
-    """The controller follows its last command for ever."""
+    """Let the emulated controller follow its last command forever."""
 
     def on_step(self: EmulatedMoteus, now_us: float) -> None:
         del self, now_us
@@ -21,7 +23,7 @@ def disable_watchdog() -> None:
 
 
 def enable_again() -> None:
-    """The controller returns to position mode half a second after its watchdog has stopped it."""
+    """Let the emulated controller return to position mode 0.5 s after its watchdog has stopped it."""
     correct_on_step = EmulatedMoteus.on_step
 
     def on_step(self: EmulatedMoteus, now_us: float) -> None:

@@ -252,7 +252,8 @@ def make_lidar_scan(
     *obstacles: KnownObstacle, at: tuple[float, float] = (0.0, 0.0), timestamp_ns: int = 0
 ) -> AzimuthScan:
     """Return the scan of a lidar near the ground that looks along x, with the given obstacles around it."""
-    position, ahead = np.array([*at, 0.05]), make_rotation(0.0)
+    position = np.array([*at, 0.05])
+    ahead = make_rotation(0.0)
     ranges = render_lidar_scan(
         obstacles, position, ahead, beam_count=361, timestamp_ns=timestamp_ns
     )

@@ -33,20 +33,23 @@ class ObservationRecorder(HoldPose):
     """A controller that records its observations, and holds the joints unless a test sets another response."""
 
     observations: list[Observation]
-    # Its only entry is how it answers.
+    # Its only entry is the function that answers an observation.
     answers: list[Callable[["ObservationRecorder", Observation], Any]]
 
     def update(self, observation: Observation) -> ControllerCommand:
-        """Record the observation, and return the command that the test has set, or else one that holds the joints."""
+        """Record the observation, and return the command that the test has set, or one that holds the joints."""
         self.observations.append(observation)
-        return self.answers[0](self, observation) if self.answers else super().update(observation)
+        if self.answers:
+            return self.answers[0](self, observation)
+        return super().update(observation)
 
 
 class ServiceThread:
     """A service that runs in a thread."""
 
     def __init__(self, name: str, config: RunConfig, connection: ConnectionSettings) -> None:
-        self.stopped, self.error = threading.Event(), None
+        self.stopped = threading.Event()
+        self.error: SnakesimError | None = None
         self.thread = threading.Thread(
             target=self._run_service, args=(name, config, connection), name=name
         )

@@ -28,17 +28,21 @@ from snakesim_testing.hal.small_robots import make_description, make_joint_state
 T = TypeVar("T")
 
 PERIOD_S = 0.01
-AMPLITUDE_M, WAVELENGTH_M, LENGTH_M = 0.045, 0.6, 6.0
-BODY_RADIUS_M, PEG_RADIUS_M, CLEARANCE_M = 0.04, 0.05, 0.005
+AMPLITUDE_M = 0.045  # of the route
+WAVELENGTH_M = 0.6
+LENGTH_M = 6.0
+BODY_RADIUS_M = 0.04
+PEG_RADIUS_M = 0.05
+CLEARANCE_M = 0.005  # between body and peg
 
 
 def tick_to_time_ns(tick: int) -> int:
-    """Robot time of a tick."""
+    """Return the robot time of a tick."""
     return tick * round(PERIOD_S * 1e9)
 
 
 def require_value(value: T | None) -> T:
-    """A value that must be there."""
+    """Return a value that must not be None."""
     assert value is not None
     return value
 
@@ -73,7 +77,7 @@ def make_robot(
 
 
 def make_world(**changes: Any) -> WorldModel:
-    """A world model with a body at the origin and nothing around it, with whatever is to be different."""
+    """Return a world model with a body at the origin and nothing around it, with changes of its fields."""
     values: dict[str, Any] = {
         "tick": 0,
         "timestamp_ns": 0,
@@ -89,7 +93,7 @@ def make_world(**changes: Any) -> WorldModel:
 def make_contact(
     obstacle: str, force_w: tuple[float, float, float], link_index: int = 0, body_s_m: float = 0.1
 ) -> WorldContact:
-    """A contact on the right of a body along x."""
+    """Return a contact on the right side of a body that lies along x."""
     return WorldContact(
         link=link_index,
         obstacle=obstacle,
@@ -102,7 +106,7 @@ def make_contact(
 
 
 def make_route(amplitude_m: float = AMPLITUDE_M, wavelength_m: float = WAVELENGTH_M) -> Route:
-    """A sine along x."""
+    """Return a route that is a sine along x."""
     return Route(sample_sine_curve(amplitude_m, wavelength_m, LENGTH_M))
 
 
@@ -136,7 +140,7 @@ class ObservationStage:
     pegs: list[KnownObstacle]
     speed_m_s: float = 0.2
     path_id: int = 0
-    assumed_obstacle_friction: float = 0.0  # that the path was planned with
+    assumed_obstacle_friction: float = 0.0  # the path was planned with this friction
 
     def make_observation(
         self,
@@ -151,30 +155,38 @@ class ObservationStage:
         pose_age_ticks: int | None = None,
         without: str = "",
     ) -> Observation:
-        """turned: joint -> how far it is from where the route has it. without: `world` or `trajectory`, perhaps."""
+        """Return what a controller observes of a body on the route.
+
+        Args:
+            tick: Tick of the observation and of the joint state.
+            tail_s_m: Position of the tail along the route.
+            world_age_ticks: Age of the world model.
+            world_tail_s_m: Position of the tail in the world model. None: the true one.
+            turned: Difference between a joint angle and that of the route in rad, by joint index.
+            torque_nm: Measured torque of every joint.
+            contacts: Contacts in the world model. None: their time is unknown.
+            pose_age_ticks: Age of the pose in the world model. None: that of the world model.
+            without: What is missing: "world", "trajectory" or nothing.
+        """
         axes = [joint.axis for joint in self.robot.joints]
         segments = compute_yaw_segments_m(axes, [link.length_m for link in self.robot.links])
-        lay = place_chain_on_route(self.route, tail_s_m, segments)
-        angles = expand_yaw_angles(axes, lay.angles_rad)
-        for joint, by in (turned or {}).items():
-            angles[joint] += by
-        seen = (
-            lay
-            if world_tail_s_m is None
-            else place_chain_on_route(self.route, world_tail_s_m, segments)
-        )
+        true_placement = place_chain_on_route(self.route, tail_s_m, segments)
+        angles = expand_yaw_angles(axes, true_placement.angles_rad)
+        for joint, angle_rad in (turned or {}).items():
+            angles[joint] += angle_rad
+        seen_placement = true_placement
+        if world_tail_s_m is not None:
+            seen_placement = place_chain_on_route(self.route, world_tail_s_m, segments)
+        world_tick = tick - world_age_ticks
+        pose_tick = world_tick if pose_age_ticks is None else tick - pose_age_ticks
         world = make_world(
-            tick=tick - world_age_ticks,
-            timestamp_ns=tick_to_time_ns(tick - world_age_ticks),
-            pose_timestamp_ns=tick_to_time_ns(
-                tick - (world_age_ticks if pose_age_ticks is None else pose_age_ticks)
-            ),
-            base_position_w=(*seen.tail_w, BODY_RADIUS_M),
-            base_orientation_wxyz=quaternion_from_yaw(seen.heading_rad),
+            tick=world_tick,
+            timestamp_ns=tick_to_time_ns(world_tick),
+            pose_timestamp_ns=tick_to_time_ns(pose_tick),
+            base_position_w=(*seen_placement.tail_w, BODY_RADIUS_M),
+            base_orientation_wxyz=quaternion_from_yaw(seen_placement.heading_rad),
             contacts=contacts or [],
-            contacts_timestamp_ns=None
-            if contacts is None
-            else tick_to_time_ns(tick - world_age_ticks),
+            contacts_timestamp_ns=None if contacts is None else tick_to_time_ns(world_tick),
             obstacles=self.pegs,
         )
         joints = make_joint_state(
@@ -207,13 +219,13 @@ class ObservationStage:
 def make_stage(
     module_count: int = 13, axes: tuple[Axis, ...] = ("yaw",), torque_nm: float = 7.0
 ) -> ObservationStage:
-    """A robot among pegs."""
+    """Return a robot on a sine route with a peg at each inflection."""
     route = make_route()
     return ObservationStage(make_robot(module_count, axes, torque_nm), route, make_pegs(route))
 
 
 def compute_body_points(stage: ObservationStage, tail_s_m: float) -> np.ndarray:
-    """Nodes (2, n_nodes) of the body on the route."""
+    """Return the nodes (2, n_nodes) of the body on the route."""
     axes = [joint.axis for joint in stage.robot.joints]
     segments = compute_yaw_segments_m(axes, [link.length_m for link in stage.robot.links])
     lay = place_chain_on_route(stage.route, tail_s_m, segments)

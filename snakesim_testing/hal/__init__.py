@@ -1,1 +1,1 @@
-"""Robots, hosts and networks of the HAL, small enough for tests."""
+"""Small robots, hosts and networks for tests of the HAL."""

@@ -1,4 +1,4 @@
-"""A custom sensor sample."""
+"""A sample of a custom sensor, with a field of each allowed type."""
 
 from typing import Annotated, Any, Literal
 
@@ -9,7 +9,7 @@ from snakesim_hal.wire.messages import CustomSample
 
 
 class SkinSample(CustomSample, frozen=True, kw_only=True):
-    """One of each kind of field."""
+    """A sample with one field of each allowed type."""
 
     pressed_n: Annotated[list[q.Force | None], Meta(max_length=3)]
     flow_m_s: q.VelocityVector
@@ -19,16 +19,14 @@ class SkinSample(CustomSample, frozen=True, kw_only=True):
     note: Annotated[str, Meta(max_length=9)] | None = None
 
 
-PLACE: dict[str, Any] = {
+MOUNTING: dict[str, Any] = {
     "tick": 3,
     "timestamp_ns": 2,
     "link": 1,
     "position_l": (0.0, 0.1, 0.0),
     "orientation_l_wxyz": (1.0, 0.0, 0.0, 0.0),
 }
-
-
-GOOD: dict[str, Any] = {
+VALID_VALUES: dict[str, Any] = {
     "pressed_n": [1.5, None],
     "flow_m_s": (1.0, 2.0, 3.0),
     "wet": True,

@@ -1,4 +1,7 @@
-"""A real backend of first-order joints, a host that runs it in a thread, and a client in another, over real Zenoh."""
+"""Runs a HAL host and its clients in threads of the test, which communicate over a real Zenoh network.
+
+The backend moves its joints with a first-order lag.
+"""
 
 import math
 import sys
@@ -44,55 +47,65 @@ LIMIT_S = 20.0
 
 
 @contextmanager
-def fast_thread_switching(every_s: float = 0.0005) -> Iterator[None]:
-    """Threads take turns so often: host and client share one interpreter here; in real life they are processes."""
+def fast_thread_switching(interval_s: float = 0.0005) -> Iterator[None]:
+    """Switch between threads often. Here host and client share one interpreter, elsewhere they are processes."""
     before_s = sys.getswitchinterval()
-    sys.setswitchinterval(every_s)
+    sys.setswitchinterval(interval_s)
     try:
         yield
     finally:
         sys.setswitchinterval(before_s)
 
 
-def wait_for_messages(reader: SampleReader[MessageT], what: str, count: int = 1) -> list[MessageT]:
-    """What a reader has got, as soon as it is so many."""
-    found: list[MessageT] = []
-    wait_until(lambda: found.extend(reader.drain()) or len(found) >= count, what)
-    return found
+def wait_for_messages(
+    reader: SampleReader[MessageT], description: str, count: int = 1
+) -> list[MessageT]:
+    """Wait until a reader has received at least `count` messages, and return them."""
+    messages: list[MessageT] = []
+
+    def has_enough() -> bool:
+        messages.extend(reader.drain())
+        return len(messages) >= count
+
+    wait_until(has_enough, description)
+    return messages
 
 
 @contextmanager
 def connected_sessions(*namespaces: str | None) -> Iterator[list[Session]]:
-    """Sessions on a network of their own; the first one listens."""
+    """Open one session for each namespace, on a network of their own. The first session listens."""
     with ExitStack() as stack:
         endpoint = find_free_endpoint()
-        links = [
-            ConnectionSettings(endpoint, name, listen=not i) for i, name in enumerate(namespaces)
+        connections = [
+            ConnectionSettings(endpoint, namespace, listen=index == 0)
+            for index, namespace in enumerate(namespaces)
         ]
-        yield [stack.enter_context(open_session(each)) for each in links]
+        yield [stack.enter_context(open_session(connection)) for connection in connections]
 
 
 class LagBackend(Backend):
-    """Joints that follow their setpoints with a first-order lag. Neither mass nor contacts."""
+    """Moves joints to their setpoints with a first-order lag, without mass and contacts."""
 
     class Settings(msgspec.Struct):
-        """None."""
+        """This backend has no settings."""
 
     def __init__(self, config: RunConfig, settings: Any = None) -> None:
         self._config = config
         count = config.robot.chain.modules
         self._period_s = config.period_ns * 1e-9
         self.angles = [0.0] * count
-        self._points = SafeSetpoints([JointMode.PASSIVE] * count, [0.0] * count, [0.0] * count)
+        self._setpoints = SafeSetpoints([JointMode.PASSIVE] * count, [0.0] * count, [0.0] * count)
         self.enacted: list[SafeSetpoints] = []
         self.advanced = 0
-        self.fails_in: str | None = None  # sample, enact, advance or faults
+        self.fails_in: str | None = (
+            None  # the method that raises `fails_with`: sample, enact, advance or faults
+        )
         self.fails_with: Exception = BackendError("diverged")
-        self.read_s = 0.0  # what a sample takes
+        self.read_s = 0.0  # duration of `sample`
         self.next_faults: list[Fault] = []
 
     def describe(self) -> RobotDescription:
-        """From the robot file, and the pose."""
+        """Describe the robot of the configuration, with a pose sensor."""
         described = msgspec.structs.replace(
             describe_run_robot(self._config, "lag"), simulated_time=True
         )
@@ -104,7 +117,7 @@ class LagBackend(Backend):
         return msgspec.structs.replace(described, sensors=[*described.sensors, pose_sensor])
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        """Joints every tick, the pose every fifth."""
+        """Return the joint state, and in every fifth tick also the pose."""
         self._fail("sample")
         time.sleep(self.read_s)
         count = len(self.angles)
@@ -124,17 +137,17 @@ class LagBackend(Backend):
         )
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
-        """From now on."""
+        """Keep the setpoints, which the joints follow in the next periods."""
         self._fail("enact")
-        self._points = setpoints
+        self._setpoints = setpoints
         self.enacted.append(setpoints)
 
     def advance(self) -> None:
-        """One period."""
+        """Move the joints for one period."""
         self._fail("advance")
         self.advanced += 1
         for i, (mode, target) in enumerate(
-            zip(self._points.mode, self._points.target, strict=True)
+            zip(self._setpoints.mode, self._setpoints.target, strict=True)
         ):
             if mode == JointMode.POSITION:
                 self.angles[i] += 0.5 * (target - self.angles[i])
@@ -142,33 +155,35 @@ class LagBackend(Backend):
                 self.angles[i] += target * self._period_s
 
     def faults(self) -> list[Fault]:
-        """Those that the test planted."""
+        """Return the faults that the test has put into `next_faults`, once."""
         self._fail("faults")
-        found, self.next_faults = self.next_faults, []
-        return found
+        new_faults = self.next_faults
+        self.next_faults = []
+        return new_faults
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing, because this backend has no resources."""
 
-    def _fail(self, where: str) -> None:
-        if self.fails_in == where:
+    def _fail(self, method: str) -> None:
+        """Raise the error of the test if it is planned for this method."""
+        if self.fails_in == method:
             raise self.fails_with
 
 
 @dataclass
 class SineFollower:
-    """A control service: holds the lease and has every joint follow a sine of the robot's time."""
+    """A control service that holds the lease, and moves every joint along a sine of the robot's time."""
 
     amplitude_rad: float = 0.2
     name: str = "control"
     ticks_seen: list[int] = field(default_factory=list[int])
     armed_ticks: list[int] = field(default_factory=list[int])
     stopped: threading.Event = field(default_factory=threading.Event)
-    # Receives everything, sends nothing.
+    # While it is set, the follower receives messages but sends none.
     silent: threading.Event = field(default_factory=threading.Event)
 
     def run(self, connection: ConnectionSettings) -> None:
-        """Until stopped."""
+        """Connect to the host, and answer its clock until `stopped` is set."""
         with open_session(connection) as session:
             client = HostClient(session, self.name)
             robot = client.wait_for_description()
@@ -180,9 +195,9 @@ class SineFollower:
                     return
                 if clock is None or self.silent.is_set():
                     continue
-                self._act(clock, client, commander, client.read(joints), robot)
+                self._command_joints(clock, client, commander, client.read(joints), robot)
 
-    def _act(
+    def _command_joints(
         self,
         clock: Clock,
         client: HostClient,
@@ -192,20 +207,21 @@ class SineFollower:
     ) -> None:
         self.ticks_seen.append(clock.tick)
         if joints is not None and commander.ensure_lease(clock):
-            points = commander.make_hold_setpoints(joints)
+            setpoints = commander.make_hold_setpoints(joints)
             if clock.lifecycle == "armed":
                 self.armed_ticks.append(clock.tick)
-                wave = self.amplitude_rad * math.sin(2 * math.pi * clock.timestamp_ns * 1e-9)
-                points = RequestedSetpoints(
-                    points.mode, [wave] * len(robot.joints), points.torque_limit_nm
+                phase_rad = 2 * math.pi * clock.timestamp_ns * 1e-9
+                angle_rad = self.amplitude_rad * math.sin(phase_rad)
+                setpoints = RequestedSetpoints(
+                    setpoints.mode, [angle_rad] * len(robot.joints), setpoints.torque_limit_nm
                 )
-            commander.send_command(clock, joints, points)
+            commander.send_command(clock, joints, setpoints)
         client.report_done(clock.tick)
 
 
 @dataclass
 class RunningHost:
-    """A host at work."""
+    """A HAL host that runs in a thread, and a client that watches it."""
 
     host: Host
     backend: LagBackend
@@ -217,22 +233,23 @@ class RunningHost:
 
     @property
     def status(self) -> RobotStatus:
-        """The newest that was published."""
+        """The newest status that the host has published. It waits for the first one."""
         wait_until(lambda: self._refresh() is not None, "a status")
         assert self._status is not None
         return self._status
 
     def _refresh(self) -> RobotStatus | None:
-        found = self._statuses.drain()
-        self._status = found[-1] if found else self._status
+        new_statuses = self._statuses.drain()
+        if new_statuses:
+            self._status = new_statuses[-1]
         return self._status
 
     def request(self, key: str, request: Message) -> Answer:
-        """Ask the host; a no is an answer too."""
+        """Send a request to the host, and return its answer, which may be a refusal."""
         return self.session.send_request(key, request)
 
     def request_lifecycle(self, action: Any) -> Answer:
-        """Arm (naming the robot rightly), disarm, reset or finish."""
+        """Request the host to "arm" with the right name of the robot, to "disarm", to "reset" or to "finish"."""
         config_hash = self.host.description.config_hash
         request = LifecycleRequest(
             action=action, robot="worm", backend="lag", config_hash=config_hash
@@ -240,46 +257,61 @@ class RunningHost:
         return self.request(keys.LIFECYCLE, request)
 
     def arm(self) -> None:
-        """As soon as the host is ready: on a busy machine a status is soon out of date."""
+        """Arm the robot as soon as the host is ready. On a busy machine the first request may come too early."""
         wait_until(lambda: self.status.ready_to_arm and self.request_lifecycle("arm").ok, "armed")
 
     def wait_for_lifecycle(self, lifecycle: str) -> None:
-        """Wait for a state to be shown."""
+        """Wait until the host publishes this lifecycle state."""
         wait_until(lambda: self.status.lifecycle == lifecycle, f"lifecycle {lifecycle}")
 
     def has_ended(self) -> bool:
-        """Whether the host's loop is over."""
+        """Return whether the thread of the host has ended."""
         return not self.thread.is_alive()
 
 
 @contextmanager
-def running_host(config: RunConfig, **host: Any) -> Iterator[RunningHost]:
-    """A host of a `LagBackend`, and a client that watches it. The host is stopped at the end."""
-    endpoint, backend = find_free_endpoint(), LagBackend(config)
-    link = ConnectionSettings(endpoint, "lab/worm")
+def running_host(config: RunConfig, **options: Any) -> Iterator[RunningHost]:
+    """Run a host of a `LagBackend` and a client that watches it, and stop the host at the end of the context.
+
+    Args:
+        config: Configuration of the run.
+        **options: Fields of `HostOptions`.
+    """
+    endpoint = find_free_endpoint()
+    backend = LagBackend(config)
+    connection = ConnectionSettings(endpoint, "lab/worm")
     with (
-        open_session(ConnectionSettings(endpoint, "lab/worm", listen=True)) as own,
-        open_session(link) as watcher,
+        open_session(ConnectionSettings(endpoint, "lab/worm", listen=True)) as host_session,
+        open_session(connection) as watcher,
     ):
-        faulty, faults = create_host_faults(config, GuardedBackend(backend), own)
-        made = Host(config, faulty, own, HostOptions(faults=faults, **host))
-        thread = threading.Thread(target=made.run, name="host")
+        faulty_backend, faults = create_host_faults(config, GuardedBackend(backend), host_session)
+        host = Host(config, faulty_backend, host_session, HostOptions(faults=faults, **options))
+        thread = threading.Thread(target=host.run, name="host")
         statuses = watcher.declare_latched_reader(keys.STATUS, RobotStatus)
         thread.start()
         try:
-            yield RunningHost(made, backend, link, watcher, thread, statuses)
+            yield RunningHost(host, backend, connection, watcher, thread, statuses)
         finally:
-            made.request_stop()
+            host.request_stop()
             thread.join(LIMIT_S)
-            assert not thread.is_alive(), "the host did not stop"
+            assert not thread.is_alive(), f"the host did not stop within {LIMIT_S:g} s"
 
 
 @contextmanager
 def running_commanded_host(
-    config: RunConfig, ticks: int = 5, **host: Any
+    config: RunConfig, ticks: int = 5, **options: Any
 ) -> Iterator[tuple[RunningHost, SineFollower]]:
-    """A host that is armed, and a follower that has commanded it for more ticks than that."""
-    with running_host(config, **host) as run, running_follower(run.link, SineFollower()) as control:
+    """Run an armed host and a follower that has already commanded it for more than `ticks` ticks.
+
+    Args:
+        config: Configuration of the run.
+        ticks: Number of ticks with commands before the context is entered.
+        **options: Fields of `HostOptions`.
+    """
+    with (
+        running_host(config, **options) as run,
+        running_follower(run.link, SineFollower()) as control,
+    ):
         run.arm()
         wait_until(lambda: len(control.armed_ticks) > ticks, "commands")
         yield run, control
@@ -289,7 +321,7 @@ def running_commanded_host(
 def running_follower(
     connection: ConnectionSettings, follower: SineFollower
 ) -> Iterator[SineFollower]:
-    """A follower in a thread of its own."""
+    """Run a follower in a thread, and stop it at the end of the context."""
     thread = threading.Thread(target=follower.run, args=(connection,), name=follower.name)
     thread.start()
     try:
@@ -297,4 +329,4 @@ def running_follower(
     finally:
         follower.stopped.set()
         thread.join(LIMIT_S)
-        assert not thread.is_alive(), "the follower did not stop"
+        assert not thread.is_alive(), f"the follower did not stop within {LIMIT_S:g} s"

@@ -1,4 +1,4 @@
-"""Small robots, configurations and files for the tests of the HAL."""
+"""Makes small robots, messages, configurations and files for tests."""
 
 import copy
 import tomllib
@@ -97,7 +97,7 @@ decimation = 2
 
 
 def with_changes(base: dict[str, Any], **dotted: Any) -> dict[str, Any]:
-    """Return a deep copy of a table with other values; `__` in a name stands for the dot: limits__torque_nm=0.1."""
+    """Return a deep copy of a table with other values. Two underscores in a name mean a dot: limits__torque_nm=0.1."""
     copied = copy.deepcopy(base)
     for name, value in dotted.items():
         *parents, last = name.split("__")

@@ -85,12 +85,20 @@ def _make_strategy(type_info: inspect.Type) -> st.SearchStrategy[Any]:  # noqa: 
 
 def find_min_integer(info: inspect.IntType) -> int | None:
     """Return the minimum integer of a type; None if it has no lower bound."""
-    return info.ge if info.ge is not None else None if info.gt is None else info.gt + 1
+    if info.ge is not None:
+        return info.ge
+    if info.gt is not None:
+        return info.gt + 1
+    return None
 
 
 def find_max_integer(info: inspect.IntType) -> int | None:
     """Return the maximum integer of a type; None if it has no upper bound."""
-    return info.le if info.le is not None else None if info.lt is None else info.lt - 1
+    if info.le is not None:
+        return info.le
+    if info.lt is not None:
+        return info.lt - 1
+    return None
 
 
 def make_plain_example(struct: type[msgspec.Struct]) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""What every suite needs to drive real processes and networks. Knows nothing of ours: the attacks use it too."""
+"""Runs real processes, networks and pages for every test suite."""

@@ -1,4 +1,4 @@
-"""Controllers and backends that misbehave."""
+"""The source of a controller and a backend that misbehave in tick 30, in a way that a test inserts."""
 
 BAD = """
 import ctypes

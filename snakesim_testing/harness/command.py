@@ -1,4 +1,4 @@
-"""The `snakesim` command, in real processes, on loopback ports of its own."""
+"""Runs the `snakesim` command in real processes, on unused ports of the loopback interface."""
 
 import contextlib
 import os
@@ -17,14 +17,15 @@ from snakesim_testing.harness.processes import find_processes_of_run, find_run_p
 from snakesim_testing.harness.wait import TIMEOUT_S, wait_until
 
 SNAKESIM_COMMAND = [sys.executable, "-m", "snakesim_operator"]
-WITH_TESTS = ["setpriv", "--pdeathsig", "KILL"]  # ends when the tests are killed, too
-TIMED_OUT = 124  # as timeout(1) has it: no exit code of ours
-HANDED_DOWN = {"MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "ARGS", "WORKERS"}
+END_WITH_TESTS = ["setpriv", "--pdeathsig", "KILL"]  # the process ends even if the tests are killed
+TIMED_OUT = 124  # the exit code of timeout(1), which `snakesim` does not use
+# Variables that `make` passes to its commands.
+MAKE_VARIABLES = {"MAKEFLAGS", "MFLAGS", "MAKEOVERRIDES", "MAKELEVEL", "ARGS", "WORKERS"}
 
 
 @dataclass(frozen=True)
 class CompletedRun:
-    """A finished command."""
+    """The exit code and the output of a command that has ended."""
 
     code: int
     out: str
@@ -38,9 +39,14 @@ class CompletedRun:
 
 
 def make_environment(home: Path, **more: str) -> dict[str, str]:
-    """The caller's environment without what `make` hands down, and with a state folder of the test's own."""
-    kept = {name: value for name, value in os.environ.items() if name not in HANDED_DOWN}
-    return {**kept, "XDG_STATE_HOME": str(home), "PYTHONUNBUFFERED": "1", **more}
+    """Return the environment of the test without the variables of `make`, and with a state folder of its own.
+
+    Args:
+        home: The state folder.
+        **more: Further variables.
+    """
+    inherited = {name: value for name, value in os.environ.items() if name not in MAKE_VARIABLES}
+    return {**inherited, "XDG_STATE_HOME": str(home), "PYTHONUNBUFFERED": "1", **more}
 
 
 def snakesim(
@@ -128,16 +134,16 @@ class RunningCommand:
 
     @property
     def home(self) -> Path:
-        """The folder in which it was started."""
+        """The folder in which the command was started."""
         return self.out.parent
 
     @property
     def endpoint(self) -> str:
-        """The endpoint of its network, as it prints it."""
+        """The endpoint of the network of the run, which the command prints."""
         return self.asked_endpoint or self._find_printed(r"network: (\S+?),")
 
     def console(self) -> str:
-        """The address of its live console, once it is printed."""
+        """Wait until the run has printed the address of its live console, and return it."""
         return self._find_printed(r"console: (http\S+)")
 
     def _find_printed(self, pattern: str) -> str:
@@ -145,9 +151,9 @@ class RunningCommand:
             lambda: re.search(pattern, self.printed()) or self.process.poll() is not None,
             f"{pattern!r} from the run",
         )
-        found = re.search(pattern, self.printed())
-        assert found is not None, self.describe_ending()
-        return found[1]
+        match = re.search(pattern, self.printed())
+        assert match is not None, self.describe_ending()
+        return match[1]
 
     def describe_ending(self) -> str:
         """Return exit code and last output of the run, for the text of a failure."""
@@ -168,9 +174,10 @@ class RunningCommand:
 
     def run_tool(self, *arguments: str, timeout_s: float = TIMEOUT_S) -> CompletedRun:
         """Run a tool on the same machine with the endpoint of this run."""
-        where = (*arguments, "--endpoint", self.endpoint)
         return snakesim(
-            *where,
+            *arguments,
+            "--endpoint",
+            self.endpoint,
             cwd=self.home,
             timeout_s=timeout_s,
             extra_env=self.extra_env,
@@ -183,8 +190,8 @@ class RunningCommand:
 
     def parts(self) -> dict[str, int]:
         """Return the process ids of host and services that are alive, by name."""
-        own = ("host", "guidance", "navigation", "control")
-        return {name: pid for name, pid in find_run_processes(self.out).items() if name in own}
+        parts = ("host", "guidance", "navigation", "control")
+        return {name: pid for name, pid in find_run_processes(self.out).items() if name in parts}
 
     def end(self, timeout_s: float = TIMEOUT_S) -> int:
         """Wait until the run has ended, and return its exit code."""
@@ -219,7 +226,7 @@ def running_snakesim(
         process = subprocess.Popen(
             [
                 *command_prefix,
-                *WITH_TESTS,
+                *END_WITH_TESTS,
                 *SNAKESIM_COMMAND,
                 "run",
                 *arguments,

@@ -1,4 +1,4 @@
-"""A disk that is too small, made of a limit on the size of files."""
+"""Simulates a full disk by a limit on the size of files."""
 
 import resource
 import signal

@@ -1,4 +1,4 @@
-"""A connection to a console as its page opens one, which can send any message; and plain HTTP."""
+"""Connects to a console as its page does, sends any message, and sends plain HTTP requests."""
 
 import contextlib
 import http.client
@@ -32,7 +32,7 @@ STOP = "EMERGENCY STOP  (Esc)"
 
 
 class ViewerPage:
-    """One viewer. A context manager."""
+    """The connection of one viewer to a console. It is closed at the end of the context."""
 
     def __init__(self, address: str, origin: str | None = None, *, draws: bool = True) -> None:
         """Connect to the page server of a console, as a browser does.
@@ -68,47 +68,45 @@ class ViewerPage:
         self._socket.close()
 
     def send_message(self, message: Any) -> None:
-        """Send a message; bytes and text as they are."""
+        """Send a message. Bytes and text are sent unchanged."""
         raw = message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message)
         with contextlib.suppress(ConnectionClosed):
             self._socket.send(raw)
 
     def find(self, label: str) -> str:
-        """The id of the control with a label, once it is there."""
+        """Wait until the page has a control with this label, and return the id of the control."""
         return wait_until(lambda: self._find_control_id(label), f"{label!r} on the page", 60.0)
 
     def change(self, control: str, updates: Any) -> None:
-        """Say that a control, by its id, has other values."""
+        """Send new values of the control with this id."""
         self.send_message({"type": "GuiUpdateMessage", "uuid": control, "updates": updates})
 
     def click(self, label: str) -> None:
-        """Press a button."""
+        """Press the button with this label."""
         self.change(self.find(label), {"value": True})
 
     def ended(self) -> int | None:
-        """The code with which the console suspended up, if it has."""
+        """Return the code with which the console has closed the connection, or None if it is open."""
         self._reader.join(10.0)
         return self.closed_by
 
     def _find_control_id(self, label: str) -> str | None:
-        return next(
-            (uuid for uuid, props in list(self.controls.items()) if props.get("label") == label),
-            None,
-        )
+        for uuid, props in list(self.controls.items()):  # a copy, because `_read` adds controls
+            if props.get("label") == label:
+                return uuid
+        return None
 
     def _read(self) -> None:
-        unzip = zstandard.ZstdDecompressor()
+        decompressor = zstandard.ZstdDecompressor()
         try:
             while True:
                 data = self._socket.recv()
                 assert isinstance(data, bytes)
-                size, packed = (
-                    int.from_bytes(data[:8], "little"),
-                    int.from_bytes(data[8:16], "little"),
-                )
-                for message in msgspec.msgpack.decode(
-                    unzip.decompress(data[16 : 16 + packed], size)
-                )["messages"]:
+                decompressed_size = int.from_bytes(data[:8], "little")
+                compressed_size = int.from_bytes(data[8:16], "little")
+                compressed = data[16 : 16 + compressed_size]
+                batch = decompressor.decompress(compressed, decompressed_size)
+                for message in msgspec.msgpack.decode(batch)["messages"]:
                     self._handle_message(message)
         except ConnectionClosed as closed:
             self.closed_by = None if closed.rcvd is None else closed.rcvd.code
@@ -124,7 +122,7 @@ class ViewerPage:
 
 
 def origin_of(address: str) -> str:
-    """The origin of a page at this address, as its browser sends it."""
+    """Return the origin of a page at this address, as its browser sends it."""
     parts = urlsplit(address)
     return f"{parts.scheme}://{parts.netloc}"
 
@@ -132,7 +130,14 @@ def origin_of(address: str) -> str:
 def send_http_request(
     address: str, method: str, path: str = "/stop", **headers: str
 ) -> tuple[int, str]:
-    """Status and text of an HTTP request. path: behind the token that ends the address."""
+    """Send an HTTP request to a console, and return the status and the text of the response.
+
+    Args:
+        address: Address of the console, which ends with its token.
+        method: The HTTP method.
+        path: Path after the token.
+        **headers: Headers of the request.
+    """
     parts = urlsplit(address)
     connection = http.client.HTTPConnection(parts.netloc, timeout=20.0)
     with contextlib.closing(connection):
@@ -142,8 +147,9 @@ def send_http_request(
 
 
 def flood(address: str, message: Any, seconds: float) -> int:
-    """Send one message over and over; how often it went."""
-    sent, end_s = 0, time.monotonic() + seconds
+    """Send one message as often as possible for some seconds, and return how often it was sent."""
+    sent = 0
+    end_s = time.monotonic() + seconds
     with ViewerPage(address) as page:
         while time.monotonic() < end_s:
             page.send_message(message)

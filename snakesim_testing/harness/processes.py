@@ -1,4 +1,4 @@
-"""The processes of a run, as the system knows them."""
+"""Finds the processes of a run in /proc."""
 
 import contextlib
 import re
@@ -40,16 +40,16 @@ def find_processes_of_run(out: Path) -> list[tuple[int, str]]:
 
 def find_run_processes(out: Path) -> dict[str, int]:
     """Return the process ids of a run by name of the part. A second process of a part is named `NAME again`."""
-    found: dict[str, int] = {}
+    pid_by_name: dict[str, int] = {}
     for pid, line in sorted(find_processes_of_run(out)):
         service = SERVICE.search(line)
-        name = (
-            service[1]
-            if service
-            else next((name for module, name in PROGRAMS.items() if module in line), "run")
-        )
-        found[f"{name} again" if name in found else name] = pid
-    return found
+        if service is not None:
+            name = service[1]
+        else:
+            name = next((name for module, name in PROGRAMS.items() if module in line), "run")
+        is_second = name in pid_by_name
+        pid_by_name[f"{name} again" if is_second else name] = pid
+    return pid_by_name
 
 
 def assert_no_process_left(out: Path, limit_s: float = 10.0) -> None:

@@ -1,4 +1,4 @@
-"""A TCP connection through a relay that can stall: what is sent waits, and comes all at once when it goes on."""
+"""Relays TCP connections, and can stall them: the relay holds all data back, and delivers it at once later."""
 
 import asyncio
 import contextlib
@@ -7,14 +7,14 @@ CHUNK_BYTES = 64 * 1024
 
 
 class StallingRelay:
-    """Relays connections from a port of its own to another port of the loopback. An async context manager."""
+    """Relays connections from a port of its own to another address. It is an async context manager."""
 
     def __init__(self, host: str, port: int) -> None:
-        """host, port: where it relays to."""
-        self._behind = host, port
-        self._goes_on = asyncio.Event()
-        self._goes_on.set()
-        self._ways: set[asyncio.Task[None]] = set()
+        """Relay to this host and port."""
+        self._target = (host, port)
+        self._may_pass = asyncio.Event()
+        self._may_pass.set()
+        self._copy_tasks: set[asyncio.Task[None]] = set()
 
     async def __aenter__(self) -> "StallingRelay":
         self._server = await asyncio.start_server(self._relay, "127.0.0.1", 0)
@@ -23,31 +23,31 @@ class StallingRelay:
 
     async def __aexit__(self, *_: object) -> None:
         self._server.close()
-        for way in self._ways:
-            way.cancel()
+        for task in self._copy_tasks:
+            task.cancel()
 
     def stall(self) -> None:
-        """Hold back everything, in both directions, from now on."""
-        self._goes_on.clear()
+        """Hold back all data in both directions from now on."""
+        self._may_pass.clear()
 
     def go_on(self) -> None:
-        """Deliver what was held back."""
-        self._goes_on.set()
+        """Deliver the data that was held back, and relay again."""
+        self._may_pass.set()
 
     async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        behind, to_behind = await asyncio.open_connection(*self._behind)
-        ways = [
-            asyncio.create_task(self._copy(reader, to_behind)),
-            asyncio.create_task(self._copy(behind, writer)),
+        target_reader, target_writer = await asyncio.open_connection(*self._target)
+        tasks = [
+            asyncio.create_task(self._copy(reader, target_writer)),
+            asyncio.create_task(self._copy(target_reader, writer)),
         ]
-        self._ways.update(ways)
-        await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-        for end in (writer, to_behind):
-            end.close()
+        self._copy_tasks.update(tasks)
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for stream in (writer, target_writer):
+            stream.close()
 
     async def _copy(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError):
             while data := await reader.read(CHUNK_BYTES):
-                await self._goes_on.wait()
+                await self._may_pass.wait()
                 writer.write(data)
                 await writer.drain()

@@ -1,4 +1,4 @@
-"""Wait on a condition, with a deadline."""
+"""Waits for a condition until a deadline."""
 
 import time
 from collections.abc import Callable

@@ -1,1 +1,1 @@
-"""A lab on loopback, with certificates and a router."""
+"""Labs with certificates and a router, and machines as network namespaces, for tests."""

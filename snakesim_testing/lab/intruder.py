@@ -1,7 +1,8 @@
-"""`python -m snakesim_testing.lab.intruder SESSION.json5`: holds a viewer's certificate, and does what it can with it.
+"""Attacks a robot with the certificate of a viewer.
 
-It repeats every message that it receives, at the same key. It commands with the epoch and the next sequence number
-that it reads, and it answers in the robot's place. It prints how often, every tenth of a second.
+Run it with `python -m snakesim_testing.lab.intruder SESSION.json5`. It publishes every message that it receives again.
+It sends commands with the lease epoch and the next sequence number that it reads, and answers requests in the robot's
+place. Every 0.1 s it prints the number of attempts of each kind.
 """
 
 import sys

@@ -1,6 +1,7 @@
-"""Machines of a lab as network namespaces, and links between them. Needs root; nothing outside them is touched.
+"""Creates the machines of a lab as network namespaces, and links between them.
 
-A namespace has no name: it lives as long as a process in it, and that one ends with this process. So nothing is left.
+It needs root, but changes nothing outside of the namespaces. A namespace has no name: it exists as long as a process
+in it, and this process ends with the tests. Thus nothing is left.
 """
 
 import json
@@ -16,15 +17,16 @@ from snakesim_hal.base.arithmetic import SINGLE_THREAD_ENV
 from snakesim_hal.base.process import SERVICE_PRIORITY, make_python_command, set_parent_death_signal
 
 NET = "10.78.0"
-HURRIED = ("chrt", "--fifo", str(SERVICE_PRIORITY))
+REAL_TIME_PRIORITY = ("chrt", "--fifo", str(SERVICE_PRIORITY))
 
 
 class NamespaceMachine:
-    """One network namespace."""
+    """A machine that is a network namespace."""
 
     def __init__(self, stack: ExitStack, name: str = "a machine") -> None:
-        self.name, self._stack = name, stack
-        self._holder = self._started(
+        self.name = name
+        self._stack = stack
+        self._holder = self._start_process(
             ["unshare", "--net", "sh", "-c", "echo ready; exec sleep infinity"]
         )
         assert self._holder.stdout is not None
@@ -89,8 +91,11 @@ class NamespaceMachine:
             inherits: File descriptors that the program inherits.
             hurried: Whether the program gets a real-time priority, as on a machine that has nothing else to do.
         """
-        return self._started(
-            self.wrap_command(*(HURRIED if hurried else ()), *command), log, env or {}, inherits
+        return self._start_process(
+            self.wrap_command(*(REAL_TIME_PRIORITY if hurried else ()), *command),
+            log,
+            env or {},
+            inherits,
         )
 
     def start_module(
@@ -109,7 +114,7 @@ class NamespaceMachine:
             hurried=hurried,
         )
 
-    def _started(
+    def _start_process(
         self,
         command: list[str],
         log: Path | None = None,

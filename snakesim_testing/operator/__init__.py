@@ -1,1 +1,1 @@
-"""Recorded runs, browsers and viewers for tests of the operator package."""
+"""Run records, browsers and console viewers for tests of the operator package."""

@@ -1,4 +1,7 @@
-"""A headless Chromium, driven over its DevTools protocol: no package is needed but websockets, which viser brings."""
+"""Controls a headless Chromium through its DevTools protocol.
+
+The only package that this needs is websockets, which viser installs.
+"""
 
 import base64
 import json
@@ -14,16 +17,20 @@ from typing import Any
 
 from websockets.sync.client import ClientConnection, connect
 
-CHROMIUM = next(
-    (
-        path
-        for name in ("chromium", "chromium-browser", "google-chrome")
-        if (path := shutil.which(name))
-    ),
-    None,
-)
-MAX_ERROR_CHARACTERS = 500  # of the text of one error
-MISSING = "needs a browser: install the Debian package chromium"
+
+def _find_chromium() -> str | None:
+    """Return the path of an installed Chromium or Chrome, or None if there is none."""
+    for name in ("chromium", "chromium-browser", "google-chrome"):
+        path = shutil.which(name)
+        if path is not None:
+            return path
+    return None
+
+
+CHROMIUM = _find_chromium()
+MAX_ERROR_CHARACTERS = 500  # an error may contain a whole script
+MAX_PAGE_CHARACTERS = 3000  # the part of the page's text that a failure message contains
+BROWSER_MISSING = "needs a browser: install the Debian package chromium"
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
@@ -37,35 +44,40 @@ FLAGS = (
     "--remote-debugging-port=0",
 )
 WEBGL_FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-NO_WEBGL_FLAGS = ("--disable-gpu",)  # pages without 3D are drawn about twenty times faster
-WINDOW = {"url": "about:blank", "newWindow": True}
-START_S, ANSWER_S = 60.0, 60.0
+NO_WEBGL_FLAGS = ("--disable-gpu",)  # a page without 3D is rendered about twenty times faster
+NEW_WINDOW = {"url": "about:blank", "newWindow": True}
+START_LIMIT_S = 60.0
+ANSWER_LIMIT_S = 60.0
+END_LIMIT_S = 10.0
+POLL_PERIOD_S = 0.02
 
 
 class BrowserTab:
-    """One page."""
+    """One page of a browser, and the errors that its console has shown."""
 
     def __init__(self, socket: ClientConnection) -> None:
-        self._socket, self._number = socket, 0
-        self.errors: list[str] = []  # of the page's console
+        self._socket = socket
+        self._last_request_id = 0
+        self.errors: list[str] = []  # texts of the errors in the page's console
         for domain in ("Page", "Runtime", "Log"):
             self.send(f"{domain}.enable")
-        # A page in the background draws nothing.
+        # Chromium renders nothing of a page that does not have the focus.
         self.send("Emulation.setFocusEmulationEnabled", enabled=True)
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """A command of the protocol, and its result."""
-        self._number += 1
-        self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        """Send a command of the DevTools protocol, and return its result."""
+        self._last_request_id += 1
+        request = {"id": self._last_request_id, "method": method, "params": parameters}
+        self._socket.send(json.dumps(request))
         while True:
-            answer = json.loads(self._socket.recv(timeout=ANSWER_S))
-            if answer.get("id") == self._number:
-                assert "error" not in answer, answer
-                return answer["result"]
-            self._note(answer)
+            message = json.loads(self._socket.recv(timeout=ANSWER_LIMIT_S))
+            if message.get("id") == self._last_request_id:
+                assert "error" not in message, message
+                return message["result"]
+            self._record_error(message)
 
-    def _note(self, event: dict[str, Any]) -> None:
-        """Store the text of an event of the browser if it reports an error of the page."""
+    def _record_error(self, event: dict[str, Any]) -> None:
+        """Keep the text of an event of the browser if it reports an error of the page."""
         method = event.get("method")
         params = event.get("params", {})
         if method == "Runtime.exceptionThrown":
@@ -81,74 +93,93 @@ class BrowserTab:
             return
         self.errors.append(error_text[:MAX_ERROR_CHARACTERS])
 
-    def value(self, script: str) -> Any:
-        """The value of a JavaScript expression."""
-        return self.send("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
-            "value"
-        )
+    def evaluate(self, script: str) -> Any:
+        """Return the value of a JavaScript expression in the page."""
+        answer = self.send("Runtime.evaluate", expression=script, returnByValue=True)
+        return answer["result"].get("value")
 
-    def text(self) -> str:
-        """All visible text."""
-        return self.value("document.documentElement.innerText") or ""
+    def read_text(self) -> str:
+        """Return all visible text of the page."""
+        return self.evaluate("document.documentElement.innerText") or ""
 
     def wait_for(self, text: str, limit_s: float = 60.0) -> float:
-        """Until the page shows a text; returns how long it took in seconds."""
-        began = time.monotonic()
-        while text not in (shown := self.text()):
-            assert time.monotonic() - began < limit_s, (
-                f"{text!r} is not on the page:\n{shown[:3000]}"
-            )
-            time.sleep(0.02)
-        return time.monotonic() - began
+        """Wait until the page shows a text, and return how long that took, in seconds."""
+        start_s = time.monotonic()
+        while text not in (page_text := self.read_text()):
+            is_in_time = time.monotonic() - start_s < limit_s
+            assert is_in_time, f"{text!r} is not on the page:\n{page_text[:MAX_PAGE_CHARACTERS]}"
+            time.sleep(POLL_PERIOD_S)
+        return time.monotonic() - start_s
 
     def wait_until_loaded(self, limit_s: float = 60.0) -> None:
-        """Until the page's own scripts have run: earlier input is lost."""
+        """Wait until the scripts of the page have run. The page loses earlier input."""
         deadline = time.monotonic() + limit_s
-        while self.value("document.readyState") != "complete":
-            assert time.monotonic() < deadline, "the page does not load"
-            time.sleep(0.02)
+        while self.evaluate("document.readyState") != "complete":
+            assert time.monotonic() < deadline, f"the page did not load within {limit_s:g} s"
+            time.sleep(POLL_PERIOD_S)
 
     def click(self, label: str, hold_s: float = 0.0) -> None:
-        """Press and release the element with this label. A disabled button does nothing, as for a person."""
-        # Not at a place on the screen, and in one go: the page moves and replaces things while it changes.
-        find = f"[...document.querySelectorAll('html *')].findLast(e => e.innerText?.trim() === {json.dumps(label)})"
-        event = "{bubbles: true, pointerId: 1, clientX: r.x + 1, clientY: r.y + 1}"
-        found = self.send(
-            "Runtime.evaluate",
-            expression=f"(async () => {{ const e = {find}; if (!e) return false; const r = e.getBoundingClientRect();"
-            f"e.dispatchEvent(new PointerEvent('pointerdown', {event}));"
-            + (f"await new Promise(done => setTimeout(done, {1000 * hold_s}));" if hold_s else "")
-            + f"e.dispatchEvent(new PointerEvent('pointerup', {event})); e.click(); return true; }})()",
-            awaitPromise=True,
-            returnByValue=True,
-        )["result"].get("value")
-        assert found, f"no {label!r} on the page:\n{self.text()[:3000]}"
+        """Press and release the element with this label. A disabled button does nothing, as for a person.
 
-    def type(self, label: str, text: str) -> None:
-        """Type a text into the field behind a label, over what is there."""
-        assert self.value(
+        Args:
+            label: The text of the element. The last element with this text is clicked.
+            hold_s: How long the element stays pressed.
+        """
+        # One script finds the element and clicks it: the page moves and replaces elements while it changes.
+        text = json.dumps(label)
+        find = f"[...document.querySelectorAll('html *')].findLast(e => e.innerText?.trim() === {text})"
+        event = "{bubbles: true, pointerId: 1, clientX: r.x + 1, clientY: r.y + 1}"
+        hold = ""
+        if hold_s:
+            hold = f"await new Promise(done => setTimeout(done, {1000 * hold_s}));"
+        script = (
+            f"(async () => {{ const e = {find}; if (!e) return false; const r = e.getBoundingClientRect();"
+            f"e.dispatchEvent(new PointerEvent('pointerdown', {event}));"
+            f"{hold}"
+            f"e.dispatchEvent(new PointerEvent('pointerup', {event})); e.click(); return true; }})()"
+        )
+        answer = self.send(
+            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
+        )
+        self._assert_label_exists(label, was_found=answer["result"].get("value"))
+
+    def enter_text(self, label: str, text: str) -> None:
+        """Replace the text in the input field that belongs to a label."""
+        was_found = self.evaluate(
             f"(() => {{ let e = [...document.querySelectorAll('body *')].findLast(e => e.innerText?.trim() === "
             f"{json.dumps(label)}); while (e && !e.querySelector('input[type=text]')) e = e.parentElement;"
             "if (!e) return false; const field = e.querySelector('input[type=text]');"
             "field.focus(); field.select(); return true; })()"
-        ), f"no {label!r} on the page:\n{self.text()[:3000]}"
+        )
+        self._assert_label_exists(label, was_found=was_found)
         self.send("Input.insertText", text=text)
-        self.value("document.activeElement.blur()")
+        self.evaluate("document.activeElement.blur()")
 
-    def press(self, key: str, code: int, **more: str) -> None:
-        """Press a key. more: such as the `text` that it types."""
-        for kind, typed in (("keyDown", more), ("keyUp", {})):
+    def _assert_label_exists(self, label: str, *, was_found: bool) -> None:
+        assert was_found, f"no {label!r} on the page:\n{self.read_text()[:MAX_PAGE_CHARACTERS]}"
+
+    def press_key(self, key: str, code: int, **key_down: str) -> None:
+        """Press and release a key.
+
+        Args:
+            key: Name of the key.
+            code: Windows code of the key.
+            **key_down: Further parameters of the press, such as the `text` that the key enters.
+        """
+        for event_type, parameters in (("keyDown", key_down), ("keyUp", {})):
             self.send(
                 "Input.dispatchKeyEvent",
-                type=kind,
+                type=event_type,
                 key=key,
                 code=key,
                 windowsVirtualKeyCode=code,
-                **typed,
+                **parameters,
             )
 
-    def size(self, width: int, height: int, *, scale: float = 1.0, mobile: bool = False) -> None:
-        """The size of the window."""
+    def set_window_size(
+        self, width: int, height: int, *, scale: float = 1.0, mobile: bool = False
+    ) -> None:
+        """Set the size of the window in CSS pixels, and the screen pixels for each of them."""
         self.send(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -157,30 +188,36 @@ class BrowserTab:
             mobile=mobile,
         )
 
-    def picture(self, **more: Any) -> bytes:
-        """What it shows, as a PNG. more: for the protocol, such as `clip`."""
-        return base64.b64decode(self.send("Page.captureScreenshot", format="png", **more)["data"])
+    def capture_screenshot(self, **parameters: Any) -> bytes:
+        """Return a picture of the page as a PNG file.
+
+        Args:
+            **parameters: Further parameters of the command captureScreenshot of DevTools, such as `clip`.
+        """
+        answer = self.send("Page.captureScreenshot", format="png", **parameters)
+        return base64.b64decode(answer["data"])
 
 
 class ChromiumBrowser:
-    """A running Chromium."""
+    """A running Chromium, and the connections to its pages."""
 
     def __init__(self, port: int) -> None:
         self._port = port
         self._sockets: list[ClientConnection] = []
 
-    def open(
+    def open_page(
         self, address: str, width: int = 1440, height: int = 900, scale: float = 1.0
     ) -> BrowserTab:
-        """A new page; each is a viewer of its own."""
+        """Open an address in a new page. The console counts each page as a viewer."""
         root = f"127.0.0.1:{self._port}/"
-        with urllib.request.urlopen(f"http://{root}json/version", timeout=ANSWER_S) as answer:
-            whole = self._connect(json.load(answer)["webSocketDebuggerUrl"])
-        whole.send(json.dumps({"id": 1, "method": "Target.createTarget", "params": WINDOW}))
-        made = json.loads(whole.recv(timeout=ANSWER_S))["result"]["targetId"]
-        socket = self._connect(f"ws://{root}devtools/page/{made}")
-        tab = BrowserTab(socket)
-        tab.size(width, height, scale=scale)
+        with urllib.request.urlopen(f"http://{root}json/version", timeout=ANSWER_LIMIT_S) as answer:
+            browser_socket = self._connect(json.load(answer)["webSocketDebuggerUrl"])
+        request = {"id": 1, "method": "Target.createTarget", "params": NEW_WINDOW}
+        browser_socket.send(json.dumps(request))
+        answer = json.loads(browser_socket.recv(timeout=ANSWER_LIMIT_S))
+        target_id = answer["result"]["targetId"]
+        tab = BrowserTab(self._connect(f"ws://{root}devtools/page/{target_id}"))
+        tab.set_window_size(width, height, scale=scale)
         tab.send("Page.navigate", url=address)
         return tab
 
@@ -190,7 +227,7 @@ class ChromiumBrowser:
         return socket
 
     def close(self) -> None:
-        """End all connections."""
+        """Close all connections to the browser."""
         for socket in self._sockets:
             socket.close()
 
@@ -202,26 +239,31 @@ def open_chromium(*, with_webgl: bool = True) -> Iterator[ChromiumBrowser]:
     Args:
         with_webgl: Whether the browser supports WebGL.
     """
-    assert CHROMIUM is not None, MISSING
-    flags = (*FLAGS, *(WEBGL_FLAGS if with_webgl else NO_WEBGL_FLAGS))
+    assert CHROMIUM is not None, BROWSER_MISSING
+    webgl_flags = WEBGL_FLAGS if with_webgl else NO_WEBGL_FLAGS
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
-            [CHROMIUM, *flags, f"--user-data-dir={profile}", "about:blank"],
+            [CHROMIUM, *FLAGS, *webgl_flags, f"--user-data-dir={profile}", "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
         try:
-            port_file, deadline = Path(profile) / "DevToolsActivePort", time.monotonic() + START_S
-            while not port_file.is_file() or not port_file.read_text().strip():
-                assert process.poll() is None and time.monotonic() < deadline, (
-                    "chromium did not start"
-                )
-                time.sleep(0.05)
-            browser = ChromiumBrowser(int(port_file.read_text().split()[0]))
+            browser = ChromiumBrowser(_wait_for_port(process, Path(profile)))
             try:
                 yield browser
             finally:
                 browser.close()
         finally:
             process.terminate()
-            process.wait(10)
+            process.wait(END_LIMIT_S)
+
+
+def _wait_for_port(process: "subprocess.Popen[bytes]", profile: Path) -> int:
+    """Return the port of the DevTools protocol as soon as the browser has written it into its profile."""
+    port_file = profile / "DevToolsActivePort"
+    deadline = time.monotonic() + START_LIMIT_S
+    while not port_file.is_file() or not port_file.read_text().strip():
+        assert process.poll() is None, "chromium ended before it was ready"
+        assert time.monotonic() < deadline, f"chromium did not start within {START_LIMIT_S:g} s"
+        time.sleep(POLL_PERIOD_S)
+    return int(port_file.read_text().split()[0])

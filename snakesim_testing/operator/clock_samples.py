@@ -1,4 +1,4 @@
-"""Clock samples for recordings."""
+"""Builds clock samples for tests of recordings."""
 
 import time
 
@@ -9,7 +9,8 @@ from snakesim_hal.wire.messages import Clock
 from snakesim_testing.hal import small_robots as rig
 
 
-def clock(tick: int) -> ReceivedSample:
+def make_clock_sample(tick: int) -> ReceivedSample:
+    """Return a clock message of this tick as a recorder receives it now."""
     return ReceivedSample(
         keys.CLOCK, encode(rig.make_clock(tick)), format_encoding(Clock), time.monotonic_ns()
     )

@@ -1,4 +1,4 @@
-"""A stop that is always ready, for a console without a robot."""
+"""An emergency stop that is always ready, for tests of a console without a robot."""
 
 from concurrent.futures import Future
 
@@ -12,13 +12,15 @@ class ReadyStop:
         self.requesters: list[str] = []
 
     def request_stop(self, requester: str) -> "Future[str]":
+        """Keep the name of the requester, and confirm the stop."""
         self.requesters.append(requester)
-        stopped: Future[str] = Future()
-        stopped.set_result("stopped")
-        return stopped
+        confirmation: Future[str] = Future()
+        confirmation.set_result("stopped")
+        return confirmation
 
     def check_readiness(self) -> StopReadiness:
+        """Report that the stop is ready."""
         return StopReadiness(is_ready=True, text="ready")
 
     def start_self_test_if_due(self) -> None:
-        """It is."""
+        """Start no self-test, because this stop needs none."""

@@ -1,4 +1,7 @@
-"""The servers of a console within the test's own process: the front server in a thread, and pages behind it."""
+"""Runs the servers of a console within the process of the test.
+
+The front server runs in a thread. The page server, if a test needs it, runs behind the front server.
+"""
 
 import asyncio
 import threading
@@ -22,20 +25,20 @@ def running_front_server(ports: ConsolePorts, stop: StopPath | None) -> Iterator
         stop: Stops the robot. None for the console of a recording.
     """
     server = FrontServer(ports.browser_socket, ports.page_socket_path, ports.token, stop)
-    ended = asyncio.Event()
-    loops: Queue[asyncio.AbstractEventLoop] = Queue()
+    end_requested = asyncio.Event()
+    started_loops: Queue[asyncio.AbstractEventLoop] = Queue()
 
     async def serve() -> None:
-        loops.put(asyncio.get_running_loop())
-        await server.run(ended)
+        started_loops.put(asyncio.get_running_loop())
+        await server.run(end_requested)
 
     thread = threading.Thread(target=asyncio.run, args=(serve(),))
     thread.start()
-    loop = loops.get()
+    loop = started_loops.get()
     try:
         yield server
     finally:
-        loop.call_soon_threadsafe(ended.set)
+        loop.call_soon_threadsafe(end_requested.set)
         thread.join()
 
 

@@ -1,4 +1,8 @@
-"""A viewer without a browser: connects to a console as viser's page does, reads all it is sent, and answers in turn."""
+"""A viewer of the console without a browser.
+
+It connects to a console as viser's page does, reads all messages, and sends the answers that the console waits for.
+Run `python -m snakesim_testing.operator.viewer ADDRESS COUNT` to connect COUNT viewers until the console ends.
+"""
 
 import asyncio
 import contextlib
@@ -28,74 +32,82 @@ CAMERA = {
     "up_direction": (0.0, 0.0, 1.0),
 }
 POLL_S = 0.02
-ASKED = "LocalStorageGetItemRequestMessage"
+STORAGE_REQUEST_TYPE = "LocalStorageGetItemRequestMessage"
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 
 
 class ConsoleViewer:
-    """One page."""
+    """One page of the console, and the elements that the console has put on it."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
-        self._unzip = zstandard.ZstdDecompressor()
-        self._of: dict[str, dict[str, Any]] = {}  # what is on the page, by its id
+        self._decompressor = zstandard.ZstdDecompressor()
+        self._element_by_uuid: dict[str, dict[str, Any]] = {}
 
-    async def come(self) -> None:
-        """Send the first message of a page: from then on it counts as a viewer."""
+    async def register_as_viewer(self) -> None:
+        """Send the first message of a page. The console counts the page as a viewer from then on."""
         await self.send_message(CAMERA)
 
-    async def batch(self) -> list[dict[str, Any]]:
-        """The next messages."""
+    async def receive_batch(self) -> list[dict[str, Any]]:
+        """Wait for the next batch of messages, and update the elements of the page.
+
+        A batch has two lengths of 8 bytes, the decompressed and the compressed one, and then the compressed messages.
+        """
         data = await self._socket.recv()
         assert isinstance(data, bytes)
-        size, packed = int.from_bytes(data[:8], "little"), int.from_bytes(data[8:16], "little")
-        messages = msgspec.msgpack.decode(self._unzip.decompress(data[16 : 16 + packed], size))[
-            "messages"
-        ]
+        decompressed_size = int.from_bytes(data[:8], "little")
+        compressed_size = int.from_bytes(data[8:16], "little")
+        compressed = data[16 : 16 + compressed_size]
+        batch = self._decompressor.decompress(compressed, decompressed_size)
+        messages = msgspec.msgpack.decode(batch)["messages"]
         for message in messages:
-            if "props" in message and "uuid" in message:
-                self._of[message["uuid"]] = dict(message["props"])
-            elif "updates" in message and message.get("uuid") in self._of:
-                self._of[message["uuid"]] |= message["updates"]
+            self._update_elements(message)
         return messages
 
-    async def answer(self, batch: list[dict[str, Any]]) -> None:
-        """Tell the console that a batch has been shown, if it asks."""
-        for message in batch:
-            if message["type"] == ASKED:
-                reported = {"value": None, "error": None, "request_uuid": message["request_uuid"]}
-                await self.send_message({"type": "LocalStorageGetItemResponseMessage", **reported})
+    def _update_elements(self, message: dict[str, Any]) -> None:
+        """Add the element that a message creates, or change the one that it updates."""
+        uuid = message.get("uuid")
+        if "props" in message and uuid is not None:
+            self._element_by_uuid[uuid] = dict(message["props"])
+        elif "updates" in message and uuid in self._element_by_uuid:
+            self._element_by_uuid[uuid] |= message["updates"]
 
-    async def watch(self) -> None:
-        """Show all that comes, until the connection ends."""
+    async def confirm_batch(self, batch: list[dict[str, Any]]) -> None:
+        """Confirm to the console that the page has shown a batch, if the batch contains a request for it."""
+        for message in batch:
+            if message["type"] == STORAGE_REQUEST_TYPE:
+                response = {
+                    "type": "LocalStorageGetItemResponseMessage",
+                    "value": None,
+                    "error": None,
+                    "request_uuid": message["request_uuid"],
+                }
+                await self.send_message(response)
+
+    async def receive_until_closed(self) -> None:
+        """Receive and confirm all batches until the connection ends."""
         with contextlib.suppress(ConnectionClosed):
             while True:
-                await self.answer(await self.batch())
+                await self.confirm_batch(await self.receive_batch())
 
-    def has(self, label: str) -> bool:
-        """Whether a button, an input or a command with this label is there."""
-        return any(props.get("label") == label for props in self._of.values())
+    def has_label(self, label: str) -> bool:
+        """Return whether the page has a button, an input or a command with this label."""
+        return any(props.get("label") == label for props in self._element_by_uuid.values())
 
-    def visible(self, label: str) -> bool:
-        """Whether a button or an input with this label is there, and not hidden."""
+    def is_visible(self, label: str) -> bool:
+        """Return whether the page has a button or an input with this label that is not hidden."""
         return any(
             props.get("label") == label and props.get("visible", True)
-            for props in self._of.values()
+            for props in self._element_by_uuid.values()
         )
 
-    def shows(self, text: str) -> bool:
-        """Whether a text is on the page, as HTML."""
-        return any(text in props.get("content", "") for props in self._of.values())
+    def shows_text(self, text: str) -> bool:
+        """Return whether the HTML of the page contains a text."""
+        return any(text in props.get("content", "") for props in self._element_by_uuid.values())
 
     async def click(self, button: str) -> None:
-        """Press a button."""
-        await self.send_message(
-            {
-                "type": "GuiUpdateMessage",
-                "uuid": await self.wait_for_uuid(button),
-                "updates": {"value": True},
-            }
-        )
+        """Press the button with this label."""
+        await self.choose(button, value=True)
 
     async def choose(self, label: str, value: str | bool | int) -> None:
         """Set the value of an input: press a button, choose from a list, or enter a number."""
@@ -108,7 +120,7 @@ class ConsoleViewer:
         )
 
     async def trigger(self, command: str) -> None:
-        """Press the key of a command."""
+        """Press the key of the command with this label."""
         await self.send_message(
             {"type": "CommandTriggerMessage", "uuid": await self.wait_for_uuid(command)}
         )
@@ -116,27 +128,27 @@ class ConsoleViewer:
     async def wait_for_uuid(self, label: str) -> str:
         """Return the id of the button, input or command with a label, as soon as the page has received it.
 
-        The parts of a page arrive one after another, while `watch` runs. On a busy computer a label that belongs
-        together with another one may arrive later.
+        The parts of a page arrive one after another, while `receive_until_closed` runs. On a busy computer a label
+        that belongs together with another one may arrive later.
         """
         deadline = time.monotonic() + TIMEOUT_S
         while time.monotonic() < deadline:
-            for uuid, props in self._of.items():
+            for uuid, props in self._element_by_uuid.items():
                 if props.get("label") == label:
                     return uuid
             await asyncio.sleep(POLL_S)
         raise AssertionError(f"no {label!r} on the page within {TIMEOUT_S:g} s")
 
     async def send_message(self, message: dict[str, Any]) -> None:
-        """Send any message."""
+        """Send any message to the console."""
         await self._socket.send(msgspec.msgpack.encode(message))
 
 
-def viewing(address: str) -> connect:
-    """The connection of a page; `async with` it."""
-    socket = address.replace("http", "ws")
+def connect_viewer(address: str) -> connect:
+    """Return the connection of a page to the console at this address, for `async with`."""
+    socket_address = address.replace("http", "ws")
     return connect(
-        socket,
+        socket_address,
         subprotocols=[PROTOCOL],
         compression=None,
         max_size=None,
@@ -146,16 +158,16 @@ def viewing(address: str) -> connect:
 
 
 async def watch(address: str) -> None:
-    """Look on until the console ends."""
-    async with viewing(address) as socket:
+    """Connect one viewer, and keep it connected until the console ends."""
+    async with connect_viewer(address) as socket:
         viewer = ConsoleViewer(socket)
-        await viewer.come()
-        await viewer.watch()
+        await viewer.register_as_viewer()
+        await viewer.receive_until_closed()
 
 
-async def watch_together(address: str, count: int) -> None:
-    """So many viewers."""
-    await asyncio.gather(*[watch(address) for _ in range(count)])
+async def watch_together(address: str, viewer_count: int) -> None:
+    """Connect several viewers, and keep them connected until the console ends."""
+    await asyncio.gather(*[watch(address) for _ in range(viewer_count)])
 
 
 if __name__ == "__main__":

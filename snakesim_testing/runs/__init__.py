@@ -1,1 +1,1 @@
-"""The `snakesim` command and whole runs, in processes or in one."""
+"""Runs the `snakesim` command and whole runs for tests, in processes of their own or in the test's process."""

@@ -1,6 +1,7 @@
-"""A robot whose emulated drives a scripted operator bends into drawn shapes, and `snakesim robot shape check` asks for.
+"""Writes a robot with emulated drives, and bends it into the shapes that `snakesim robot shape check` requests.
 
-The drives are emulated in the process of the host. A file has the pose into which a hand bends them.
+The drives are emulated in the process of the host. The file pose.txt contains the pose into which the scripted
+operator bends them.
 """
 
 import re
@@ -17,11 +18,12 @@ from snakesim_operator.features.commissioning.shape.design import (
     PLACEMENT_TOLERANCE_RAD,
     design_poses,
 )
-from snakesim_testing.runs.bench import lab_folder
+from snakesim_testing.runs.bench_host import write_lab_folder
 from snakesim_testing.runs.command import run_in_background
 
-JOINTS = 4
+JOINT_COUNT = 4
 POSE_FILE = "pose.txt"
+OPERATOR_ERROR_RAD = 0.9 * PLACEMENT_TOLERANCE_RAD  # of each joint, at most
 SCENARIO = """
 robot = "./snake.toml"
 scene = "flat"
@@ -56,15 +58,17 @@ class Real(FeetechBackend):
 
 
 def make_bent_folder(folder: Path, backend: str) -> Path:
-    """A lab's folder: a robot without IMUs, its scenario, and a backend whose emulated servos look real."""
-    return lab_folder(folder, JOINTS, SCENARIO.format(backend=backend), {"real.py": REAL})
+    """Write a robot without IMUs, its scenario, and a backend whose servos are described as real into a folder."""
+    return write_lab_folder(
+        folder, JOINT_COUNT, SCENARIO.format(backend=backend), {"real.py": REAL}
+    )
 
 
 class ScriptedOperator:
     """Bends the emulated robot as `snakesim robot shape check` asks, within the tolerance of a person."""
 
     def __init__(
-        self, home: Path, endpoint: str, drive_order: Sequence[int] = range(JOINTS)
+        self, home: Path, endpoint: str, drive_order: Sequence[int] = range(JOINT_COUNT)
     ) -> None:
         """Prepare to check the robot of a folder.
 
@@ -81,24 +85,25 @@ class ScriptedOperator:
         self._rng = np.random.default_rng(1)
 
     def check(self) -> tuple[int, str]:
-        """Answer every request of the check; return its exit code, and all that it printed."""
+        """Run the check, bend the robot at every request, and return the exit code and the output of the check."""
         arguments = ("robot", "shape", "check", "snake.toml", "--endpoint", self._endpoint)
         with run_in_background(self._home, *arguments, stdin=subprocess.PIPE) as process:
             assert process.stdout is not None and process.stdin is not None
-            printed: list[str] = []
+            printed_lines: list[str] = []
             for line in process.stdout:
-                printed.append(line)
+                printed_lines.append(line)
                 if "Then press Enter" in line:
-                    found = re.search(r"into shape (\w)", line)
-                    self._bend(self._poses["straight" if found is None else found[1]].angle_rad)
+                    shape = re.search(r"into shape (\w)", line)
+                    pose_name = "straight" if shape is None else shape[1]
+                    self._bend_robot(self._poses[pose_name].angle_rad)
                     process.stdin.write("\n")
                     process.stdin.flush()
-            return process.wait(20), "".join(printed)
+            return process.wait(20), "".join(printed_lines)
 
-    def _bend(self, drawn_rad: Floats) -> None:
-        placed_rad = (
-            drawn_rad + self._rng.uniform(-1.0, 1.0, len(drawn_rad)) * 0.9 * PLACEMENT_TOLERANCE_RAD
-        )
+    def _bend_robot(self, angles_rad: Floats) -> None:
+        """Bend the robot into a pose, with the errors of a person."""
+        relative_errors = self._rng.uniform(-1.0, 1.0, len(angles_rad))
+        placed_rad = angles_rad + relative_errors * OPERATOR_ERROR_RAD
         text = " ".join(f"{placed_rad[joint]:.4f}" for joint in self._drive_order)
         (self._home / "new.txt").write_text(text)
         (self._home / "new.txt").replace(self._home / POSE_FILE)

@@ -1,8 +1,8 @@
-"""A robot with serial numbers whose joints can be checked."""
+"""Writes a robot whose drives report serial numbers, so that its joints can be checked against its file."""
 
 from pathlib import Path
 
-from snakesim_testing.runs.bench import lab_folder
+from snakesim_testing.runs.bench_host import write_lab_folder
 
 REAL = '''
 from pathlib import Path
@@ -42,8 +42,9 @@ latency_ticks = 2
 """
 
 
-JOINTS = 3
+JOINT_COUNT = 3
 
 
 def make_checked_folder(folder: Path) -> Path:
-    return lab_folder(folder, JOINTS, SCENARIO, {"real.py": REAL, "serials": "A1 B2 C3"})
+    """Write the robot, its scenario and its backend `real.py` into a folder, and return the folder."""
+    return write_lab_folder(folder, JOINT_COUNT, SCENARIO, {"real.py": REAL, "serials": "A1 B2 C3"})

@@ -1,4 +1,4 @@
-"""Drives the real `snakesim` command, and reads what it leaves."""
+"""Runs the `snakesim` command in processes of its own, and reads the files of its runs."""
 
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -76,13 +76,24 @@ def running_armed_snakesim(out: Path, *arguments: str) -> Iterator[RunningComman
             assert_no_process_left(out)
 
 
-def run_to_summary(out: Path, *arguments: str, **more: str) -> tuple[CompletedRun, RunSummary]:
-    """Run `snakesim run` to its end, and return the completed run and its summary. Fails if a process is left."""
+def run_to_summary(out: Path, *arguments: str, **extra_env: str) -> tuple[CompletedRun, RunSummary]:
+    """Run `snakesim run` to its end, and fail if it leaves a process behind.
+
+    Args:
+        out: Folder for the files of the run.
+        *arguments: Arguments of `snakesim run`.
+        **extra_env: Further environment variables.
+
+    Returns:
+        The completed command and the summary of the run.
+    """
     network = [] if "--router" in arguments else ["--endpoint", find_free_endpoint()]
-    ended = snakesim("run", *arguments, "--out", str(out), *network, cwd=out.parent, extra_env=more)
-    assert (out / SUMMARY_FILENAME).is_file(), ended.printed
+    completed = snakesim(
+        "run", *arguments, "--out", str(out), *network, cwd=out.parent, extra_env=extra_env
+    )
+    assert (out / SUMMARY_FILENAME).is_file(), completed.printed
     assert_no_process_left(out)
-    return ended, read_summary(out)
+    return completed, read_summary(out)
 
 
 def read_summary(out: Path) -> RunSummary:

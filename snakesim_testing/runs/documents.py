@@ -1,8 +1,8 @@
-"""What a document asks its reader to type: its fenced blocks, section by section, as one shell script.
+"""Turns the fenced code blocks of a document into one shell script for each section, so that a test can run them.
 
     ```sh               commands, one after the other
-    ```sh background    a command in a terminal of its own; the next one, or the section's end, ends it with Ctrl-C
-    ```python wave.py   a file that the reader is asked to save
+    ```sh background    a command in a terminal of its own; the next such block or the section's end stops it by Ctrl-C
+    ```python wave.py   a file that the reader saves
 
 `# ... (exit code 1)` behind a command is its exit code, if that is not 0.
 """
@@ -22,8 +22,8 @@ import pytest
 REPOSITORY = Path(__file__).parents[2]
 UV = REPOSITORY / ".tools" / "bin" / "uv"
 needs_uv = pytest.mark.skipif(not UV.is_file(), reason="`make setup` has put no uv into .tools")
-LEFT_OUT_EVERYWHERE = ("*.egg-info", "__pycache__", ".*_cache")
-LEFT_OUT_OF_ROOT = (".venv", ".tools", ".git", "runs", "build")
+EXCLUDED_EVERYWHERE = ("*.egg-info", "__pycache__", ".*_cache")
+EXCLUDED_FROM_ROOT = (".venv", ".tools", ".git", "runs", "build")
 PROLOGUE = """\
 set -eum
 ip link set lo up 2>/dev/null || true
@@ -44,27 +44,30 @@ trap 'code=$?; end_background; cat background-*.log 2>/dev/null || true; exit $c
 """
 
 
-def leave_out(folder: str, names: list[str]) -> set[str]:
-    """Return what a copy of the repository leaves out. `snakesim_testing/runs` is part of it, `runs` is not."""
-    patterns = LEFT_OUT_EVERYWHERE
+def list_excluded_names(folder: str, names: list[str]) -> set[str]:
+    """Return the names in a folder that a copy of the repository excludes, for `shutil.copytree`.
+
+    `snakesim_testing/runs` is part of a copy, but the folder `runs` of the repository is not.
+    """
+    patterns = EXCLUDED_EVERYWHERE
     if Path(folder) == REPOSITORY:
-        patterns += LEFT_OUT_OF_ROOT
+        patterns += EXCLUDED_FROM_ROOT
     return {name for name in names if any(fnmatch(name, pattern) for pattern in patterns)}
 
 
 @dataclass
 class DocumentSection:
-    """A heading, and what is to be typed below it."""
+    """A section of a document, with its code blocks and the files that the reader has saved."""
 
     title: str
-    # (words behind the fence, content).
+    # The info line and the content of each block.
     blocks: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
-    # To be saved: here, or in a section before.
+    # The content of each file that this section or an earlier one contains, by its name.
     files: dict[str, str] = field(default_factory=dict[str, str])
 
     @property
     def has_commands(self) -> bool:
-        """Whether anything is to be typed at all."""
+        """Whether the section contains any commands."""
         return any(info.startswith("sh") for info, _ in self.blocks)
 
 
@@ -99,7 +102,7 @@ def parse_sections(path: Path) -> list[DocumentSection]:
 
 
 def make_bash_script(section: DocumentSection) -> str:
-    """All commands of a section, for bash."""
+    """Return a bash script that runs all commands of a section, and fails at the first unexpected exit code."""
     parts = [PROLOGUE]
     for number, (info, content) in enumerate(section.blocks):
         if info == "sh background":
@@ -108,35 +111,37 @@ def make_bash_script(section: DocumentSection) -> str:
                 f"end_background\n( {content.rstrip()} ) >{log} 2>&1 &\nrunning=$!\nawait_running {log}\n"
             )
         elif info == "sh":
-            parts += [
-                _expecting(command)
-                for command in re.split(r"(?<!\\)\n", content)
-                if command.strip()
-            ]
+            commands = re.split(r"(?<!\\)\n", content)  # a backslash continues a line
+            parts += [_check_exit_code(command) for command in commands if command.strip()]
     return "\n".join(parts)
 
 
-def _expecting(command: str) -> str:
-    code = re.search(r"#.*\(exit code (\d+)\)", command)
-    reported = f"echo '$' {shlex.quote(command)}"
-    if code is None:
-        return f"{reported}\n{command}"
-    return (
-        f"{reported}\ncode=0; {command.partition('#')[0].strip()} || code=$?; [ $code = {code[1]} ]"
-    )
+def _check_exit_code(command: str) -> str:
+    """Return bash lines that print a command, run it, and compare its exit code with that in its comment, or 0."""
+    echo = f"echo '$' {shlex.quote(command)}"
+    exit_code = re.search(r"#.*\(exit code (\d+)\)", command)
+    if exit_code is None:
+        return f"{echo}\n{command}"
+    command_without_comment = command.partition("#")[0].strip()
+    return f"{echo}\ncode=0; {command_without_comment} || code=$?; [ $code = {exit_code[1]} ]"
 
 
-def clone(folder: Path) -> None:
-    """The repository's files, and an environment that `make` takes for its own: it lends what is installed here."""
-    shutil.copytree(REPOSITORY, folder, ignore=leave_out, symlinks=True)
+def copy_repository(folder: Path) -> None:
+    """Copy the repository into a folder, with an environment that uses the packages of this environment.
+
+    `make` regards the environment as complete, and does not install anything.
+    """
+    shutil.copytree(REPOSITORY, folder, ignore=list_excluded_names, symlinks=True)
     (folder / ".tools").symlink_to(REPOSITORY / ".tools")
     venv = folder / ".venv"
     subprocess.run(
         [UV, "venv", "--quiet", "--offline", "--python", sys.executable, venv], check=True
     )
     library = next((venv / "lib").glob("python*/site-packages"))
-    lent = sysconfig.get_path("purelib")
-    (library / "lent.pth").write_text(f"import site; site.addsitedir({lent!r})\n")
+    installed_packages = sysconfig.get_path("purelib")
+    (library / "installed.pth").write_text(
+        f"import site; site.addsitedir({installed_packages!r})\n"
+    )
     command = venv / "bin" / "snakesim"
     entry = "import sys\nfrom snakesim_operator.__main__ import main\n"
     entry += "if __name__ == '__main__':\n    sys.exit(main())\n"

@@ -1,4 +1,7 @@
-"""A robot whose emulated drives a test turns as a person would by hand."""
+"""Writes a robot whose emulated drives a test turns, as an operator turns the joints of a real robot by hand.
+
+The file drives.json contains the angles of the drives.
+"""
 
 import json
 from pathlib import Path
@@ -7,16 +10,15 @@ from snakesim_hal.model.files import decode_table, read_table_with_base
 from snakesim_hal.model.robot import RobotFile
 from snakesim_testing.benches.workbench import read_example_from_docs
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.bench import lab_folder
+from snakesim_testing.runs.bench_host import write_lab_folder
 from snakesim_testing.runs.in_process_command import snakesim
 
-JOINTS = 4
-
-
+JOINT_COUNT = 4
 BACKEND = "./held.py:Held"
+ANGLE_TOLERANCE_RAD = 1e-3
 
 
-HELD = '''
+HELD_BACKEND = '''
 
 import json
 from pathlib import Path
@@ -49,22 +51,23 @@ on_route = false
 
 
 def make_hand_turned_folder(folder: Path) -> Path:
-    """A lab's folder: robot file with a comment, scenario, backend."""
-    return lab_folder(folder, JOINTS, SCENARIO, {"held.py": read_example_from_docs() + HELD})
+    """Write the robot, its scenario and its backend `held.py` into a folder, and return the folder."""
+    return write_lab_folder(
+        folder, JOINT_COUNT, SCENARIO, {"held.py": read_example_from_docs() + HELD_BACKEND}
+    )
 
 
-def robot(home: Path) -> RobotFile:
-    """The robot file as it stands."""
+def read_robot_file(home: Path) -> RobotFile:
+    """Return the current robot file of a folder."""
     return decode_table(read_table_with_base(str(home / "snake.toml"), "robots"), RobotFile)
 
 
 def wait_for_published_angle(home: Path, endpoint: str, angle_rad: float) -> None:
-    """Wait until the host publishes an angle of joint_1."""
+    """Wait until the host publishes this angle of joint_1."""
 
-    def published() -> bool:
-        output = snakesim(
-            "topic", "echo", "sensor/joints", "--count", "1", "--endpoint", endpoint, cwd=home
-        ).out
-        return abs(json.loads(output)["message"]["angle_rad"][0] - angle_rad) < 1e-3
+    def is_published() -> bool:
+        command = ("topic", "echo", "sensor/joints", "--count", "1", "--endpoint", endpoint)
+        sample = json.loads(snakesim(*command, cwd=home).out)["message"]
+        return abs(sample["angle_rad"][0] - angle_rad) < ANGLE_TOLERANCE_RAD
 
-    wait_until(published, f"joint_1 at {angle_rad} rad")
+    wait_until(is_published, f"joint_1 at {angle_rad} rad")

@@ -1,12 +1,12 @@
-"""A robot that claims to be real and was not checked, and what its backend received."""
+"""Writes a robot that is described as real and was not checked, and reads the setpoints that its backend received."""
 
 import json
 from pathlib import Path
 from typing import Any
 
 from snakesim_testing.benches.workbench import read_example_from_docs
-from snakesim_testing.runs.bench import lab_folder
-from snakesim_testing.runs.hand_turned_robot import JOINTS, SCENARIO
+from snakesim_testing.runs.bench_host import write_lab_folder
+from snakesim_testing.runs.hand_turned_robot import JOINT_COUNT, SCENARIO
 
 BACKEND = "./setpoint_log.py:SetpointLog"
 
@@ -32,13 +32,16 @@ class SetpointLog(Workbench):
 
 
 def make_jogged_folder(folder: Path) -> Path:
+    """Write the robot, its scenario and its backend `setpoint_log.py` into a folder, and return the folder."""
     real = read_example_from_docs().replace("emulated=True", "emulated=False")
-    return lab_folder(folder, JOINTS, SCENARIO, {"setpoint_log.py": real + SETPOINT_LOG})
+    return write_lab_folder(folder, JOINT_COUNT, SCENARIO, {"setpoint_log.py": real + SETPOINT_LOG})
 
 
 def read_setpoints(home: Path) -> dict[str, Any]:
+    """Return the newest setpoints that the backend received, with their tick and the lifecycle state."""
     return json.loads((home / "setpoints.json").read_text())
 
 
-def stopped(home: Path) -> bool:
+def is_at_fault(home: Path) -> bool:
+    """Return whether the backend received its newest setpoints while the robot was at fault."""
     return read_setpoints(home)["lifecycle"] == "fault"

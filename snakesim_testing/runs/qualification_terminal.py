@@ -1,4 +1,7 @@
-"""A person at the terminal of `snakesim drive qualify`, with an emulated drive on the bench."""
+"""Runs `snakesim drive qualify` in a pseudo-terminal, and answers its questions as a person would.
+
+The drive on the bench is emulated. The command treats it as real, therefore a person must act on it.
+"""
 
 import contextlib
 import os
@@ -36,16 +39,18 @@ CTRL_C = "\x03"
 CTRL_D = "\x04"  # end of input
 HEADING_PATTERN = re.compile(r"^ ?\d+/\d+  (?P<title>.+)$")
 QUESTION_START = "       > "
-QUESTION_END = ":"  # of a line that waits for the person
-MOVED_RAD = 0.002
-LOOKED_NS = 2_000_000_000  # for which the person has looked at the shaft when the question comes
+QUESTION_END = ":"  # of a line that waits for an answer
+MIN_MOTION_RAD = 0.002
+OBSERVED_NS = (
+    2_000_000_000  # the person has watched the shaft for this time when the question appears
+)
 
 
 class Bench:
-    """One emulated drive on a bus. `snakesim drive qualify` treats it as real, so that a person must act."""
+    """One emulated drive on a bus."""
 
     def __init__(self, folder: Path, driver_type: str) -> None:
-        """Start the drive.
+        """Start an emulated drive on a bus of its own.
 
         Args:
             folder: Folder for the files of drive and bus.
@@ -71,21 +76,21 @@ class Bench:
         return self.drive.read_log()[-1]
 
     def assert_stays_off(self) -> None:
-        """Fail unless the drive is without torque, and does not move any more."""
+        """Wait until the drive has no torque, and fail unless it stays without torque and at rest for 1 s."""
         wait_until(lambda: not self.read_newest_state().is_enabled, "a drive without torque", 5.0)
-        time.sleep(0.3)  # what still swings comes to rest
+        time.sleep(0.3)  # a joint that still swings comes to rest
         before = self.read_newest_state()
         time.sleep(1.0)
         after = self.read_newest_state()
         assert not after.is_enabled
-        assert abs(after.angle_rad - before.angle_rad) < MOVED_RAD
+        assert abs(after.angle_rad - before.angle_rad) < MIN_MOTION_RAD
 
 
 class QualificationTerminal:
-    """`snakesim drive qualify` in a pseudo terminal of its own, and the person in front of it."""
+    """A pseudo-terminal in which `snakesim drive qualify` runs, and the keyboard of its operator."""
 
     def __init__(self, home: Path, bench: Bench) -> None:
-        """Start the command; its folder is `home / "out"`.
+        """Start the command, which writes into the folder `home / "out"`.
 
         Args:
             home: Folder in which it runs.
@@ -97,17 +102,13 @@ class QualificationTerminal:
         self._close_event = threading.Event()
         self._printed = ""
         self._answered_lines = 0
+        command = (*SNAKESIM_COMMAND, "drive", "qualify", bench.driver_type)
         options = ("--channel", bench.channel, "--scenario", str(bench.scenario))
         record = ("--out", str(self.folder), "--key", "key.pem", "--operator", "A. Person")
         # As in a shell: the terminal belongs to the command, which gets its signals.
         in_terminal = ("env", "--default-signal=HUP,INT", "setsid", "--ctty")
         self.process = subprocess.Popen(
-            [
-                *in_terminal,
-                *(*SNAKESIM_COMMAND, "drive", "qualify", bench.driver_type),
-                *options,
-                *record,
-            ],
+            [*in_terminal, *command, *options, *record],
             cwd=home,
             env=make_environment(home),
             stdin=command_fd,
@@ -119,7 +120,7 @@ class QualificationTerminal:
         self._reader.start()
 
     def _read(self) -> None:
-        """Read what the command prints, until the terminal is closed. A blocked read would keep it open."""
+        """Read the output of the command until the terminal is closed. A blocked read would keep the terminal open."""
         with contextlib.suppress(OSError):  # the command has ended
             while not self._close_event.is_set():
                 if select.select([self._fd], [], [], 0.02)[0]:
@@ -131,7 +132,7 @@ class QualificationTerminal:
         return self._printed.replace("\r\n", "\n")
 
     def type(self, text: str) -> None:
-        """Type a text."""
+        """Type a text on the keyboard."""
         os.write(self._fd, text.encode())
 
     def close(self) -> None:
@@ -146,7 +147,7 @@ class QualificationTerminal:
         return read_record(self.folder / PROGRESS)
 
     def find_question(self) -> str:
-        """Return the question that is shown and was not answered yet; empty if there is none."""
+        """Return the question that is not answered yet, or an empty text if there is none."""
         lines = self.printed.split("\n")[self._answered_lines : -1]
         for line in lines:
             if line.startswith(QUESTION_START) and line.endswith(QUESTION_END):
@@ -154,7 +155,7 @@ class QualificationTerminal:
         return ""
 
     def wait_for_question(self) -> str:
-        """Return the next question, once it is shown; empty if the command ends without one."""
+        """Wait for the next question, and return it. Return an empty text if the command ends without a question."""
         wait_until(
             lambda: self.find_question() or self.process.poll() is not None,
             "a question or the end",
@@ -162,21 +163,18 @@ class QualificationTerminal:
         return self.find_question()
 
     def answer(self, text: str) -> None:
-        """Answer the question that is shown."""
+        """Answer the current question."""
         self._answered_lines = self.printed.count("\n")
         self.type(text)
 
     def find_step(self) -> str:
-        """Return the title of the step that the command shows; empty before the first one."""
-        titles = [
-            match["title"]
-            for line in self.printed.split("\n")
-            if (match := HEADING_PATTERN.match(line))
-        ]
+        """Return the title of the current step, or an empty text before the first step."""
+        headings = [HEADING_PATTERN.match(line) for line in self.printed.split("\n")]
+        titles = [heading["title"] for heading in headings if heading is not None]
         return titles[-1] if titles else ""
 
     def end(self) -> int:
-        """Return the exit code of the command, once it has ended and no host is left."""
+        """Wait until the command and its host have ended, and return the exit code of the command."""
         code = self.process.wait(30)
         time.sleep(0.1)  # the last lines arrive
         host = f"{self.folder}/host.json"
@@ -185,8 +183,8 @@ class QualificationTerminal:
 
 
 @contextlib.contextmanager
-def put_on_bench(home: Path, driver_type: str) -> Iterator[Bench]:
-    """Start an emulated drive, and end it at the end of the context."""
+def emulated_drive_on_bench(home: Path, driver_type: str) -> Iterator[Bench]:
+    """Start an emulated drive on a bench, and end it with the context."""
     bench = Bench(home / "bench", driver_type)
     try:
         yield bench
@@ -196,8 +194,8 @@ def put_on_bench(home: Path, driver_type: str) -> Iterator[Bench]:
 
 
 @contextlib.contextmanager
-def at_the_terminal(home: Path, bench: Bench) -> Iterator[QualificationTerminal]:
-    """Run the command in a terminal until the end of the context."""
+def running_qualification(home: Path, bench: Bench) -> Iterator[QualificationTerminal]:
+    """Run `snakesim drive qualify` in a terminal until the end of the context."""
     terminal = QualificationTerminal(home, bench)
     try:
         yield terminal
@@ -211,8 +209,8 @@ def at_the_terminal(home: Path, bench: Bench) -> Iterator[QualificationTerminal]
 Answer = Callable[[QualificationTerminal, str], str]
 
 
-def answer_truly(terminal: QualificationTerminal, question: str) -> str:
-    """Answer each question as a person would who looks at the drive."""
+def answer_as_person(terminal: QualificationTerminal, question: str) -> str:
+    """Return the answer to a question that a person gives who watches the drive."""
     bench = terminal.bench
     for action, instruction in INSTRUCTIONS.items():
         if instruction in question:
@@ -220,18 +218,19 @@ def answer_truly(terminal: QualificationTerminal, question: str) -> str:
             return ENTER
     if "turn the positive way" in question:
         log = bench.drive.read_log()
-        begun_ns = time.monotonic_ns() - LOOKED_NS
-        before = [state for state in log if state.monotonic_ns < begun_ns]
-        return "y\n" if log[-1].angle_rad > before[-1].angle_rad else "n\n"
+        start_ns = time.monotonic_ns() - OBSERVED_NS
+        states_before = [state for state in log if state.monotonic_ns < start_ns]
+        turned_positively = log[-1].angle_rad > states_before[-1].angle_rad
+        return "y\n" if turned_positively else "n\n"
     if "without torque" in question:
         return "n\n" if bench.read_newest_state().is_enabled else "y\n"
-    if "y, n" in question:  # clamp, current and switch
+    if "y, n" in question:  # whether the clamp, the current limit and the switch are in place
         return "y\n"
     return ENTER
 
 
 def skip_step(terminal: QualificationTerminal, question: str) -> str:
-    """Leave the step out."""
+    """Return the answer that skips the current step."""
     del terminal, question
     return f"{SKIP}\n"
 
@@ -241,19 +240,20 @@ def answer_until(
     last_question: str,
     others: Mapping[str, Answer] | None = None,
 ) -> None:
-    """Answer question after question until one is shown that contains a text; empty: until the command ends.
+    """Answer all questions until a certain one.
 
     Args:
         terminal: The terminal.
-        last_question: Part of the question that is left unanswered.
-        others: Answers that differ from `answer_truly`, by a part of the question or by the title of the step.
+        last_question: Part of the question that is left unanswered. Empty: all questions are answered until the
+            command ends.
+        others: Answers that differ from `answer_as_person`, by a part of the question or by the title of the step.
     """
     while question := terminal.wait_for_question():
         if last_question and last_question in question:
             return
-        answer: Answer = answer_truly
+        answer: Answer = answer_as_person
         for part, other in (others or {}).items():
             if part in question or part == terminal.find_step():
                 answer = other
         terminal.answer(answer(terminal, question))
-    assert not last_question, f"it ended without {last_question!r}: {terminal.printed}"
+    assert not last_question, f"the command ended without {last_question!r}: {terminal.printed}"

@@ -1,4 +1,4 @@
-"""The files of a robot of four servos on one serial port, whose host and services are separate programs."""
+"""Writes the files of a robot with four servos on one serial port. Its host and services are separate programs."""
 
 from pathlib import Path
 

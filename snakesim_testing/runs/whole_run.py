@@ -1,4 +1,4 @@
-"""Whole runs in one process, with what the controller was shown and what it answered at every tick."""
+"""Simulates whole runs in the process of the test, and records the telemetry of the controller at every tick."""
 
 import dataclasses
 import time
@@ -19,61 +19,64 @@ from snakesim_hal.controller import (
 )
 from snakesim_hal.model.plugins import CONTROLLERS, register_plugin_temporarily
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
+from snakesim_hal.wire.messages import ControlState
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate
 
 
 @dataclass
 class RecordedTicks:
-    """What happened, one row a tick."""
+    """The record of a run, and the telemetry of its controller in each tick."""
 
     record: RunRecord
     reports: list[Telemetry]
-    update_us: list[float]  # how long the controller took
+    update_us: list[float]  # duration of each update of the controller
 
     @property
     def path_s_m(self) -> Floats:
         """Arc length of the tail along the route, projected from the measured pose, (ticks,)."""
         route = self.record.route
         assert route is not None
-        places: list[float] = []
-        near: float | None = None
+        arc_lengths_m: list[float] = []
+        near_m: float | None = None  # the search starts at the previous point
         for point in self.record.position_w_m[:, :2]:
-            near = route.project_point(point, near)
-            places.append(near)
-        return np.array(places)
+            near_m = route.project_point(point, near_m)
+            arc_lengths_m.append(near_m)
+        return np.array(arc_lengths_m)
 
     @property
-    def moved_m(self) -> float:
-        """How far the tail came along the route."""
+    def advance_m(self) -> float:
+        """The distance that the tail moved along the route."""
         return float(self.path_s_m[-1] - self.path_s_m[0])
 
     @property
     def states(self) -> list[str]:
-        """As control reported them."""
-        return [state.state for state in self._reported()]
+        """The state that control had reported at each tick."""
+        return [state.state for state in self._list_newest_states()]
 
     @property
     def reasons(self) -> list[str]:
-        """As control reported them."""
-        return [state.reason for state in self._reported()]
+        """The reason of the state that control had reported at each tick."""
+        return [state.reason for state in self._list_newest_states()]
 
-    def _reported(self) -> list[Any]:
-        reported = [
-            state for state in self.record.control_states if state.tick in range(len(self.reports))
-        ]
-        by_tick = {state.tick: state for state in reported}
-        now = by_tick[0]
-        return [now := by_tick.get(tick, now) for tick in range(len(self.reports))]
+    def _list_newest_states(self) -> list[ControlState]:
+        """Return the newest control state at each tick. Control does not report one in every tick."""
+        state_by_tick = {state.tick: state for state in self.record.control_states}
+        newest = state_by_tick[0]
+        newest_states: list[ControlState] = []
+        for tick in range(len(self.reports)):
+            newest = state_by_tick.get(tick, newest)
+            newest_states.append(newest)
+        return newest_states
 
     @property
-    def turns(self) -> list[int | None]:
-        """Propulsion joints in their order; None while nothing pushes."""
-        found: list[int | None] = []
+    def propulsion_joints(self) -> list[int | None]:
+        """The propulsion joints in their order. None: no joint pushed."""
+        joints: list[int | None] = []
         for report in self.reports:
-            if not found or found[-1] != report.propulsion_joint:
-                found.append(report.propulsion_joint)
-        return found
+            if not joints or joints[-1] != report.propulsion_joint:
+                joints.append(report.propulsion_joint)
+        return joints
 
 
 def _make_recording_controller(
@@ -93,23 +96,23 @@ def _make_recording_controller(
         update_durations_us: List to which the duration of each update in µs is added.
     """
 
-    class Watched(controller_class):
+    class RecordingController(controller_class):
         def update(self, observation: Observation) -> ControllerCommand:
             if observation.tick in ticks_without_world:
                 observation = dataclasses.replace(observation, world=None)
             if observation.tick in ticks_without_trajectory:
                 observation = dataclasses.replace(observation, trajectory=None)
-            began = time.perf_counter()
+            start_s = time.perf_counter()
             command = super().update(observation)  # pyright: ignore[reportAbstractUsage] - not abstract here
-            update_durations_us.append((time.perf_counter() - began) * 1e6)
+            update_durations_us.append((time.perf_counter() - start_s) * 1e6)
             telemetry.append(command.telemetry)
             return command
 
-    return Watched
+    return RecordingController
 
 
 def load_run_config(scenario: str, *sets: str) -> RunConfig:
-    """Load a bundled scenario, with changes as `--set` takes them."""
+    """Load a bundled scenario, with changes such as "duration_s=2", as the option `--set` expects them."""
     return load_scenario(scenario, [parse_set_option(text) for text in sets]).config
 
 
@@ -131,14 +134,14 @@ def run_controller(
     config = msgspec.structs.replace(config, duration_s=duration_s or config.duration_s)
     telemetry: list[Telemetry] = []
     update_us: list[float] = []
-    watched = _make_recording_controller(
+    recording_controller = _make_recording_controller(
         load_controller(config.controller),
         ticks_without_world,
         ticks_without_trajectory,
         telemetry,
         update_us,
     )
-    with register_plugin_temporarily(CONTROLLERS, config.controller, watched):
+    with register_plugin_temporarily(CONTROLLERS, config.controller, recording_controller):
         result = simulate(config)
     assert result.summary.ended == "complete", result.summary.ended
     assert len(telemetry) == len(result.record.time_s)

@@ -1,4 +1,4 @@
-"""A straight, stiff snake that glides over level ground of every kind, and an integrator of the same without MuJoCo."""
+"""Simulates a straight, stiff snake that glides over level ground, with MuJoCo and with an integrator of its own."""
 
 import math
 from typing import Any
@@ -80,7 +80,7 @@ class GlidingSnake:
         return self.data.subtree_com[self.sim.first_link_body, :2].copy()
 
     def go(self, time_s: float) -> None:
-        """Simulate for a time."""
+        """Run the simulation for a time."""
         self.physics.step(round(time_s / self.model.opt.timestep))
 
     def throw(self, velocity_w: Floats) -> None:
@@ -88,7 +88,7 @@ class GlidingSnake:
         self.data.qvel[:2] = velocity_w
 
     def push(self, force_per_weight: Floats) -> None:
-        """Push every link by a force in proportion to its weight."""
+        """Apply a force to every link in proportion to its weight."""
         self._forces_w[:, :2] = G * self._masses_kg[:, None] * force_per_weight
 
     def drag(self, velocity_w: Floats, time_s: float) -> Floats:

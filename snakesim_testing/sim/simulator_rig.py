@@ -1,4 +1,4 @@
-"""Robots and scenes for the tests: small, noiseless, and changed in one place at a time."""
+"""Makes small simulated robots without noise, and drives their backend tick by tick."""
 
 from typing import Any, TypeVar
 
@@ -25,7 +25,7 @@ QUIET = {
 
 
 def merge_tables(base: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    """`base` with the leaves of `change` put over it; a key `x!` replaces the whole of x."""
+    """Return `base` with the values of `change`, merged table by table. A key `x!` replaces the whole of x."""
     result = dict(base)
     for key, value in change.items():
         if key.endswith("!"):
@@ -44,7 +44,16 @@ def make_config(
     base_robot: str = "planar13",
     **top: Any,
 ) -> RunConfig:
-    """A run of a straight, noiseless robot at the origin, heading along x, on flat ground of friction 0.3."""
+    """Return the configuration of a run with a straight robot without noise on flat ground with friction 0.3.
+
+    The robot is at the origin, and its head points along x.
+
+    Args:
+        robot: Changes of the robot file, see `merge_tables`.
+        scene: Changes of the scene.
+        base_robot: Name of the shipped robot.
+        **top: Changes of the scenario.
+    """
     quiet = merge_tables(read_table_with_base(base_robot, "robots").values, {"sensors!": QUIET})
     table = {
         "name": "test",
@@ -60,7 +69,7 @@ def make_config(
 
 
 def open_sim(config: RunConfig, **settings: Any) -> SimBackend:
-    """A backend on that configuration."""
+    """Open the simulator with this configuration and these settings."""
     return SimBackend(config, msgspec.convert(settings, SimSettings))
 
 
@@ -79,25 +88,25 @@ class SimulatorRig:
         target: float | list[float] = 0.0,
         limit: float | None = None,
     ) -> None:
-        """The same for all joints, or one each."""
+        """Set the mode and the target of all joints, or a list with one for each joint, and the same torque limit."""
         modes = mode if isinstance(mode, list) else [mode] * self.count
         targets = target if isinstance(target, list) else [float(target)] * self.count
         limits = [self.config.robot.limits.torque_nm if limit is None else limit] * self.count
         self.sim.enact(SafeSetpoints(modes, targets, limits), "armed")
 
     def sample(self) -> Samples:
-        """The samples of the present tick."""
+        """Return the samples of the current tick."""
         return self.sim.sample(self.tick, self.tick * self.config.period_ns)
 
     def sample_only_sensor(self, kind: type[MessageT]) -> MessageT:
-        """The message of the only sensor with such messages at the present tick."""
+        """Return the message of the only sensor with messages of this type at the current tick."""
         (message,) = (
             message for message in self.sample().by_key.values() if isinstance(message, kind)
         )
         return message
 
     def advance(self, seconds: float = 0.0) -> None:
-        """At least one tick."""
+        """Advance the simulator by a time, but at least by one tick."""
         for _ in range(max(round(seconds * 1e9 / self.config.period_ns), 1)):
             self.sim.advance()
             self.tick += 1
@@ -106,7 +115,7 @@ class SimulatorRig:
 def make_resting_body(
     config: RunConfig, settings: SimSettings, angle_rad: float = 0.0
 ) -> tuple[SimModel, MjData, PhysicsStepper]:
-    """A body without motors on the ground, every joint at this angle."""
+    """Return a body without motors on the ground, whose joints are all at this angle."""
     sim = build_sim_model(config, settings, motors=False)
     data = MjData(sim.model)
     data.qpos[2] = config.robot.module.radius_m

@@ -1,4 +1,4 @@
-"""A snake that swims in MuJoCo's fluid, and the same without MuJoCo, from the formulas of its documentation.
+"""Simulates a snake that swims in MuJoCo's fluid, with MuJoCo and with the formulas of its documentation.
 
 Source: MuJoCo's documentation, Computation, Fluid forces, Ellipsoid model. Like MuJoCo, the formulas here leave out the
 forces of added mass that are in proportion to acceleration. The largest area of an ellipsoid is pi r_max r_mid.
@@ -162,7 +162,7 @@ class Swimmer:
         return self.data.qfrc_fluid[:3].copy()
 
     def compute_force_n(self, velocity_m_s: Floats) -> Floats:
-        """Return the same by the formulas, without MuJoCo."""
+        """Return this force from the formulas, without MuJoCo."""
         links = len(self.ellipsoids.radii_m)
         forces_n, _ = self.ellipsoids.compute_forces(
             np.tile(velocity_m_s, (links, 1)), np.zeros((links, 3))
@@ -170,7 +170,7 @@ class Swimmer:
         return forces_n.sum(axis=0)
 
     def glide(self, velocity_m_s: Floats, time_s: float) -> Floats:
-        """Throw the body, and return how far it moves, (3,) in m."""
+        """Start the body with a velocity, and return how far it moves, (3,) in m."""
         self.data.qvel[:3] = velocity_m_s
         before_m = self.data.qpos[:3].copy()
         self.physics.step(round(time_s / self.model.opt.timestep))
@@ -179,7 +179,7 @@ class Swimmer:
     def glide_without_mujoco(
         self, velocity_m_s: Floats, time_s: float, step_s: float = 2e-3
     ) -> Floats:
-        """Return the same by the classical Runge-Kutta method, from the formulas."""
+        """Return this distance from the formulas, integrated by the classical Runge-Kutta method."""
         displacement_m = np.zeros(3)
         for _ in range(round(time_s / step_s)):
             first = self.compute_force_n(velocity_m_s) / self.mass_kg

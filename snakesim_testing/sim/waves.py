@@ -1,4 +1,4 @@
-"""Snakes whose joints follow a wave on flat ground: in the simulator, and by a momentum balance without MuJoCo."""
+"""Simulates snakes whose joints follow a wave on flat ground, with MuJoCo and with a momentum balance."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -51,7 +51,7 @@ class JointWave:
 
     @property
     def period_s(self) -> float:
-        """Return the period."""
+        """Return the period of the wave in s."""
         return 2 * np.pi / self.rate
 
 
@@ -104,7 +104,8 @@ def simulate_wave(
     sim = build_sim_model(config, SimSettings(timestep_s=step_s), motors=False)
     data = mujoco.MjData(sim.model)
     data.qpos[2] = config.robot.module.radius_m
-    data.qpos[3], data.qpos[6] = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
+    data.qpos[3] = np.cos(yaw_rad / 2)
+    data.qpos[6] = np.sin(yaw_rad / 2)
     return follow_wave(sim, data, PhysicsStepper(sim, data), wave)
 
 
@@ -139,7 +140,8 @@ def follow_wave(
     step_s = model.opt.timestep
     tail, head = sim.feet.geoms[[0, -1]]
     step_count = int(PERIODS * wave.period_s / step_s) + 1
-    center_m, axis_m = np.empty((step_count, 2)), np.empty((step_count, 2))
+    center_m = np.empty((step_count, 2))
+    axis_m = np.empty((step_count, 2))
     for k in range(step_count):
         end_time_s = (k + 1) * step_s
         position_torques_nm = servo_nm_per_rad * (
@@ -195,12 +197,13 @@ def integrate_momentum_balance(
     joint_count = len(robot.link_lengths_m) - 1
     chain = PlanarChain(robot, has_middle_contacts=in_the_middle)
     step_count = int(PERIODS * wave.period_s / step_s) + 1
-    center, axis = np.empty((step_count, 2)), np.empty((step_count, 2))
+    center_m = np.empty((step_count, 2))
+    axis_m = np.empty((step_count, 2))
     for k in range(step_count):
         time_s = k * step_s
         angles_rad = wave.at(time_s, joint_count)
         rates_rad_s = wave.rates_at(time_s, joint_count)
         instant = chain.advance(angles_rad, rates_rad_s, find_friction, step_s)
-        center[k] = instant.center.real, instant.center.imag
-        axis[k] = instant.axis.real, instant.axis.imag
-    return BodyTrack(center, axis, step_s, wave.period_s)
+        center_m[k] = instant.center.real, instant.center.imag
+        axis_m[k] = instant.axis.real, instant.axis.imag
+    return BodyTrack(center_m, axis_m, step_s, wave.period_s)

@@ -138,7 +138,7 @@ def run_script(script: str, cwd: Path, prefix: list[str]) -> str:
 )
 def test_section_commands_succeed_as_printed(section: DocumentSection, tmp_path: Path) -> None:
     folder = tmp_path / "snakesim"
-    documents.clone(folder)
+    documents.copy_repository(folder)
     for name, content in section.files.items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(content, encoding="utf-8")
@@ -153,7 +153,7 @@ def test_readme_commands_succeed_in_fresh_clone(tmp_path: Path) -> None:
     """
     origin = tmp_path / "origin"
     git = ["git", "-c", "user.name=x", "-c", "user.email=x@example.org"]
-    shutil.copytree(REPOSITORY, origin, ignore=documents.leave_out, symlinks=True)
+    shutil.copytree(REPOSITORY, origin, ignore=documents.list_excluded_names, symlinks=True)
     for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "Copy the working tree"]):
         subprocess.run([*git, "-C", str(origin), *arguments], check=True)
     clone = tmp_path / "snakesim"

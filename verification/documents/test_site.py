@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, open_chromium
+from snakesim_testing.operator.browser import BROWSER_MISSING, CHROMIUM, open_chromium
 from snakesim_testing.runs.documents import REPOSITORY
 
 SITE = REPOSITORY / "build" / "docs"
@@ -24,7 +24,7 @@ def test_menu_contains_every_page() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+@pytest.mark.skipif(CHROMIUM is None, reason=BROWSER_MISSING)
 def test_site_search_works_from_folder_without_network() -> None:
     subprocess.run([sys.executable, "docs/site/build.py"], cwd=REPOSITORY, check=True)
     loads_from_network = re.compile(
@@ -35,11 +35,11 @@ def test_site_search_works_from_folder_without_network() -> None:
     # A code block that was rendered as text contains this element.
     assert not [page for page, html in pages.items() if "<code>``" in html]
     with open_chromium() as browser:
-        tab = browser.open(f"file://{SITE}/docs/concepts/safety.html")
+        tab = browser.open_page(f"file://{SITE}/docs/concepts/safety.html")
         tab.wait_for("Safety")
         tab.wait_until_loaded()
-        tab.value("document.querySelector('input[name=query]').focus()")
+        tab.evaluate("document.querySelector('input[name=query]').focus()")
         tab.send("Input.insertText", text="leas")
-        tab.press("e", 69, text="e")  # the page starts a search at the release of a key
+        tab.press_key("e", 69, text="e")  # the page starts a search at the release of a key
         tab.wait_for("matching documents")
         assert not tab.errors

@@ -27,12 +27,17 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
-from snakesim_testing.can.driver_loop import JOINTS, DriverLoop, config, loop
+from snakesim_testing.can.driver_loop import (
+    JOINT_COUNT,
+    DriverLoop,
+    make_can_config,
+    open_driver_loop,
+)
 from verification.fuzz.texts import flipped
 
 PER_TICK = 40
 PER_OPENING = 2000  # frames until the bus is opened again, with the stranger on it
-ROBOT = config(
+ROBOT = make_can_config(
     clock_mode="realtime", robot__sensors__contacts__rate_hz=50.0, robot__sensors__imu__rate_hz=50.0
 )
 KINDS = ("again", "bit-flipped", "other node", "other message", "length", "random", "odd id")
@@ -56,9 +61,9 @@ class FrameMaker:
             case "bit-flipped" if data:
                 data = flipped(rng, data)
             case "other node":
-                identifier = identifier & ~((1 << NODE_BITS) - 1) | rng.randrange(JOINTS + 2)
+                identifier = identifier & ~((1 << NODE_BITS) - 1) | rng.randrange(JOINT_COUNT + 2)
             case "other message":
-                identifier = rng.choice(list(Opcode)) << NODE_BITS | rng.randrange(JOINTS + 2)
+                identifier = rng.choice(list(Opcode)) << NODE_BITS | rng.randrange(JOINT_COUNT + 2)
             case "length":
                 data = (data + rng.randbytes(8))[: rng.randrange(9)]
             case "random":
@@ -98,7 +103,7 @@ class BusIntruder:
 
 def is_from_module(identifier: int) -> bool:
     """Whether a module of the robot could have sent it."""
-    return parse_opcode(identifier) not in FROM_HOST and 1 <= parse_node(identifier) <= JOINTS
+    return parse_opcode(identifier) not in FROM_HOST and 1 <= parse_node(identifier) <= JOINT_COUNT
 
 
 def run(frame_count: int, seed: int) -> Counter[str]:
@@ -136,7 +141,7 @@ def _opened(maker: FrameMaker, words: Counter[str]) -> Iterator[tuple[DriverLoop
     try:
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr(VirtualWire, "idle", speaks_when_idle)
-            with loop(ROBOT, bring_up_limit_s=0.5) as run:
+            with open_driver_loop(ROBOT, bring_up_limit_s=0.5) as run:
                 early = False
                 yield run, strangers[0]
     finally:
@@ -147,7 +152,7 @@ def _opened(maker: FrameMaker, words: Counter[str]) -> Iterator[tuple[DriverLoop
 def _tick(run: DriverLoop, stranger: BusIntruder, words: Counter[str]) -> None:
     """A period under fire; now and then somebody resets and arms."""
     if run.tick % 20 == 10:
-        run.lifecycle, run.wanted = "disarmed", None
+        run.lifecycle, run.setpoints = "disarmed", None
     if run.tick % 20 == 15:
         run.lifecycle = "armed"
     stranger.speak(PER_TICK)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_testing.runs.documents import REPOSITORY, UV, leave_out
+from snakesim_testing.runs.documents import REPOSITORY, UV, list_excluded_names
 from verification.installation.ways_to_install import run_successful_program
 
 
@@ -14,7 +14,7 @@ from verification.installation.ways_to_install import run_successful_program
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the repository, so that a build leaves nothing in it. Links stay links, as in a clone."""
     folder = tmp_path_factory.mktemp("sources") / "snakesim"
-    shutil.copytree(REPOSITORY, folder, ignore=leave_out, symlinks=True)
+    shutil.copytree(REPOSITORY, folder, ignore=list_excluded_names, symlinks=True)
     return folder
 
 

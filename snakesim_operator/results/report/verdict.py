@@ -103,7 +103,7 @@ def _judge_stopped_run(record: RunRecord, summary: RunSummary, fault: Fault) -> 
 def _judge_joint_test(record: RunRecord, summary: RunSummary, command: str) -> RunVerdict:
     """Judge a run that tests the joints and is not meant to locomote: it is good if it moved every joint.
 
-    A joint was moved if its target deviated by more than MOVED_RAD from the median of its targets.
+    A joint was moved if its target deviated by more than MIN_MOVED_RAD from the median of its targets.
 
     Args:
         record: The recorded run.

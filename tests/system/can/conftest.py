@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_testing.can.interface import ip, must
+from snakesim_testing.can.interface import assert_succeeded, run_ip
 
 CHANNEL = "vcan0"
 HERE = Path(__file__).parent
@@ -65,9 +65,9 @@ def raw_socket(channel: str) -> Iterator[socket.socket]:
 def spare_channel() -> Iterator[str]:
     """An interface of the test's own, which it may take down."""
     name = f"vcan{os.getpid() % 100_000}"
-    added = ip("link", "add", name, "type", "vcan")
+    added = run_ip("link", "add", name, "type", "vcan")
     if added.returncode:
         pytest.skip(f"may not add an interface here: {added.stderr.strip()}")
-    must(ip("link", "set", name, "up"))
+    assert_succeeded(run_ip("link", "set", name, "up"))
     yield name
-    ip("link", "delete", name)
+    run_ip("link", "delete", name)

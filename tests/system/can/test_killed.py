@@ -20,16 +20,16 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_testing.can.listened_bus import (
     IN_GUEST,
-    JOINTS,
+    JOINT_COUNT,
     LATE_MS,
     NODES,
     RATE_HZ,
     RobotOnBus,
-    bench,
-    first_in,
-    passed_for_module_ms,
-    stop_commands,
-    uptimes_ms,
+    find_first_reports,
+    measure_module_duration_ms,
+    open_robot_on_bus,
+    read_uptimes_ms,
+    select_stop_commands,
 )
 from snakesim_testing.runs.in_process_command import snakesim
 
@@ -39,7 +39,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 @pytest.fixture
 def robot(tmp_path: Path, channel: str) -> Iterator[RobotOnBus]:
-    with bench(tmp_path, channel) as made:
+    with open_robot_on_bus(tmp_path, channel) as made:
         yield made
 
 
@@ -55,20 +55,24 @@ def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: RobotOnBus
     _, control = robot.arm()
     killed_ns = killed(control)
     passive = {ModuleState.DISARMED}
-    robot.until(
-        lambda: len(first_in(robot.listener.listen(), passive, killed_ns)) == JOINTS,
+    robot.wait_until(
+        lambda: (
+            len(find_first_reports(robot.listener.receive_frames(), passive, killed_ns))
+            == JOINT_COUNT
+        ),
         "modules stopped",
     )
-    robot.until(
+    robot.wait_until(
         lambda: "lease of control expired" in robot.run_command("status").printed,
         "the fault in the status",
     )
-    received = list(robot.listener.listen())
+    received = list(robot.listener.receive_frames())
     last_ms = (max(h.at_ns for h in received if h.opcode == Opcode.SET_POINT) - killed_ns) / 1e6
-    stop = next(h for h in stop_commands(received) if h.at_ns > killed_ns)
+    stop = next(h for h in select_stop_commands(received) if h.at_ns > killed_ns)
     stop_ms = (stop.at_ns - killed_ns) / 1e6
     rest_ms = max(
-        (h.at_ns - stop.at_ns) / 1e6 for h in first_in(received, passive, killed_ns).values()
+        (h.at_ns - stop.at_ns) / 1e6
+        for h in find_first_reports(received, passive, killed_ns).values()
     )
     lease_ms, period_ms = robot.config.lease_ns / 1e6, robot.config.period_ns / 1e6
     assert last_ms <= stop_ms <= lease_ms + 2 * period_ms + LATE_MS
@@ -84,24 +88,28 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(
     robot: RobotOnBus, channel: str
 ) -> None:
     host, _ = robot.arm()
-    armed = [ModuleState.ARMED] * JOINTS
+    armed = [ModuleState.ARMED] * JOINT_COUNT
     assert robot.listener.states() == armed, robot.read_log("host")
     killed_ns = killed(host)
     period_ms = robot.config.period_ns / 1e6
     fault = {ModuleState.FAULT}
-    robot.until(
-        lambda: len(first_in(robot.listener.listen(), fault, killed_ns)) == JOINTS,
+    robot.wait_until(
+        lambda: (
+            len(find_first_reports(robot.listener.receive_frames(), fault, killed_ns))
+            == JOINT_COUNT
+        ),
         "modules in fault",
     )
-    beats = {node: len(uptimes_ms(robot.listener.listen(), node)) for node in NODES}
-    robot.until(
+    beats = {node: len(read_uptimes_ms(robot.listener.receive_frames(), node)) for node in NODES}
+    robot.wait_until(
         lambda: all(
-            len(uptimes_ms(robot.listener.listen(), node)) > beats[node] + 1 for node in NODES
+            len(read_uptimes_ms(robot.listener.receive_frames(), node)) > beats[node] + 1
+            for node in NODES
         ),
         "heartbeats",
     )
     received = robot.listener.received
-    stopped = first_in(received, fault, killed_ns)
+    stopped = find_first_reports(received, fault, killed_ns)
     assert all(h.opcode == Opcode.HEARTBEAT for h in stopped.values()), (
         "told at once, without a Sync"
     )
@@ -121,13 +129,14 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(
     last_ms = (max(from_host) - killed_ns) / 1e6
     took_ms = [(stopped[node].at_ns - last[node]) / 1e6 for node in NODES]
     own_ms = [
-        passed_for_module_ms(received, node, last[node], stopped[node].at_ns) for node in NODES
+        measure_module_duration_ms(received, node, last[node], stopped[node].at_ns)
+        for node in NODES
     ]
     assert last_ms < LATE_MS
     assert max(took_ms) <= 100 + period_ms + LATE_MS
     assert max(own_ms) <= 100 + period_ms
     assert min(own_ms) > 100 - period_ms
-    assert robot.listener.states() == [ModuleState.FAULT] * JOINTS
+    assert robot.listener.states() == [ModuleState.FAULT] * JOINT_COUNT
     print(
         f"| host, SIGKILL | last frame {last_ms:.1f} ms after it | all modules FAULT (watchdog), "
         f"motor off, {max(took_ms):.0f} ms after their last setpoint by the kernel's clock, "
@@ -143,7 +152,7 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(
     assert all(
         (r["emulated"], r["state"], r["faults"]) == ("yes", "fault", "watchdog") for r in rows
     )
-    assert len({r["serial"] for r in rows}) == JOINTS
+    assert len({r["serial"] for r in rows}) == JOINT_COUNT
     print(
         f"| `snakesim drive scan can {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |"
     )

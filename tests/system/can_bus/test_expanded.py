@@ -26,7 +26,7 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_can_backend.protocol.expanded import list_nodes
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.operator.registered import run_registered
+from snakesim_testing.operator.registered_command import run_registered_command
 
 EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
 
@@ -35,7 +35,7 @@ EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
 def expanded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The file, as `snakesim drive dbc` writes it."""
     path = tmp_path_factory.mktemp("dbc") / "expanded.dbc"
-    assert run_registered(COMMANDS, ["drive", "dbc", "--out", str(path)]) == 0
+    assert run_registered_command(COMMANDS, ["drive", "dbc", "--out", str(path)]) == 0
     return path
 
 

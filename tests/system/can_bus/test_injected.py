@@ -19,10 +19,10 @@ from snakesim_hal.faults.faulty_backend import FaultyBackend
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_testing.can.driver_loop import (
     DriverLoop,
-    armed,
-    cleared_and_armed_again,
-    config,
-    loop,
+    arm_and_wave,
+    make_can_config,
+    open_driver_loop,
+    reset_and_arm_again,
 )
 from snakesim_testing.messages import raises_error
 
@@ -35,7 +35,7 @@ def inject(run: DriverLoop, text: str, *, begins: bool = True) -> None:
 
 
 def test_what_a_module_cannot_know_the_host_makes() -> None:
-    with loop() as run:
+    with open_driver_loop() as run:
         run.run(3)
         faulty = FaultyBackend(run.backend)
         faulty.inject(parse_injection("wrong:joint_2@0=0.4"), begins=True)
@@ -60,13 +60,16 @@ def test_what_cannot_be_had_is_refused_before_anything_is_opened(
     settings: CanSettings, text: str
 ) -> None:
     with raises_error(ConfigError, code=("injection/not-supported", "injection/unknown-target")):
-        CanBackend.check(config(faults=[text]), settings)
+        CanBackend.check(make_can_config(faults=[text]), settings)
 
 
 def test_injection_allows_everything_emulators_and_virtual_bus_support() -> None:
     texts = [f"{kind}:joint_1@1" for kind in (*FAULT_DESCRIPTIONS, "wrong", "nan")]
     texts += [f"{kind}:bus_1@1" for kind in ("cut", "bus_off", "error_passive", "overflow", "full")]
-    assert CanBackend.check(config(faults=texts), CanSettings()) == ("lockstep", "realtime")
+    assert CanBackend.check(make_can_config(faults=texts), CanSettings()) == (
+        "lockstep",
+        "realtime",
+    )
 
 
 # --- the bus -------------------------------------------------------------------------------------------------
@@ -89,11 +92,11 @@ BUS_FAULTS = [
 def test_a_bus_that_fails_stops_the_joints_and_comes_back(
     kind: str, after: int, what: list[str], then: list[str], counted: set[str]
 ) -> None:
-    with loop() as run:
-        armed(run)
+    with open_driver_loop() as run:
+        arm_and_wave(run)
         inject(run, f"{kind}:bus_1")
         start = run.tick
-        run.run(13, run.waving)
+        run.run(13, run.wave_joints)
         assert [fault.what for fault in run.faults] == what
         assert run.faults[0].tick - start == after
         assert run.lifecycle == "fault"
@@ -102,7 +105,7 @@ def test_a_bus_that_fails_stops_the_joints_and_comes_back(
         assert [fault.what for fault in run.faults] == what + then
         assert run.backend.modules.monitor.minor_error_counts.keys() == counted
         assert run.states() == [ModuleState.FAULT if then else ModuleState.DISARMED] * 4
-        cleared_and_armed_again(run)
+        reset_and_arm_again(run)
 
 
 def test_one_end_of_a_virtual_bus() -> None:

@@ -14,11 +14,11 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation import emulator_child
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
-RUN = config()
+RUN = make_can_config()
 VCAN = ["vcan0"]
 
 # --- what is refused ---------------------------------------------------------------------------------------

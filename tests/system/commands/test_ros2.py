@@ -26,7 +26,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Clock, LocomotionIntent, Trajectory
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.operator.ros2_rig import SERVICE_HASHES
+from snakesim_testing.operator.ros2_robots import SERVICE_HASHES
 from snakesim_testing.runs.command import run_in_background, running_snakesim
 from snakesim_testing.runs.in_process_command import run_command_for_robot
 

@@ -16,7 +16,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, LocomotionIntent, RobotStatus, Trajectory
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import RunningCommand, running_snakesim
-from snakesim_testing.runs.keyboard import LEFT, UP, at_the_keyboard
+from snakesim_testing.runs.teleop_terminal import LEFT, UP, running_teleop
 
 pytestmark = pytest.mark.e2e
 STEER = Path(__file__).parents[3] / "examples" / "steer.py"
@@ -47,9 +47,9 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
         run.wait_for("Locomoting")
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             intents, way = session.declare_reader(keys.INTENT, LocomotionIntent), Way(session)
-            with at_the_keyboard(run, tmp_path) as lost:
+            with running_teleop(run, tmp_path) as lost:
                 assert intents.drain() == []
-                assert lost.shows("nothing requested yet") is None
+                assert lost.wait_for_text("nothing requested yet") is None
                 lost.type(2 * UP)
                 wait_until(lambda: way.is_at(0.1, "teleop"), "navigation to go at 0.1 m/s")
                 lost.type(LEFT)
@@ -57,15 +57,15 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                     lambda: (intents.drain() or [NOTHING])[-1].heading_w_rad is not None,
                     "a direction",
                 )
-                lost.shows("requested: +0.10 m/s")
+                lost.wait_for_text("requested: +0.10 m/s")
                 lost.process.send_signal(signal.SIGKILL)
                 wait_until(lambda: way.is_at(0.0, "expired"), "navigation to stop", 5.0)
-            with at_the_keyboard(run, tmp_path) as left:
+            with running_teleop(run, tmp_path) as left:
                 left.type(UP)
                 wait_until(lambda: way.is_at(0.05, "teleop"), "navigation to go at 0.05 m/s")
                 left.type(b"q")
                 assert left.process.wait(10) == 0
-                assert left.given_back
+                assert left.is_restored
                 wait_until(
                     lambda: way.speed_m_s == 0.0 or way.is_at(0.0, "wants it to stop"),
                     "navigation to stop",
@@ -81,12 +81,12 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                 program.terminate()
                 assert program.stderr is not None
                 assert program.stderr.read() == b""
-            with at_the_keyboard(run, tmp_path) as stops:
+            with running_teleop(run, tmp_path) as stops:
                 stops.type(b" ")
                 wait_until(lambda: lifecycle(session) == "estop", "the emergency stop", 5.0)
                 stops.process.send_signal(signal.SIGTERM)
                 assert stops.process.wait(10) == 0
-                assert stops.given_back
+                assert stops.is_restored
 
 
 @pytest.fixture(scope="module")
@@ -115,10 +115,10 @@ def test_teleop_says_what_a_paused_clock_waits_for(
     why, run = " waits for navigation's answer to tick ", in_lockstep
     with (
         open_session(ConnectionSettings(run.endpoint, "planar13")) as session,
-        at_the_keyboard(run, tmp_path) as operator,
+        running_teleop(run, tmp_path) as operator,
     ):
         operator.type(UP)
-        operator.shows("requested: +0.05 m/s")
+        operator.wait_for_text("requested: +0.05 m/s")
         states, found = (
             session.declare_reader(keys.CONTROL_STATE, ControlState),
             list[ControlState](),
@@ -129,7 +129,7 @@ def test_teleop_says_what_a_paused_clock_waits_for(
             return any(one.state == "NotLocomoting" and why in one.reason for one in found)
 
         with frozen(run.part("navigation")):
-            operator.shows(why)
+            operator.wait_for_text(why)
             wait_until(told, "control to say so, too")
         assert "PowerOff" not in {one.state for one in found}
 
@@ -137,8 +137,8 @@ def test_teleop_says_what_a_paused_clock_waits_for(
 def test_teleop_says_that_robot_stopped_sending(
     in_lockstep: RunningCommand, tmp_path: Path
 ) -> None:
-    with at_the_keyboard(in_lockstep, tmp_path) as operator:
-        operator.shows("armed: ")
+    with running_teleop(in_lockstep, tmp_path) as operator:
+        operator.wait_for_text("armed: ")
         with frozen(in_lockstep.part("host")):
-            operator.shows("the robot has sent no clock for ")
-            operator.shows("s ago): ")  # before what may be cut off at the edge
+            operator.wait_for_text("the robot has sent no clock for ")
+            operator.wait_for_text("s ago): ")  # before what may be cut off at the edge

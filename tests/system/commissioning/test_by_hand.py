@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from snakesim_testing.runs.bench import host
+from snakesim_testing.runs.bench_host import running_bench_host
 from snakesim_testing.runs.command import run_in_background, running_snakesim
 from snakesim_testing.runs.hand_turned_robot import (
     BACKEND,
-    JOINTS,
+    JOINT_COUNT,
     make_hand_turned_folder,
-    robot,
+    read_robot_file,
     wait_for_published_angle,
 )
 from snakesim_testing.runs.in_process_command import snakesim
@@ -60,11 +60,11 @@ def enter(process: subprocess.Popen[str]) -> str:
 
 
 def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
-    pose_rad = [0.0] * JOINTS
+    pose_rad = [0.0] * JOINT_COUNT
     set_joint_angles(home, pose_rad)
-    with host(home, BACKEND) as endpoint:
+    with running_bench_host(home, BACKEND) as endpoint:
         with calibrating(home, endpoint, "direction", "snake.toml") as process:
-            for joint in range(JOINTS):
+            for joint in range(JOINT_COUNT):
                 assert read_output_line(process).startswith(
                     f"joint_{joint + 1}: turn the link in front of it to the left"
                 )
@@ -80,8 +80,8 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
         )
         assert stale.code == 2
         assert "restart the host with this file" in stale.err
-    set_joint_angles(home, [0.0] * JOINTS)
-    with host(home, BACKEND) as endpoint:
+    set_joint_angles(home, [0.0] * JOINT_COUNT)
+    with running_bench_host(home, BACKEND) as endpoint:
         with calibrating(home, endpoint, "limits", "snake.toml", "joint_1") as process:
             assert read_output_line(process).startswith("Move each joint")
             for angle_rad in (-0.9, 1.2):
@@ -98,7 +98,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
             set_joint_angles(home, [1.2, 0.4, np.pi / 4, 0.0])
             assert "45 of 45 degrees: matches the file" in read_output_line(process)
             assert process.wait(20) == 0
-        set_joint_angles(home, [0.0] * JOINTS)
+        set_joint_angles(home, [0.0] * JOINT_COUNT)
         wait_for_published_angle(home, endpoint, ZERO_RAD[0])
         assert (
             snakesim(
@@ -113,7 +113,7 @@ def test_what_hands_do_ends_up_in_the_robot_file(home: Path) -> None:
             ).code
             == 0
         )
-    found = robot(home).joint_table
+    found = read_robot_file(home).joint_table
     assert [joint.drive.sign for joint in found] == SIGN.tolist()
     assert [joint.drive.zero_rad for joint in found] == pytest.approx(ZERO_RAD.tolist(), abs=1e-3)
     ends = found[0].limits
@@ -136,7 +136,7 @@ def swapped(home: Path, endpoint: str) -> str:
 
 
 def test_by_hand_refuses_armed_robot_shipped_file_and_unknown_joint(home: Path) -> None:
-    set_joint_angles(home, [0.0] * JOINTS)
+    set_joint_angles(home, [0.0] * JOINT_COUNT)
     before = (home / "snake.toml").read_bytes()
     with running_snakesim(
         home / "run", "bench.toml", "--backend", "./held.py:Held", "--duration", "600"

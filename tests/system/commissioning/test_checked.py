@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from snakesim_testing.harness.endpoint import find_free_endpoint
-from snakesim_testing.runs.checked_robot import JOINTS, make_checked_folder
+from snakesim_testing.runs.checked_robot import JOINT_COUNT, make_checked_folder
 from snakesim_testing.runs.command import CompletedRun, snakesim
 
 
@@ -33,9 +33,10 @@ def test_checked_robot_can_be_armed_until_file_or_drive_changes(home: Path) -> N
     checking = run(home, "check", "--controller", "joint_check", "--duration", "10")
     assert checking.code == 0, checking.out
     judged = snakesim("robot", "check", "check", "--write", "snake.toml", "--straight", cwd=home)
-    assert judged.code == 0 and f"{JOINTS} of {JOINTS} joints match the robot file" in judged.out, (
-        judged.out
-    )
+    assert (
+        judged.code == 0
+        and f"{JOINT_COUNT} of {JOINT_COUNT} joints match the robot file" in judged.out
+    ), judged.out
     text = (home / "snake.toml").read_text()
     assert "[checked]" in text
     assert 'serials = ["A1", "B2", "C3"]' in text

@@ -11,9 +11,14 @@ from pathlib import Path
 import pytest
 
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.runs.bench import host
+from snakesim_testing.runs.bench_host import running_bench_host
 from snakesim_testing.runs.command import run_in_background
-from snakesim_testing.runs.jogged_robot import BACKEND, make_jogged_folder, read_setpoints, stopped
+from snakesim_testing.runs.jogged_robot import (
+    BACKEND,
+    is_at_fault,
+    make_jogged_folder,
+    read_setpoints,
+)
 
 REPEAT_S = 0.03  # of a key
 HELD_BACK = 270  # keys that come at once, as after a stall of some seconds
@@ -44,7 +49,7 @@ def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], 
 
 @pytest.mark.quiet
 def test_it_moves_while_the_key_repeats_and_only_that_joint(home: Path) -> None:
-    with host(home, BACKEND) as endpoint:
+    with running_bench_host(home, BACKEND) as endpoint:
         assert moved_and_stood(home, endpoint)
         wait_until(lambda: read_setpoints(home)["lifecycle"] == "disarmed", "the end of it")
         assert stopped_when_killed(home, endpoint)
@@ -55,7 +60,7 @@ def moved_and_stood(home: Path, endpoint: str) -> bool:
     with jogging(home, endpoint) as (process, terminal):
 
         def ended() -> bool:
-            return process.poll() is not None or stopped(home)
+            return process.poll() is not None or is_at_fault(home)
 
         wait_until(
             lambda: ended() or read_setpoints(home)["mode"] == [0, 1, 0, 0],

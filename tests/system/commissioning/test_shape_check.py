@@ -7,8 +7,8 @@ import pytest
 
 from snakesim_operator.features.commissioning.shape.design import PLACEMENT_TOLERANCE_RAD
 from snakesim_testing.harness.endpoint import find_free_endpoint
-from snakesim_testing.runs.bench import host
-from snakesim_testing.runs.bent_robot import JOINTS, ScriptedOperator, make_bent_folder
+from snakesim_testing.runs.bench_host import running_bench_host
+from snakesim_testing.runs.bent_robot import JOINT_COUNT, ScriptedOperator, make_bent_folder
 from snakesim_testing.runs.command import CompletedRun
 from snakesim_testing.runs.command import snakesim as run_snakesim
 from snakesim_testing.runs.in_process_command import snakesim
@@ -38,7 +38,7 @@ def test_faults_of_robot_without_imus_are_named_on_every_drive_type(
     home = make_bent_folder(tmp_path, backend)
     with (home / "bench.toml").open("a") as scenario:
         scenario.write(MOUNTED.format(backend=backend))
-    with host(home, backend) as endpoint:
+    with running_bench_host(home, backend) as endpoint:
         code, printed = ScriptedOperator(home, endpoint, drive_order=(0, 1, 3, 2)).check()
     assert code == 1, printed
     lines = {line.split()[0]: line for line in printed.splitlines() if line.startswith("joint_")}
@@ -67,10 +67,12 @@ def start(home: Path, out: str, *words: str) -> CompletedRun:
 
 def test_robot_without_imus_can_be_armed_after_shapes_and_start_check(tmp_path: Path) -> None:
     home = make_bent_folder(tmp_path, "Real")
-    with host(home, "./real.py:Real") as endpoint:
+    with running_bench_host(home, "./real.py:Real") as endpoint:
         code, printed = ScriptedOperator(home, endpoint).check()
     assert code == 0, printed
-    assert f"{JOINTS} of {JOINTS} joints match the robot file; 0 wrong; 0 unknown" in printed
+    assert (
+        f"{JOINT_COUNT} of {JOINT_COUNT} joints match the robot file; 0 wrong; 0 unknown" in printed
+    )
     assert 'by_shape = ["order", "sign", "gear", "zero"]' in (home / "snake.toml").read_text()
     refused = start(home, "never", "--duration", "0.1")
     assert refused.code == 1
@@ -85,7 +87,7 @@ def test_robot_without_imus_can_be_armed_after_shapes_and_start_check(tmp_path: 
     assert "nothing was written" in unknown.out
     judged = snakesim(*evaluate, "--gear-by-hand", cwd=home)
     assert judged.code == 0, judged.out
-    assert f"{JOINTS} with properties that drawn shapes confirmed" in judged.out
+    assert f"{JOINT_COUNT} with properties that drawn shapes confirmed" in judged.out
     assert start(home, "moves", "--duration", "0.1").code == 0
 
     # The shapes count for the mounting that was checked.

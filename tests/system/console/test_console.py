@@ -20,12 +20,12 @@ from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.page import origin_of
 from snakesim_testing.harness.processes import assert_no_process_left, find_processes_with
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, BrowserTab, open_chromium
+from snakesim_testing.operator.browser import BROWSER_MISSING, CHROMIUM, BrowserTab, open_chromium
 from snakesim_testing.operator.ready_stop import ReadyStop
 from snakesim_testing.operator.served_console import running_console
 from snakesim_testing.runs.command import RunningCommand, running_snakesim
 
-pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
+pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=BROWSER_MISSING)]
 
 RUN = (
     *(
@@ -65,14 +65,16 @@ def test_console_page_shows_moving_snake_and_escape_stops_it(tmp_path: Path) -> 
         began_s = time.monotonic()
         address = run.console()
         told_after_s = time.monotonic() - began_s
-        page = browser.open(address, *SMALL)
+        page = browser.open_page(address, *SMALL)
         page.wait_for("planar13")
         drawn_after_s = time.monotonic() - began_s
         page.wait_for("SIMULATOR")
         live_after_s = time.monotonic() - began_s
         page.wait_for("armed by snakesim run")
-        before = page.picture(clip=GROUND)
-        wait_until(lambda: page.picture(clip=GROUND) != before, "a snake that moves on the page")
+        before = page.capture_screenshot(clip=GROUND)
+        wait_until(
+            lambda: page.capture_screenshot(clip=GROUND) != before, "a snake that moves on the page"
+        )
         stopped_after_s = stop_in(page, run)
         assert stopped_after_s < STOP_LIMIT_S, f"{stopped_after_s:.2f} s"
         print(
@@ -80,10 +82,10 @@ def test_console_page_shows_moving_snake_and_escape_stops_it(tmp_path: Path) -> 
             f"{live_after_s:.1f} s, motors off {stopped_after_s:.2f} s after the key"
         )
         page.wait_for("ESTOP")
-        page.value(
+        page.evaluate(
             "document.querySelectorAll('[class*=ScrollArea-viewport]').forEach(e => { e.scrollTop = 300; })"
         )
-        assert page.value(STATE_TOP) >= 0  # in sight all the same
+        assert page.evaluate(STATE_TOP) >= 0  # in sight all the same
         # On a busy computer the second stop may report for a moment that its self-test is late (503).
         assert not [error for error in page.errors if not error.endswith("/stop")], page.errors
 
@@ -97,7 +99,7 @@ def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
     """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
     with running_console(ReadyStop()) as (server, address), open_chromium() as browser:
         ConsolePage(server, None, None, PageLog(), recorded="a run")
-        page = browser.open("about:blank", *SMALL)
+        page = browser.open_page("about:blank", *SMALL)
         for prefers in ("light", "dark"):
             page.send(
                 "Emulation.setEmulatedMedia",
@@ -105,16 +107,16 @@ def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
             )
             page.send("Page.navigate", url=address)
             page.wait_for("Dark page")
-            wait_until(lambda prefers=prefers: page.value(LOOK) == prefers, f"a {prefers} page")
+            wait_until(lambda prefers=prefers: page.evaluate(LOOK) == prefers, f"a {prefers} page")
         page.click("Dark page")
-        wait_until(lambda: page.value(LOOK) == "light", "the viewer's choice")
-        page.value("window.ends = 0; addEventListener('pointercancel', () => { ends += 1; })")
+        wait_until(lambda: page.evaluate(LOOK) == "light", "the viewer's choice")
+        page.evaluate("window.ends = 0; addEventListener('pointercancel', () => { ends += 1; })")
         for count, leave in enumerate(("window.dispatchEvent(new Event('blur'))", HIDE), start=1):
-            page.value(
+            page.evaluate(
                 "document.body.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))"
             )
-            page.value(leave)
-            assert page.value("ends") == count
+            page.evaluate(leave)
+            assert page.evaluate("ends") == count
 
 
 @pytest.mark.slow
@@ -128,22 +130,22 @@ def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
             RobotOperations(ConnectionSettings(find_free_endpoint(), "planar13"), log),
             log,
         ).show_snapshot(make_expected_snapshot(config))
-        page = browser.open(address, 400, 800, 0.5)
+        page = browser.open_page(address, 400, 800, 0.5)
         page.wait_for("planar13")
         for tab in ("Joints", "State", "Signals", "Log"):
             page.click(tab)
             wait_until(
-                lambda: page.value(PANEL_WIDTHS) == [400, 400],
+                lambda: page.evaluate(PANEL_WIDTHS) == [400, 400],
                 f"a panel as wide as the phone in tab {tab}",
             )
         # On a busy computer the stop may report for a moment that it does not answer; then its box is higher.
-        wait_until(lambda: page.value(f"{STOP_BOX}.bottom") < 100, "a second stop at the top")
+        wait_until(lambda: page.evaluate(f"{STOP_BOX}.bottom") < 100, "a second stop at the top")
         page.wait_for("Stops the robot even if EMERGENCY STOP does not react. Self-test: ready")
-        assert page.value(f"{NOTICE_BOX}.top > {STOP_BOX}.bottom"), (
+        assert page.evaluate(f"{NOTICE_BOX}.top > {STOP_BOX}.bottom"), (
             "a notice, such as of missing WebGL, is not covered"
         )
-        page.size(1400, 860)
-        wait_until(lambda: page.value(TAB_LINES) == 1, "tabs in one line")
+        page.set_window_size(1400, 860)
+        wait_until(lambda: page.evaluate(TAB_LINES) == 1, "tabs in one line")
 
 
 @pytest.mark.slow
@@ -154,19 +156,19 @@ def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -
         origin = origin_of(address)
         port = origin.rpartition(":")[2]
         for wrong in (f"{origin}/", f"{origin}/signals", f"{origin}/{'x' * 22}/"):
-            browser.open(wrong, *SMALL).wait_for("open the address that the console printed")
-        evil = browser.open("data:text/html,<title>another site</title>", *SMALL)
-        evil.value(
+            browser.open_page(wrong, *SMALL).wait_for("open the address that the console printed")
+        evil = browser.open_page("data:text/html,<title>another site</title>", *SMALL)
+        evil.evaluate(
             ANOTHER_SITE.format(
                 page=address.replace("http", "ws").rstrip("/"), stop=f"{address}stop"
             )
         )
         wait_until(
-            lambda: evil.value("[opened, posted]") == [False, True], "what another site may do"
+            lambda: evil.evaluate("[opened, posted]") == [False, True], "what another site may do"
         )
-        page = browser.open(f"http://localhost:{port}{urlsplit(address).path}signals", *SMALL)
+        page = browser.open_page(f"http://localhost:{port}{urlsplit(address).path}signals", *SMALL)
         page.wait_for("Self-test: ready")
-        assert SILENT not in page.text()
+        assert SILENT not in page.read_text()
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             status = session.wait_for_latched(keys.STATUS, RobotStatus, 10.0)
             assert status is not None and status.lifecycle != "estop", (
@@ -178,7 +180,7 @@ def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -
                 page.wait_for(SILENT)
             finally:
                 os.kill(front, signal.SIGCONT)
-            wait_until(lambda: SILENT not in page.text(), "a second stop that answers")
+            wait_until(lambda: SILENT not in page.read_text(), "a second stop that answers")
             pages = console_process(run)
             os.kill(pages, signal.SIGSTOP)
             try:
@@ -214,9 +216,9 @@ def console_process(run: RunningCommand, part: str = "") -> int:
 def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
     with open_chromium() as browser, running_snakesim(tmp_path / "run", *RUN) as run:
         address = run.console()
-        first = browser.open(address, *SMALL)
+        first = browser.open_page(address, *SMALL)
         first.wait_for("Take control")
-        second = browser.open(address, *SMALL)  # after the first, whose number is thus 1
+        second = browser.open_page(address, *SMALL)  # after the first, whose number is thus 1
         for tab in (first, second):
             tab.wait_for("armed by snakesim run")
             tab.wait_for("Take control")
@@ -224,12 +226,12 @@ def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
         second.wait_for("viewer 1 has control")
         second.click("Take control")  # greyed out
         first.wait_for("Release control")
-        assert "Release control" not in second.text()
+        assert "Release control" not in second.read_text()
         first.click("Pause")
         second.wait_for("PAUSED")
         change_settings(first, run)
         first.click("Resume")
-        wait_until(lambda: "PAUSED" not in second.text(), "the end of the pause")
+        wait_until(lambda: "PAUSED" not in second.read_text(), "the end of the pause")
         # No limit: two pages drawn without a graphics card take seconds for a key.
         stop_in(second, run)
         first.wait_for("ESTOP")
@@ -247,7 +249,7 @@ def change_settings(tab: BrowserTab, run: RunningCommand) -> None:
     """Of the controller, while it runs, by typing one into the page."""
     tab.click("Parameters")
     tab.wait_for("amplitude_rad, rad")
-    tab.type("amplitude_rad, rad", "0.4")
+    tab.enter_text("amplitude_rad, rad", "0.4")
     tab.click("Apply")
     with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
         in_force = session.wait_for_latched(
@@ -271,7 +273,7 @@ def stop_in(tab: BrowserTab, run: RunningCommand) -> float:
             lambda: any(fastest_rad_s(one) > 0.05 for one in joints.drain()), "moving joints"
         )
         pressed_s = time.monotonic()
-        tab.press("Escape", 27)
+        tab.press_key("Escape", 27)
         wait_until(
             lambda: status.pop_newest(lambda one: one.lifecycle == "estop") is not None, "the stop"
         )

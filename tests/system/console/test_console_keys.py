@@ -9,8 +9,8 @@ import pytest
 from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import LocomotionIntent, RobotStatus, Trajectory
-from snakesim_testing.operator.console_wait import LIMIT_S, until
-from snakesim_testing.operator.viewer import ConsoleViewer, viewing
+from snakesim_testing.operator.console_wait import LIMIT_S, wait_for_condition
+from snakesim_testing.operator.viewer import ConsoleViewer, connect_viewer
 from snakesim_testing.runs.command import running_snakesim
 
 pytestmark = pytest.mark.e2e
@@ -33,25 +33,27 @@ def test_keys_drive_a_lost_page_stands_still_and_another_stops(tmp_path: Path) -
 
 
 async def drive_and_stop(address: str, endpoint: str) -> None:
-    async with viewing(address) as others:
+    async with connect_viewer(address) as others:
         other = ConsoleViewer(others)
-        await other.come()
-        watching = asyncio.create_task(other.watch())
-        await until(lambda: other.shows("armed by snakesim run"), "an armed robot")
+        await other.register_as_viewer()
+        watching = asyncio.create_task(other.receive_until_closed())
+        await wait_for_condition(
+            lambda: other.shows_text("armed by snakesim run"), "an armed robot"
+        )
         with open_session(ConnectionSettings(endpoint, "planar13")) as session:
             intents, paths = (
                 session.declare_reader(keys.INTENT, LocomotionIntent),
                 session.declare_reader(keys.TRAJECTORY, Trajectory),
             )
             status = session.declare_latched_reader(keys.STATUS, RobotStatus)
-            async with viewing(address) as mine:
+            async with connect_viewer(address) as mine:
                 driver = ConsoleViewer(mine)
-                await driver.come()
-                driving = asyncio.create_task(driver.watch())
-                await until(lambda: driver.has("Take control"), "the controls")
+                await driver.register_as_viewer()
+                driving = asyncio.create_task(driver.receive_until_closed())
+                await wait_for_condition(lambda: driver.has_label("Take control"), "the controls")
                 await driver.trigger("Drive: ahead")  # of somebody who has no control
                 await driver.click("Take control")
-                await until(lambda: driver.has("Release control"), "control")
+                await wait_for_condition(lambda: driver.has_label("Release control"), "control")
                 await hold(
                     driver,
                     "Drive: ahead",
@@ -78,14 +80,18 @@ async def drive_and_stop(address: str, endpoint: str) -> None:
                     lambda: any((i.speed_m_s or 0) < 0 for i in intents.drain()),
                 )
             await driving  # the page is closed while its key is held
-            stopped = await until(
+            stopped = await wait_for_condition(
                 lambda: paths.pop_newest(lambda path: path.speed_m_s == 0), "a robot told to stand"
             )
             assert "viewer 2" in stopped.reason
-            await until(lambda: other.shows("no viewer has control"), "the return of control")
+            await wait_for_condition(
+                lambda: other.shows_text("no viewer has control"), "the return of control"
+            )
             await other.trigger("Emergency stop")
-            await until(lambda: status.pop_newest(lambda one: one.lifecycle == "estop"), "the stop")
-            await until(lambda: other.shows(">ESTOP<"), "the stop on the page")
+            await wait_for_condition(
+                lambda: status.pop_newest(lambda one: one.lifecycle == "estop"), "the stop"
+            )
+            await wait_for_condition(lambda: other.shows_text(">ESTOP<"), "the stop on the page")
         watching.cancel()
 
 

@@ -17,22 +17,22 @@ from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.in_process import simulate
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.browser import (
+    BROWSER_MISSING,
     CHROMIUM,
-    MISSING,
     BrowserTab,
     ChromiumBrowser,
     open_chromium,
 )
 from verification.screenshots import run_recording_console
 
-pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=MISSING)]
+pytestmark = [pytest.mark.e2e, pytest.mark.skipif(CHROMIUM is None, reason=BROWSER_MISSING)]
 
 READABLE_PX = 9.0  # height of a text
 
 
 def searched(tab: BrowserTab, words: str, then: str) -> None:
     """Type a search, and press what has this label."""
-    tab.value(
+    tab.evaluate(
         f"(() => {{ const field = document.getElementById('search'); field.value = {json.dumps(words)};"
         "field.dispatchEvent(new Event('input')); })()"
     )
@@ -41,7 +41,7 @@ def searched(tab: BrowserTab, words: str, then: str) -> None:
 
 def cells(tab: BrowserTab) -> dict[str, list[str]]:
     """What the tables say of each signal."""
-    rows = tab.value(
+    rows = tab.evaluate(
         "[...document.querySelectorAll('tr')].map(row => [...row.cells].map(cell => cell.innerText.trim()))"
     )
     return {row[0].removeprefix("■\xa0"): row[1:5] for row in rows}
@@ -54,7 +54,7 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
     angle = record.angle_rad[:, 4]
     measured, wanted = "angle_rad.joint_5, rad", "control.reference_rad.joint_5, rad"
     with run_recording_console(str(tmp_path / "run"), 1.0) as address, open_chromium() as browser:
-        tab = browser.open(f"{address.rstrip('/')}/signals", 800, 900)
+        tab = browser.open_page(f"{address.rstrip('/')}/signals", 800, 900)
         tab.wait_for(" signals")
         tab.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
         searched(tab, "joint_5 angle", measured)
@@ -75,7 +75,7 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
 
         point(tab, 0.25)  # in the first plot: the cursor of both follows
         wait_until(lambda: cells(tab)[measured] != said[measured], "another instant")
-        cursors = tab.value(
+        cursors = tab.evaluate(
             "[...document.querySelectorAll('.cursor')].map(one => one.getBoundingClientRect().left)"
         )
         assert len(cursors) == 2
@@ -85,11 +85,11 @@ def test_console_signals_can_be_searched_compared_inspected_and_saved(tmp_path: 
             lambda: now_s(address) == pytest.approx(0.5, abs=0.05), "the time that was pressed"
         )
 
-        tab.value(
+        tab.evaluate(
             "(() => { const [low, high] = document.querySelectorAll('.ranges input');"
             "low.value = '-1'; high.value = '1'; high.onchange(); })()"
         )
-        wait_until(lambda: tab.value(AXIS) == [-1, 1], "the range that was typed")
+        wait_until(lambda: tab.evaluate(AXIS) == [-1, 1], "the range that was typed")
         for label, file in (
             ("Save CSV", "signals.csv"),
             ("Save SVG", "signals.svg"),
@@ -121,10 +121,10 @@ def labels_of_the_report_are_read_on_a_phone(
     (folder / "report.html").write_text(
         render_report(record, summarize_run(record, "complete")), encoding="utf-8"
     )
-    phone = browser.open((folder / "report.html").as_uri(), 400, 900)
-    phone.size(400, 900, mobile=True)
+    phone = browser.open_page((folder / "report.html").as_uri(), 400, 900)
+    phone.set_window_size(400, 900, mobile=True)
     phone.wait_for("Playback")
-    heights = phone.value(
+    heights = phone.evaluate(
         "[...document.querySelectorAll('.figure text.small')]"
         ".filter(label => /^\\d+ (cm|m|N)$/.test(label.textContent)).map(label => label.getBoundingClientRect().height)"
     )
@@ -137,7 +137,7 @@ AXIS = "document.querySelector('.plot').layout.yaxis.range"
 
 def point(tab: BrowserTab, share: float, *, press: bool = False) -> None:
     """Move the pointer to a share of the time in the first plot."""
-    at = tab.value(
+    at = tab.evaluate(
         "(() => { const plot = document.querySelector('.plot'), r = plot.getBoundingClientRect(),"
         f"s = plot._fullLayout._size; return [r.left + s.l + {share} * s.w, r.top + s.t + s.h / 2]; }})()"
     )

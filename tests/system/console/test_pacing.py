@@ -6,7 +6,7 @@ from typing import Any
 import viser
 
 from snakesim_testing.operator.served_console import running_console
-from snakesim_testing.operator.viewer import ASKED, ConsoleViewer, viewing
+from snakesim_testing.operator.viewer import STORAGE_REQUEST_TYPE, ConsoleViewer, connect_viewer
 
 CHANGES = 200
 LIMIT_S = 20.0
@@ -17,16 +17,16 @@ def test_a_slow_page_gets_the_newest_state_only() -> None:
         text = server.gui.add_text("Tick", "0")
 
         async def slow() -> list[str]:
-            async with viewing(address) as socket:
+            async with connect_viewer(address) as socket:
                 viewer = ConsoleViewer(socket)
-                await viewer.come()
+                await viewer.register_as_viewer()
                 changing = asyncio.create_task(_change(text))
                 batch = await _until_asked(viewer)
                 await changing  # while the page still draws
                 last = str(CHANGES - 1)
                 seen = list[str]()
                 while last not in seen:
-                    await viewer.answer(batch)
+                    await viewer.confirm_batch(batch)
                     batch = await _until_asked(viewer)
                     seen += _values(batch)
                 return seen
@@ -39,15 +39,15 @@ def test_a_page_that_keeps_up_gets_every_change() -> None:
         text = server.gui.add_text("Tick", "")
 
         async def quick() -> list[str]:
-            async with viewing(address) as socket:
+            async with connect_viewer(address) as socket:
                 viewer = ConsoleViewer(socket)
-                await viewer.come()
+                await viewer.register_as_viewer()
                 seen = list[str]()
                 for i in range(5):
                     text.value = str(i)
                     while str(i) not in seen:
-                        batch = await viewer.batch()
-                        await viewer.answer(batch)
+                        batch = await viewer.receive_batch()
+                        await viewer.confirm_batch(batch)
                         seen += _values(batch)
                 return seen
 
@@ -63,8 +63,8 @@ async def _change(text: viser.GuiTextHandle) -> None:
 async def _until_asked(viewer: ConsoleViewer) -> list[dict[str, Any]]:
     """All messages up to the question whether they have been shown."""
     found = list[dict[str, Any]]()
-    while not any(message["type"] == ASKED for message in found):
-        found += await viewer.batch()
+    while not any(message["type"] == STORAGE_REQUEST_TYPE for message in found):
+        found += await viewer.receive_batch()
     return found
 
 

@@ -7,18 +7,26 @@ from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import M_PER_N, draw
 from snakesim_operator.features.console.scene.robot_scene import RobotScene
 from snakesim_testing.hal.small_robots import make_description
-from snakesim_testing.operator.drawn_samples import contact, joints, pushing, world
+from snakesim_testing.operator.drawn_samples import (
+    make_contact,
+    make_control_state,
+    make_joints,
+    make_world_model,
+)
 from snakesim_testing.operator.served_console import running_console
 
 
 def test_scene_force_without_contact_is_dashed_until_contact():
-    point = contact((0.0, 10.0, 0.0))
-    control = pushing([point], [10.0])
+    point = make_contact((0.0, 10.0, 0.0))
+    control = make_control_state([point], [10.0])
     with running_console() as (server, _):
         scene = RobotScene(server.scene, make_description(), None)
         for felt in ([], [point], []):
             snapshot = RobotSnapshot(
-                robot=make_description(), body=joints(), world=world(felt, []), control=control
+                robot=make_description(),
+                body=make_joints(),
+                world=make_world_model(felt, []),
+                control=control,
             )
             drawing = draw(snapshot, None)
             assert drawing is not None
@@ -56,7 +64,11 @@ def test_scene_perceived_shapes_are_drawn_until_forgotten():
         scene = RobotScene(server.scene, make_description(), None)
         for obstacles in (found, []):
             drawing = draw(
-                RobotSnapshot(robot=make_description(), body=joints(), world=world([], obstacles)),
+                RobotSnapshot(
+                    robot=make_description(),
+                    body=make_joints(),
+                    world=make_world_model([], obstacles),
+                ),
                 None,
             )
             assert drawing is not None

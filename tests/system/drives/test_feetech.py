@@ -18,7 +18,7 @@ from snakesim_testing.harness.command import (
 )
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.lab.machines import HURRIED
+from snakesim_testing.lab.machines import REAL_TIME_PRIORITY
 from snakesim_testing.runs.servo_row import write_servo_row
 
 pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Where everything runs, with servos on `./servos`."""
     folder = tmp_path_factory.mktemp("servos")
     write_servo_row(folder, "feetech", "servos")
-    first = HURRIED if os.geteuid() == 0 else ()  # real servos wait for nobody
+    first = REAL_TIME_PRIORITY if os.geteuid() == 0 else ()  # real servos wait for nobody
     printed = folder / "servos.log"
     with printed.open("wb") as file:
         servos = subprocess.Popen(

@@ -21,8 +21,8 @@ from snakesim_testing.runs.qualification_terminal import (
     ENTER,
     Answer,
     answer_until,
-    at_the_terminal,
-    put_on_bench,
+    emulated_drive_on_bench,
+    running_qualification,
     skip_step,
 )
 
@@ -46,7 +46,10 @@ def skip_all_but(*kept: str) -> dict[str, Answer]:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_person_confirms_every_step_of_a_drive(tmp_path: Path):
-    with put_on_bench(tmp_path, "odrive") as bench, at_the_terminal(tmp_path, bench) as terminal:
+    with (
+        emulated_drive_on_bench(tmp_path, "odrive") as bench,
+        running_qualification(tmp_path, bench) as terminal,
+    ):
         answer_until(terminal, "")
         assert terminal.end() == 0, terminal.printed
     record = read_record(terminal.folder / RECORD)
@@ -56,8 +59,8 @@ def test_person_confirms_every_step_of_a_drive(tmp_path: Path):
 
 @pytest.mark.timeout(300)
 def test_interrupted_qualification_continues_and_asks_what_is_unknown_again(tmp_path: Path):
-    with put_on_bench(tmp_path, "odrive") as bench:
-        with at_the_terminal(tmp_path, bench) as terminal:
+    with emulated_drive_on_bench(tmp_path, "odrive") as bench:
+        with running_qualification(tmp_path, bench) as terminal:
             answer_until(terminal, "Block the shaft: hold", {TITLES["limits"]: skip_step})
             assert bench.read_newest_state().is_enabled
             terminal.type(CTRL_C)
@@ -67,7 +70,7 @@ def test_interrupted_qualification_continues_and_asks_what_is_unknown_again(tmp_
         before = get_verdicts(terminal.read_progress())
         confirmed = dict.fromkeys(STEP_KEYS[:4], "confirmed")
         assert before == {**confirmed, "limits": "unknown"}
-        with at_the_terminal(tmp_path, bench) as terminal:
+        with running_qualification(tmp_path, bench) as terminal:
             answer_until(terminal, "", skip_all_but("limits", "torque", "supply", "estop_key"))
             assert terminal.end() == 1, terminal.printed
             assert terminal.printed.count("done before") == 3
@@ -89,7 +92,10 @@ def test_no_is_refuted_and_not_known_or_skipped_is_unknown(tmp_path: Path):
         SHAFT_TURNED: lambda _terminal, _question: "n\n",
         WITHOUT_TORQUE: lambda _terminal, _question: ENTER,
     }
-    with put_on_bench(tmp_path, "odrive") as bench, at_the_terminal(tmp_path, bench) as terminal:
+    with (
+        emulated_drive_on_bench(tmp_path, "odrive") as bench,
+        running_qualification(tmp_path, bench) as terminal,
+    ):
         answer_until(terminal, "", answers)
         assert terminal.end() == 1, terminal.printed
     record = read_record(terminal.folder / RECORD)
@@ -107,9 +113,9 @@ def test_no_is_refuted_and_not_known_or_skipped_is_unknown(tmp_path: Path):
 
 
 def test_nothing_starts_until_the_person_confirms_that_it_is_safe(tmp_path: Path):
-    with put_on_bench(tmp_path, "odrive") as bench:
+    with emulated_drive_on_bench(tmp_path, "odrive") as bench:
         for confirmation in ("n\n", ENTER):
-            with at_the_terminal(tmp_path, bench) as terminal:
+            with running_qualification(tmp_path, bench) as terminal:
                 answer_until(terminal, "A switch that cuts the motor supply")
                 terminal.answer(confirmation)
                 assert terminal.end() == 1
@@ -119,8 +125,8 @@ def test_nothing_starts_until_the_person_confirms_that_it_is_safe(tmp_path: Path
 
 
 def test_closed_terminal_in_the_middle_of_a_motion_stops_the_motor(tmp_path: Path):
-    with put_on_bench(tmp_path, "odrive") as bench:
-        with at_the_terminal(tmp_path, bench) as terminal:
+    with emulated_drive_on_bench(tmp_path, "odrive") as bench:
+        with running_qualification(tmp_path, bench) as terminal:
             answer_until(terminal, READY, {})
             while terminal.find_step() != TITLES["limits"]:
                 terminal.answer(ENTER)
@@ -136,8 +142,8 @@ def test_closed_terminal_in_the_middle_of_a_motion_stops_the_motor(tmp_path: Pat
 
 
 def test_end_of_input_stops_the_motor_and_keys_typed_early_answer_nothing(tmp_path: Path):
-    with put_on_bench(tmp_path, "odrive") as bench:
-        with at_the_terminal(tmp_path, bench) as terminal:
+    with emulated_drive_on_bench(tmp_path, "odrive") as bench:
+        with running_qualification(tmp_path, bench) as terminal:
             answer_until(terminal, READY, {})
             while terminal.find_step() != TITLES["limits"]:
                 terminal.answer(ENTER)

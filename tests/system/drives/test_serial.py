@@ -19,7 +19,7 @@ from snakesim_testing.harness.command import (
 )
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
-from snakesim_testing.lab.machines import HURRIED
+from snakesim_testing.lab.machines import REAL_TIME_PRIORITY
 from snakesim_testing.runs.servo_row import write_servo_row
 
 pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
@@ -41,7 +41,7 @@ def pose(folder: Path) -> Iterator[str]:
     """Servos on `./servos`; where they send the pose."""
     address = f"127.0.0.1:{find_free_port()}"
     # Real servos wait for nobody.
-    output, first = folder / "servos.log", HURRIED if os.geteuid() == 0 else ()
+    output, first = folder / "servos.log", REAL_TIME_PRIORITY if os.geteuid() == 0 else ()
     with output.open("wb") as file:
         servos = subprocess.Popen(
             [

@@ -26,7 +26,7 @@ from snakesim_testing.can.firmware_replay import (
     shrink_difference,
 )
 from snakesim_testing.can.firmware_traffic import NODE, Traffic
-from snakesim_testing.can.module_rig import parameter, setpoint
+from snakesim_testing.can.module_rig import make_parameter_request, make_setpoint
 
 EVENTS_PER_SEED = 2000
 SEEDS = range(6)
@@ -88,7 +88,7 @@ def arm_with(parameters: dict[ModuleParameter, float], sensors: str, target: Can
         f"poll {BOOTED_US}",
     ]
     events += [
-        describe_event(parameter(index, value, node_id=NODE), BOOTED_US)
+        describe_event(make_parameter_request(index, value, node_id=NODE), BOOTED_US)
         for index, value in parameters.items()
     ]
     events.append(describe_event(make_command(CommandAction.ARM, NODE), BOOTED_US))
@@ -141,7 +141,7 @@ def test_the_control_law_is_that_of_the_specification(replay: Path) -> None:
         angle_rad = round(choose.uniform(-3, 3), 3)
         speed_rad_s = round(choose.uniform(-6, 6), 3)
         sensors = f"sensors 1 0 0 0 0 24000 0 {winding_tenths_c} 200" + " 0" * 23
-        events += arm_with(parameters, sensors, setpoint(0, mode, target, limit_nm, NODE))
+        events += arm_with(parameters, sensors, make_setpoint(0, mode, target, limit_nm, NODE))
         events.append(f"torque {angle_rad} {speed_rad_s}")
         expected_nm.append(
             compute_expected_torque(
@@ -160,7 +160,9 @@ def test_the_control_law_is_that_of_the_specification(replay: Path) -> None:
 def test_a_module_that_is_not_driven_has_no_torque(replay: Path) -> None:
     sensors = "sensors 1 0 0 0 0 24000 0 200 200" + " 0" * 23
     events = arm_with(
-        {ModuleParameter.STIFFNESS: 20.0}, sensors, setpoint(0, JointMode.POSITION, 1.0, 3.0, NODE)
+        {ModuleParameter.STIFFNESS: 20.0},
+        sensors,
+        make_setpoint(0, JointMode.POSITION, 1.0, 3.0, NODE),
     )
     events += ["torque 0 0", f"poll {BOOTED_US + 100_000}", "torque 0 0"]
     completed = subprocess.run(

@@ -29,7 +29,7 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_can_backend.settings import CanSettings
 from snakesim_native.programs import JOINT_MODULES, get_program
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 from snakesim_testing.harness.wait import wait_until
 
 GARBAGE_RECORDS = 5_000
@@ -41,7 +41,7 @@ def start_modules(
 ) -> subprocess.Popen[bytes]:
     """Start the program with the four modules of a small robot, and wait until they are on the bus."""
     modules_path = folder / "modules.txt"
-    modules_path.write_text(describe_modules(config(), CanSettings()))
+    modules_path.write_text(describe_modules(make_can_config(), CanSettings()))
     process = subprocess.Popen(
         [
             program or get_program(JOINT_MODULES),
@@ -212,7 +212,7 @@ def test_modules_of_two_programs_with_the_same_ids_are_seen(tmp_path: Path) -> N
 def test_a_folder_that_other_users_can_enter_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "bus"
     folder.mkdir(mode=0o755)
-    (tmp_path / "modules.txt").write_text(describe_modules(config(), CanSettings()))
+    (tmp_path / "modules.txt").write_text(describe_modules(make_can_config(), CanSettings()))
     command = [get_program(JOINT_MODULES), "--bus", folder, "--modules", tmp_path / "modules.txt"]
     refused = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
     assert refused.returncode == 2

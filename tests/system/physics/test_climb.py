@@ -16,7 +16,7 @@ def test_a_whole_snake_climbs_over_a_step(height_m: float) -> None:
         "control.search_after_s=0.0",
     )
     whole = run_controller(load_run_config("mamba_step", *near), duration_s=11.0)
-    assert whole.moved_m > BEHIND_M
+    assert whole.advance_m > BEHIND_M
     assert (whole.record.mode == JointMode.TORQUE.value).any()  # on the level it pushes by torque
 
 
@@ -27,4 +27,4 @@ def test_a_step_that_it_may_not_climb_stops_it() -> None:
         "scene.step.0.position_m=[2.3,0.0]",
         "control.search_after_s=0.0",
     )
-    assert run_controller(load_run_config("mamba_step", *low), duration_s=6.0).moved_m < 1.0
+    assert run_controller(load_run_config("mamba_step", *low), duration_s=6.0).advance_m < 1.0

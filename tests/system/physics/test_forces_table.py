@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_testing.runs.solved_and_measured import (
+from snakesim_testing.runs.desired_and_measured_forces import (
     STEP_S,
     measure_difference_causes,
     run_and_measure_forces,

@@ -25,7 +25,7 @@ def triplet(*sets: str) -> RecordedTicks:
 
 
 def propelled(whole: RecordedTicks) -> list[int]:
-    return [turn for turn in whole.turns if turn is not None]
+    return [turn for turn in whole.propulsion_joints if turn is not None]
 
 
 # --- the case study -------------------------------------------------------------------------------------------
@@ -37,7 +37,7 @@ def propelled(whole: RecordedTicks) -> list[int]:
 def test_triplet_with_35_newtons_moves_half_a_meter(noise: tuple[str, ...]):
     whole = triplet(*noise)
     assert whole.record.time_s[-1] <= 10.0
-    assert whole.moved_m >= 0.5
+    assert whole.advance_m >= 0.5
     turns = propelled(whole)
     assert len(turns) >= 4
     assert turns == [turns[0] - k for k in range(len(turns))]
@@ -172,7 +172,7 @@ def test_braking_obstacles_between_push_points_do_not_stop_pushing(clearance_m: 
         )
     scene = msgspec.structs.replace(config.scene, cylinder=pegs)
     whole = run_controller(msgspec.structs.replace(config, scene=scene), duration_s=8.0)
-    assert whole.moved_m > 0.5
+    assert whole.advance_m > 0.5
     assert ["peg_0_1", "peg_0_2", "peg_0_3"] in [
         [p.obstacle for p in report.push_points] for report in whole.reports
     ]
@@ -183,11 +183,11 @@ def test_steep_wave_pushes_with_contacts_further_apart():
     whole = run_controller(
         load_run_config("peg_row", "scene.route.amplitude_m=0.05"), duration_s=8.0
     )  # 34.9 degrees
-    assert whole.moved_m > 1.0
+    assert whole.advance_m > 1.0
     assert set(whole.states[STARTED:]) == {"Locomoting"}
     assert not any(report.jammed for report in whole.reports)
     turns = propelled(whole)
-    assert len(turns) < 2 * whole.moved_m / whole.record.config.robot.module.length_m
+    assert len(turns) < 2 * whole.advance_m / whole.record.config.robot.module.length_m
     assert not whole.record.host.limited_commands
 
 
@@ -197,7 +197,7 @@ def test_steep_wave_pushes_with_contacts_further_apart():
 @pytest.mark.slow
 def test_two_newtons_are_too_little_and_said_to_be():
     whole = run_controller(load_run_config("triplet", f"{TRIPLET}.propulsion_n=2"))
-    assert abs(whole.moved_m) < 0.02
+    assert abs(whole.advance_m) < 0.02
     assert whole.states[-1] == "NotLocomoting"
     assert "too little against the friction" in whole.reasons[-1]
     assert not any(report.jammed for report in whole.reports)
@@ -232,7 +232,7 @@ def test_body_clear_of_every_peg_is_not_jammed():
 def test_triplet_travels_three_body_lengths_with_backward_hand_overs():
     whole = run_controller(load_run_config("peg_row"))
     body_m = whole.record.config.robot.length_m
-    assert whole.moved_m >= 3 * body_m >= 4.29
+    assert whole.advance_m >= 3 * body_m >= 4.29
     assert set(whole.states[STARTED:]) == {"Locomoting"}
     every_second = whole.path_s_m[::100]
     assert np.diff(every_second).min() > 0.05
@@ -251,7 +251,7 @@ def test_any_number_of_modules_moves_with_the_same_code(modules, min_advance_m):
     whole = run_controller(
         load_run_config("peg_row", f"robot.chain.modules={modules}"), duration_s=6.0
     )
-    assert whole.moved_m >= min_advance_m
+    assert whole.advance_m >= min_advance_m
     assert set(whole.states[STARTED:]) == {"Locomoting"}
     assert not any(report.jammed for report in whole.reports)
 
@@ -259,7 +259,7 @@ def test_any_number_of_modules_moves_with_the_same_code(modules, min_advance_m):
 @pytest.mark.slow
 def test_robot_with_pitch_joints_crosses_hills_among_pegs():
     whole = run_controller(load_run_config("mamba_hills", "controller=obstacle_triplet"))
-    assert whole.moved_m >= 0.3
+    assert whole.advance_m >= 0.3
     axes = [joint.axis for joint in whole.record.description.joints]
     assert {axes[turn] for turn in propelled(whole)} == {"yaw"}
 
@@ -267,7 +267,7 @@ def test_robot_with_pitch_joints_crosses_hills_among_pegs():
 def test_path_following_moves_steadily_along_the_row():
     whole = run_controller(load_run_config("peg_row", "controller=path_following"), duration_s=6.0)
     wanted = whole.record.config.mission.speed_m_s * 6.0
-    assert 0.7 * wanted < whole.moved_m < 1.2 * wanted
+    assert 0.7 * wanted < whole.advance_m < 1.2 * wanted
     assert set(whole.states[STARTED:]) == {"Locomoting"}
 
 
@@ -288,7 +288,7 @@ def test_pegs_that_grip_are_a_jam_too():
     whole = run_controller(
         load_run_config("triplet", "scene.pegs_along_route.0.friction=1.0"), duration_s=4.0
     )
-    assert whole.moved_m < 0.15
+    assert whole.advance_m < 0.15
     assert whole.reports[-1].jammed
 
 
@@ -300,7 +300,7 @@ def test_pegs_that_grip_are_a_jam_too():
 def test_it_goes_through_a_random_field_that_nobody_laid_out(seed: int):
     field = (f"scene.random_field.0.seed={seed}", "scene.random_field.0.density_per_m2=12")
     whole = run_controller(load_run_config("surveyed_clutter", *field), duration_s=13.0)
-    assert whole.moved_m > 1.5
+    assert whole.advance_m > 1.5
 
 
 @pytest.mark.slow
@@ -311,4 +311,4 @@ def test_clutter_without_contact_search_moves_only_by_push(scale: float):
     alone = (f"control.push_scale={scale}", "control.search_after_s=0")
     whole = run_controller(load_run_config("surveyed_clutter", *field, *alone), duration_s=5.0)
     assert len(whole.record.trajectories) >= 2
-    assert whole.moved_m < 0.1  # pushed as shipped: 1.16 m
+    assert whole.advance_m < 0.1  # pushed as shipped: 1.16 m

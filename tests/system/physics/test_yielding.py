@@ -153,7 +153,7 @@ def test_snake_advances_at_fixed_obstacles_and_displaces_loose_ones() -> None:
     fixed, held, pushed = (
         run_controller(
             load_run_config("peg_row", *(peg + text for text in made)), duration_s=6.0
-        ).moved_m
+        ).advance_m
         for made in ((), ("mass_kg=20", "base_friction=1.0"), ("mass_kg=0.5",))
     )
     assert held == pytest.approx(fixed, rel=0.1)

@@ -17,7 +17,7 @@ from snakesim_testing.runs.command import (
 )
 from snakesim_testing.runs.documents import REPOSITORY, UV, needs_uv
 from snakesim_testing.runs.in_process_command import snakesim
-from snakesim_testing.runs.keyboard import UP, at_the_keyboard
+from snakesim_testing.runs.teleop_terminal import UP, running_teleop
 
 pytestmark = pytest.mark.e2e
 RUN = ("clutter", "--clock-mode", "realtime", "--duration", "600", "--stay", "--set", "rate_hz=50")
@@ -89,7 +89,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _demonstrate(run: RunningCommand, home: Path) -> None:
     at = Recording(run, home)
-    with at_the_keyboard(run, home) as terminal:
+    with running_teleop(run, home) as terminal:
         wait_until(
             lambda: "Enter begins an episode" in at.printed, "the recorder at the robot", 20.0
         )

@@ -41,7 +41,7 @@ from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.file_size import limited_file_size
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
-from snakesim_testing.operator.clock_samples import clock
+from snakesim_testing.operator.clock_samples import make_clock_sample
 
 
 class Whisker(CustomSample, frozen=True, kw_only=True):
@@ -68,7 +68,7 @@ def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
         time.monotonic_ns(),
     )
     negative = msgspec.structs.replace(done(0), payload=msgspec.msgpack.encode({"tick": -1}))
-    sent = [clock(7), done(8), done(2_000_000), intent, done(6, "guidance"), negative]
+    sent = [make_clock_sample(7), done(8), done(2_000_000), intent, done(6, "guidance"), negative]
     for arrival in sent:
         recording.write_arrival(arrival)
     recording.close({"dropped": {}})
@@ -87,7 +87,7 @@ def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
 def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
     recording = RecordingWriter(tmp_path / "a.mcap")
     for tick in range(50):
-        recording.write_arrival(clock(tick))
+        recording.write_arrival(make_clock_sample(tick))
         if tick in (20, 30):
             recording.flush()
     recording.close({"version": "1"})
@@ -121,10 +121,10 @@ from pathlib import Path
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.recording.recover import recover_recording
 from snakesim_testing.harness.file_size import limited_file_size
-from snakesim_testing.operator.clock_samples import clock
+from snakesim_testing.operator.clock_samples import make_clock_sample
 recording = RecordingWriter(Path(sys.argv[1]))
 for tick in range(10**9):
-    recording.write_arrival(clock(tick))
+    recording.write_arrival(make_clock_sample(tick))
     recording.flush_when_due()
     print(time.monotonic(), tick, flush=True)
     time.sleep(0.002)
@@ -165,7 +165,7 @@ def test_recording_on_full_disk_ends_readable(tmp_path: Path) -> None:
     with limited_file_size(20_000):
         recording = RecordingWriter(tmp_path / "a.mcap")
         for tick in range(5000):
-            recording.write_arrival(clock(tick))
+            recording.write_arrival(make_clock_sample(tick))
             if tick % 50 == 0:
                 recording.flush()
         recording.close({})
@@ -235,13 +235,13 @@ def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
             "the recorder",
         )
         for tick in range(40):
-            host.send(keys.CLOCK, clock(tick).payload)
+            host.send(keys.CLOCK, make_clock_sample(tick).payload)
             if tick == 20:
                 told.set()
                 time.sleep(0.2)  # many of its turns
     recorder.join()
     assert [one.payload for one in RecordingReader(path).read_messages([keys.CLOCK])] == [
-        clock(t).payload for t in range(40)
+        make_clock_sample(t).payload for t in range(40)
     ]
 
 
@@ -255,7 +255,12 @@ def test_recording_sample_before_description_keeps_its_schema(tmp_path: Path) ->
     described = encode(msgspec.structs.replace(make_description(), custom={own: schema}))
     robot = ReceivedSample(keys.DESCRIPTION, described, format_encoding(RobotDescription), 0)
     recording = RecordingWriter(path)
-    for arrival in (early, clock(4), robot, msgspec.structs.replace(early, monotonic_ns=1)):
+    for arrival in (
+        early,
+        make_clock_sample(4),
+        robot,
+        msgspec.structs.replace(early, monotonic_ns=1),
+    ):
         recording.write_arrival(arrival)
     recording.close({})
     with path.open("rb") as file:

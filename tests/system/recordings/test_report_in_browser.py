@@ -5,8 +5,12 @@ from pathlib import Path
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.operator.browser import CHROMIUM, MISSING, open_chromium
-from snakesim_testing.operator.recorded_triplet import ReportReader, read, triplet
+from snakesim_testing.operator.browser import BROWSER_MISSING, CHROMIUM, open_chromium
+from snakesim_testing.operator.triplet_report import (
+    ReportReader,
+    render_and_check_report,
+    simulate_triplet,
+)
 
 DRAWN = "document.querySelectorAll('.chart .main-svg .xaxislayer-above').length"
 OVERFLOW_PX = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
@@ -14,20 +18,20 @@ OVERFLOW_PX = "document.documentElement.scrollWidth - document.documentElement.c
 
 @pytest.fixture(scope="module")
 def record() -> RunRecord:
-    return triplet()
+    return simulate_triplet()
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+@pytest.mark.skipif(CHROMIUM is None, reason=BROWSER_MISSING)
 @pytest.mark.parametrize("width", [1400, 400])
 def test_every_chart_of_a_report_is_drawn_without_errors(
     record: RunRecord, tmp_path: Path, width: int
 ) -> None:
-    reader: ReportReader = read(record)
+    reader: ReportReader = render_and_check_report(record)
     page = tmp_path / "report.html"
     page.write_text(reader.html)
     with open_chromium() as browser:
-        tab = browser.open(page.as_uri(), width)
+        tab = browser.open_page(page.as_uri(), width)
         tab.wait_until_loaded()
         assert tab.errors == []
-        assert tab.value(DRAWN) == len(reader.charts) > 3
-        assert tab.value(OVERFLOW_PX) == 0
+        assert tab.evaluate(DRAWN) == len(reader.charts) > 3
+        assert tab.evaluate(OVERFLOW_PX) == 0

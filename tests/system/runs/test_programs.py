@@ -18,9 +18,9 @@ SERVICES = ("guidance", "navigation", "control")
 
 def test_programs_started_in_any_order_equal_one_run(lab: LabPrograms) -> None:
     for name in SERVICES[:2]:
-        lab.service(name)
-    other_goal = lab.service("control", "--set", "mission.speed_m_s=0.3")
-    first = lab.host("never-armed")
+        lab.start_service(name)
+    other_goal = lab.start_service("control", "--set", "mission.speed_m_s=0.3")
+    first = lab.start_host("never-armed")
     waited = lab.folder / "service-control.log"
     wait_until(lambda: "control: waiting for the network" in waited.read_text(), "control waits")
     router = lab.start("start", "router", str(lab.router_file))
@@ -31,7 +31,7 @@ def test_programs_started_in_any_order_equal_one_run(lab: LabPrograms) -> None:
     refused = lab.run_operator_command("robot", "arm", "planar13", "sim").err
     assert "not armed: " in refused and f"(control, process {other_goal.pid})" in refused, refused
     other_goal.kill()
-    lab.service("control")
+    lab.start_service("control")
     wait_until(
         lambda: (
             "next: `snakesim robot arm planar13 sim --session "
@@ -45,8 +45,8 @@ def test_programs_started_in_any_order_equal_one_run(lab: LabPrograms) -> None:
     ), said
     first.send_signal(signal.SIGKILL)  # at tick 0, where the next host begins as well
     first.wait()
-    second = lab.host("second")
-    lab.until_armed()
+    second = lab.start_host("second")
+    lab.wait_until_armed()
     assert second.wait(60) == 0, (lab.folder / "host-triplet.log").read_text()
     _, alone = command.run_to_summary(lab.folder / "alone", *SCENARIO)
     assert RunRecord.load(lab.folder / "second").host.command_digest == alone.command_digest

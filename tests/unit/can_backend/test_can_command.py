@@ -20,11 +20,11 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import align_columns
 from snakesim_hal.model.scenario import load_scenario as load_scenario
 from snakesim_hal.model.scenario import parse_set_option
-from snakesim_testing.can.frames import health, heartbeat
+from snakesim_testing.can.frames import make_health_frame, make_heartbeat_frame
 from snakesim_testing.messages import raises_error
-from snakesim_testing.operator.registered import run_registered
+from snakesim_testing.operator.registered_command import run_registered_command
 
-run_command = partial(run_registered, COMMANDS)
+run_command = partial(run_registered_command, COMMANDS)
 TRIPLET = load_scenario("triplet").config
 
 # --- load --------------------------------------------------------------------------------------------------
@@ -144,7 +144,7 @@ def test_can_scan_lists_modules_by_node_and_serial() -> None:
 
 
 def test_can_scan_sends_only_requests_for_identities() -> None:
-    _, sent_by_scan = scan_frames(make_identity(3, 0xCAFE), heartbeat(3, 1.0))
+    _, sent_by_scan = scan_frames(make_identity(3, 0xCAFE), make_heartbeat_frame(3, 1.0))
     assert sent_by_scan
     assert set(sent_by_scan) == {make_command(CommandAction.IDENTIFY)}
 
@@ -152,8 +152,8 @@ def test_can_scan_sends_only_requests_for_identities() -> None:
 def test_can_scan_of_reporting_module_has_all_values_with_units() -> None:
     (row,), _ = scan_frames(
         make_identity(3, 0xCAFE),
-        heartbeat(3, 12.34, ModuleState.FAULT, fault_leak=1, fault_voltage=1),
-        health(3, voltage=23.9, motor_temperature=41, board_temperature=33),
+        make_heartbeat_frame(3, 12.34, ModuleState.FAULT, fault_leak=1, fault_voltage=1),
+        make_health_frame(3, voltage=23.9, motor_temperature=41, board_temperature=33),
         load_layouts()[Opcode.SHAFT_LOAD].encode(3, torque=-1.25),
     )
     del row["channel"]
@@ -174,7 +174,7 @@ def test_can_scan_of_reporting_module_has_all_values_with_units() -> None:
 
 
 def test_can_scan_of_module_with_heartbeat_alone_has_only_state() -> None:
-    (row,), _ = scan_frames(make_identity(62, 0xBEEF), heartbeat(62, 1.0))
+    (row,), _ = scan_frames(make_identity(62, 0xBEEF), make_heartbeat_frame(62, 1.0))
     assert row["state"] == "disarmed"
     assert row["faults"] == "none"
     assert row["voltage"] == UNKNOWN
@@ -223,7 +223,7 @@ def test_can_scan_of_foreign_bus_names_it_and_sends_nothing(
         ),
         can.Message(arbitration_id=0x1234567, data=bytes(8)),
         can.Message(arbitration_id=0x7FF, data=bytes(3), is_extended_id=False),
-        to_python_can(heartbeat(4, 1.0)),
+        to_python_can(make_heartbeat_frame(4, 1.0)),
     ]
     with can.Bus(interface="virtual", channel=channel) as bus:
         periodic_tasks = [bus.send_periodic(message, 0.01) for message in foreign_messages]

@@ -20,17 +20,24 @@ from snakesim_can_backend.protocol.definitions import LastStop, ModuleState, Opc
 from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.programs import host_program
 from snakesim_testing.can.listened_bus import (
-    JOINTS,
+    JOINT_COUNT,
     NODES,
     RATE_HZ,
     ReceivedFrame,
     RobotOnBus,
-    bench,
-    first_in,
-    passed_for_module_ms,
-    stop_commands,
+    find_first_reports,
+    measure_module_duration_ms,
+    open_robot_on_bus,
+    select_stop_commands,
 )
-from snakesim_testing.can.module_rig import BOOTED, MS, QUIET, ModuleFirmware, armed, setpoint
+from snakesim_testing.can.module_rig import (
+    BOOTED_AT_US,
+    RESTING_READINGS,
+    US_PER_MS,
+    ModuleFirmware,
+    arm_module,
+    make_setpoint,
+)
 from verification.faults.observer import Observer, TrialError
 from verification.faults.row import InjectionTrial, MeasurementRequest
 
@@ -43,9 +50,9 @@ MAX_RETRIES = 10  # of each trial, on average
 POLL_PERIOD_S = 0.4  # long, because an emulated machine needs its time for the modules and the host
 
 # A single module.
-MODULE_PERIOD_US = 10 * MS
-POLL_PERIOD_US = MS / 10
-MAX_SILENCE_US = 1000 * MS  # a module that is still armed then has no watchdog
+MODULE_PERIOD_US = 10 * US_PER_MS
+POLL_PERIOD_US = US_PER_MS / 10
+MAX_SILENCE_US = 1000 * US_PER_MS  # a module that is still armed then has no watchdog
 
 
 # --- the host ends, with modules on the kernel's bus ---------------------------------------------------------------
@@ -62,9 +69,9 @@ def _measure_ended_host(
     rng = random.Random(7)
     fault_delays_ms: list[float] = []  # of the last module in each trial, by the kernel's clock
     trial_count = 0
-    with bench(request.folder, CHANNEL) as robot:
-        robot.modules()
-        robot.control()
+    with open_robot_on_bus(request.folder, CHANNEL) as robot:
+        robot.start_modules()
+        robot.start_control()
         while trial_count < request.trials:
             trial = _run_ended_host_trial(request, robot, number, rng, fault_delays_ms)
             if trial is not None:
@@ -77,7 +84,7 @@ def _measure_ended_host(
                     f"this machine is too busy: the robot stopped by itself {request.retried} times"
                 )
     request.add_note(
-        f"the real host process and control, {JOINTS} modules in a process of their own, at {RATE_HZ:g} Hz on "
+        f"the real host process and control, {JOINT_COUNT} modules in a process of their own, at {RATE_HZ:g} Hz on "
         f"{CHANNEL}; from the signal to the last module's fault by the kernel's clock: at most "
         f"{max(fault_delays_ms, default=0):.0f} ms. Each trial begins with a new host that is armed by an operator"
     )
@@ -97,7 +104,7 @@ def _run_ended_host_trial(
     """Start and arm a host, and send it a signal. Return None if the trial must be repeated with a new host."""
     try:
         with _start_armed_host(request, robot) as host_pid:
-            robot.listener.forget()
+            robot.listener.discard_frames()
             time.sleep(MOVING_S + rng.random() / RATE_HZ)
             signal_ns = time.time_ns()
             os.kill(host_pid, number)
@@ -118,11 +125,11 @@ def _judge_ended_host_trial(
         signal_ns: When the host got the signal, by the kernel's clock.
         fault_delays_ms: Gets the time from the signal to the last module's fault, by the kernel's clock.
     """
-    frames = robot.listener.listen()
+    frames = robot.listener.receive_frames()
     if not _was_moving(frames, signal_ns):
         return None
-    faults = first_in(frames, {ModuleState.FAULT}, signal_ns)
-    if len(faults) < JOINTS:
+    faults = find_first_reports(frames, {ModuleState.FAULT}, signal_ns)
+    if len(faults) < JOINT_COUNT:
         states = robot.listener.states()
         return InjectionTrial(
             value=None, failure=f"not all in fault {OBSERVED_S:g} s after the signal: {states}"
@@ -145,7 +152,7 @@ def _measure_module_delay_ms(
 ) -> float:
     """Return the time from the last setpoint of a module to its fault, in ms of the module's own time."""
     setpoint_times_ns = [frame.at_ns for frame in frames if _is_setpoint(frame, node)]
-    return passed_for_module_ms(frames, node, max(setpoint_times_ns), fault.at_ns)
+    return measure_module_duration_ms(frames, node, max(setpoint_times_ns), fault.at_ns)
 
 
 def _was_moving(frames: Sequence[ReceivedFrame], at_ns: int) -> bool:
@@ -153,7 +160,7 @@ def _was_moving(frames: Sequence[ReceivedFrame], at_ns: int) -> bool:
     recent_ns = at_ns - round(3e9 / RATE_HZ)
     recent = [frame for frame in frames if frame.at_ns > recent_ns]
     has_setpoints = all(any(_is_setpoint(frame, node) for frame in recent) for node in NODES)
-    return has_setpoints and not stop_commands(recent)
+    return has_setpoints and not select_stop_commands(recent)
 
 
 def _is_setpoint(frame: ReceivedFrame, node: int) -> bool:
@@ -186,7 +193,7 @@ def _arm_modules(request: MeasurementRequest, robot: RobotOnBus, observer: Obser
         TrialError: The modules were not armed within ARMING_TIMEOUT_S.
     """
     deadline_s = time.monotonic() + ARMING_TIMEOUT_S
-    while robot.listener.states() != [ModuleState.ARMED] * JOINTS:
+    while robot.listener.states() != [ModuleState.ARMED] * JOINT_COUNT:
         if time.monotonic() > deadline_s:
             log_end = robot.read_log("host")[-300:]
             raise TrialError(
@@ -194,7 +201,7 @@ def _arm_modules(request: MeasurementRequest, robot: RobotOnBus, observer: Obser
             )
         if observer.get_lifecycle() != "armed":
             observer.arm(ARMING_TIMEOUT_S)
-        robot.listener.forget()
+        robot.listener.discard_frames()
         observer.listen_for(POLL_PERIOD_S)
     request.count_retries(observer.failed_armings)
 
@@ -219,13 +226,13 @@ def measure_silent_host(request: MeasurementRequest) -> Iterator[InjectionTrial]
     """
     rng = random.Random(8)
     for _ in range(request.trials):
-        module: ModuleFirmware = armed()
-        now_us = BOOTED
+        module: ModuleFirmware = arm_module()
+        now_us = BOOTED_AT_US
         for count in range(rng.randrange(5, 40)):
             now_us += MODULE_PERIOD_US
-            module.handle_sync(count, QUIET)
+            module.handle_sync(count, RESTING_READINGS)
             module.poll(now_us)
-            module.receive_setpoint(setpoint(count), now_us)
+            module.receive_setpoint(make_setpoint(count), now_us)
         assert module.state == ModuleState.ARMED, module.state
         last_setpoint_us = now_us
         while module.state == ModuleState.ARMED and now_us - last_setpoint_us < MAX_SILENCE_US:
@@ -234,4 +241,4 @@ def measure_silent_host(request: MeasurementRequest) -> Iterator[InjectionTrial]
         failure = ""
         if module.state != ModuleState.FAULT:
             failure = f"the state of the module is {module.state.name}"
-        yield InjectionTrial(value=(now_us - last_setpoint_us) / MS, failure=failure)
+        yield InjectionTrial(value=(now_us - last_setpoint_us) / US_PER_MS, failure=failure)

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 
 from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario
-from snakesim_testing.can.listened_bus import JOINTS, RATE_HZ, SCENARIO
+from snakesim_testing.can.listened_bus import JOINT_COUNT, RATE_HZ, SCENARIO
 from snakesim_testing.hal.small_robots import write_scenario_files
 from verification.faults.observer import Observer
 from verification.faults.robot import START_TIMEOUT_S, ProcessRobot, start_robot
@@ -37,7 +37,7 @@ def measure_clock_step(request: MeasurementRequest) -> Iterator[InjectionTrial]:
         if request.trials % 2:
             _step_wall_clock(-STEP_S)
     request.add_note(
-        f"{JOINTS} joints at {RATE_HZ:g} Hz, holding; the clock goes {STEP_S:g} s ahead and back in turn. A step "
+        f"{JOINT_COUNT} joints at {RATE_HZ:g} Hz, holding; the clock goes {STEP_S:g} s ahead and back in turn. A step "
         f"during which the robot stopped was repeated, at most {MAX_ATTEMPTS} times: an emulated machine causes stops "
         "by itself"
     )
@@ -48,7 +48,7 @@ def _make_small_config(request: MeasurementRequest) -> RunConfig:
     scenario = write_scenario_files(
         request.folder, scenario=SCENARIO.replace('channels = ["CHANNEL"]\n', "")
     )
-    values = {"robot.chain.modules": JOINTS, "backend": request.backend, "duration_s": 3600.0}
+    values = {"robot.chain.modules": JOINT_COUNT, "backend": request.backend, "duration_s": 3600.0}
     overrides = [KeyOverride(key, value, "the fault table") for key, value in values.items()]
     return load_scenario(scenario, overrides).config
 

@@ -30,17 +30,17 @@ from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.scenario import load_scenario as load_scenario
 from snakesim_hal.model.scenario import parse_set_option
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.can.driver_loop import JOINTS, config, loop
-from snakesim_testing.can.frames import read
-from snakesim_testing.can.recorded_wire import (
+from snakesim_testing.can.driver_loop import JOINT_COUNT, make_can_config, open_driver_loop
+from snakesim_testing.can.frames import decode_signals
+from snakesim_testing.can.recording_bus import (
     DISARMED,
     EMERGENCY,
     WIRES,
-    RecordedWire,
-    go,
+    RecordingWire,
+    describe_host_frames,
     is_action,
     is_setpoint,
-    words,
+    run_in_lifecycle_state,
 )
 from snakesim_testing.messages import raises_error
 
@@ -48,7 +48,7 @@ from snakesim_testing.messages import raises_error
 
 
 def test_bring_up_enables_nothing() -> None:
-    with loop() as run:
+    with open_driver_loop() as run:
         sent = WIRES[0].sent
         assert {parse_opcode(frame.id) for frame in sent} == {
             Opcode.COMMAND,
@@ -66,8 +66,8 @@ def test_bring_up_enables_nothing() -> None:
         )
         assert disarm < written
         assert parse_node(sent[disarm].id) == BROADCAST
-        assert run.states() == [DISARMED] * JOINTS
-        assert not any(is_setpoint(frame) for frame in go(run, "disarmed", 30))
+        assert run.states() == [DISARMED] * JOINT_COUNT
+        assert not any(is_setpoint(frame) for frame in run_in_lifecycle_state(run, "disarmed", 30))
         assert run.faults == []
         assert run.true_speed_rad_s == [0.0] * 30
 
@@ -75,19 +75,19 @@ def test_bring_up_enables_nothing() -> None:
 def test_opening_silent_module_is_reported_and_everything_closed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    class Deaf(RecordedWire):
+    class Deaf(RecordingWire):
         def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
             super().__init__(channel, peer)
-            self.deaf_to = lambda frame: (
+            self.should_ignore = lambda frame: (
                 parse_opcode(frame.id) == Opcode.JOINT_STATE and parse_node(frame.id) == 2
             )
 
     monkeypatch.setattr(modules, "VirtualWire", Deaf)
-    with raises_error(BackendError, code="drive/silent", field="joint_2"), loop():
+    with raises_error(BackendError, code="drive/silent", field="joint_2"), open_driver_loop():
         pass
     (wire,) = WIRES
-    assert wire.closed == 1
-    assert words(wire.sent)[-1] == "disarm"
+    assert wire.close_count == 1
+    assert describe_host_frames(wire.sent)[-1] == "disarm"
     assert not any(map(is_setpoint, wire.sent))
 
 
@@ -131,44 +131,55 @@ def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
     kind: str, state: ModuleState, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found_as(monkeypatch, 2, lambda module: left_behind(module, kind))
-    with loop() as run:
-        go(run, "disarmed", 2)
+    with open_driver_loop() as run:
+        run_in_lifecycle_state(run, "disarmed", 2)
         assert run.states() == [DISARMED, state, DISARMED, DISARMED]
-        assert words(WIRES[0].sent).count("clear 2") == (state == DISARMED)
-        found = [fault for _ in range(3) for fault in (go(run, "disarmed"), *run.faults)[1:]]
+        assert describe_host_frames(WIRES[0].sent).count("clear 2") == (state == DISARMED)
+        found = [
+            fault
+            for _ in range(3)
+            for fault in (run_in_lifecycle_state(run, "disarmed"), *run.faults)[1:]
+        ]
         assert {fault.joint for fault in found} == (set() if state == DISARMED else {"joint_2"})
 
 
 def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     weak = {ModuleParameter.RATED_TORQUE: 1.0}
     found_as(monkeypatch, 3, lambda module: module.parameters.values.update(weak))
-    with raises_error(BackendError, code="drive/unsupported-setting", field="joint_3"), loop():
+    with (
+        raises_error(BackendError, code="drive/unsupported-setting", field="joint_3"),
+        open_driver_loop(),
+    ):
         pass
 
 
 def test_paces_and_what_is_checked_before_anything_is_opened(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert CanBackend.check(config(), CanSettings()) == ("lockstep", "realtime")
+    assert CanBackend.check(make_can_config(), CanSettings()) == ("lockstep", "realtime")
     with raises_error(ConfigError, code="bus/not-available", field="nocan7"):
-        CanBackend.check(config(), CanSettings(channels=["nocan7"]))
+        CanBackend.check(make_can_config(), CanSettings(channels=["nocan7"]))
     asked: list[str] = []
     monkeypatch.setattr("snakesim_can_backend.bus.adapter.validate_interface", asked.append)
-    assert CanBackend.check(config(), CanSettings(channels=["can0", "can1"])) == ("realtime",)
-    assert CanBackend.check(config(), CanSettings(channels=["vcan0"], emulators="process")) == (
+    assert CanBackend.check(make_can_config(), CanSettings(channels=["can0", "can1"])) == (
+        "realtime",
+    )
+    assert CanBackend.check(
+        make_can_config(), CanSettings(channels=["vcan0"], emulators="process")
+    ) == (
         "lockstep",
         "realtime",
     )
     assert asked == ["can0", "can1", "vcan0"]
     with raises_error(ConfigError, code="bus/not-virtual"):
-        CanBackend.check(config(), CanSettings(emulators="none"))
+        CanBackend.check(make_can_config(), CanSettings(emulators="none"))
     with raises_error(ConfigError, code="drive/unsupported-setting"):
-        CanBackend.check(config(robot__safety__action="hold"), CanSettings())
+        CanBackend.check(make_can_config(robot__safety__action="hold"), CanSettings())
     assert WIRES == []
 
 
 def test_opening_describes_joints_with_serials_and_firmware() -> None:
-    with loop() as run:
+    with open_driver_loop() as run:
         joints = run.backend.describe().joints
         assert len({joint.serial for joint in joints}) == 4
         assert all(len(joint.serial) == 8 for joint in joints)
@@ -191,15 +202,17 @@ def test_opened_command_acts_one_period_after_its_state() -> None:
     change_at = 15
     speeds = []
     for torque_nm in (0.0, 1.0):
-        with loop() as run:
-            run.wanted = SafeSetpoints([JointMode.TORQUE] * JOINTS, [0.0] * JOINTS, [4.0] * JOINTS)
+        with open_driver_loop() as run:
+            run.setpoints = SafeSetpoints(
+                [JointMode.TORQUE] * JOINT_COUNT, [0.0] * JOINT_COUNT, [4.0] * JOINT_COUNT
+            )
             run.arm()
 
             def wish(tick: int, torque_nm: float = torque_nm) -> SafeSetpoints:
                 return SafeSetpoints(
-                    [JointMode.TORQUE] * JOINTS,
-                    [torque_nm * (tick == change_at)] * JOINTS,
-                    [4.0] * JOINTS,
+                    [JointMode.TORQUE] * JOINT_COUNT,
+                    [torque_nm * (tick == change_at)] * JOINT_COUNT,
+                    [4.0] * JOINT_COUNT,
                 )
 
             run.run(change_at + 5 - run.tick, wish)
@@ -210,16 +223,20 @@ def test_opened_command_acts_one_period_after_its_state() -> None:
 
 
 def test_opened_period_has_one_sync_and_one_setpoint_per_module() -> None:
-    with loop() as run:
+    with open_driver_loop() as run:
         run.arm()
         for _ in range(20):
-            sent = go(run, "armed")
+            sent = run_in_lifecycle_state(run, "armed")
             assert [parse_opcode(frame.id) for frame in sent] == [
                 Opcode.SYNC,
-                *[Opcode.SET_POINT] * JOINTS,
+                *[Opcode.SET_POINT] * JOINT_COUNT,
             ]
             assert [parse_node(frame.id) for frame in sent[1:]] == [1, 2, 3, 4]
-        counts = [read(f)["count"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC]
+        counts = [
+            decode_signals(f)["count"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC
+        ]
         assert counts == [i % 256 for i in range(len(counts))]
-        times = [read(f)["time"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC]
+        times = [
+            decode_signals(f)["time"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC
+        ]
         assert np.diff(times[-20:]).tolist() == [10_000] * 19

@@ -23,14 +23,14 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_testing.can.driver_loop import DriverLoop, config
-from snakesim_testing.can.recorded_wire import (
+from snakesim_testing.can.driver_loop import DriverLoop, make_can_config
+from snakesim_testing.can.recording_bus import (
     WIRES,
-    RecordedWire,
-    go,
+    RecordingWire,
+    describe_host_frames,
     is_action,
     is_setpoint,
-    words,
+    run_in_lifecycle_state,
 )
 from snakesim_testing.messages import raises_error
 
@@ -59,7 +59,7 @@ class NoProcess:
 @pytest.fixture
 def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]], DriverLoop]]:
     """Opens a driver for two buses with so many joints each, on emulators with three and one."""
-    run, channels = config(robot__sensors__pose__rate_hz=100.0), ["bus_a", "bus_b"]
+    run, channels = make_can_config(robot__sensors__pose__rate_hz=100.0), ["bus_a", "bus_b"]
     real = CanSettings(
         channels=channels, joints_per_channel=[3, 1], emulators="process", physics_model="inertia"
     )
@@ -70,7 +70,7 @@ def two_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[list[int]],
     monkeypatch.setattr(
         "snakesim_can_backend.bus.adapter.validate_interface", lambda _channel: None
     )
-    monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordedWire(name, end))
+    monkeypatch.setattr(modules, "open_wire", lambda name, bit_rate: RecordingWire(name, end))
     monkeypatch.setattr(modules, "EmulatorProcess", NoProcess)
     opened: list[CanBackend] = []
 
@@ -95,7 +95,7 @@ def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Drive
     assert pose.startswith("127.0.0.1:")
     assert stepped
     run.arm()
-    run.run(30, run.waving)
+    run.run(30, run.wave_joints)
     assert run.faults == []
     a, b = WIRES
     for wire, nodes in ((a, {1, 2, 3}), (b, {4})):
@@ -103,14 +103,14 @@ def test_every_module_is_spoken_to_on_its_own_bus(two_buses: Callable[..., Drive
         assert {parse_node(frame.id) for frame in wire.sent if is_setpoint(frame)} == nodes
     counts = [[f.data for f in wire.sent if parse_opcode(f.id) == Opcode.SYNC] for wire in WIRES]
     assert counts[0] == counts[1], "all are seen at one instant"
-    b.refuses = is_setpoint
-    run.run(7, run.waving)
+    b.should_refuse = is_setpoint
+    run.run(7, run.wave_joints)
     assert [fault.cause[:6] for fault in run.faults if fault.what == "bus_stuck"] == ["bus_b:"]
     stopped = NoProcess.stopped
     run.backend.close()
-    assert [words(wire.sent)[-1] for wire in WIRES] == ["disarm", "disarm"]
+    assert [describe_host_frames(wire.sent)[-1] for wire in WIRES] == ["disarm", "disarm"]
     assert NoProcess.stopped == stopped + 1
-    assert [wire.closed for wire in WIRES] == [1, 1]
+    assert [wire.close_count for wire in WIRES] == [1, 1]
 
 
 def test_two_buses_in_lockstep_have_no_frames_left_in_flight(
@@ -137,7 +137,7 @@ def test_two_buses_module_on_wrong_bus_is_detected_before_enabling(
 ) -> None:
     with raises_error(BackendError, code="drive/not-complete", field="joint_3"):
         two_buses([2, 2], bring_up_limit_s=0.3)
-    assert [wire.closed for wire in WIRES] == [1, 1]
+    assert [wire.close_count for wire in WIRES] == [1, 1]
     assert not any(
         is_action(frame, CommandAction.DISARM) for wire in WIRES for frame in wire.sent
     ), "they are another's"
@@ -164,7 +164,7 @@ def test_two_buses_failure_of_one_does_not_block_the_other(
             raise BackendError("the bus is broken")
         return False
 
-    WIRES[0].refuses = broken
+    WIRES[0].should_refuse = broken
     with raises_error(BackendError, code="backend/failed"):
-        go(run, "estop")
-    assert words(WIRES[1].sent)[-1] == "emergency"
+        run_in_lifecycle_state(run, "estop")
+    assert describe_host_frames(WIRES[1].sent)[-1] == "emergency"

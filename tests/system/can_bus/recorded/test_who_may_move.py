@@ -17,19 +17,19 @@ from snakesim_can_backend.protocol.definitions import (
 )
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.wire.messages import JointMode, LifecycleState
-from snakesim_testing.can.driver_loop import JOINTS, cleared_and_armed_again, loop
-from snakesim_testing.can.frames import read
-from snakesim_testing.can.recorded_wire import (
+from snakesim_testing.can.driver_loop import JOINT_COUNT, open_driver_loop, reset_and_arm_again
+from snakesim_testing.can.frames import decode_signals
+from snakesim_testing.can.recording_bus import (
     ARMED,
     DISARMED,
     EMERGENCY,
     WIRES,
-    go,
+    describe_host_frames,
+    find_module,
     is_action,
     is_setpoint,
-    module_of,
-    none,
-    words,
+    match_no_frame,
+    run_in_lifecycle_state,
 )
 
 # --- who may move ------------------------------------------------------------------------------------------
@@ -46,56 +46,64 @@ from snakesim_testing.can.recorded_wire import (
 def test_setpoints_are_sent_only_to_armed_robot_until_a_stop(
     lifecycle: LifecycleState, said: list[str], state: ModuleState, cleared: list[str]
 ) -> None:
-    with loop() as run:
+    with open_driver_loop() as run:
         run.arm()
-        run.run(20, run.waving)
+        run.run(20, run.wave_joints)
         assert max(run.true_speed_rad_s) > 0.3
-        sent = go(run, lifecycle, 40)
+        sent = run_in_lifecycle_state(run, lifecycle, 40)
         assert not any(map(is_setpoint, sent))
-        assert words(sent)[:1] == said and len(words(sent)) <= 3, "a word, and not all the time"
-        assert run.states() == [state] * JOINTS
+        assert describe_host_frames(sent)[:1] == said and len(describe_host_frames(sent)) <= 3, (
+            "a word, and not all the time"
+        )
+        assert run.states() == [state] * JOINT_COUNT
         assert run.true_speed_rad_s[-1] < 0.05
-        assert words(go(run, "disarmed"))[:1] == cleared
-        cleared_and_armed_again(run)
+        assert describe_host_frames(run_in_lifecycle_state(run, "disarmed"))[:1] == cleared
+        reset_and_arm_again(run)
         assert run.faults == []
 
 
 @pytest.mark.parametrize("latched", ["estop", "fault"])
 def test_clearing_and_arming_between_two_ticks_works(latched: LifecycleState) -> None:
-    with loop() as run:
+    with open_driver_loop() as run:
         run.arm()
-        go(run, latched, 25)
-        assert words(go(run, "armed"))[:2] == ["clear", "arm"]
+        run_in_lifecycle_state(run, latched, 25)
+        assert describe_host_frames(run_in_lifecycle_state(run, "armed"))[:2] == ["clear", "arm"]
         run.arm()
-        run.run(20, run.waving)
+        run.run(20, run.wave_joints)
         assert run.faults == []
         assert max(run.true_speed_rad_s[-10:]) > 0.1
 
 
 def test_lost_arming_and_stop_frames_are_sent_again() -> None:
-    with loop() as run:
-        WIRES[0].loses = lambda frame: (
+    with open_driver_loop() as run:
+        WIRES[0].should_lose = lambda frame: (
             is_action(frame, CommandAction.ARM, CommandAction.STOP)
             and parse_node(frame.id) == BROADCAST
         )
-        sent = go(run, "armed", 6)
-        assert words(sent)[:5] == ["arm", "arm 1", "arm 2", "arm 3", "arm 4"]
-        assert run.states() == [ARMED] * JOINTS
+        sent = run_in_lifecycle_state(run, "armed", 6)
+        assert describe_host_frames(sent)[:5] == ["arm", "arm 1", "arm 2", "arm 3", "arm 4"]
+        assert run.states() == [ARMED] * JOINT_COUNT
         assert run.faults == []
-        assert words(go(run, "fault", 3)) == ["stop", "stop 1", "stop 2", "stop 3", "stop 4"]
-        go(run, "fault", 20)
-        assert run.states() == [DISARMED] * JOINTS
+        assert describe_host_frames(run_in_lifecycle_state(run, "fault", 3)) == [
+            "stop",
+            "stop 1",
+            "stop 2",
+            "stop 3",
+            "stop 4",
+        ]
+        run_in_lifecycle_state(run, "fault", 20)
+        assert run.states() == [DISARMED] * JOINT_COUNT
 
 
 def test_module_that_disarmed_itself_is_not_armed_again_automatically() -> None:
-    with loop() as run:
-        go(run, "armed", 3)
-        assert run.states() == [ARMED] * JOINTS
-        module_of(run, 2).receive(make_command(CommandAction.DISARM), 0.0)
+    with open_driver_loop() as run:
+        run_in_lifecycle_state(run, "armed", 3)
+        assert run.states() == [ARMED] * JOINT_COUNT
+        find_module(run, 2).receive(make_command(CommandAction.DISARM), 0.0)
         before = len(WIRES[0].sent)
         run.run(5)
-        assert words(WIRES[0].sent[before:]) == ["stop"]
-        assert module_of(run, 2).state == DISARMED
+        assert describe_host_frames(WIRES[0].sent[before:]) == ["stop"]
+        assert find_module(run, 2).state == DISARMED
         assert [(fault.what, fault.joint) for fault in run.faults] == [
             ("module_not_armed", "joint_2")
         ]
@@ -108,23 +116,23 @@ def test_lost_emergency_frame_is_repeated_until_all_modules_confirm() -> None:
         lost.extend([frame] * (frame.id == 0))
         return frame.id == 0 and len(lost) < 10
 
-    with loop() as run:
+    with open_driver_loop() as run:
         run.arm()
-        WIRES[0].loses = lose_some
-        go(run, "estop", 10)
-        assert run.states() == [EMERGENCY] * JOINTS
-        assert words(go(run, "estop", 10)) == []
+        WIRES[0].should_lose = lose_some
+        run_in_lifecycle_state(run, "estop", 10)
+        assert run.states() == [EMERGENCY] * JOINT_COUNT
+        assert describe_host_frames(run_in_lifecycle_state(run, "estop", 10)) == []
 
 
 # --- frames that the bus does not take ---------------------------------------------------------------------
 
 
 def test_setpoint_rejected_by_bus_is_replaced_and_never_sent_late() -> None:
-    with loop() as run:
+    with open_driver_loop() as run:
         run.arm()
         start = run.tick
         refused = (start + 4, start + 5, start + 9)
-        WIRES[0].refuses = lambda frame: (
+        WIRES[0].should_refuse = lambda frame: (
             is_setpoint(frame) and parse_node(frame.id) == 2 and run.tick in refused
         )
         by_tick: dict[int, list[dict[str, float]]] = {}
@@ -138,7 +146,7 @@ def test_setpoint_rejected_by_bus_is_replaced_and_never_sent_late() -> None:
                 ),
             )
             mine = [f for f in WIRES[0].sent[before:] if is_setpoint(f) and parse_node(f.id) == 2]
-            by_tick[tick] = [read(frame) for frame in mine]
+            by_tick[tick] = [decode_signals(frame) for frame in mine]
         assert [tick for tick, frames in by_tick.items() if not frames] == list(refused)
         assert all(len(frames) == 1 for tick, frames in by_tick.items() if tick not in refused)
         sent = {tick: frames[0] for tick, frames in by_tick.items() if frames}
@@ -148,27 +156,27 @@ def test_setpoint_rejected_by_bus_is_replaced_and_never_sent_late() -> None:
         counts = [int(frame["count"]) for frame in sent.values()]
         assert all((b - a) % 16 == 1 for a, b in pairwise(counts)), "a count is of what was sent"
         assert run.faults == []
-        assert run.states() == [ARMED] * JOINTS
+        assert run.states() == [ARMED] * JOINT_COUNT
 
 
 def test_bus_without_sync_is_reported_even_when_disarmed() -> None:
-    with loop() as run:
+    with open_driver_loop() as run:
         run.run(2)
-        WIRES[0].refuses = lambda frame: parse_opcode(frame.id) == Opcode.SYNC
+        WIRES[0].should_refuse = lambda frame: parse_opcode(frame.id) == Opcode.SYNC
         run.run(8)
         assert [fault.what for fault in run.faults] == ["bus_stuck"], (
             "and no module is blamed for it"
         )
-        assert run.samples[-1].joints.valid == [False] * JOINTS
+        assert run.samples[-1].joints.valid == [False] * JOINT_COUNT
 
 
 # --- modules that restart ----------------------------------------------------------------------------------
 
 
 def test_restarted_module_is_not_armed_before_its_parameters_are_set() -> None:
-    with loop(faults=["reboot:joint_2@0.3"]) as run:
+    with open_driver_loop(faults=["reboot:joint_2@0.3"]) as run:
         run.arm()
-        module = module_of(run, 2)
+        module = find_module(run, 2)
         run.run(25 - run.tick)
         assert module.state == ARMED
         states: list[ModuleState] = []
@@ -179,27 +187,27 @@ def test_restarted_module_is_not_armed_before_its_parameters_are_set() -> None:
         assert module.parameters.values[ModuleParameter.STIFFNESS] == 0.0
         assert "module_restarted" in [fault.what for fault in run.faults]
         assert run.lifecycle == "fault"
-        go(run, "armed", 8)  # cleared and armed between two ticks
-        assert run.states() == [ARMED] * JOINTS
+        run_in_lifecycle_state(run, "armed", 8)  # cleared and armed between two ticks
+        assert run.states() == [ARMED] * JOINT_COUNT
         assert module.parameters.values[ModuleParameter.STIFFNESS] == 40.0
 
 
 def test_robot_is_not_armed_while_module_rejects_parameters() -> None:
-    with loop(faults=["reboot:joint_2@0.3"]) as run:
-        WIRES[0].loses = lambda frame: parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST
+    with open_driver_loop(faults=["reboot:joint_2@0.3"]) as run:
+        WIRES[0].should_lose = lambda frame: parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST
         run.run(60)
         assert run.lifecycle == "fault"
         before = len(run.faults)
-        sent = go(run, "armed", 1) + go(run, "fault", 3)
-        assert "clear" in words(sent)
-        assert "arm" not in words(sent)
+        sent = run_in_lifecycle_state(run, "armed", 1) + run_in_lifecycle_state(run, "fault", 3)
+        assert "clear" in describe_host_frames(sent)
+        assert "arm" not in describe_host_frames(sent)
         assert [(fault.what, fault.joint) for fault in run.faults[before:]] == [
             ("module_not_configured", "joint_2")
         ]
         assert ARMED not in run.states()
-        WIRES[0].loses = none
+        WIRES[0].should_lose = match_no_frame
         before = len(run.faults)
-        go(run, "armed", 8)
-        assert run.states() == [ARMED] * JOINTS
+        run_in_lifecycle_state(run, "armed", 8)
+        assert run.states() == [ARMED] * JOINT_COUNT
         assert run.faults[before:] == []
-        assert module_of(run, 2).parameters.values[ModuleParameter.STIFFNESS] == 40.0
+        assert find_module(run, 2).parameters.values[ModuleParameter.STIFFNESS] == 40.0

@@ -25,7 +25,7 @@ from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
 from snakesim_testing.messages import raises_error
 
@@ -33,7 +33,7 @@ JOINTS = 2
 EDS_HEARTBEAT_TIME = (
     "ParameterName=Producer heartbeat time\nObjectType=0x7\nDataType=0x0006\nAccessType="
 )
-CONFIG = config(JOINTS, backend="cia402")
+CONFIG = make_can_config(JOINTS, backend="cia402")
 
 
 class DriveRobot(DriveRig):

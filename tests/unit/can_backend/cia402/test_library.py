@@ -27,10 +27,10 @@ from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drives import BusCommand
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 
 JOINTS = 2
-CONFIG = config(JOINTS, backend="cia402")
+CONFIG = make_can_config(JOINTS, backend="cia402")
 EDS = str(BUNDLED)
 
 

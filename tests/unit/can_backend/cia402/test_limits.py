@@ -25,7 +25,7 @@ from snakesim_can_backend.cia402.sdo import ReadStep, WriteStep
 from snakesim_can_backend.cia402.settings import Cia402Settings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.joints import Joint
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 from snakesim_testing.messages import raises_error
 
 FITTING_OBJECTS: dict[ObjectEntry, int] = {  # suits a joint of 4 N·m, 5 rad/s and 1.5 rad
@@ -41,7 +41,7 @@ FITTING_OBJECTS: dict[ObjectEntry, int] = {  # suits a joint of 4 N·m, 5 rad/s 
 
 
 def make_joint(**dotted: Any) -> Joint:
-    return config(1, backend="cia402", **dotted).robot.joint_table[0]
+    return make_can_config(1, backend="cia402", **dotted).robot.joint_table[0]
 
 
 def list_incompatibilities(

@@ -36,9 +36,9 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import FaultInjection
-from snakesim_testing.can.driver_loop import config
-from snakesim_testing.can.frames import heartbeat, read
-from snakesim_testing.can.module_rig import chain
+from snakesim_testing.can.driver_loop import make_can_config
+from snakesim_testing.can.frames import decode_signals, make_heartbeat_frame
+from snakesim_testing.can.module_rig import make_chain
 from snakesim_testing.messages import raises_error
 
 JOINT_NAMES = [f"joint_{i}" for i in range(1, 5)]
@@ -56,7 +56,7 @@ class EmulatedModules:
     """
 
     def __init__(self) -> None:
-        self.chain = chain()
+        self.chain = make_chain()
         self.channel = f"bring-up-{uuid.uuid4().hex[:8]}"
         self.far = VirtualWire(self.channel)
         self.near = VirtualWire(self.channel, self)
@@ -107,7 +107,11 @@ def drop_selected_frame(
 
 def list_actions(frames: list[CanFrame]) -> list[float]:
     """Return the actions of the commands among frames."""
-    return [read(frame)["action"] for frame in frames if parse_opcode(frame.id) == Opcode.COMMAND]
+    return [
+        decode_signals(frame)["action"]
+        for frame in frames
+        if parse_opcode(frame.id) == Opcode.COMMAND
+    ]
 
 
 # --- discovery ---------------------------------------------------------------------------------------------
@@ -174,7 +178,7 @@ def test_bring_up_lost_identity_answer_is_requested_again(modules: EmulatedModul
 def test_bring_up_foreign_frames_are_forwarded_and_truncated_ones_ignored(
     modules: EmulatedModules,
 ) -> None:
-    foreign_frame = heartbeat(3, 1.0)
+    foreign_frame = make_heartbeat_frame(3, 1.0)
     truncated_frame = CanFrame(load_layouts()[Opcode.IDENTITY].encode(9).id, b"\x01\x02")
     for frame in (foreign_frame, truncated_frame):
         modules.far.send(frame)
@@ -289,7 +293,7 @@ def test_bring_up_lists_all_problems_in_one_error() -> None:
 
 def make_parameters(**changed: float) -> dict[int, dict[ModuleParameter, float]]:
     """Return the parameters of every node. The changes apply to node 2."""
-    run = config()
+    run = make_can_config()
     parameters = plan_parameters(run.robot, CanSettings(), plan_reports(run, CanSettings()))
     parameters[2] |= {ModuleParameter[name.upper()]: value for name, value in changed.items()}
     return parameters
@@ -305,7 +309,7 @@ def test_bring_up_writes_every_parameter_and_reads_the_ratings(modules: Emulated
     assert applied[1][ModuleParameter.STIFFNESS] == 40.0
     assert [applied[node][ModuleParameter.TAIL] for node in (1, 2, 3, 4)] == [1, 0, 0, 0]
     assert applied[1][ModuleParameter.RATED_TORQUE] == pytest.approx(4.0)
-    requests = [read(frame) for frame in modules.received_by_modules]
+    requests = [decode_signals(frame) for frame in modules.received_by_modules]
     assert {parse_opcode(frame.id) for frame in modules.received_by_modules} == {
         Opcode.PARAMETER_REQUEST
     }
@@ -347,7 +351,7 @@ def test_bring_up_repeated_truncated_or_foreign_answers_are_ignored(
 def test_bring_up_frames_received_during_configuration_are_forwarded(
     modules: EmulatedModules,
 ) -> None:
-    foreign_frame = heartbeat(3, 9.0)
+    foreign_frame = make_heartbeat_frame(3, 9.0)
     modules.far.send(foreign_frame)
     forwarded: list[CanFrame] = []
     configure_modules([modules.bus], make_parameters(), 5.0, forwarded.append)

@@ -6,7 +6,7 @@ import pytest
 from snakesim_can_backend.protocol.definitions import ModuleState
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import parse_injection
-from snakesim_testing.can.driver_loop import cleared_and_armed_again, loop
+from snakesim_testing.can.driver_loop import open_driver_loop, reset_and_arm_again
 from snakesim_testing.can.module_faults import MODULE_FAULTS
 from snakesim_testing.messages import raises_error
 
@@ -20,11 +20,11 @@ AT_REST_RAD_S = 0.05
 def test_module_fault_names_its_joint_and_stops_the_robot(
     kind: str, expected_fault: str, max_periods: int
 ) -> None:
-    with loop(faults=[f"{kind}:joint_3@{START_TICK / 100}"]) as run:
+    with open_driver_loop(faults=[f"{kind}:joint_3@{START_TICK / 100}"]) as run:
         run.arm()
-        run.run(START_TICK - run.tick, run.waving)
+        run.run(START_TICK - run.tick, run.wave_joints)
         assert not run.faults
-        run.run(max_periods, run.waving)
+        run.run(max_periods, run.wave_joints)
         assert run.faults, f"{kind} was not seen within {max_periods} periods"
         fault = run.faults[0]
         run.run(30)
@@ -50,21 +50,21 @@ def test_module_fault_names_its_joint_and_stops_the_robot(
             run.backend.inject(parse_injection(f"{kind}:joint_3@0"), begins=False)
             run.run(10)
         if kind != "overheat":  # a hot winding cools for minutes
-            cleared_and_armed_again(run)
+            reset_and_arm_again(run)
 
 
 def test_duplicate_module_is_detected_before_any_drive_is_enabled() -> None:
     with (
         raises_error(BackendError, code="drive/not-complete"),
-        loop(faults=["duplicate:joint_3@0"]),
+        open_driver_loop(faults=["duplicate:joint_3@0"]),
     ):
         pass
 
 
 def test_persistent_fault_is_reported_again_and_blocks_arming_until_gone() -> None:
-    with loop(faults=["leak:joint_1@0.3-0.8"]) as run:
+    with open_driver_loop(faults=["leak:joint_1@0.3-0.8"]) as run:
         run.arm()
-        run.run(60, run.waving)
+        run.run(60, run.wave_joints)
         assert [fault.what for fault in run.faults] == ["module_leak"]
         assert run.lifecycle == "fault"
         run.lifecycle = "disarmed"
@@ -76,6 +76,6 @@ def test_persistent_fault_is_reported_again_and_blocks_arming_until_gone() -> No
         assert run.states() == [ModuleState.DISARMED] * 4
         assert len(run.faults) == 2
         angles_before_rad = list(run.samples[-1].joints.angle_rad)
-        run.wanted = None
+        run.setpoints = None
         run.arm()
         assert np.allclose(run.samples[-1].joints.angle_rad, angles_before_rad, atol=0.02)

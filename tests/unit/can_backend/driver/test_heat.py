@@ -16,7 +16,7 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointMode, Power
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings
-from snakesim_testing.can.driver_loop import chain_of
+from snakesim_testing.can.driver_loop import find_chain
 from snakesim_testing.contract.rig import BackendRig
 from snakesim_testing.hal.small_robots import make_run_config
 
@@ -53,7 +53,7 @@ def get_windings(backend: SimBackend | CanBackend) -> ThermalModel:
     """Return the thermal model of the windings."""
     if isinstance(backend, SimBackend):
         return backend._windings
-    return chain_of(backend).thermal
+    return find_chain(backend).thermal
 
 
 def wait_for_temperature(rig: BackendRig, celsius: float) -> None:

@@ -23,12 +23,12 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.model.fault_kinds import parse_injection
 from snakesim_hal.wire.messages import JointMode, LifecycleRequest
-from snakesim_testing.can.driver_loop import JOINTS, chain_of, config
+from snakesim_testing.can.driver_loop import JOINT_COUNT, find_chain, make_can_config
 from snakesim_testing.can.module_faults import MODULE_FAULTS
 from snakesim_testing.contract.rig import BackendRig
 
 FAILING_JOINT = 2  # index of joint_3
-OTHER_JOINTS = [i for i in range(JOINTS) if i != FAILING_JOINT]
+OTHER_JOINTS = [i for i in range(JOINT_COUNT) if i != FAILING_JOINT]
 DEADLINE_PERIODS = 5  # 50 ms
 
 
@@ -67,7 +67,7 @@ class IsolatingRobot(BackendRig):
 @contextmanager
 def open_swinging_robot(max_isolated: int = 1) -> Iterator[IsolatingRobot]:
     """Open a robot that is armed, and whose other joints swing."""
-    run = config(robot__safety__max_isolated_joints=max_isolated)
+    run = make_can_config(robot__safety__max_isolated_joints=max_isolated)
     backend = CanBackend(run, CanSettings(physics_model="inertia"))
     try:
         robot = IsolatingRobot(backend, "lockstep", run.period_ns)
@@ -85,7 +85,7 @@ def test_failed_module_stops_alone_unless_fault_concerns_robot(
     kind: str, fault_kind: str, max_periods: int
 ) -> None:
     with open_swinging_robot() as robot:
-        assert robot.states() == [ModuleState.ARMED] * JOINTS
+        assert robot.states() == [ModuleState.ARMED] * JOINT_COUNT
         assert all(robot.are_other_joints_moving())
         robot.inject(f"{kind}:joint_{FAILING_JOINT + 1}")
         robot.swing_other_joints(max_periods + 1)
@@ -100,7 +100,7 @@ def test_failed_module_stops_alone_unless_fault_concerns_robot(
         robot.assert_armed()
         assert all(robot.are_other_joints_moving())
         assert {fault.joint for fault in robot.faults} == {f"joint_{FAILING_JOINT + 1}"}
-        assert [robot.states()[i] for i in OTHER_JOINTS] == [ModuleState.ARMED] * (JOINTS - 1)
+        assert [robot.states()[i] for i in OTHER_JOINTS] == [ModuleState.ARMED] * (JOINT_COUNT - 1)
 
 
 @pytest.mark.parametrize("kind", ["mute", "reboot", "checksum"])
@@ -123,7 +123,7 @@ def test_isolated_joint_follows_again_after_a_reset(kind: str) -> None:
         robot.arm()
         robot.swing_other_joints(30)
         robot.assert_armed()
-        assert robot.states() == [ModuleState.ARMED] * JOINTS
+        assert robot.states() == [ModuleState.ARMED] * JOINT_COUNT
         assert robot.authority.isolated_joints == []
         assert len(robot.faults) == fault_count, robot.faults[fault_count:]
 
@@ -139,7 +139,7 @@ def test_robot_with_isolated_joint_can_be_armed_again() -> None:
         robot.assert_armed()
         assert all(robot.are_other_joints_moving())
         assert robot.states()[FAILING_JOINT] == ModuleState.DISARMED
-        assert [robot.states()[i] for i in OTHER_JOINTS] == [ModuleState.ARMED] * (JOINTS - 1)
+        assert [robot.states()[i] for i in OTHER_JOINTS] == [ModuleState.ARMED] * (JOINT_COUNT - 1)
 
 
 def test_failed_joints_beyond_the_allowed_number_stop_the_robot() -> None:
@@ -156,7 +156,7 @@ def test_failed_joints_beyond_the_allowed_number_stop_the_robot() -> None:
 
 def fail_and_reset_within_a_period(robot: IsolatingRobot, *joints: int) -> None:
     """Let modules fail with a latched fault, and reset the robot within one period."""
-    chain = chain_of(robot.can)
+    chain = find_chain(robot.can)
     for joint in joints:
         chain.slots[joint].module._fail(ModuleFault.SENSOR, chain.now_us)
     for _ in range(20):
@@ -185,11 +185,11 @@ def test_isolated_joint_reset_within_one_period_can_be_armed(
             robot.wait_periods(20)
         fail_and_reset_within_a_period(robot, *joints)
         assert robot.authority.state == "disarmed"
-        assert robot.states() == [ModuleState.DISARMED] * JOINTS
+        assert robot.states() == [ModuleState.DISARMED] * JOINT_COUNT
         robot.arm()
         robot.swing_other_joints(30)
         robot.assert_armed()
-        assert robot.states() == [ModuleState.ARMED] * JOINTS
+        assert robot.states() == [ModuleState.ARMED] * JOINT_COUNT
         assert robot.authority.isolated_joints == []
 
 
@@ -237,4 +237,4 @@ def test_lost_module_is_disabled_immediately() -> None:
         robot.swing_other_joints(3)
         robot.assert_armed()
         assert robot.states()[FAILING_JOINT] == ModuleState.DISARMED
-        assert chain_of(robot.can).slots[FAILING_JOINT].module.demand == PASSIVE
+        assert find_chain(robot.can).slots[FAILING_JOINT].module.demand == PASSIVE

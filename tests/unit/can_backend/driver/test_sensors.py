@@ -27,8 +27,16 @@ from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Imu, Power
 from snakesim_hal.wire.quantities import Vector
-from snakesim_testing.can.driver_loop import config
-from snakesim_testing.can.frames import accelerometer, answer, begin, contact, gyro, health, syncs
+from snakesim_testing.can.driver_loop import make_can_config
+from snakesim_testing.can.frames import (
+    answer_sync,
+    make_accelerometer_frame,
+    make_contact_frame,
+    make_gyro_frame,
+    make_health_frame,
+    run_syncs,
+    start_sync,
+)
 
 JOINTS = 4
 PERIOD_NS = 10_000_000
@@ -58,8 +66,8 @@ def get_contacts(samples: Samples) -> Contacts:
 
 
 def test_joint_state_of_newest_sync_has_age_zero() -> None:
-    reading, sensors = make_sensors(config())
-    syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
+    reading, sensors = make_sensors(make_can_config())
+    run_syncs(reading, 1, angle=0.5, velocity=-1.0, torque=2.0)
     joints = sensors.make_samples(tick=7, timestamp_ns=70_000_000).joints
     assert joints.tick == 7
     assert joints.timestamp_ns == 70_000_000
@@ -72,10 +80,10 @@ def test_joint_state_of_newest_sync_has_age_zero() -> None:
 
 def test_joint_state_of_silent_module_is_valid_for_the_lease() -> None:
     lease_periods = 5
-    reading, sensors = make_sensors(config())
-    syncs(reading, 1, angle=0.5)
+    reading, sensors = make_sensors(make_can_config())
+    run_syncs(reading, 1, angle=0.5)
     for missed in range(1, 9):
-        syncs(reading, 1, [1, 2, 4], angle=0.6)  # node 3 is silent
+        run_syncs(reading, 1, [1, 2, 4], angle=0.6)  # node 3 is silent
         joints = sensors.make_samples(7 + missed, 0).joints
         assert joints.age_ns == [0, 0, missed * PERIOD_NS, 0]
         assert joints.valid == [True, True, missed <= lease_periods, True]
@@ -83,8 +91,8 @@ def test_joint_state_of_silent_module_is_valid_for_the_lease() -> None:
 
 
 def test_joint_state_never_received_is_invalid() -> None:
-    reading, sensors = make_sensors(config())
-    syncs(reading, 1, [1, 2, 4])
+    reading, sensors = make_sensors(make_can_config())
+    run_syncs(reading, 1, [1, 2, 4])
     joints = sensors.make_samples(0, 0).joints
     assert joints.valid == [True, True, False, True]
     assert joints.age_ns[2] == NEVER_RECEIVED_AGE_NS
@@ -97,12 +105,12 @@ def test_joint_state_never_received_is_invalid() -> None:
 
 
 def test_contacts_are_sampled_only_at_requested_syncs() -> None:
-    run = config(**ALL_SENSORS)
+    run = make_can_config(**ALL_SENSORS)
     schedule = ReportSchedule(100.0, contact_every=3)
     reading, sensors = make_sensors(run, schedule)
     for tick in range(300):
-        sync = begin(reading, contacts=are_contacts_due(schedule, reading.sync + 1))
-        answer(reading)
+        sync = start_sync(reading, contacts=are_contacts_due(schedule, reading.sync + 1))
+        answer_sync(reading)
         assert are_contacts_due(schedule, sync) is (sync % 256 % 3 == 0)
         assert (keys.CONTACTS in sensors.make_samples(tick, 0).by_key) is are_contacts_due(
             schedule, sync
@@ -113,20 +121,22 @@ def test_contacts_are_sampled_only_at_requested_syncs() -> None:
 
 
 def test_contacts_without_touch_are_an_empty_list() -> None:
-    reading, sensors = make_sensors(config(**ALL_SENSORS))
-    begin(reading, contacts=True)
-    reading.process_frame(contact(2, reading.sync, touched=False, force_x=9.0))
+    reading, sensors = make_sensors(make_can_config(**ALL_SENSORS))
+    start_sync(reading, contacts=True)
+    reading.process_frame(make_contact_frame(2, reading.sync, touched=False, force_x=9.0))
     assert get_contacts(sensors.make_samples(3, 30)) == Contacts(
         tick=3, timestamp_ns=30, contacts=[], measured_force_n=0.0
     )
 
 
 def test_contact_is_in_the_frame_of_its_link() -> None:
-    run = config(**ALL_SENSORS)
+    run = make_can_config(**ALL_SENSORS)
     reading, sensors = make_sensors(run)
-    begin(reading, contacts=True)
+    start_sync(reading, contacts=True)
     reading.process_frame(
-        contact(2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2)
+        make_contact_frame(
+            2, reading.sync, force_x=1.0, force_y=-3.0, along=0.04, bearing=math.pi / 2
+        )
     )
     (reported,) = get_contacts(sensors.make_samples(3, 30)).contacts
     radius_m = run.robot.module.radius_m
@@ -143,11 +153,11 @@ def test_contact_is_in_the_frame_of_its_link() -> None:
 
 def test_contact_below_threshold_of_robot_is_omitted() -> None:
     reading, sensors = make_sensors(
-        config(**ALL_SENSORS, robot__sensors__contacts__threshold_n=1.0)
+        make_can_config(**ALL_SENSORS, robot__sensors__contacts__threshold_n=1.0)
     )
-    begin(reading, contacts=True)
+    start_sync(reading, contacts=True)
     for node, force_n in ((1, 0.9), (2, 1.0), (3, -1.05)):
-        reading.process_frame(contact(node, reading.sync, force_z=force_n))
+        reading.process_frame(make_contact_frame(node, reading.sync, force_z=force_n))
     assert [reported.link for reported in get_contacts(sensors.make_samples(0, 0)).contacts] == [
         2,
         3,
@@ -184,12 +194,12 @@ def compute_capsule_point(
 def test_contact_anywhere_on_a_capsule_is_reported_within_bus_resolution(
     link: int, position_fraction: float, polar: float, bearing: float
 ) -> None:
-    run = config(**ALL_SENSORS)
+    run = make_can_config(**ALL_SENSORS)
     length_m = run.robot.link_lengths_m[link]
     radius_m = run.robot.module.radius_m
     point = compute_capsule_point(position_fraction * length_m, polar, bearing, length_m, radius_m)
     reading, sensors = make_sensors(run)
-    sync = begin(reading, contacts=True)
+    sync = start_sync(reading, contacts=True)
     values = (*encode_contact(LinkLoad(link, point, (1.0, 2.0, 3.0))), sync)
     reading.process_frame(
         write_tail_contact(1, values) if link == 0 else write_contact(link, values)
@@ -227,12 +237,12 @@ def test_contact_position_is_on_the_capsule(
 
 
 def test_imu_sample_has_only_new_and_complete_reports() -> None:
-    reading, sensors = make_sensors(config(**ALL_SENSORS))
-    syncs(reading, 1)
+    reading, sensors = make_sensors(make_can_config(**ALL_SENSORS))
+    run_syncs(reading, 1)
     assert keys.IMU not in sensors.make_samples(0, 0).by_key
-    reading.process_frame(gyro(3, 0, 0.5))
-    reading.process_frame(accelerometer(3, 0, 9.81))
-    reading.process_frame(gyro(1, 0, 0.5))  # incomplete: without its acceleration
+    reading.process_frame(make_gyro_frame(3, 0, 0.5))
+    reading.process_frame(make_accelerometer_frame(3, 0, 9.81))
+    reading.process_frame(make_gyro_frame(1, 0, 0.5))  # incomplete: without its acceleration
     imu = sensors.make_samples(1, 10).by_key[keys.IMU]
     assert isinstance(imu, Imu)
     assert imu.tick == 1
@@ -244,8 +254,8 @@ def test_imu_sample_has_only_new_and_complete_reports() -> None:
 
 
 def test_power_sample_is_made_every_half_second() -> None:
-    reading, sensors = make_sensors(config())
-    syncs(reading, 1)
+    reading, sensors = make_sensors(make_can_config())
+    run_syncs(reading, 1)
     ticks_with_power = [
         tick for tick in range(101) if keys.POWER in sensors.make_samples(tick, 0).by_key
     ]
@@ -253,12 +263,14 @@ def test_power_sample_is_made_every_half_second() -> None:
 
 
 def test_power_sample_of_modules_without_report_is_invalid() -> None:
-    reading, sensors = make_sensors(config())
-    syncs(reading, 1)
+    reading, sensors = make_sensors(make_can_config())
+    run_syncs(reading, 1)
     reading.process_frame(
-        health(2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1)
+        make_health_frame(
+            2, voltage=23.5, current=-1.5, motor_temperature=-10, board_temperature=40, leak=1
+        )
     )
-    reading.process_frame(health(4, voltage=24.0))
+    reading.process_frame(make_health_frame(4, voltage=24.0))
     power = sensors.make_samples(50, 7).by_key[keys.POWER]
     assert isinstance(power, Power)
     assert power.tick == 50
@@ -273,20 +285,20 @@ def test_power_sample_of_modules_without_report_is_invalid() -> None:
 
 
 def test_power_values_of_a_module_expire() -> None:
-    reading, sensors = make_sensors(config())
-    syncs(reading, 1)
-    reading.process_frame(health(2, voltage=23.5))
+    reading, sensors = make_sensors(make_can_config())
+    run_syncs(reading, 1)
+    reading.process_frame(make_health_frame(2, voltage=23.5))
 
     def get_valid_flags(tick: int) -> list[bool]:
         power = sensors.make_samples(tick, 0).by_key[keys.POWER]
         assert isinstance(power, Power)
         return power.valid
 
-    syncs(reading, 125)  # at 100 Hz: two and a half report periods
+    run_syncs(reading, 125)  # at 100 Hz: two and a half report periods
     assert get_valid_flags(50) == [False, True, False, False]
-    syncs(reading, 1)
+    run_syncs(reading, 1)
     assert get_valid_flags(100) == [False] * JOINTS
-    reading.process_frame(health(2, voltage=23.5))
+    reading.process_frame(make_health_frame(2, voltage=23.5))
     assert get_valid_flags(150) == [False, True, False, False]
 
 
@@ -294,7 +306,7 @@ def test_power_values_of_a_module_expire() -> None:
 
 
 def test_sensor_descriptions_have_rates_and_delays() -> None:
-    run = config(**ALL_SENSORS)
+    run = make_can_config(**ALL_SENSORS)
     sensors = describe_sensors(run, ReportSchedule(100.0, 4, 20), pose_delay_s=0.02)
     rates_hz = {sensor.key: sensor.rate_hz for sensor in sensors}
     assert rates_hz == {

@@ -14,8 +14,8 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
     frame_id,
 )
-from snakesim_testing.can.frames import answer, joint_state
-from snakesim_testing.can.monitor_rig import MonitorRig, answering, list_findings, quiet
+from snakesim_testing.can.frames import answer_sync, make_joint_state_frame
+from snakesim_testing.can.monitor_rig import MonitorRig, list_findings, make_reply, send_nothing
 
 # --- the bus -----------------------------------------------------------------------------------------------
 
@@ -33,17 +33,17 @@ from snakesim_testing.can.monitor_rig import MonitorRig, answering, list_finding
 def test_bus_watch_bus_failure_is_reported_without_joint(kind: Kind, advice: str) -> None:
     rig = MonitorRig()
     error = BusError(kind, "can0", "transmit errors 200, receive errors 3")
-    (finding,) = rig.tick(errors=[error])
+    (finding,) = rig.run_tick(errors=[error])
     assert finding.what == kind
     assert finding.joint is None
     assert finding.cause.startswith("can0: transmit errors 200, receive errors 3; ")
     assert advice in finding.cause
-    assert rig.tick(errors=[error]) == []
-    assert [reported.cause[:5] for reported in rig.tick(errors=[BusError(kind, "can1", "")])] == [
-        "can1:"
-    ], "the same fault of another bus is a new fault"
+    assert rig.run_tick(errors=[error]) == []
+    assert [
+        reported.cause[:5] for reported in rig.run_tick(errors=[BusError(kind, "can1", "")])
+    ] == ["can1:"], "the same fault of another bus is a new fault"
     rig.reset()
-    assert list_findings(rig.tick(errors=[error])) == [(kind, None)]
+    assert list_findings(rig.run_tick(errors=[error])) == [(kind, None)]
 
 
 @pytest.mark.parametrize(
@@ -52,15 +52,15 @@ def test_bus_watch_bus_failure_is_reported_without_joint(kind: Kind, advice: str
 def test_bus_watch_minor_errors_are_only_counted(kind: Kind) -> None:
     rig = MonitorRig()
     for _ in range(2):
-        assert rig.tick(errors=[BusError(kind, "can0", "")]) == []
-    assert rig.watch.minor_error_counts == {kind: 2}
+        assert rig.run_tick(errors=[BusError(kind, "can0", "")]) == []
+    assert rig.monitor.minor_error_counts == {kind: 2}
 
 
 def test_bus_watch_bus_full_for_three_periods_is_stuck() -> None:
     rig = MonitorRig()
     for full_channel in ("can1", "can1", "", "can1", "can1"):
-        assert rig.tick(unsent=full_channel) == [], "a queue may be full for a moment"
-    (finding,) = rig.tick(unsent="can1")
+        assert rig.run_tick(unsent=full_channel) == [], "a queue may be full for a moment"
+    (finding,) = rig.run_tick(unsent="can1")
     assert finding.what == "bus_stuck"
     assert finding.joint is None
     for text in (
@@ -70,26 +70,26 @@ def test_bus_watch_bus_full_for_three_periods_is_stuck() -> None:
         "txqueuelen is below 64",
     ):
         assert text in finding.cause
-    assert rig.tick(unsent="can1") == []
+    assert rig.run_tick(unsent="can1") == []
 
 
 # --- unknown nodes and other hosts -------------------------------------------------------------------------
 
 
 def answer_with_unknown_node(reading: ModuleReports) -> None:
-    """Let node 9 answer, too, which is no joint of the robot."""
-    answer(reading, [2])
-    reading.process_frame(joint_state(9, reading.sync))
+    """Let node 9 answer_sync, too, which is no joint of the robot."""
+    answer_sync(reading, [2])
+    reading.process_frame(make_joint_state_frame(9, reading.sync))
 
 
 def test_bus_watch_unknown_node_answering_every_sync_is_reported() -> None:
     rig = MonitorRig()
-    assert rig.ticks(2, answer_with_unknown_node) == []
-    (finding,) = rig.tick(answer_with_unknown_node)
+    assert rig.run_ticks(2, answer_with_unknown_node) == []
+    (finding,) = rig.run_tick(answer_with_unknown_node)
     assert finding == FaultFinding(
         "unknown_node", "node 9 is on the bus, but is not a joint of this robot"
     )
-    assert rig.ticks(5, answer_with_unknown_node) == []
+    assert rig.run_ticks(5, answer_with_unknown_node) == []
 
 
 @pytest.mark.parametrize(
@@ -118,50 +118,50 @@ def test_bus_watch_reports_a_second_host(
     frame: CanFrame, expected_fault: str, expected_text: str
 ) -> None:
     rig = MonitorRig()
-    send_frame = answering(ModuleState.DISARMED, frame)
-    (finding,) = rig.tick(send_frame)
+    send_frame = make_reply(ModuleState.DISARMED, frame)
+    (finding,) = rig.run_tick(send_frame)
     assert finding.what == expected_fault
     assert finding.joint is None
     assert expected_text in finding.cause
-    assert rig.tick(send_frame) == []
+    assert rig.run_tick(send_frame) == []
     rig.reset()
-    assert rig.tick() == [], "the second host has ended"
-    assert list_findings(rig.tick(send_frame)) == [(expected_fault, None)]
+    assert rig.run_tick() == [], "the second host has ended"
+    assert list_findings(rig.run_tick(send_frame)) == [(expected_fault, None)]
 
 
 def test_bus_watch_parameters_changed_by_another_host_are_rewritten() -> None:
     rig = MonitorRig()
-    rig.reading.process_frame(
+    rig.reports.process_frame(
         load_layouts()[Opcode.PARAMETER_REQUEST].encode(2, index=1, operation=1)
     )
-    assert list_findings(rig.tick()) == [("second_host", None)]
-    assert rig.watch.pop_changed_joints() == {0, 1, 2}
+    assert list_findings(rig.run_tick()) == [("second_host", None)]
+    assert rig.monitor.pop_changed_joints() == {0, 1, 2}
 
 
 def test_bus_watch_identity_request_is_no_second_host() -> None:
     rig = MonitorRig()
-    rig.reading.process_frame(make_command(CommandAction.IDENTIFY))
-    assert rig.tick() == []
-    assert rig.watch.pop_changed_joints() == set()
+    rig.reports.process_frame(make_command(CommandAction.IDENTIFY))
+    assert rig.run_tick() == []
+    assert rig.monitor.pop_changed_joints() == set()
 
 
 def test_bus_watch_module_without_sync_is_not_silent() -> None:
     rig = MonitorRig()
     for i in range(10):
-        assert list_findings(rig.tick(quiet, unsent="can0")) == (
+        assert list_findings(rig.run_tick(send_nothing, unsent="can0")) == (
             [("bus_stuck", None)] if i == 2 else []
         )
-    assert rig.ticks(2, quiet) == []
-    assert list_findings(rig.tick(quiet)) == [("module_silent", 1)]
+    assert rig.run_ticks(2, send_nothing) == []
+    assert list_findings(rig.run_tick(send_nothing)) == [("module_silent", 1)]
 
 
 def test_bus_watch_interface_down_is_not_also_reported_stuck() -> None:
     rig = MonitorRig()
     down = BusError("interface_down", "can1", "")
     up = BusError("interface_up", "can1", "")
-    assert list_findings(rig.tick(errors=[down], unsent="can1")) == [("interface_down", None)]
+    assert list_findings(rig.run_tick(errors=[down], unsent="can1")) == [("interface_down", None)]
     for _ in range(10):
-        assert rig.tick(unsent="can1") == []
-    rig.tick(errors=[up], unsent="can1")
-    findings = [finding for _ in range(3) for finding in rig.tick(unsent="can1")]
+        assert rig.run_tick(unsent="can1") == []
+    rig.run_tick(errors=[up], unsent="can1")
+    findings = [finding for _ in range(3) for finding in rig.run_tick(unsent="can1")]
     assert list_findings(findings) == [("bus_stuck", None)]

@@ -7,7 +7,7 @@ from snakesim_can_backend.emulator.bus_time import MAX_AHEAD_US, BusTime, traffi
 from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.commands import make_sync
 from snakesim_can_backend.protocol.definitions import CanFrame, Opcode, frame_id, parse_opcode
-from snakesim_testing.can.module_rig import measure_bus_traffic, setpoint
+from snakesim_testing.can.module_rig import make_setpoint, measure_bus_traffic
 
 MAX_BITS_OF_8_BYTES = compute_max_frame_bits(8)
 
@@ -53,11 +53,11 @@ def test_bus_frames_of_one_module_keep_their_order():
 def test_bus_frames_of_the_host_delay_answers():
     bus = BusTime()
     for node in range(10):
-        bus.record_host_frame(setpoint(0, node_id=node + 1), 0.0)
+        bus.record_host_frame(make_setpoint(0, node_id=node + 1), 0.0)
     bus.enqueue(1, make_frame(Opcode.JOINT_STATE, 1), 0.0)
     assert bus.next_us() == 10 * compute_max_frame_bits(6) + MAX_BITS_OF_8_BYTES
     for _ in range(10_000):
-        bus.record_host_frame(setpoint(0), 0.0)
+        bus.record_host_frame(make_setpoint(0), 0.0)
     assert bus.next_us() <= MAX_AHEAD_US + MAX_BITS_OF_8_BYTES
 
 

@@ -18,8 +18,8 @@ from snakesim_can_backend.protocol.definitions import (
 from snakesim_drivers.motion_capture.mocap_sample import MocapSample
 from snakesim_hal.physics.physics_model import LinkLoad
 from snakesim_hal.wire.messages import Imu, JointMode
-from snakesim_testing.can.driver_loop import config
-from snakesim_testing.can.module_rig import RigHost, chain, only, setpoint
+from snakesim_testing.can.driver_loop import make_can_config
+from snakesim_testing.can.module_rig import RigHost, decode_frames_of, make_chain, make_setpoint
 from snakesim_testing.hal.small_robots import make_pose
 
 GRAVITY_M_S2 = 9.81
@@ -100,7 +100,7 @@ SYNCS = {  # times of Syncs in us, and the steps of 1 ms that are simulated by t
 @pytest.mark.parametrize("syncs", SYNCS.values(), ids=list(SYNCS))
 def test_chain_time_advances_only_from_sync_to_later_sync(syncs: list[tuple[int, int]]):
     physics_model = PushedModel(4)
-    module_chain = chain(physics_model=physics_model)
+    module_chain = make_chain(physics_model=physics_model)
     for time_us, steps in syncs:
         module_chain.receive(0, make_sync(0, time_us))
         module_chain.receive(0, make_command(CommandAction.IDENTIFY))
@@ -109,13 +109,17 @@ def test_chain_time_advances_only_from_sync_to_later_sync(syncs: list[tuple[int,
 
 def test_chain_two_buses_with_same_sync_share_one_step():
     physics_model = PushedModel(5)
-    module_chain = chain(config(5), physics_model=physics_model, channels=["vcan0", "vcan1"])
+    module_chain = make_chain(
+        make_can_config(5), physics_model=physics_model, channels=["vcan0", "vcan1"]
+    )
     for tick in range(3):
         for channel in (0, 1):
             module_chain.receive(channel, make_sync(tick, tick * 10_000))
     assert physics_model.steps == 20
     assert module_chain.modules_per_bus == [3, 2]
-    assert [item["count"] for item in only(module_chain.pop_frames(1), Opcode.JOINT_STATE)] == [
+    assert [
+        item["count"] for item in decode_frames_of(module_chain.pop_frames(1), Opcode.JOINT_STATE)
+    ] == [
         0,
         0,
         1,
@@ -125,46 +129,48 @@ def test_chain_two_buses_with_same_sync_share_one_step():
     ]
     module_chain.receive(1, make_command(CommandAction.ARM))
     assert [item.module.state for item in module_chain.slots] == [1, 1, 1, 2, 2]
-    module_chain.receive(0, setpoint(0, node_id=4))
+    module_chain.receive(0, make_setpoint(0, node_id=4))
     assert module_chain.slots[3].module._pending_demand is None, "node 4 is on the other bus"
 
 
 def test_chain_contact_force_is_measured_by_neighbor_links():
-    module_chain = chain(config(**SENSORS), physics_model=PushedModel(4))
+    module_chain = make_chain(make_can_config(**SENSORS), physics_model=PushedModel(4))
     module_chain.slots[0].module.parameters.values[ModuleParameter.TAIL] = 1.0
     module_chain.receive(0, make_sync(0, 0))
     frames = module_chain.pop_frames(0)
-    contacts = only(frames, Opcode.CONTACT)
+    contacts = decode_frames_of(frames, Opcode.CONTACT)
     assert [report["touched"] for report in contacts] == [0, 1, 0, 0]
     assert contacts[1]["force_y"] == pytest.approx(12.0)
     assert contacts[1]["force_z"] == pytest.approx(204.75)
     assert contacts[1]["along"] == pytest.approx(0.05) and contacts[1]["bearing"] == pytest.approx(
         -np.pi
     ), "half a revolution"
-    [tail] = only(frames, Opcode.TAIL_CONTACT)
+    [tail] = decode_frames_of(frames, Opcode.TAIL_CONTACT)
     assert tail["force_y"] == pytest.approx(-5.0)
     assert tail["bearing"] == 0.0
 
 
 def test_chain_modules_send_imu_reports_in_turn():
-    module_chain = chain(config(**SENSORS), physics_model=PushedModel(4))
+    module_chain = make_chain(make_can_config(**SENSORS), physics_model=PushedModel(4))
     for slot in module_chain.slots:
         slot.module.parameters.values[ModuleParameter.IMU_EVERY] = 4.0
     for tick in range(4):
         module_chain.receive(0, make_sync(tick, 0))
-        gyros = only(module_chain.pop_frames(0), Opcode.GYRO)
+        gyros = decode_frames_of(module_chain.pop_frames(0), Opcode.GYRO)
         assert len(gyros) == 1
         assert gyros[0]["rate_x"] in (1.0, 2.0, 3.0, 4.0)
     module_chain.receive(0, make_sync(4, 0))
     frames = module_chain.pop_frames(0)
-    assert only(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(GRAVITY_M_S2)
-    assert only(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
+    assert decode_frames_of(frames, Opcode.ACCELEROMETER)[0]["acceleration_z"] == pytest.approx(
+        GRAVITY_M_S2
+    )
+    assert decode_frames_of(frames, Opcode.SHAFT_LOAD)[0]["torque"] == pytest.approx(0.25)
 
 
 def test_chain_pose_is_sent_once_per_sync():
     sent: list[bytes] = []
-    module_chain = chain(
-        config(6, **SENSORS),
+    module_chain = make_chain(
+        make_can_config(6, **SENSORS),
         physics_model=PushedModel(6),
         channels=["a", "b"],
         send_pose=sent.append,
@@ -184,9 +190,9 @@ def run_with_noise(seed: int) -> tuple[list, list]:
         "robot__sensors": {"joints": {"angle_noise_rad": 1e-3}},
         "seed": seed,
     }
-    host = RigHost(chain(config(**settings)))
+    host = RigHost(make_chain(make_can_config(**settings)))
     host.arm()
-    return [host.tick(0.3 if tick < 50 else -0.3) for tick in range(100)], host.states()
+    return [host.run_tick(0.3 if tick < 50 else -0.3) for tick in range(100)], host.states()
 
 
 def test_chain_with_same_seed_sends_the_same_frames():
@@ -194,20 +200,20 @@ def test_chain_with_same_seed_sends_the_same_frames():
     assert (frames, states) == run_with_noise(1)
     assert states == [ModuleState.ARMED] * 4
     assert frames != run_with_noise(2)[0]
-    angles = [state["angle"] for state in only(frames[49], Opcode.JOINT_STATE)]
+    angles = [state["angle"] for state in decode_frames_of(frames[49], Opcode.JOINT_STATE)]
     assert angles == pytest.approx([0.3] * 4, abs=0.01)
 
 
 def test_chain_watchdog_in_stepped_time_ends_within_the_step():
-    host = RigHost(chain())
+    host = RigHost(make_chain())
     host.arm()
     for _ in range(5):
-        host.tick(2.0, JointMode.TORQUE)
-    frames = [frame for _ in range(12) for frame in host.tick()]
+        host.run_tick(2.0, JointMode.TORQUE)
+    frames = [frame for _ in range(12) for frame in host.run_tick()]
     assert host.states() == [ModuleState.FAULT] * 4
     uptimes_s = [
         heartbeat["uptime"]
-        for heartbeat in only(frames, Opcode.HEARTBEAT, 1)
+        for heartbeat in decode_frames_of(frames, Opcode.HEARTBEAT, 1)
         if heartbeat["last_stop"] == 3
     ]
     assert uptimes_s[0] == pytest.approx(0.1 + 0.05 + 0.1, abs=0.0011)
@@ -215,7 +221,7 @@ def test_chain_watchdog_in_stepped_time_ends_within_the_step():
 
 def test_chain_in_real_time_catches_up_only_short_pauses():
     physics_model = PushedModel(4)
-    module_chain = chain(physics_model=physics_model, is_stepped=False)
+    module_chain = make_chain(physics_model=physics_model, is_stepped=False)
     module_chain.advance_to(150_000.0)
     assert physics_model.steps == 150
     module_chain.advance_to(1_150_000.0)
@@ -226,11 +232,11 @@ def test_chain_in_real_time_catches_up_only_short_pauses():
 
 
 def test_chain_hot_module_derates_its_torque():
-    host = RigHost(chain(physics_model=PushedModel(4)))
+    host = RigHost(make_chain(physics_model=PushedModel(4)))
     host.arm()
     host.chain.thermal.winding_temperature_c[1] = 95.0
-    frames = host.ticks(10, 4.0, JointMode.TORQUE)
-    states = only(frames, Opcode.JOINT_STATE)
+    frames = host.run_ticks(10, 4.0, JointMode.TORQUE)
+    states = decode_frames_of(frames, Opcode.JOINT_STATE)
     assert [state["derated"] for state in states] == [0, 1, 0, 0]
     assert states[1]["torque"] / 4.0 == pytest.approx(1.0 - 0.8 * 15 / 25, abs=0.01)
     assert states[0]["torque"] > 3.9

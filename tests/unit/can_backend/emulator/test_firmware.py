@@ -19,18 +19,18 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
 )
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.can.frames import corrupted
+from snakesim_testing.can.frames import corrupt_checksum
 from snakesim_testing.can.module_rig import (
-    BOOTED,
-    MS,
+    BOOTED_AT_US,
     NODE,
-    QUIET,
-    armed,
-    booted,
-    new_module,
-    only,
-    parameter,
-    setpoint,
+    RESTING_READINGS,
+    US_PER_MS,
+    arm_module,
+    boot_module,
+    decode_frames_of,
+    make_module,
+    make_parameter_request,
+    make_setpoint,
 )
 from snakesim_testing.hypothesis_profiles import choose_trial_count
 
@@ -41,37 +41,37 @@ def apply_setpoint(
     module: ModuleFirmware, count: int, now_us: float, **setpoint_fields: Any
 ) -> None:
     """Send a setpoint, and the Sync that applies it."""
-    module.receive_setpoint(setpoint(count, **setpoint_fields), now_us)
-    module.handle_sync(count, QUIET)
+    module.receive_setpoint(make_setpoint(count, **setpoint_fields), now_us)
+    module.handle_sync(count, RESTING_READINGS)
 
 
 def test_firmware_boots_silently_until_its_first_heartbeat():
-    module = new_module()
+    module = make_module()
     module.poll(0.0)
-    module.receive(make_command(CommandAction.IDENTIFY), 50 * MS)
-    module.receive(make_command(CommandAction.ARM), 50 * MS)
-    module.handle_sync(1, QUIET)
-    module.poll(99 * MS)
+    module.receive(make_command(CommandAction.IDENTIFY), 50 * US_PER_MS)
+    module.receive(make_command(CommandAction.ARM), 50 * US_PER_MS)
+    module.handle_sync(1, RESTING_READINGS)
+    module.poll(99 * US_PER_MS)
     assert module.frames == []
     assert module.state == ModuleState.BOOT
-    module.poll(100 * MS)
-    [first_heartbeat] = only(module.frames, Opcode.HEARTBEAT)
+    module.poll(100 * US_PER_MS)
+    [first_heartbeat] = decode_frames_of(module.frames, Opcode.HEARTBEAT)
     assert first_heartbeat["state"] == ModuleState.DISARMED
     assert first_heartbeat["uptime"] == pytest.approx(0.1)
     assert len(module.frames) == 1
 
 
 def test_firmware_sends_ten_heartbeats_and_two_health_reports_per_second():
-    module = booted()
+    module = boot_module()
     for ms in range(1, 1001):
-        module.poll(BOOTED + ms * MS)
-    assert len(only(module.frames, Opcode.HEARTBEAT)) == 10
-    assert len(only(module.frames, Opcode.HEALTH)) == 2
+        module.poll(BOOTED_AT_US + ms * US_PER_MS)
+    assert len(decode_frames_of(module.frames, Opcode.HEARTBEAT)) == 10
+    assert len(decode_frames_of(module.frames, Opcode.HEALTH)) == 2
 
 
 def test_firmware_position_target_is_limited_to_the_angle_limit():
-    module = armed(angle_limit=0.5)
-    apply_setpoint(module, 0, BOOTED, mode=JointMode.POSITION, target=-1.0)
+    module = arm_module(angle_limit=0.5)
+    apply_setpoint(module, 0, BOOTED_AT_US, mode=JointMode.POSITION, target=-1.0)
     assert module.demand.target == -0.5
 
 
@@ -79,21 +79,21 @@ def test_firmware_position_target_is_limited_to_the_angle_limit():
     ("cause", "fault"), [("leak", ModuleFault.LEAK), ("hot", ModuleFault.OVERHEAT)]
 )
 def test_firmware_fault_remains_until_cause_is_gone_and_cleared(cause: str, fault: ModuleFault):
-    module = armed()
+    module = arm_module()
     module.health.leak = cause == "leak"
     module.health.winding_c = 110.0 if cause == "hot" else 20.0
-    module.poll(BOOTED + MS)
-    [heartbeat] = only(module.frames, Opcode.HEARTBEAT)
+    module.poll(BOOTED_AT_US + US_PER_MS)
+    [heartbeat] = decode_frames_of(module.frames, Opcode.HEARTBEAT)
     assert heartbeat[f"fault_{fault.name.lower()}"] == 1
     assert heartbeat["last_stop"] == LastStop[fault.name]
     module.health.winding_c = 80.0 if cause == "hot" else 20.0
-    module.receive(make_command(CommandAction.CLEAR), BOOTED + 2 * MS)
+    module.receive(make_command(CommandAction.CLEAR), BOOTED_AT_US + 2 * US_PER_MS)
     assert module.state == ModuleState.FAULT
     module.health.leak = False
     module.health.winding_c = 79.0
-    module.poll(BOOTED + 3 * MS)
+    module.poll(BOOTED_AT_US + 3 * US_PER_MS)
     assert module.state == ModuleState.FAULT, "the fault is latched"
-    module.receive(make_command(CommandAction.CLEAR), BOOTED + 3 * MS)
+    module.receive(make_command(CommandAction.CLEAR), BOOTED_AT_US + 3 * US_PER_MS)
     assert module.state == ModuleState.DISARMED
     assert module.faults == 0
 
@@ -113,83 +113,87 @@ def test_firmware_fault_remains_until_cause_is_gone_and_cleared(cause: str, faul
 def test_firmware_out_of_sequence_setpoint_is_dropped_and_counting_continues(
     first: int, count: int, is_accepted: bool
 ):
-    module = armed()
-    apply_setpoint(module, first, BOOTED, target=1.0)
-    apply_setpoint(module, count, BOOTED, target=2.0)
+    module = arm_module()
+    apply_setpoint(module, first, BOOTED_AT_US, target=1.0)
+    apply_setpoint(module, count, BOOTED_AT_US, target=2.0)
     assert module.demand.target == pytest.approx(2.0 if is_accepted else 1.0)
     assert module.rejected_frame_count == (not is_accepted)
-    apply_setpoint(module, count + 1, BOOTED, target=3.0)
+    apply_setpoint(module, count + 1, BOOTED_AT_US, target=3.0)
     assert module.demand.target == pytest.approx(3.0)
     assert module.state == ModuleState.ARMED
 
 
 def test_firmware_setpoints_without_syncs_do_not_feed_the_watchdog():
-    module = armed()
-    apply_setpoint(module, 0, BOOTED)
+    module = arm_module()
+    apply_setpoint(module, 0, BOOTED_AT_US)
     for count in range(1, 30):
-        module.receive_setpoint(setpoint(count, JointMode.PASSIVE), BOOTED + count * 10 * MS)
-        module.poll(BOOTED + count * 10 * MS)
+        module.receive_setpoint(
+            make_setpoint(count, JointMode.PASSIVE), BOOTED_AT_US + count * 10 * US_PER_MS
+        )
+        module.poll(BOOTED_AT_US + count * 10 * US_PER_MS)
     assert module.state == ModuleState.FAULT
     assert module.last_stop == LastStop.WATCHDOG
     assert module.demand.mode == JointMode.PASSIVE
 
 
 def test_firmware_setpoint_with_wrong_checksum_is_ignored():
-    module = armed()
-    apply_setpoint(module, 0, BOOTED, target=1.0)
-    module.receive_setpoint(corrupted(setpoint(1, target=2.0)), BOOTED + 50 * MS)
-    module.handle_sync(1, QUIET)
+    module = arm_module()
+    apply_setpoint(module, 0, BOOTED_AT_US, target=1.0)
+    module.receive_setpoint(
+        corrupt_checksum(make_setpoint(1, target=2.0)), BOOTED_AT_US + 50 * US_PER_MS
+    )
+    module.handle_sync(1, RESTING_READINGS)
     assert module.demand.target == pytest.approx(1.0)
-    assert module._watchdog_fed_us == BOOTED
+    assert module._watchdog_fed_us == BOOTED_AT_US
     assert module.rejected_frame_count == 1
 
 
 def test_firmware_stopping_module_damps_until_at_rest():
-    module = armed()
-    apply_setpoint(module, 0, BOOTED)
+    module = arm_module()
+    apply_setpoint(module, 0, BOOTED_AT_US)
     module.health.speed_rad_s = 3.0
-    module.receive(make_command(CommandAction.STOP), BOOTED)
+    module.receive(make_command(CommandAction.STOP), BOOTED_AT_US)
     assert module.state == ModuleState.STOPPING
     assert module.demand[:2] == (JointMode.VELOCITY, 0.0)
-    assert only(module.frames, Opcode.HEARTBEAT)[-1]["mode"] == JointMode.VELOCITY
-    module.poll(BOOTED + 50 * MS)
+    assert decode_frames_of(module.frames, Opcode.HEARTBEAT)[-1]["mode"] == JointMode.VELOCITY
+    module.poll(BOOTED_AT_US + 50 * US_PER_MS)
     assert module.state == ModuleState.STOPPING
     module.health.speed_rad_s = 0.04
-    module.poll(BOOTED + 51 * MS)
+    module.poll(BOOTED_AT_US + 51 * US_PER_MS)
     assert module.state == ModuleState.DISARMED
     assert module.demand.mode == JointMode.PASSIVE
     assert module.last_stop == LastStop.STOP
 
 
 def test_firmware_stopping_ends_after_watchdog_time():
-    module = armed(stop_mode=0, watchdog=0.05)
+    module = arm_module(stop_mode=0, watchdog=0.05)
     module.health.speed_rad_s = 3.0
-    module.receive(make_command(CommandAction.STOP), BOOTED)
+    module.receive(make_command(CommandAction.STOP), BOOTED_AT_US)
     assert module.demand.mode == JointMode.PASSIVE
-    module.poll(BOOTED + 50 * MS)
+    module.poll(BOOTED_AT_US + 50 * US_PER_MS)
     assert module.state == ModuleState.DISARMED
 
 
 @pytest.mark.parametrize(
-    "frame", [ARM_COMMAND_WITHOUT_KEY, corrupted(make_command(CommandAction.ARM))]
+    "frame", [ARM_COMMAND_WITHOUT_KEY, corrupt_checksum(make_command(CommandAction.ARM))]
 )
 def test_firmware_command_without_key_or_checksum_is_ignored(frame):
-    module = booted()
-    module.receive(frame, BOOTED)
+    module = boot_module()
+    module.receive(frame, BOOTED_AT_US)
     assert module.state == ModuleState.DISARMED
 
 
 def test_firmware_reboot_loses_unsaved_parameters():
-    module = armed()
-    module.receive(make_command(CommandAction.DISARM), BOOTED)
-    module.receive(parameter(ModuleParameter.STIFFNESS, 12.0), BOOTED)
-    module.receive(parameter(ModuleParameter.DAMPING, 2.0), BOOTED)
-    module.receive(parameter(ModuleParameter.DAMPING, operation=2), BOOTED)
-    module.receive(make_command(CommandAction.REBOOT, NODE), BOOTED)
+    module = arm_module()
+    module.receive(make_command(CommandAction.DISARM), BOOTED_AT_US)
+    module.receive(make_parameter_request(ModuleParameter.STIFFNESS, 12.0), BOOTED_AT_US)
+    module.receive(make_parameter_request(ModuleParameter.DAMPING, 2.0), BOOTED_AT_US)
+    module.receive(make_parameter_request(ModuleParameter.DAMPING, operation=2), BOOTED_AT_US)
+    module.receive(make_command(CommandAction.REBOOT, NODE), BOOTED_AT_US)
     assert module.state == ModuleState.BOOT
     module.frames.clear()
-    module.poll(BOOTED + 100 * MS)
-    [heartbeat] = only(module.frames, Opcode.HEARTBEAT)
+    module.poll(BOOTED_AT_US + 100 * US_PER_MS)
+    [heartbeat] = decode_frames_of(module.frames, Opcode.HEARTBEAT)
     assert heartbeat["uptime"] == pytest.approx(0.1)
     values = module.parameters.values
     assert values[ModuleParameter.STIFFNESS] == 0.0
@@ -198,11 +202,11 @@ def test_firmware_reboot_loses_unsaved_parameters():
 
 def test_firmware_uptime_saturates_at_end_of_range() -> None:
     """Check that the uptime does not wrap around, because an uptime of 0 would look like a restart."""
-    module = booted()
-    module._boot_start_us = -(2**32 - 50) * MS
+    module = boot_module()
+    module._boot_start_us = -(2**32 - 50) * US_PER_MS
     heartbeats = [
         load_layouts()[Opcode.HEARTBEAT].decode(module.make_heartbeat(at_us).data)
-        for at_us in (0.0, 100 * MS, 500 * MS)
+        for at_us in (0.0, 100 * US_PER_MS, 500 * US_PER_MS)
     ]
     assert [heartbeat["uptime"] for heartbeat in heartbeats] == pytest.approx(
         [4294967.246, 4294967.295, 4294967.295], abs=1e-6
@@ -210,30 +214,36 @@ def test_firmware_uptime_saturates_at_end_of_range() -> None:
 
 
 def test_firmware_answers_every_sync_with_its_count():
-    module = booted(contact_every=4, imu_every=5, tail=1)
+    module = boot_module(contact_every=4, imu_every=5, tail=1)
     for count in range(20):
-        module.handle_sync(count, QUIET)
-    states = only(module.frames, Opcode.JOINT_STATE)
+        module.handle_sync(count, RESTING_READINGS)
+    states = decode_frames_of(module.frames, Opcode.JOINT_STATE)
     assert [state["count"] for state in states] == [count % 16 for count in range(20)]
-    assert [report["count"] for report in only(module.frames, Opcode.CONTACT)] == [0, 4, 8, 12, 0]
-    assert len(only(module.frames, Opcode.TAIL_CONTACT)) == 5
+    assert [report["count"] for report in decode_frames_of(module.frames, Opcode.CONTACT)] == [
+        0,
+        4,
+        8,
+        12,
+        0,
+    ]
+    assert len(decode_frames_of(module.frames, Opcode.TAIL_CONTACT)) == 5
 
 
 def test_firmware_hanging_module_repeats_state_until_hardware_watchdog():
-    module = armed()
-    apply_setpoint(module, 3, BOOTED)
+    module = arm_module()
+    apply_setpoint(module, 3, BOOTED_AT_US)
     module.is_hanging = True
     module.frames.clear()
-    module.handle_sync(4, QUIET)
-    [state] = only(module.frames, Opcode.JOINT_STATE)
+    module.handle_sync(4, RESTING_READINGS)
+    [state] = decode_frames_of(module.frames, Opcode.JOINT_STATE)
     assert state["count"] == 3
     assert module.demand.mode == JointMode.TORQUE
     for elapsed_ms in range(1, 300):
-        module.poll(BOOTED + elapsed_ms * MS)
+        module.poll(BOOTED_AT_US + elapsed_ms * US_PER_MS)
         assert (module.demand.mode == JointMode.PASSIVE) == (elapsed_ms >= 100)
-    assert not only(module.frames, Opcode.HEARTBEAT)
+    assert not decode_frames_of(module.frames, Opcode.HEARTBEAT)
     module.is_hanging = False
-    module.poll(BOOTED + 301 * MS)
+    module.poll(BOOTED_AT_US + 301 * US_PER_MS)
     assert module.last_stop == LastStop.WATCHDOG
 
 
@@ -242,20 +252,22 @@ def test_firmware_hanging_module_repeats_state_until_hardware_watchdog():
 ANY_FRAMES = st.one_of(
     st.sampled_from(list(CommandAction)).map(make_command),
     st.just(make_emergency()),
-    st.builds(setpoint, st.integers(0, 15), st.sampled_from(list(JointMode))),
-    st.builds(corrupted, st.builds(setpoint, st.integers(0, 15))),
-    st.builds(corrupted, st.just(make_command(CommandAction.ARM))),
-    st.builds(parameter, st.integers(0, 20), st.floats(-1, 40, width=32), st.integers(0, 4)),
+    st.builds(make_setpoint, st.integers(0, 15), st.sampled_from(list(JointMode))),
+    st.builds(corrupt_checksum, st.builds(make_setpoint, st.integers(0, 15))),
+    st.builds(corrupt_checksum, st.just(make_command(CommandAction.ARM))),
+    st.builds(
+        make_parameter_request, st.integers(0, 20), st.floats(-1, 40, width=32), st.integers(0, 4)
+    ),
     st.builds(make_sync, st.integers(0, 255), st.just(0)),
 )
-PAUSES = st.sampled_from([0.0, 1.0 * MS, 20 * MS, 120 * MS])
+PAUSES = st.sampled_from([0.0, 1.0 * US_PER_MS, 20 * US_PER_MS, 120 * US_PER_MS])
 
 
 def deliver_frame(module: ModuleFirmware, frame, now_us: float) -> None:
     """Deliver a frame to the handler of its opcode."""
     opcode = frame.id >> 6
     if opcode == Opcode.SYNC:
-        module.handle_sync(frame.data[0], QUIET)
+        module.handle_sync(frame.data[0], RESTING_READINGS)
     elif opcode == Opcode.SET_POINT:
         module.receive_setpoint(frame, now_us)
     else:
@@ -265,8 +277,8 @@ def deliver_frame(module: ModuleFirmware, frame, now_us: float) -> None:
 @settings(max_examples=choose_trial_count(100), deadline=None)
 @given(st.lists(st.tuples(ANY_FRAMES, PAUSES, st.booleans()), max_size=60))
 def test_firmware_drives_only_when_armed_with_valid_setpoints(events):
-    module = booted()
-    now_us = BOOTED
+    module = boot_module()
+    now_us = BOOTED_AT_US
     module.health.speed_rad_s = 1.0
     for frame, pause_us, leak in events:
         now_us += pause_us
@@ -289,8 +301,8 @@ def test_firmware_drives_only_when_armed_with_valid_setpoints(events):
 
 @pytest.mark.parametrize(("voltage_v", "faults"), [(18.0, 0), (17.99, 1 << ModuleFault.VOLTAGE)])
 def test_firmware_supply_below_18_v_is_a_fault(voltage_v: float, faults: int) -> None:
-    module = armed()
+    module = arm_module()
     module.health.voltage_v = voltage_v
-    module.poll(BOOTED + 10 * MS)
+    module.poll(BOOTED_AT_US + 10 * US_PER_MS)
     assert module.faults == faults
     assert module.state == (ModuleState.FAULT if faults else ModuleState.ARMED)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 
 INERTIA_KG_M2 = 0.005 + 0.2 * 0.1**2 / 12  # kg·m², of the middle joints of the test robot
 
 
 def make_model(**settings: Any) -> InertiaModel:
-    return InertiaModel(config(3), InertiaSettings(**{"drag_nm": 0.0, **settings}))
+    return InertiaModel(make_can_config(3), InertiaSettings(**{"drag_nm": 0.0, **settings}))
 
 
 def apply_torque(model: InertiaModel, torque_nm: float, seconds: float) -> None:
@@ -49,7 +49,7 @@ def test_joint_at_its_end_stop_stops_completely():
 
 
 def test_control_period_is_a_whole_number_of_steps():
-    run = config(3, rate_hz=300)
+    run = make_can_config(3, rate_hz=300)
     steps = run.period_ns * 1e-9 / InertiaModel(run, InertiaSettings()).step_s
     assert steps == pytest.approx(4.0)
 

@@ -9,14 +9,14 @@ from snakesim_hal.physics.loose_gear import (
     Looseness,
     move_rotor_inertia_to_motor_side,
 )
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 
 BACKLASH_RAD = 0.03
 SLIP_NM = 0.2
 
 
 def test_backlash_drive_turns_through_gap_before_its_link_moves() -> None:
-    run = config(3)
+    run = make_can_config(3)
     joints = run.robot.joint_table
     looseness = {"joint_2": Looseness(backlash_rad=BACKLASH_RAD)}
     links = InertiaModel(
@@ -36,7 +36,7 @@ def test_backlash_drive_turns_through_gap_before_its_link_moves() -> None:
 
 
 def test_link_behind_slipping_coupling_gets_at_most_the_slip_torque() -> None:
-    run = config(3)
+    run = make_can_config(3)
     joints = run.robot.joint_table
     looseness = {"joint_2": Looseness(slip_torque_nm=SLIP_NM)}
     links = InertiaModel(
@@ -59,7 +59,7 @@ def test_link_behind_slipping_coupling_gets_at_most_the_slip_torque() -> None:
 
 
 def test_link_below_slip_torque_follows_its_drive() -> None:
-    run = config(3)
+    run = make_can_config(3)
     joints = run.robot.joint_table
     looseness = {"joint_2": Looseness(slip_torque_nm=5.0)}
     links = InertiaModel(

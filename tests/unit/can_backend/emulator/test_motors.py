@@ -11,7 +11,7 @@ from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings, SimSettings
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 
 STEP_S = 1e-3
 RESPONSE_S = 0.01
@@ -22,7 +22,7 @@ AT_REST = np.zeros(1)
 
 def make_motor(**robot):
     """Return the power stage of one motor, and the configuration of its run."""
-    run = config(1, **{f"robot__{key}": value for key, value in robot.items()})
+    run = make_can_config(1, **{f"robot__{key}": value for key, value in robot.items()})
     return PowerStages(run.robot, STEP_S), run
 
 

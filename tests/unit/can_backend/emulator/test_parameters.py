@@ -12,14 +12,20 @@ from snakesim_can_backend.protocol.definitions import (
     ParameterOperation,
     ParameterResult,
 )
-from snakesim_testing.can.module_rig import BOOTED, armed, booted, only, parameter
+from snakesim_testing.can.module_rig import (
+    BOOTED_AT_US,
+    arm_module,
+    boot_module,
+    decode_frames_of,
+    make_parameter_request,
+)
 
 
 def request_parameter(module, *request, **fields):
     """Send a parameter request, and return the result and the value of the answer."""
     module.frames.clear()
-    module.receive(parameter(*request, **fields), BOOTED)
-    [answer] = only(module.frames, Opcode.PARAMETER_ANSWER)
+    module.receive(make_parameter_request(*request, **fields), BOOTED_AT_US)
+    [answer] = decode_frames_of(module.frames, Opcode.PARAMETER_ANSWER)
     return ParameterResult(int(answer["result"])), answer["value"]
 
 
@@ -32,7 +38,7 @@ def request_parameter(module, *request, **fields):
     ],
 )
 def test_parameter_range_ends_can_be_written_in_single_precision(index):
-    module = booted()
+    module = boot_module()
     for end in (PARAMETERS[index].low, PARAMETERS[index].high):
         result, value = request_parameter(module, index, end)
         assert result == ParameterResult.DONE
@@ -51,23 +57,27 @@ def test_parameter_range_ends_can_be_written_in_single_precision(index):
     ],
 )
 def test_parameter_invalid_request_is_refused_and_changes_nothing(index, value, result):
-    module = booted()
+    module = boot_module()
     before = dict(module.parameters.values)
     assert request_parameter(module, index, value)[0] == result
     assert module.parameters.values == before
 
 
 def test_parameter_value_nan_is_refused():
-    module = booted()
-    valid_request = parameter(ModuleParameter.DAMPING, 1.0)
+    module = boot_module()
+    valid_request = make_parameter_request(ModuleParameter.DAMPING, 1.0)
     module.receive(
-        CanFrame(valid_request.id, valid_request.data[:2] + struct.pack("<f", float("nan"))), BOOTED
+        CanFrame(valid_request.id, valid_request.data[:2] + struct.pack("<f", float("nan"))),
+        BOOTED_AT_US,
     )
-    assert only(module.frames, Opcode.PARAMETER_ANSWER)[0]["result"] == ParameterResult.OUT_OF_RANGE
+    assert (
+        decode_frames_of(module.frames, Opcode.PARAMETER_ANSWER)[0]["result"]
+        == ParameterResult.OUT_OF_RANGE
+    )
 
 
 def test_parameter_of_armed_module_is_read_but_not_written():
-    module = armed()
+    module = arm_module()
     assert (
         request_parameter(module, ModuleParameter.DAMPING, 1.0)[0]
         == ParameterResult.NOT_WHILE_ARMED

@@ -13,7 +13,7 @@ from snakesim_can_backend.settings import CanSettings, MountedModule
 from snakesim_hal.base.errors import ConfigError
 from snakesim_native.libraries import PACKAGE
 from snakesim_native.programs import JOINT_MODULE_REPLAY, JOINT_MODULES
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 from snakesim_testing.messages import raises_error
 
 FIRMWARE = PACKAGE / "joint_module" / "firmware"
@@ -23,7 +23,7 @@ INCLUDE = re.compile(r"^#include <(.+)>$", re.MULTILINE)
 def read_modules(settings: CanSettings | None = None, **dotted: Any) -> dict[str, dict[str, float]]:
     """Return the description of every module, by the name of its joint."""
     modules: dict[str, dict[str, float]] = {}
-    for line in describe_modules(config(**dotted), settings or CanSettings()).splitlines():
+    for line in describe_modules(make_can_config(**dotted), settings or CanSettings()).splitlines():
         name, *fields = line.split()
         modules[name] = {
             key: float(value) for key, value in zip(fields[::2], fields[1::2], strict=True)

@@ -15,7 +15,7 @@ from snakesim_can_backend.protocol.definitions import CanFrame, CommandAction, M
 from snakesim_drivers.motion_capture.emulated_mocap import PoseSender
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.can.module_rig import chain, only, setpoint
+from snakesim_testing.can.module_rig import decode_frames_of, make_chain, make_setpoint
 from snakesim_testing.messages import raises_error
 
 ServedChain = tuple[VirtualWire, EmulatorServer, Callable[[float], list[CanFrame]]]
@@ -52,20 +52,20 @@ def send_tick(host_wire: VirtualWire, tick: int) -> None:
     """Send the Sync and the setpoints of one control cycle."""
     host_wire.send(make_sync(tick, 0))
     for node in range(1, JOINTS + 1):
-        host_wire.send(setpoint(tick, JointMode.POSITION, 0.2, node_id=node))
+        host_wire.send(make_setpoint(tick, JointMode.POSITION, 0.2, node_id=node))
 
 
 def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():
-    module_chain = chain(is_stepped=False)
+    module_chain = make_chain(is_stepped=False)
     with serve_chain(module_chain) as (host_wire, _, run_until):
         assert run_until(0.09) == []
-        assert len(only(run_until(0.11), Opcode.HEARTBEAT)) == JOINTS
+        assert len(decode_frames_of(run_until(0.11), Opcode.HEARTBEAT)) == JOINTS
         host_wire.send(make_command(CommandAction.ARM))
         frames = []
         for tick in range(50):
             send_tick(host_wire, tick)
             frames += run_until(0.11 + 0.01 * (tick + 1))
-        states = only(frames, Opcode.JOINT_STATE, 1)
+        states = decode_frames_of(frames, Opcode.JOINT_STATE, 1)
         assert [state["count"] for state in states] == [tick % 16 for tick in range(50)]
         assert states[-1]["angle"] == pytest.approx(0.2, abs=0.01)
         run_until(0.69)
@@ -75,7 +75,7 @@ def test_server_modules_boot_follow_setpoints_and_stop_after_watchdog():
 
 
 def test_server_pause_does_not_look_like_a_host_pause():
-    module_chain = chain(is_stepped=False)
+    module_chain = make_chain(is_stepped=False)
     with serve_chain(module_chain) as (host_wire, server, run_until):
         run_until(0.11)
         host_wire.send(make_command(CommandAction.ARM))
@@ -89,7 +89,7 @@ def test_server_pause_does_not_look_like_a_host_pause():
 
 
 def test_server_stepped_emulators_run_while_the_host_waits():
-    module_chain = chain()
+    module_chain = make_chain()
     name = f"test-{uuid.uuid4().hex[:8]}"
     server_wire = VirtualWire(name)
     server = EmulatorServer([server_wire], module_chain)
@@ -100,7 +100,7 @@ def test_server_stepped_emulators_run_while_the_host_waits():
         assert not wait([host_wire], 1.0), "stepped modules send nothing before the next Sync"
         host_wire.send(make_sync(0, 0))
         assert wait([host_wire], 1.0)
-        assert len(only(host_wire.receive(), Opcode.JOINT_STATE)) == JOINTS
+        assert len(decode_frames_of(host_wire.receive(), Opcode.JOINT_STATE)) == JOINTS
     finally:
         host_wire.close()
 

@@ -5,13 +5,13 @@ import pytest
 
 from snakesim_drivers.emulation.inertia import InertiaModel, InertiaSettings
 from snakesim_hal.physics.sticking_encoder import StickingEncoderModel
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 
 DEAD_ZONE_RAD = 0.02
 
 
 def test_measured_angle_sticks_in_dead_zone_then_jumps_to_shaft() -> None:
-    run = config(3)
+    run = make_can_config(3)
     shafts = InertiaModel(run, InertiaSettings(drag_nm=0.0))
     model = StickingEncoderModel(shafts, run.robot.joint_table, {"joint_2": DEAD_ZONE_RAD})
     measured_rad = [float(model.angle_rad[1])]

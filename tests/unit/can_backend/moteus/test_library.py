@@ -23,13 +23,13 @@ from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.can.driver_loop import config
+from snakesim_testing.can.driver_loop import make_can_config
 from snakesim_testing.drivers.drive_rig import drives_of
 from snakesim_testing.messages import raises_error
 
 VALUE_TYPES = (moteus.INT8, moteus.INT16, moteus.INT32, moteus.F32)
 JOINTS = 4
-CONFIG = config(JOINTS, backend="moteus")
+CONFIG = make_can_config(JOINTS, backend="moteus")
 
 
 def make_library_client(number: int = 1, **options: Any) -> moteus.Controller:
@@ -247,11 +247,11 @@ def test_moteus_library_reads_every_frame_of_a_run() -> None:
 @pytest.mark.parametrize("number", [0, 127])
 def test_moteus_ids_of_host_and_broadcast_are_no_controllers(number: int) -> None:
     """Refuse 127, because the firmware uses it as broadcast: all controllers would follow one joint."""
-    invalid_config = config(backend="moteus", robot__joints={"joint_2": {"id": number}})
+    invalid_config = make_can_config(backend="moteus", robot__joints={"joint_2": {"id": number}})
     with raises_error(ConfigError, code="drive/unsupported-setting"):
         MoteusBackend.check(invalid_config, MoteusSettings())
     MoteusBackend.check(
-        config(backend="moteus", robot__joints={"joint_2": {"id": 126}}), MoteusSettings()
+        make_can_config(backend="moteus", robot__joints={"joint_2": {"id": 126}}), MoteusSettings()
     )
 
 

@@ -17,7 +17,7 @@ from snakesim_can_backend.protocol.definitions import (
     Opcode,
 )
 from snakesim_hal.wire.messages import JointMode, LifecycleState
-from snakesim_testing.can.frames import read
+from snakesim_testing.can.frames import decode_signals
 
 LIFECYCLES: tuple[LifecycleState, ...] = get_args(LifecycleState)
 TARGET_SIGNALS = {
@@ -40,7 +40,7 @@ def encode_setpoint(mode: JointMode, target: float, limit_nm: float = 4.0) -> Ca
 def test_setpoint_target_and_limit_are_rounded_to_nearest_step(
     mode: JointMode, target: float, limit_nm: float
 ) -> None:
-    sent = read(encode_setpoint(mode, target, limit_nm))
+    sent = decode_signals(encode_setpoint(mode, target, limit_nm))
     step = load_layouts()[Opcode.SET_POINT].signals[TARGET_SIGNALS[mode]].scale
     assert abs(sent[TARGET_SIGNALS[mode]] - target) <= step / 2 * (1 + 1e-9)
     assert abs(sent["torque_limit"] - limit_nm) <= 0.0005 * (1 + 1e-9)
@@ -50,11 +50,13 @@ def test_setpoint_target_and_limit_are_rounded_to_nearest_step(
 def test_setpoint_beyond_the_range_is_sent_as_its_end(
     mode: JointMode, magnitude: float, is_negative: bool
 ) -> None:
-    sent = read(encode_setpoint(mode, -magnitude if is_negative else magnitude, 65.6 + magnitude))
+    sent = decode_signals(
+        encode_setpoint(mode, -magnitude if is_negative else magnitude, 65.6 + magnitude)
+    )
     max_target = 32767 * load_layouts()[Opcode.SET_POINT].signals[TARGET_SIGNALS[mode]].scale
     assert sent[TARGET_SIGNALS[mode]] == pytest.approx(-max_target if is_negative else max_target)
     assert sent["torque_limit"] == pytest.approx(65.535)
-    assert read(encode_setpoint(mode, 0.0, -1.0))["torque_limit"] == 0.0
+    assert decode_signals(encode_setpoint(mode, 0.0, -1.0))["torque_limit"] == 0.0
 
 
 @given(st.floats(-1e6, 1e6))
@@ -124,4 +126,4 @@ def test_commands_repeat_state_to_a_module_that_differs(
 def test_sync_contains_count_and_time_modulo_their_ranges(count: int, time_us: int) -> None:
     frame = commands.make_sync(count, time_us)
     assert frame.id == 0x080
-    assert read(frame) == {"count": count % 256, "time": time_us % 2**32}
+    assert decode_signals(frame) == {"count": count % 256, "time": time_us % 2**32}

@@ -12,10 +12,10 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, JointMode, LeaseRequest, SensorDescription
 from snakesim_testing.hal.authority_rig import (
     ARM,
-    CLEAR,
     DISARM,
     ESTOP,
-    JOINTS,
+    JOINT_COUNT,
+    RESET,
     AuthorityRig,
     list_modes,
     make_armed_rig,
@@ -102,7 +102,7 @@ def test_arming_hundred_unknown_joints_is_refused_within_message_length() -> Non
 def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
     """Reset and armed again within one period, the backend would never receive the stop."""
     rig = make_armed_rig()
-    rig.tick_with(0.1)
+    rig.run_tick_with_command(0.1)
     match stop:
         case "estop":
             rig.authority.handle_estop_request(ESTOP, rig.tick)
@@ -112,7 +112,7 @@ def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
             rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     if stop != "disarm":
         rig.pass_tick()  # the motors receive the stop, but not yet its reset
-        rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
+        rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.acquire()
     rig.send(0.1)
     answer = rig.arm()
@@ -125,7 +125,7 @@ def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
 def test_arming_for_the_first_time_waits_for_no_stop() -> None:
     rig = AuthorityRig()
     rig.authority.latch_fault(HOT)
-    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
+    rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.observe(0.1)
     rig.acquire()
     rig.send(0.1)
@@ -134,7 +134,7 @@ def test_arming_for_the_first_time_waits_for_no_stop() -> None:
 
 def test_arming_after_a_disarm_needs_a_new_command() -> None:
     rig = make_armed_rig()
-    rig.tick_with(0.1)
+    rig.run_tick_with_command(0.1)
     rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     rig.pass_tick()
     assert rig.arm().reason == "no commands from control yet"
@@ -187,7 +187,7 @@ def test_arming_in_lockstep_does_not_wait_for_power_reports() -> None:
     )
     rig.observe(0.1)
     rig.acquire()
-    rig.tick_with(0.1)
+    rig.run_tick_with_command(0.1)
     rig.send(0.1)
     assert rig.arm().ok
 
@@ -204,7 +204,7 @@ def test_arming_in_lockstep_drops_commands_of_the_last_session(was_used: bool) -
     assert rig.arm().ok
     decision = rig.authority.compute_setpoints(rig.tick)
     assert decision.command_sequence is None, "a command of the last arm session was applied"
-    assert decision.setpoints.target == pytest.approx([0.1] * JOINTS)
+    assert decision.setpoints.target == pytest.approx([0.1] * JOINT_COUNT)
 
 
 # --- commands and the lease ------------------------------------------------------------------------------------
@@ -212,11 +212,11 @@ def test_arming_in_lockstep_drops_commands_of_the_last_session(was_used: bool) -
 
 def test_command_of_another_arm_session_neither_moves_nor_renews() -> None:
     rig = make_armed_rig()
-    rig.tick_with(0.1, arm_session=1)
+    rig.run_tick_with_command(0.1, arm_session=1)
     for other_session in (0, 2, 0, 2):
         assert rig.send(0.2, arm_session=other_session) == "before_arming"
-        assert rig.pass_tick().setpoints.target == pytest.approx([0.1] * JOINTS)
-    rig.tick_with(0.2, arm_session=0)
+        assert rig.pass_tick().setpoints.target == pytest.approx([0.1] * JOINT_COUNT)
+    rig.run_tick_with_command(0.2, arm_session=0)
     assert rig.authority.state == "fault"
     assert rig.authority.faults[0].what == "lease_expired"
     assert rig.authority.rejected_counts == {"before_arming": 5}
@@ -239,14 +239,14 @@ def test_command_under_way_at_arming_is_not_counted_as_rejected() -> None:
 def test_lease_without_commands_expires_with_a_fault() -> None:
     rig = make_armed_rig()
     for _ in range(20):
-        rig.tick_with(0.1)
+        rig.run_tick_with_command(0.1)
     for _ in range(LEASE_NS // PERIOD_NS - 1):  # the last command remains in force for one term
         assert rig.pass_tick().command_sequence == rig.sequence
     decision = rig.pass_tick()
     assert rig.authority.state == "fault"
     assert decision.command_sequence is None
     assert list_modes(decision) == {JointMode.VELOCITY}
-    assert decision.setpoints.target == [0.0] * JOINTS
+    assert decision.setpoints.target == [0.0] * JOINT_COUNT
     (fault,) = rig.authority.faults
     assert fault.what == "lease_expired"
     assert fault.tick == rig.tick
@@ -256,7 +256,7 @@ def test_lease_without_commands_expires_with_a_fault() -> None:
 
 def test_lease_taken_by_higher_priority_disarms_and_rejects_old_holder() -> None:
     rig = make_armed_rig()
-    rig.tick_with(0.1)
+    rig.run_tick_with_command(0.1)
     assert not rig.acquire("teleop").ok
     assert rig.authority.state == "armed"
     answer = rig.acquire("teleop", priority=200)
@@ -290,7 +290,7 @@ def test_holder_gone_after_estop_frees_lease_and_keeps_reason() -> None:
     rig.authority.handle_lease_holder_exit("control is gone")
     assert rig.authority.lease.holder is None
     assert "emergency stop by a person" in rig.authority.reason
-    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
+    rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.authority.handle_lease_holder_exit("control is gone")
     assert rig.authority.reason == "control is gone"
 
@@ -306,8 +306,12 @@ def test_decision_in_lockstep_uses_the_command_of_its_tick() -> None:
     rig.send(0.11, tick=0)
     rig.tick = 1
     rig.send(0.12, tick=1)
-    assert rig.authority.compute_setpoints(0).setpoints.target == pytest.approx([0.11] * JOINTS)
-    assert rig.authority.compute_setpoints(1).setpoints.target == pytest.approx([0.12] * JOINTS)
+    assert rig.authority.compute_setpoints(0).setpoints.target == pytest.approx(
+        [0.11] * JOINT_COUNT
+    )
+    assert rig.authority.compute_setpoints(1).setpoints.target == pytest.approx(
+        [0.12] * JOINT_COUNT
+    )
 
 
 def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
@@ -324,7 +328,7 @@ def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
         rig.send(0.1)
     after = rig.authority.compute_setpoints(4)
     assert after.command_sequence == before.command_sequence
-    assert after.setpoints.target == pytest.approx([0.3] * JOINTS)
+    assert after.setpoints.target == pytest.approx([0.3] * JOINT_COUNT)
 
 
 # --- stops -----------------------------------------------------------------------------------------------------
@@ -332,16 +336,16 @@ def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
 
 def test_estop_stays_until_reset_and_arming() -> None:
     rig = make_armed_rig()
-    rig.tick_with(0.2)
+    rig.run_tick_with_command(0.2)
     assert rig.authority.handle_estop_request(ESTOP, rig.tick).ok
     for _ in range(3):
-        assert list_modes(rig.tick_with(0.2)) == {JointMode.PASSIVE}
+        assert list_modes(rig.run_tick_with_command(0.2)) == {JointMode.PASSIVE}
     assert not rig.arm().ok
     assert not rig.authority.handle_lifecycle_request(DISARM, rig.now_ns).ok
-    assert rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns).ok
-    assert list_modes(rig.tick_with(0.2)) == {JointMode.PASSIVE}
+    assert rig.authority.handle_lifecycle_request(RESET, rig.now_ns).ok
+    assert list_modes(rig.run_tick_with_command(0.2)) == {JointMode.PASSIVE}
     assert rig.arm().ok
-    assert rig.pass_tick().setpoints.target == [0.1] * JOINTS  # resumes from the measured pose
+    assert rig.pass_tick().setpoints.target == [0.1] * JOINT_COUNT  # resumes from the measured pose
 
 
 @pytest.mark.parametrize(
@@ -363,7 +367,7 @@ def test_fault_starts_the_stop_mode_of_the_robot(
         rig.observe(angle_rad)
         decision = rig.pass_tick()
         assert list_modes(decision) == {mode}
-        assert decision.setpoints.target == [target] * JOINTS
+        assert decision.setpoints.target == [target] * JOINT_COUNT
 
 
 def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
@@ -378,7 +382,7 @@ def test_fault_brakes_a_position_only_joint_until_it_rests() -> None:
     assert 0.1 < braking.target[1] < 0.2
     at_rest = rig.pass_tick().setpoints
     assert at_rest.mode == [JointMode.VELOCITY, JointMode.PASSIVE, JointMode.VELOCITY]
-    assert at_rest.target == [0.0] * JOINTS
+    assert at_rest.target == [0.0] * JOINT_COUNT
 
 
 def test_fault_holds_a_moving_joint_where_it_comes_to_rest() -> None:
@@ -421,7 +425,7 @@ def test_faults_of_a_full_log_include_the_first_stop(stop: str) -> None:
 def test_faults_since_start_survive_a_reset() -> None:
     rig = make_armed_rig()
     rig.authority.latch_fault(HOT)
-    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
+    rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     assert rig.authority.faults == []
     assert [fault.what for fault in rig.authority.faults_since_start.faults] == ["hot"]
 
@@ -432,7 +436,7 @@ def test_faults_since_start_survive_a_reset() -> None:
 def test_heat_derates_then_stops_then_blocks_arming() -> None:
     rig = make_armed_rig()
     report_power(rig, [20.0, 92.5, 20.0])
-    derated = rig.tick_with(0.1)
+    derated = rig.run_tick_with_command(0.1)
     assert derated.setpoints.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
     assert derated.limit_by_joint == {1: "thermal"}
     assert rig.authority.derated_joints == {"joint_2": pytest.approx(0.6)}
@@ -443,9 +447,9 @@ def test_heat_derates_then_stops_then_blocks_arming() -> None:
     ]
     # Torque is also derated while the robot stops.
     assert stopped.setpoints.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])
-    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
+    rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.acquire()
-    rig.tick_with(0.1)
+    rig.run_tick_with_command(0.1)
     assert "joint_2 is at 110" in rig.arm().reason
     report_power(rig, [20.0, 70.0, 20.0])
     rig.pass_tick()
@@ -456,9 +460,9 @@ def test_heat_derates_then_stops_then_blocks_arming() -> None:
 def test_weak_supply_blocks_arming_with_one_explanation() -> None:
     rig = AuthorityRig()
     for _ in range(7):
-        report_power(rig, [20.0] * JOINTS, volts=12.0)
+        report_power(rig, [20.0] * JOINT_COUNT, volts=12.0)
         rig.pass_tick()
-    rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
+    rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     answer = rig.arm()
     assert answer.refusal == "not_ready"
     assert answer.reason.count("12.0 V") == 1
@@ -488,7 +492,7 @@ def test_joint_state_with_nan_is_published_as_last_good() -> None:
 
 def test_reset_without_a_fault_is_refused_with_its_reason() -> None:
     rig = make_armed_rig()
-    answer = rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns)
+    answer = rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     assert not answer.ok
     assert answer.reason == "nothing to reset in state armed"
 
@@ -513,7 +517,7 @@ def test_constant_angles_are_implausible_only_while_commanded_to_move(
     """Accept constant angles of a robot without commands for any time."""
     rig = make_armed_rig() if is_armed else make_commanded_rig()
     for tick in range(1, 400):
-        rig.tick_with(0.1 + 0.001 * tick)
+        rig.run_tick_with_command(0.1 + 0.001 * tick)
         rig.authority.observe_joints(
             make_joint_state(
                 rig.robot, 0.1, tick=tick, timestamp_ns=rig.timestamp_ns + tick * PERIOD_NS

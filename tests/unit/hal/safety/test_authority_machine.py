@@ -26,19 +26,19 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
 )
 from snakesim_testing.hal.authority_model import (
-    ALL,
+    ALL_JOINTS,
     ANGLE_LIMIT_RAD,
-    DERATE_FROM,
+    ANY_MOTION_TIME_NS,
+    DERATE_FROM_C,
+    HEALTH_FAULTS,
     INF,
-    JOINTS,
-    KNOWN_FOR_NS,
-    LONG_NS,
+    JOINT_COUNT,
+    MAX_HEALTH_AGE_NS,
     MAX_STEP_RAD,
-    MIN_V,
+    MIN_VOLTAGE_V,
     NAN,
     PERIOD_S,
-    STOP_AT,
-    WORDS,
+    STOP_AT_C,
     AuthorityModel,
     clamp,
 )
@@ -71,13 +71,13 @@ REASONS = {
     "finite": "not_finite",
 }
 TIMES_NS = st.sampled_from(
-    [0, 1, PERIOD_NS, LEASE_NS - 1, LEASE_NS, LEASE_NS + 1, KNOWN_FOR_NS + 1]
+    [0, 1, PERIOD_NS, LEASE_NS - 1, LEASE_NS, LEASE_NS + 1, MAX_HEALTH_AGE_NS + 1]
 ) | st.integers(0, 3 * LEASE_NS)
 
 
 def draw_per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
     """Return a strategy for lists with one value for each joint."""
-    return st.lists(values, min_size=JOINTS, max_size=JOINTS)
+    return st.lists(values, min_size=JOINT_COUNT, max_size=JOINT_COUNT)
 
 
 def draw_mostly(usual: Any, *others: Any) -> st.SearchStrategy[Any]:
@@ -157,9 +157,9 @@ class AuthorityMachine(AuthorityModel):
         failure=draw_mostly(
             None, "valid", "age", "nan", "inf", "short", "long", "no_valid", "no_age"
         ),
-        joint=st.integers(0, JOINTS - 1),
+        joint=st.integers(0, JOINT_COUNT - 1),
         column=st.sampled_from([0, 0, 1, 2]),
-        later_ns=draw_mostly(LONG_NS, PERIOD_NS, 0),
+        later_ns=draw_mostly(ANY_MOTION_TIME_NS, PERIOD_NS, 0),
     )
     def observe(
         self,
@@ -172,8 +172,8 @@ class AuthorityMachine(AuthorityModel):
         later_ns: int,
     ) -> None:
         """Observe a joint state, perhaps with a failure in the angles, velocities or torques."""
-        valid = [True] * JOINTS
-        age_ns = [FRESH_NS] * JOINTS
+        valid = [True] * JOINT_COUNT
+        age_ns = [FRESH_NS] * JOINT_COUNT
         columns = [list(angle), list(velocity), list(torque)]
         self.timestamp_ns += later_ns
         add_state_failure(columns, valid, age_ns, joint, column, failure)
@@ -194,7 +194,7 @@ class AuthorityMachine(AuthorityModel):
         unknown: set[int] = set()
         implausible: set[int] = set()
         frozen_joints: set[int] = set()
-        for i in range(JOINTS):
+        for i in range(JOINT_COUNT):
             measured_s = (self.timestamp_ns - age_ns[i]) * 1e-9
             is_frozen = self.is_frozen(i, (columns[0][i], columns[1][i], columns[2][i]), measured_s)
             is_valid = failure is None or i != joint
@@ -220,8 +220,8 @@ class AuthorityMachine(AuthorityModel):
     @rule(
         celsius=draw_per_joint(draw_mostly(20.0, 80.0, 81.0, 104.9, 105.0, 300.0)),
         volts=draw_per_joint(draw_mostly(24.0, 18.0, 17.9)),
-        leak=st.none() | st.integers(0, 3 * JOINTS),
-        silent=st.none() | st.integers(0, JOINTS - 1),
+        leak=st.none() | st.integers(0, 3 * JOINT_COUNT),
+        silent=st.none() | st.integers(0, JOINT_COUNT - 1),
         failure=draw_mostly(None, "nan", "short"),
     )
     def observe_power(
@@ -233,8 +233,8 @@ class AuthorityMachine(AuthorityModel):
         failure: str | None,
     ) -> None:
         """Observe a power sample, perhaps with a failure or a silent module."""
-        leaks = [i == leak for i in range(JOINTS)]
-        valid = [i != silent for i in range(JOINTS)]
+        leaks = [i == leak for i in range(JOINT_COUNT)]
+        valid = [i != silent for i in range(JOINT_COUNT)]
         if failure == "nan":
             reported = [NAN, *celsius[1:]]
         elif failure == "short":
@@ -246,11 +246,13 @@ class AuthorityMachine(AuthorityModel):
             if i == silent or not math.isfinite(reported[i]):
                 continue
             health.received_ns = self.now_ns
-            health.celsius = celsius[i]
-            health.volts = volts[i]
+            health.winding_c = celsius[i]
+            health.voltage_v = volts[i]
             health.leak = leaks[i]
-            health.hot = celsius[i] >= (DERATE_FROM if health.hot else STOP_AT)
-            if volts[i] >= MIN_V:
+            health.is_overheated = celsius[i] >= (
+                DERATE_FROM_C if health.is_overheated else STOP_AT_C
+            )
+            if volts[i] >= MIN_VOLTAGE_V:
                 health.low_since_ns = None
             elif health.low_since_ns is None:
                 health.low_since_ns = self.now_ns
@@ -260,21 +262,25 @@ class AuthorityMachine(AuthorityModel):
         faults_before = self.health_faults
         self.health_faults = set()
         for i, health in enumerate(self.healths):
-            self.health_faults |= {(fault_kind, i) for fault_kind in health.wrong(self.now_ns)}
+            self.health_faults |= {
+                (fault_kind, i) for fault_kind in health.find_faults(self.now_ns)
+            }
         for fault_kind, i in sorted(
             self.health_faults - faults_before,
-            key=lambda fault: (fault[1], WORDS.index(fault[0])),
+            key=lambda fault: (fault[1], HEALTH_FAULTS.index(fault[0])),
         ):
-            self.lose_or_fail({i} if fault_kind == "overheated" else None)
+            self.isolate_or_fail({i} if fault_kind == "overheated" else None)
         silent_before = self.silent
         self.silent = set()
         for i, health in enumerate(self.healths):
-            if health.received_ns is not None and not health.known(self.now_ns):
+            if health.received_ns is not None and not health.is_known(self.now_ns):
                 self.silent.add(i)
         newly_silent = self.silent - silent_before
         if newly_silent and not (len(newly_silent) == 1 and newly_silent <= self.isolated):
-            self.note_fault()
-        self.torque_fractions = [health.share(self.now_ns) for health in self.healths]
+            self.count_fault()
+        self.torque_fractions = [
+            health.compute_torque_fraction(self.now_ns) for health in self.healths
+        ]
 
     @rule(
         requester=HOLDERS,
@@ -296,7 +302,7 @@ class AuthorityMachine(AuthorityModel):
         if ok and action == "renew" and self.state != "armed":
             self.expires_ns = self.now_ns + LEASE_NS
         elif ok and action != "renew":
-            self.drop_lease()
+            self.release_lease()
             if self.state == "armed":
                 self.change_state("disarmed")
             if action == "acquire":
@@ -304,7 +310,7 @@ class AuthorityMachine(AuthorityModel):
                 self.priority = priority
                 self.expires_ns = self.now_ns + LEASE_NS
                 self.epoch += 1
-        self.check(answer, ok)
+        self.check_answer(answer, ok)
         if not ok:
             assert answer.refusal == ("lease_held" if action == "acquire" else "not_holder")
 
@@ -335,7 +341,7 @@ class AuthorityMachine(AuthorityModel):
         defects = defects if is_broken else set()
         if stays_near:
             joint_targets = list(self.measured[0])
-            modes = [JointMode.POSITION] * JOINTS
+            modes = [JointMode.POSITION] * JOINT_COUNT
         if "length" in defects:
             joint_targets = joint_targets[1:]
         if "finite" in defects:
@@ -403,7 +409,7 @@ class AuthorityMachine(AuthorityModel):
         """Request arming, which succeeds only if the model fulfills all conditions."""
         ready = (
             self.state == "disarmed"
-            and self.known
+            and self.has_valid_joint_state
             and self.is_lease_held
             and self.newest_command is not None
         )
@@ -413,7 +419,8 @@ class AuthorityMachine(AuthorityModel):
             if fault_kind == "leak" or (fault_kind == "overheated" and i not in self.isolated)
         }
         is_supply_weak = any(
-            health.low_since_ns is not None and health.known(self.now_ns) for health in self.healths
+            health.low_since_ns is not None and health.is_known(self.now_ns)
+            for health in self.healths
         )
         ready = (
             ready
@@ -428,7 +435,7 @@ class AuthorityMachine(AuthorityModel):
                 or mode == JointMode.PASSIVE
                 or (mode == JointMode.POSITION and abs(target - angle) <= MAX_STEP_RAD)
                 for i, mode, target, angle in zip(
-                    ALL, command.mode, command.target, self.measured[0], strict=True
+                    ALL_JOINTS, command.mode, command.target, self.measured[0], strict=True
                 )
             )
         assert (not self.authority.list_unmet_conditions(self.now_ns)) == ready
@@ -451,7 +458,7 @@ class AuthorityMachine(AuthorityModel):
             self.commands_since_arming = []
             self.active_command = None
             self.expires_ns = self.now_ns + LEASE_NS
-        self.check(answer, ready)
+        self.check_answer(answer, ready)
         assert answer.refusal == next(
             (refusal for refusal, is_met in requirements.items() if not is_met), None
         )
@@ -474,7 +481,7 @@ class AuthorityMachine(AuthorityModel):
             if self.isolated:
                 self.isolated = set()
                 self.doubtful_joints = None
-        self.check(answer, ok)
+        self.check_answer(answer, ok)
         if not ok:
             assert answer.refusal == "wrong_state"
 
@@ -483,8 +490,8 @@ class AuthorityMachine(AuthorityModel):
         """Request an emergency stop."""
         answer = self.authority.handle_estop_request(EstopRequest(requester=requester), self.tick)
         self.change_state("estop")
-        self.note_fault()
-        self.check(answer, True)
+        self.count_fault()
+        self.check_answer(answer, True)
         assert self.authority.faults[-1] == Fault(
             tick=self.tick, what="estop", cause=f"emergency stop by {requester}"
         )
@@ -492,7 +499,7 @@ class AuthorityMachine(AuthorityModel):
     @rule(
         cause=st.sampled_from(["joint_2 is hot", "", "x" * 10_000]),
         scope=draw_mostly("robot", "joint", "none"),
-        joint=st.none() | st.integers(0, JOINTS),
+        joint=st.none() | st.integers(0, JOINT_COUNT),
     )
     def latch_backend_fault(self, cause: str, scope: Any, joint: int | None) -> None:
         """Latch a fault that the backend reports."""
@@ -501,9 +508,9 @@ class AuthorityMachine(AuthorityModel):
             Fault(tick=self.tick, what="hot", cause=cause, joint=name, scope=scope)
         )
         if scope == "none":
-            self.note_fault()
+            self.count_fault()
             return
-        self.lose_or_fail({joint} if scope == "joint" and joint in ALL else None)
+        self.isolate_or_fail({joint} if scope == "joint" and joint in ALL_JOINTS else None)
 
     @rule(precedes_stop=st.booleans())
     def record_fault(self, precedes_stop: bool) -> None:
@@ -513,7 +520,7 @@ class AuthorityMachine(AuthorityModel):
             self.authority.log_fault(fault, precedes_stop=True)
         else:
             self.authority.log_fault(fault)
-        self.note_fault()
+        self.count_fault()
         assert self.authority.faults[-1].scope == ("robot" if precedes_stop else "none")
 
     @rule()
@@ -521,21 +528,29 @@ class AuthorityMachine(AuthorityModel):
         """Report that the process of the lease holder has ended."""
         self.authority.handle_lease_holder_exit("the holder is gone")
         if self.state != "armed":
-            self.drop_lease()
+            self.release_lease()
 
     # --- sequences of normal operation, because random inputs alone would hardly ever arm ------------------------
 
     def send_command_to_stay(self) -> None:
         """Send a valid command to stay at the measured angles."""
         near = [clamp(angle, -ANGLE_LIMIT_RAD, ANGLE_LIMIT_RAD) for angle in self.measured[0]]
-        still = [JointMode.POSITION] * JOINTS
+        still = [JointMode.POSITION] * JOINT_COUNT
         self.send_commands(near, still, None, False, set(), False, 0, 0, 1)
 
     @precondition(lambda self: self.state != "armed")
     @rule(angle=st.floats(-1.6, 1.6))
     def set_up_and_arm(self, angle: float) -> None:
         """Arm the robot with valid inputs."""
-        self.observe([angle] * JOINTS, [0.0] * JOINTS, [0.0] * JOINTS, None, 0, 0, LONG_NS)
+        self.observe(
+            [angle] * JOINT_COUNT,
+            [0.0] * JOINT_COUNT,
+            [0.0] * JOINT_COUNT,
+            None,
+            0,
+            0,
+            ANY_MOTION_TIME_NS,
+        )
         if self.state in ("fault", "estop"):
             self.request_less("reset")
         if not self.is_lease_held:
@@ -553,7 +568,7 @@ class AuthorityMachine(AuthorityModel):
         moves=draw_per_joint(st.floats(-0.1, 0.1) | st.floats(-1, 1)),
         torque=draw_per_joint(st.floats(-5, 5)),
         ticks=st.integers(1, 8),
-        later_ns=draw_mostly(PERIOD_NS, LONG_NS),
+        later_ns=draw_mostly(PERIOD_NS, ANY_MOTION_TIME_NS),
     )
     def run_some_ticks(
         self,
@@ -599,8 +614,8 @@ class AuthorityMachine(AuthorityModel):
         """Send a command of the previous arm session, which counts as rejected only if it answers a later state."""
         back = self.tick - self.armed_tick - later
         self.send_commands(
-            [0.0] * JOINTS,
-            [JointMode.POSITION] * JOINTS,
+            [0.0] * JOINT_COUNT,
+            [JointMode.POSITION] * JOINT_COUNT,
             None,
             False,
             set(),
@@ -622,14 +637,14 @@ class AuthorityMachine(AuthorityModel):
         """Do what a host does at the end of a tick, and check the setpoints."""
         self.now_ns += late_ns
         self.tick += 1
-        if self.state == "armed" and not self.known:
-            self.lose_or_fail(self.doubtful_joints)
+        if self.state == "armed" and not self.has_valid_joint_state:
+            self.isolate_or_fail(self.doubtful_joints)
         self.update_health()
         if self.holder is not None and not self.is_lease_held:
             if self.state == "armed":
                 self.fail()
             else:
-                self.drop_lease()
+                self.release_lease()
         self.authority.latch_faults_and_expire_lease(self.now_ns, self.tick)
         up_to = None if self.lag is None else self.tick - self.lag
         limited_before = self.authority.limited_counts.total()

@@ -8,7 +8,7 @@ import pytest
 from snakesim_hal.safety.derating import REPORT_TIMEOUT_NS, WHERE_TO_SET_MIN_VOLTAGE, HealthMonitor
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Fault, SensorDescription
-from snakesim_testing.hal.limiter_rig import JOINTS
+from snakesim_testing.hal.limiter_rig import JOINT_COUNT
 from snakesim_testing.hal.small_robots import make_description, make_power
 
 NS_PER_MS = 1_000_000
@@ -54,10 +54,10 @@ class HealthRig:
 
 def test_derating_without_samples_changes_nothing() -> None:
     rig = HealthRig()
-    assert rig.torque_fractions == [1.0] * JOINTS
+    assert rig.torque_fractions == [1.0] * JOINT_COUNT
     assert rig.derating.current_faults == []
     assert rig.evaluate(0) == []
-    assert rig.torque_fractions == [1.0] * JOINTS
+    assert rig.torque_fractions == [1.0] * JOINT_COUNT
     assert rig.derating.find_derated_joints() == {}
 
 
@@ -67,7 +67,7 @@ def test_derating_joint_without_heat_or_voltage_sensor_never_stops() -> None:
     )
     assert rig.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 24.0]) == []
     assert rig.evaluate(100 * NS_PER_MS) == []
-    assert rig.torque_fractions == [1.0] * JOINTS
+    assert rig.torque_fractions == [1.0] * JOINT_COUNT
     assert rig.supply_problems == []
     faults = rig.receive(motor_c=[0.0, 300.0, 300.0], voltage_v=[24.0, 0.0, 12.0]) + rig.evaluate(
         100 * NS_PER_MS
@@ -91,8 +91,8 @@ def test_derating_reduces_torque_linearly_with_temperature(celsius: float, fract
 def test_derating_range_comes_from_the_robot_file() -> None:
     rig = HealthRig(limits__derate_from_c=50.0, limits__stop_at_c=60.0)
     assert rig.receive(55.0) == []
-    assert rig.torque_fractions == pytest.approx([0.6] * JOINTS)
-    assert len(rig.receive(60.0)) == JOINTS
+    assert rig.torque_fractions == pytest.approx([0.6] * JOINT_COUNT)
+    assert len(rig.receive(60.0)) == JOINT_COUNT
 
 
 STOP_AT_C = 105.0
@@ -133,7 +133,7 @@ def test_derating_overheated_fault_remains_while_module_is_silent() -> None:
     rig.receive([20.0, 110.0, 20.0])
     assert rig.evaluate(10 * NS_PER_S) == []
     assert [fault.what for fault in rig.derating.current_faults] == ["overheated"]
-    assert rig.torque_fractions == [1.0] * JOINTS
+    assert rig.torque_fractions == [1.0] * JOINT_COUNT
 
 
 def test_derating_leak_is_a_fault_until_it_ends() -> None:
@@ -208,7 +208,7 @@ def test_derating_short_voltage_drop_is_no_fault() -> None:
         assert rig.receive(voltage_v=24.0, after_ns=20 * NS_PER_MS) == []
     assert rig.receive(voltage_v=12.0, after_ns=30 * NS_PER_MS) == []
     assert (
-        len(rig.receive(voltage_v=12.0, after_ns=50 * NS_PER_MS)) == JOINTS
+        len(rig.receive(voltage_v=12.0, after_ns=50 * NS_PER_MS)) == JOINT_COUNT
     )  # counted from the first low report
 
 
@@ -220,13 +220,13 @@ def test_derating_invalid_or_nan_values_are_ignored() -> None:
         == []
     )
     assert rig.evaluate(1 * NS_PER_S) == []
-    assert rig.torque_fractions == [1.0] * JOINTS
+    assert rig.torque_fractions == [1.0] * JOINT_COUNT
 
 
 @pytest.mark.parametrize("column", ["motor_c", "voltage_v", "leak", "valid"])
 def test_derating_sample_of_wrong_length_is_ignored(column: str) -> None:
     rig = HealthRig()
-    values: dict[str, Any] = {"motor_c": 300.0, column: [1.0] * (JOINTS + 1)}
+    values: dict[str, Any] = {"motor_c": 300.0, column: [1.0] * (JOINT_COUNT + 1)}
     assert rig.receive(**values) == []
 
 
@@ -258,7 +258,7 @@ def test_derating_leak_and_voltage_of_silent_module_are_ignored(values: dict[str
     rig = HealthRig()
     rig.receive(**values)
     rig.evaluate(50 * NS_PER_MS)
-    assert len(rig.derating.current_faults) == JOINTS
+    assert len(rig.derating.current_faults) == JOINT_COUNT
     rig.evaluate(3 * NS_PER_S)
     assert rig.derating.current_faults == []
 
@@ -300,4 +300,4 @@ def test_derating_heat_concerns_a_joint_and_others_the_robot(
     rig = HealthRig()
     rig.receive(**values)
     rig.evaluate(50 * NS_PER_MS)
-    assert [fault.scope for fault in rig.derating.current_faults] == [scope] * JOINTS
+    assert [fault.scope for fault in rig.derating.current_faults] == [scope] * JOINT_COUNT

@@ -20,20 +20,20 @@ from snakesim_hal.safety.limiter import (
 )
 from snakesim_hal.wire.messages import JointCommand, JointMode
 from snakesim_testing.hal.limiter_rig import (
-    ANGLE_STEP,
-    COOL,
-    JOINTS,
+    ANGLE_STEP_RAD,
+    FULL_TORQUE,
+    JOINT_COUNT,
     LIMITS,
     ROBOT,
-    SPEED_STEP,
+    SPEED_STEP_RAD_S,
     TINY,
-    TORQUE_STEP,
-    applied_for,
-    before,
-    bumpless,
-    every,
-    limited,
-    words,
+    TORQUE_STEP_NM,
+    compute_bumpless_targets,
+    find_limit_names,
+    limit_in_equal_states,
+    limit_setpoints,
+    make_last_setpoints,
+    make_measured_state,
 )
 from snakesim_testing.hal.small_robots import make_description, make_joint_command
 from snakesim_testing.hypothesis_profiles import choose_trial_count
@@ -59,7 +59,7 @@ ANY_ANGLE = st.floats(-3, 3) | st.floats(-1e4, 1e4)
 
 def draw_per_joint(values: st.SearchStrategy[Any]) -> st.SearchStrategy[list[Any]]:
     """Return a strategy for lists with one value for each joint."""
-    return st.lists(values, min_size=JOINTS, max_size=JOINTS)
+    return st.lists(values, min_size=JOINT_COUNT, max_size=JOINT_COUNT)
 
 
 @st.composite
@@ -92,15 +92,17 @@ def test_limiter_setpoints_for_any_command_are_inside_every_limit(
     case: tuple[JointCommand, MeasuredState, AppliedSetpoints],
 ) -> None:
     command, measured, last = case
-    applied = limited(command, measured, last)
+    applied = limit_setpoints(command, measured, last)
     assert np.isfinite(applied.target).all()
     assert np.isfinite(applied.torque_limit_nm).all()
     assert (applied.torque_limit_nm >= 0).all()
     assert (applied.torque_limit_nm <= LIMITS.torque_nm).all()
     if command.torque_limit_nm is not None:
         assert (applied.torque_limit_nm <= np.array(command.torque_limit_nm)).all()
-    start = np.where(applied.mode == last.mode, last.target, bumpless(command.mode, measured))
-    for i in range(JOINTS):
+    start = np.where(
+        applied.mode == last.mode, last.target, compute_bumpless_targets(command.mode, measured)
+    )
+    for i in range(JOINT_COUNT):
         target = applied.target[i]
         change = abs(target - start[i])
         assert applied.mode[i] == command.mode[i]
@@ -117,14 +119,14 @@ def test_limiter_setpoints_for_any_command_are_inside_every_limit(
                 # The rate limit is exceeded only to stay near the measured angle, or inside the limits.
                 edges = np.clip(measured.angle_rad[i] + np.array([-0.3, 0.3]), -1.5, 1.5)
                 assert (
-                    change <= ANGLE_STEP + TINY * abs(start[i]) + TINY
+                    change <= ANGLE_STEP_RAD + TINY * abs(start[i]) + TINY
                     or np.abs(edges - target).min() < TINY
                 )
             case JointMode.VELOCITY:
                 low, high = compute_bounds(command.mode[i], measured, i)
                 assert abs(target) <= 5.0
                 assert low - TINY <= target <= high + TINY
-                assert change <= SPEED_STEP + TINY * abs(start[i]) + TINY or is_at_bound(
+                assert change <= SPEED_STEP_RAD_S + TINY * abs(start[i]) + TINY or is_at_bound(
                     target, 5.0, low, high
                 )
             case JointMode.TORQUE:
@@ -133,7 +135,7 @@ def test_limiter_setpoints_for_any_command_are_inside_every_limit(
                 assert abs(target) <= max_torque_nm
                 assert target <= max(high, -max_torque_nm)
                 assert target >= min(low, max_torque_nm)
-                assert change <= TORQUE_STEP + TINY * abs(start[i]) + TINY or is_at_bound(
+                assert change <= TORQUE_STEP_NM + TINY * abs(start[i]) + TINY or is_at_bound(
                     target, max_torque_nm, low, high
                 )
 
@@ -143,14 +145,14 @@ def test_limiter_names_exactly_the_targets_it_changes(
     case: tuple[JointCommand, MeasuredState, AppliedSetpoints],
 ) -> None:
     command, measured, last = case
-    applied = limited(command, measured, last)
+    applied = limit_setpoints(command, measured, last)
     changed = {
         i
-        for i in range(JOINTS)
+        for i in range(JOINT_COUNT)
         if command.mode[i] != JointMode.PASSIVE and applied.target[i] != command.target[i]
     }
-    assert set(words(command, applied, measured)) == changed
-    repeated = limited(
+    assert set(find_limit_names(command, applied, measured)) == changed
+    repeated = limit_setpoints(
         msgspec.structs.replace(command, target=applied.target.tolist()), measured, applied
     )
     assert (repeated.target == applied.target).all()  # applied setpoints pass unchanged
@@ -161,26 +163,28 @@ def test_limiter_random_targets_never_exceed_speed_limit(
     target_sequence: list[list[float]],
 ) -> None:
     """Use a joint that follows immediately, so that only the rate limit applies."""
-    zero = np.zeros(JOINTS)
-    last = before(JointMode.POSITION)
+    zero = np.zeros(JOINT_COUNT)
+    last = make_last_setpoints(JointMode.POSITION)
     for target in target_sequence:
-        applied = limited(
+        applied = limit_setpoints(
             make_joint_command(ROBOT, target), MeasuredState(last.target, zero, zero), last
         )
-        assert np.abs(applied.target - last.target).max() <= ANGLE_STEP + TINY
+        assert np.abs(applied.target - last.target).max() <= ANGLE_STEP_RAD + TINY
         last = applied
 
 
 def test_limiter_constant_target_is_reached_at_the_rate_limit() -> None:
     for mode, requested, step in (
-        (JointMode.POSITION, 0.2, ANGLE_STEP),
-        (JointMode.VELOCITY, 4.0, SPEED_STEP),
-        (JointMode.TORQUE, 3.0, TORQUE_STEP),
+        (JointMode.POSITION, 0.2, ANGLE_STEP_RAD),
+        (JointMode.VELOCITY, 4.0, SPEED_STEP_RAD_S),
+        (JointMode.TORQUE, 3.0, TORQUE_STEP_NM),
     ):
-        last = before(mode)
+        last = make_last_setpoints(mode)
         steps = int(np.ceil(requested / step - 1e-9))
         for step_count in range(1, steps + 1):
-            last = limited(make_joint_command(ROBOT, requested, mode), every(), last)
+            last = limit_setpoints(
+                make_joint_command(ROBOT, requested, mode), make_measured_state(), last
+            )
             assert last.target[0] == pytest.approx(min(step_count * step, requested))
 
 
@@ -188,7 +192,9 @@ def test_limiter_constant_target_is_reached_at_the_rate_limit() -> None:
 @pytest.mark.parametrize("side", [1, -1])
 def test_limiter_joint_beyond_its_end_is_only_commanded_back(angle: float, side: int) -> None:
     for requested in (-1e4, -1.5, 0.0, 1.5, 1e4):
-        target = applied_for(make_joint_command(ROBOT, requested), angle=side * angle).target
+        target = limit_in_equal_states(
+            make_joint_command(ROBOT, requested), angle=side * angle
+        ).target
         assert (np.abs(target) <= 1.5).all()
         assert (
             side * target >= min(angle - 0.3, 1.5) - TINY
@@ -196,14 +202,14 @@ def test_limiter_joint_beyond_its_end_is_only_commanded_back(angle: float, side:
 
 
 def test_limiter_torque_limit_zero_allows_no_torque() -> None:
-    no_torque = [0.0] * JOINTS
+    no_torque = [0.0] * JOINT_COUNT
     for mode in JointMode:
-        applied = applied_for(
+        applied = limit_in_equal_states(
             make_joint_command(ROBOT, 1.0, mode, torque_limit_nm=no_torque), torque=3.0
         )
         assert (applied.torque_limit_nm == 0).all()
     assert (
-        applied_for(
+        limit_in_equal_states(
             make_joint_command(ROBOT, 1.0, JointMode.TORQUE, torque_limit_nm=no_torque), torque=3.0
         ).target
         == 0
@@ -212,10 +218,10 @@ def test_limiter_torque_limit_zero_allows_no_torque() -> None:
 
 def test_limiter_negative_torque_limit_counts_as_zero() -> None:
     assert (
-        applied_for(
-            make_joint_command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINTS)
+        limit_in_equal_states(
+            make_joint_command(ROBOT, 0.0, torque_limit_nm=[-0.5] * JOINT_COUNT)
         ).torque_limit_nm.tolist()
-        == [0.0] * JOINTS
+        == [0.0] * JOINT_COUNT
     )
 
 
@@ -233,16 +239,21 @@ def test_limiter_limits_states_and_setpoints_are_immutable(frozen_value: Any) ->
 
 
 def test_limiter_torque_limit_never_exceeds_that_of_the_robot() -> None:
-    applied = applied_for(make_joint_command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
+    applied = limit_in_equal_states(make_joint_command(ROBOT, 0.0, torque_limit_nm=[1e5, 4.0, 1.0]))
     assert applied.torque_limit_nm.tolist() == [4.0, 4.0, 1.0]
-    assert applied_for(make_joint_command(ROBOT, 0.0)).torque_limit_nm.tolist() == [4.0] * JOINTS
+    assert (
+        limit_in_equal_states(make_joint_command(ROBOT, 0.0)).torque_limit_nm.tolist()
+        == [4.0] * JOINT_COUNT
+    )
 
 
 def test_limiter_joints_may_have_different_modes() -> None:
     command = make_joint_command(
         ROBOT, 9.0, [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE]
     )
-    assert applied_for(command).target == pytest.approx([ANGLE_STEP, SPEED_STEP, TORQUE_STEP])
+    assert limit_in_equal_states(command).target == pytest.approx(
+        [ANGLE_STEP_RAD, SPEED_STEP_RAD_S, TORQUE_STEP_NM]
+    )
 
 
 # --- mode changes without a jump of torque -----------------------------------------------------------------------
@@ -263,9 +274,11 @@ def compute_motor_torque_nm(target: float, angle: float, velocity: float) -> flo
 def test_limiter_switch_to_position_mode_keeps_present_torque(
     angle: float, velocity: float, torque: float, requested: float, mode: JointMode
 ) -> None:
-    applied = applied_for(make_joint_command(ROBOT, requested), angle, velocity, torque, mode)
+    applied = limit_in_equal_states(
+        make_joint_command(ROBOT, requested), angle, velocity, torque, mode
+    )
     torque_after_switch = compute_motor_torque_nm(applied.target[0], angle, velocity)
-    assert abs(torque_after_switch - torque) <= 40.0 * ANGLE_STEP + 1e-6
+    assert abs(torque_after_switch - torque) <= 40.0 * ANGLE_STEP_RAD + 1e-6
 
 
 @given(
@@ -276,17 +289,17 @@ def test_limiter_switch_to_position_mode_keeps_present_torque(
 def test_limiter_switch_to_torque_mode_keeps_present_torque(
     torque: float, requested: float, mode: JointMode
 ) -> None:
-    applied = applied_for(
+    applied = limit_in_equal_states(
         make_joint_command(ROBOT, requested, JointMode.TORQUE), 0.3, 1.0, torque, mode
     )
-    assert abs(applied.target[0] - torque) <= TORQUE_STEP + TINY
+    assert abs(applied.target[0] - torque) <= TORQUE_STEP_NM + TINY
 
 
 @given(velocity=st.floats(-5, 5), requested=st.floats(-10, 10))
 def test_limiter_switch_to_velocity_mode_keeps_present_torque(
     velocity: float, requested: float
 ) -> None:
-    applied = applied_for(
+    applied = limit_in_equal_states(
         make_joint_command(ROBOT, requested, JointMode.VELOCITY),
         0.3,
         velocity,
@@ -297,32 +310,39 @@ def test_limiter_switch_to_velocity_mode_keeps_present_torque(
     bumpless_rad_s = velocity + 1.0 / joint.velocity_gain_nm_s_per_rad
     max_speed_rad_s = joint.speed_limit_rad_s
     assert (
-        min(max(bumpless_rad_s - SPEED_STEP, -max_speed_rad_s), max_speed_rad_s) - TINY
+        min(max(bumpless_rad_s - SPEED_STEP_RAD_S, -max_speed_rad_s), max_speed_rad_s) - TINY
         <= applied.target[0]
     )
     assert (
         applied.target[0]
-        <= max(min(bumpless_rad_s + SPEED_STEP, max_speed_rad_s), -max_speed_rad_s) + TINY
+        <= max(min(bumpless_rad_s + SPEED_STEP_RAD_S, max_speed_rad_s), -max_speed_rad_s) + TINY
     )
 
 
 def test_limiter_torque_limit_rises_at_the_torque_rate() -> None:
-    last = AppliedSetpoints(np.zeros(JOINTS, dtype=np.int64), np.zeros(JOINTS), np.zeros(JOINTS))
-    applied = limited(make_joint_command(ROBOT, 0.3, JointMode.POSITION), every(), last)
-    assert applied.torque_limit_nm == pytest.approx(np.full(JOINTS, TORQUE_STEP))
+    last = AppliedSetpoints(
+        np.zeros(JOINT_COUNT, dtype=np.int64), np.zeros(JOINT_COUNT), np.zeros(JOINT_COUNT)
+    )
+    applied = limit_setpoints(
+        make_joint_command(ROBOT, 0.3, JointMode.POSITION), make_measured_state(), last
+    )
+    assert applied.torque_limit_nm == pytest.approx(np.full(JOINT_COUNT, TORQUE_STEP_NM))
 
 
 def test_limiter_mode_switch_without_motion_keeps_every_torque() -> None:
     measured = MeasuredState(
         np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.0, -0.5]), np.array([1.0, -2.0, 0.0])
     )
-    hold = bumpless([JointMode.POSITION] * JOINTS, measured)
+    hold = compute_bumpless_targets([JointMode.POSITION] * JOINT_COUNT, measured)
     torques_after_switch = [
         compute_motor_torque_nm(*row)
         for row in zip(hold, measured.angle_rad, measured.velocity_rad_s, strict=True)
     ]
     assert torques_after_switch == pytest.approx(measured.torque_nm.tolist())
-    assert bumpless([JointMode.TORQUE] * JOINTS, measured) == measured.torque_nm.tolist()
+    assert (
+        compute_bumpless_targets([JointMode.TORQUE] * JOINT_COUNT, measured)
+        == measured.torque_nm.tolist()
+    )
 
 
 def test_limiter_switch_to_velocity_mode_uses_the_velocity_gain() -> None:
@@ -338,14 +358,14 @@ def test_limiter_joint_without_stiffness_has_a_finite_target() -> None:
     ) == pytest.approx(1e9)
     joints = [msgspec.structs.replace(joint, stiffness_nm_per_rad=0.0) for joint in ROBOT.joints]
     limits = JointLimits.from_description(msgspec.structs.replace(ROBOT, joints=joints))
-    measured = every(torque=4.0)
-    last = before(JointMode.PASSIVE)
+    measured = make_measured_state(torque_nm=4.0)
+    last = make_last_setpoints(JointMode.PASSIVE)
     applied = limit_command(
         make_joint_command(ROBOT, 0.0),
         measured=measured,
         last=last,
         limits=limits,
-        torque_fraction=COOL,
+        torque_fraction=FULL_TORQUE,
     )
     assert np.abs(applied.target).max() <= 0.3
 
@@ -372,12 +392,12 @@ def test_limiter_velocity_towards_joint_end_stops_before_it(side: int, delay: in
     """Drive a joint that follows its target after one or two periods."""
     angle = 0.0
     delayed = [0.0] * delay
-    last = before(JointMode.VELOCITY)
+    last = make_last_setpoints(JointMode.VELOCITY)
     speeds: list[float] = []
     for _ in range(400):
-        last = limited(
+        last = limit_setpoints(
             make_joint_command(ROBOT, side * 5.0, JointMode.VELOCITY),
-            every(angle, delayed[0]),
+            make_measured_state(angle, delayed[0]),
             last,
         )
         delayed = [*delayed[1:], float(last.target[0])]
@@ -387,7 +407,7 @@ def test_limiter_velocity_towards_joint_end_stops_before_it(side: int, delay: in
     assert max(speeds) == 5.0
     assert abs(angle) > 1.49
     # The limit at the end has priority over the rate limit, but hardly needs it.
-    assert max(np.abs(np.diff(speeds))) <= SPEED_STEP + TINY
+    assert max(np.abs(np.diff(speeds))) <= SPEED_STEP_RAD_S + TINY
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -397,11 +417,14 @@ def test_limiter_joint_at_its_end_is_never_driven_outwards(
     side: int, mode: JointMode, beyond_rad: float
 ) -> None:
     for velocity in (-50.0, -1.0, 0.0, 1.0, 50.0):
-        for last in (before(mode, side * 3.0), before(JointMode.POSITION, side * 3.0)):
+        for last in (
+            make_last_setpoints(mode, side * 3.0),
+            make_last_setpoints(JointMode.POSITION, side * 3.0),
+        ):
             for requested in (-9.0, 9.0):
-                applied = limited(
+                applied = limit_setpoints(
                     make_joint_command(ROBOT, requested, mode),
-                    every(side * (1.5 + beyond_rad), velocity),
+                    make_measured_state(side * (1.5 + beyond_rad), velocity),
                     last,
                 )
                 assert (side * applied.target <= 0.0).all()
@@ -409,13 +432,15 @@ def test_limiter_joint_at_its_end_is_never_driven_outwards(
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_limiter_torque_mode_brakes_a_fast_joint(side: int) -> None:
-    measured = every(side * 1.4, side * 5.0)
+    measured = make_measured_state(side * 1.4, side * 5.0)
     command = make_joint_command(ROBOT, side * 4.0, JointMode.TORQUE)
-    applied = limited(command, measured, before(JointMode.TORQUE, side * 4.0))
+    applied = limit_setpoints(command, measured, make_last_setpoints(JointMode.TORQUE, side * 4.0))
     allowed_rad_s = compute_stoppable_speed(0.1, 100.0, 0.01)
     # The velocity gain is 1 N·m·s/rad.
-    assert applied.target == pytest.approx(np.full(JOINTS, side * (allowed_rad_s - 5.0)))
-    assert words(command, applied, measured) == dict.fromkeys(range(JOINTS), "angle")
+    assert applied.target == pytest.approx(np.full(JOINT_COUNT, side * (allowed_rad_s - 5.0)))
+    assert find_limit_names(command, applied, measured) == dict.fromkeys(
+        range(JOINT_COUNT), "angle"
+    )
 
 
 def test_limiter_torque_bounds_with_weak_gain_allow_full_torque() -> None:
@@ -433,16 +458,24 @@ def test_limiter_torque_bounds_with_weak_gain_allow_full_torque() -> None:
 
 def test_limiter_joint_near_its_end_is_named_angle_limited() -> None:
     command = make_joint_command(ROBOT, 5.0, JointMode.VELOCITY)
-    applied = limited(command, every(1.45), before(JointMode.VELOCITY, 5.0))
-    assert words(command, applied, every(1.45)) == dict.fromkeys(range(JOINTS), "angle")
-    assert words(command, applied, every(0.0, 1.45)) == dict.fromkeys(range(JOINTS), "acceleration")
+    applied = limit_setpoints(
+        command, make_measured_state(1.45), make_last_setpoints(JointMode.VELOCITY, 5.0)
+    )
+    assert find_limit_names(command, applied, make_measured_state(1.45)) == dict.fromkeys(
+        range(JOINT_COUNT), "angle"
+    )
+    assert find_limit_names(command, applied, make_measured_state(0.0, 1.45)) == dict.fromkeys(
+        range(JOINT_COUNT), "acceleration"
+    )
 
 
 def test_limiter_torque_far_from_ends_is_not_named_angle_limited() -> None:
     command = make_joint_command(ROBOT, 5.0, JointMode.TORQUE)
-    measured = every(0.0, 1.45)
-    applied = limited(command, measured, before(JointMode.TORQUE, 4.0))
-    assert words(command, applied, measured) == dict.fromkeys(range(JOINTS), "torque")
+    measured = make_measured_state(0.0, 1.45)
+    applied = limit_setpoints(command, measured, make_last_setpoints(JointMode.TORQUE, 4.0))
+    assert find_limit_names(command, applied, measured) == dict.fromkeys(
+        range(JOINT_COUNT), "torque"
+    )
 
 
 # The maximum speed at 1.45 rad, which is below the speed limit of 5 rad/s.
@@ -468,12 +501,12 @@ def test_limiter_names_the_tightest_limit(
     limits = JointLimits.from_description(robot)
     active_limits = find_active_limits(
         command,
-        before(JointMode.VELOCITY),
-        measured=every(side * angle),
+        make_last_setpoints(JointMode.VELOCITY),
+        measured=make_measured_state(side * angle),
         limits=limits,
-        torque_fraction=COOL,
+        torque_fraction=FULL_TORQUE,
     )
-    assert active_limits == dict.fromkeys(range(JOINTS), limit_name)
+    assert active_limits == dict.fromkeys(range(JOINT_COUNT), limit_name)
 
 
 @pytest.mark.parametrize("velocity", [-3.0, 0.0, 3.0])

@@ -7,10 +7,10 @@ import pytest
 from snakesim_hal.safety.fault_log import MAX_FAULTS
 from snakesim_hal.wire.messages import Fault, JointMode
 from snakesim_testing.hal.authority_rig import (
-    CLEAR,
     DISARM,
     ESTOP,
-    JOINTS,
+    JOINT_COUNT,
+    RESET,
     AuthorityRig,
     make_armed_rig,
     report_power,
@@ -23,7 +23,7 @@ def make_armed_rig_without_joint_2(**robot: Any) -> AuthorityRig:
     """Return an armed robot that has isolated joint_2."""
     rig = make_armed_rig(safety__max_isolated_joints=1, **robot)
     rig.observe(0.1, valid=VALID_WITHOUT_JOINT_2)
-    rig.tick_with(0.1)
+    rig.run_tick_with_command(0.1)
     assert rig.authority.state == "armed"
     assert rig.authority.isolated_joints == ["joint_2"]
     return rig
@@ -56,7 +56,7 @@ def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
     assert rig.authority.reason == "armed, without joint_2: no valid and fresh state of joint_2"
     for _ in range(20):
         rig.observe(0.1, valid=VALID_WITHOUT_JOINT_2)
-        assert rig.send(0.12, torque_limit_nm=[3.0] * JOINTS) is None
+        assert rig.send(0.12, torque_limit_nm=[3.0] * JOINT_COUNT) is None
         decision = rig.pass_tick()
         setpoints = decision.setpoints
         assert setpoints.mode == [JointMode.POSITION, JointMode.PASSIVE, JointMode.POSITION]
@@ -72,7 +72,7 @@ def test_isolation_failed_joint_is_passive_while_others_continue() -> None:
 def test_isolation_passive_command_of_isolated_joint_is_not_limited() -> None:
     rig = make_armed_rig_without_joint_2()
     assert (
-        rig.tick_with(
+        rig.run_tick_with_command(
             [0.1, 0.0, 0.1], [JointMode.POSITION, JointMode.PASSIVE, JointMode.POSITION]
         ).limit_by_joint
         == {}
@@ -155,13 +155,13 @@ def test_isolation_robot_can_be_armed_again_without_the_joint() -> None:
     rig.observe(0.1, valid=VALID_WITHOUT_JOINT_2)
     rig.send([0.1, 1.4, 0.1])  # the angle of joint_2 is unknown
     assert rig.arm().ok
-    assert rig.tick_with(0.1).setpoints.isolated == {1}
+    assert rig.run_tick_with_command(0.1).setpoints.isolated == {1}
 
 
 def test_isolation_ends_after_reset_and_a_new_state() -> None:
     rig = make_armed_rig_without_joint_2()
     answer = rig.authority.handle_lifecycle_request(
-        CLEAR, rig.now_ns
+        RESET, rig.now_ns
     )  # a reset has no effect while armed
     assert answer.refusal == "wrong_state"
     assert (
@@ -170,7 +170,7 @@ def test_isolation_ends_after_reset_and_a_new_state() -> None:
     )
     rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     rig.pass_tick()
-    assert rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns).ok
+    assert rig.authority.handle_lifecycle_request(RESET, rig.now_ns).ok
     assert rig.authority.isolated_joints == []
     assert rig.authority.faults == []
     rig.send(0.1)
@@ -178,7 +178,7 @@ def test_isolation_ends_after_reset_and_a_new_state() -> None:
     rig.observe(0.1)
     rig.send(0.1)
     assert rig.arm().ok
-    assert rig.tick_with(0.1).setpoints.mode == [JointMode.POSITION] * JOINTS
+    assert rig.run_tick_with_command(0.1).setpoints.mode == [JointMode.POSITION] * JOINT_COUNT
 
 
 @pytest.mark.parametrize("stop_mode", ["passive", "damp", "hold"])
@@ -190,7 +190,7 @@ def test_isolation_no_stop_mode_moves_an_isolated_joint(stop_mode: str) -> None:
     assert setpoints.isolated == {1}
     assert setpoints.mode[1] is JointMode.PASSIVE
     assert setpoints.torque_limit_nm[1] == 0.0
-    assert rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns).ok
+    assert rig.authority.handle_lifecycle_request(RESET, rig.now_ns).ok
     assert rig.authority.isolated_joints == []
 
 
@@ -198,14 +198,14 @@ def test_isolation_remains_in_emergency_stop_until_reset() -> None:
     rig = make_armed_rig_without_joint_2()
     rig.authority.handle_estop_request(ESTOP, rig.tick)
     assert rig.authority.isolated_joints == ["joint_2"]
-    assert rig.authority.handle_lifecycle_request(CLEAR, rig.now_ns).ok
+    assert rig.authority.handle_lifecycle_request(RESET, rig.now_ns).ok
     assert rig.authority.isolated_joints == []
 
 
 def test_isolation_applies_to_overheated_joint_but_not_to_leak() -> None:
     rig = make_armed_rig(safety__max_isolated_joints=1)
     report_power(rig, [20.0, 110.0, 20.0])
-    assert rig.tick_with(0.1).setpoints.isolated == {1}
+    assert rig.run_tick_with_command(0.1).setpoints.isolated == {1}
     assert rig.authority.state == "armed"
     rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     rig.pass_tick()
@@ -213,17 +213,17 @@ def test_isolation_applies_to_overheated_joint_but_not_to_leak() -> None:
     assert rig.arm().ok  # the hot joint remains isolated
     report_power(rig, [20.0, 110.0, 20.0], volts=12.0)
     for _ in range(7):
-        rig.tick_with(0.1)
+        rig.run_tick_with_command(0.1)
     assert rig.authority.state == "fault"
     assert rig.authority.faults[-1].what == "undervoltage"
 
 
 def test_isolation_silent_health_of_lost_joint_is_not_recorded() -> None:
     rig = make_armed_rig_without_joint_2()
-    report_power(rig, [20.0] * JOINTS)
+    report_power(rig, [20.0] * JOINT_COUNT)
     rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     rig.pass_tick(250)
-    report_power(rig, [20.0] * JOINTS, valid=[True, False, True])
+    report_power(rig, [20.0] * JOINT_COUNT, valid=[True, False, True])
     rig.pass_tick(100)
     assert [fault.what for fault in rig.authority.faults] == ["state_invalid"]
     rig.pass_tick(250)

@@ -12,15 +12,15 @@ from snakesim_hal.safety.limiter import RejectionReason, find_rejection_reason, 
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointCommand, JointMode, SensorDescription
 from snakesim_testing.hal.limiter_rig import (
-    JOINTS,
+    JOINT_COUNT,
     LEASE,
     LIMITS,
     ROBOT,
-    applied_for,
-    before,
-    every,
-    limited,
-    words,
+    find_limit_names,
+    limit_in_equal_states,
+    limit_setpoints,
+    make_last_setpoints,
+    make_measured_state,
 )
 from snakesim_testing.hal.small_robots import LEASE_NS, make_description, make_joint_command
 
@@ -60,10 +60,10 @@ REFUSED_COMMANDS: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any
     ],
     "wrong_layout": [({"layout": "of another robot"}, {})],
     "wrong_length": [
-        ({"target": [0.0] * (JOINTS - 1)}, {}),
-        ({"target": [0.0] * (JOINTS + 1)}, {}),
+        ({"target": [0.0] * (JOINT_COUNT - 1)}, {}),
+        ({"target": [0.0] * (JOINT_COUNT + 1)}, {}),
         ({"target": []}, {}),
-        ({"mode": [JointMode.POSITION] * (JOINTS + 1)}, {}),
+        ({"mode": [JointMode.POSITION] * (JOINT_COUNT + 1)}, {}),
         ({"mode": [], "target": []}, {}),
         ({"torque_limit_nm": [1.0]}, {}),
         ({"torque_limit_nm": []}, {}),
@@ -73,13 +73,13 @@ REFUSED_COMMANDS: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any
             {"mode": [JointMode.POSITION, JointMode.TORQUE, JointMode.POSITION]},
             {"limits": SERVO_LIMITS},
         ),
-        ({"mode": [JointMode.VELOCITY] * JOINTS}, {"limits": SERVO_LIMITS}),
+        ({"mode": [JointMode.VELOCITY] * JOINT_COUNT}, {"limits": SERVO_LIMITS}),
     ],
     "not_finite": [
         ({"target": [0.0, NAN, 0.0]}, {}),
         ({"target": [INF, 0.0, 0.0]}, {}),
         ({"target": [0.0, 0.0, -INF]}, {}),
-        ({"target": [NAN] * JOINTS, "mode": [JointMode.PASSIVE] * JOINTS}, {}),
+        ({"target": [NAN] * JOINT_COUNT, "mode": [JointMode.PASSIVE] * JOINT_COUNT}, {}),
         ({"torque_limit_nm": [1.0, NAN, 1.0]}, {}),
         ({"torque_limit_nm": [1.0, INF, 1.0]}, {}),
     ],
@@ -88,7 +88,7 @@ REFUSED_COMMANDS: dict[RejectionReason, list[tuple[dict[str, Any], dict[str, Any
 
 def test_limiter_valid_command_is_accepted() -> None:
     assert find_reason(make_joint_command(ROBOT)) is None
-    assert find_reason(make_joint_command(ROBOT, torque_limit_nm=[0.0] * JOINTS)) is None
+    assert find_reason(make_joint_command(ROBOT, torque_limit_nm=[0.0] * JOINT_COUNT)) is None
     assert find_reason(make_joint_command(ROBOT, tick=5), now_ns=1000) is None
     assert find_reason(make_joint_command(ROBOT, valid_for_ns=10), age_ns=10) is None
     assert find_reason(make_joint_command(ROBOT, valid_for_ns=0), age_ns=0) is None
@@ -120,7 +120,7 @@ def test_limiter_every_rejection_reason_has_a_test() -> None:
 
 def test_limiter_reports_the_first_reason_in_its_order() -> None:
     defects: list[tuple[RejectionReason, dict[str, Any], dict[str, Any]]] = [
-        ("not_finite", {"target": [NAN] * JOINTS}, {}),
+        ("not_finite", {"target": [NAN] * JOINT_COUNT}, {}),
         ("wrong_length", {"torque_limit_nm": [1.0]}, {}),
         ("wrong_layout", {"layout": "other"}, {}),
         ("stale", {"valid_for_ns": 10}, {"age_ns": 11}),
@@ -145,8 +145,12 @@ TORQUE_FRACTIONS = np.array([1.0, 0.5, 0.25])  # allowed part of the 4 N·m of e
 
 def limit_hot_joints(command: JointCommand) -> tuple[list[float], dict[int, str]]:
     """Limit a command to joints that are cool, warm and hot; return torque limits, and reasons by joint."""
-    applied = limited(command, every(), before(JointMode.TORQUE, 2.0), TORQUE_FRACTIONS)
-    return applied.torque_limit_nm.tolist(), words(command, applied, every(), TORQUE_FRACTIONS)
+    applied = limit_setpoints(
+        command, make_measured_state(), make_last_setpoints(JointMode.TORQUE, 2.0), TORQUE_FRACTIONS
+    )
+    return applied.torque_limit_nm.tolist(), find_limit_names(
+        command, applied, make_measured_state(), TORQUE_FRACTIONS
+    )
 
 
 @pytest.mark.parametrize(
@@ -161,7 +165,7 @@ def limit_hot_joints(command: JointCommand) -> tuple[list[float], dict[int, str]
 def test_limiter_hot_joint_has_lower_torque_limit(
     commanded_limit_nm: float | None, applied_limit_nm: list[float], reasons: dict[int, str]
 ) -> None:
-    limits_nm = None if commanded_limit_nm is None else [commanded_limit_nm] * JOINTS
+    limits_nm = None if commanded_limit_nm is None else [commanded_limit_nm] * JOINT_COUNT
     command = make_joint_command(ROBOT, 2.0, JointMode.TORQUE, torque_limit_nm=limits_nm)
     assert limit_hot_joints(command) == (applied_limit_nm, reasons)
 
@@ -173,7 +177,7 @@ def test_limiter_cool_joint_with_excessive_torque_is_limited_by_rating() -> None
 
 def test_limiter_changed_target_of_hot_joint_names_target_limit() -> None:
     _, reasons = limit_hot_joints(make_joint_command(ROBOT, 9.0, JointMode.POSITION))
-    assert reasons == dict.fromkeys(range(JOINTS), "angle")
+    assert reasons == dict.fromkeys(range(JOINT_COUNT), "angle")
 
 
 def test_limiter_passive_hot_joint_is_not_limited() -> None:
@@ -208,15 +212,17 @@ def test_limiter_changed_target_is_named_by_its_limit(
     mode: JointMode, requested: float, limit_name: str | None
 ) -> None:
     command = make_joint_command(ROBOT, [0.0, requested, 0.0], mode)
-    applied = limited(command, every(), before(mode))
-    assert words(command, applied, every()) == ({} if limit_name is None else {1: limit_name})
+    applied = limit_setpoints(command, make_measured_state(), make_last_setpoints(mode))
+    assert find_limit_names(command, applied, make_measured_state()) == (
+        {} if limit_name is None else {1: limit_name}
+    )
 
 
 def test_limiter_setpoints_for_the_backend_are_plain_python() -> None:
-    applied = applied_for(make_joint_command(ROBOT, 0.01))
+    applied = limit_in_equal_states(make_joint_command(ROBOT, 0.01))
     setpoints = make_safe_setpoints(applied, frozenset({1}))
     assert setpoints.isolated == {1}
-    assert setpoints.mode == [JointMode.POSITION] * JOINTS
+    assert setpoints.mode == [JointMode.POSITION] * JOINT_COUNT
     assert all(type(mode) is JointMode for mode in setpoints.mode)
     assert all(type(value) is float for value in setpoints.target + setpoints.torque_limit_nm)
 

@@ -13,7 +13,7 @@ from snakesim_hal.safety.joint_limits import AppliedSetpoints, JointLimits, Join
 from snakesim_hal.safety.plausibility import PlausibilityChecker, replace_non_finite_values
 from snakesim_hal.wire.freshness import FRESH_PERIODS
 from snakesim_hal.wire.messages import Fault, JointMode, JointState
-from snakesim_testing.hal.limiter_rig import JOINTS, LIMITS, ROBOT
+from snakesim_testing.hal.limiter_rig import JOINT_COUNT, LIMITS, ROBOT
 from snakesim_testing.hal.small_robots import (
     LEASE_NS,
     PERIOD_NS,
@@ -24,7 +24,7 @@ from snakesim_testing.hypothesis_profiles import choose_trial_count
 
 REACH_RAD = 0.05 + 2 * 5.0 * 0.01  # rad that an angle may change in a period
 FAULT_KIND = "state_invalid"
-NO_JOINTS: JointMask = np.zeros(JOINTS, dtype=np.bool_)
+NO_JOINTS: JointMask = np.zeros(JOINT_COUNT, dtype=np.bool_)
 
 
 def make_applied(
@@ -32,7 +32,9 @@ def make_applied(
 ) -> AppliedSetpoints:
     """Return the same applied setpoint for every joint."""
     return AppliedSetpoints(
-        np.full(JOINTS, int(mode)), np.full(JOINTS, target), np.full(JOINTS, torque_limit)
+        np.full(JOINT_COUNT, int(mode)),
+        np.full(JOINT_COUNT, target),
+        np.full(JOINT_COUNT, torque_limit),
     )
 
 
@@ -74,7 +76,7 @@ class CheckerRig:
 
 
 def test_plausibility_first_angle_is_always_accepted() -> None:
-    assert CheckerRig(angle=1.4).angles == [1.4] * JOINTS
+    assert CheckerRig(angle=1.4).angles == [1.4] * JOINT_COUNT
 
 
 @pytest.mark.parametrize("applied", [None, make_applied()])
@@ -128,10 +130,10 @@ def test_plausibility_lost_samples_extend_the_reachable_angle(periods: int) -> N
 def test_plausibility_age_of_a_sample_counts_as_time() -> None:
     """Allow no change for a repeated measurement, and more change after an old one."""
     rig = CheckerRig()
-    assert rig.check_sample(0.1, age_ns=[PERIOD_NS] * JOINTS) is not None
-    assert rig.check_sample(0.04, age_ns=[2 * PERIOD_NS] * JOINTS) is None
-    rig = CheckerRig(age_ns=[3 * PERIOD_NS] * JOINTS)
-    assert rig.check_sample(0.4, age_ns=[0] * JOINTS) is None
+    assert rig.check_sample(0.1, age_ns=[PERIOD_NS] * JOINT_COUNT) is not None
+    assert rig.check_sample(0.04, age_ns=[2 * PERIOD_NS] * JOINT_COUNT) is None
+    rig = CheckerRig(age_ns=[3 * PERIOD_NS] * JOINT_COUNT)
+    assert rig.check_sample(0.4, age_ns=[0] * JOINT_COUNT) is None
 
 
 def test_plausibility_host_pause_extends_the_reachable_angle() -> None:
@@ -147,7 +149,7 @@ def test_plausibility_new_place_is_accepted_after_repeats_unless_armed() -> None
         faults.append(rig.check_sample(1.25, periods=0.5))
         assert [fault is None for fault in faults].index(True) == accepted_sample - 1
         accepted_rad = 1.24 if accepted_sample == 5 else 1.25
-        assert rig.angles == pytest.approx([accepted_rad] * JOINTS, abs=0.011)
+        assert rig.angles == pytest.approx([accepted_rad] * JOINT_COUNT, abs=0.011)
 
 
 def test_plausibility_inconsistent_jumps_are_never_accepted() -> None:
@@ -249,7 +251,7 @@ def test_plausibility_isolated_joint_is_not_checked(failing_joint: int) -> None:
     rig = CheckerRig()
     isolated = NO_JOINTS.copy()
     isolated[1] = True
-    valid = [i != failing_joint for i in range(JOINTS)]
+    valid = [i != failing_joint for i in range(JOINT_COUNT)]
     fault = rig.check_sample(valid=valid, isolated=isolated)
     assert (fault is None) == (failing_joint == 1)
     assert rig.doubted_joints == [2] * (failing_joint == 2)
@@ -511,7 +513,7 @@ def test_plausibility_old_sample_is_not_frozen() -> None:
     for k in range(1, FRESH_PERIODS + 1):
         assert (
             rig.check_sample(
-                0.0, 0.0, 0.5, applied=make_applied(0.1 * k), age_ns=[k * PERIOD_NS] * JOINTS
+                0.0, 0.0, 0.5, applied=make_applied(0.1 * k), age_ns=[k * PERIOD_NS] * JOINT_COUNT
             )
             is None
         )
@@ -534,16 +536,16 @@ def generate_states(
     """Yield states at the edges of every check, in which at most one joint differs, and applied setpoints."""
     timestamp_ns = 0
     target = 0.0
-    angle = [0.4] * JOINTS
+    angle = [0.4] * JOINT_COUNT
     limit_ns = LIMITS.max_state_age_ns
     for _ in range(length):
         timestamp_ns += rng.choice((0, PERIOD_NS, PERIOD_NS, PERIOD_NS, LEASE_NS))
         target += rng.choice((0.0, 0.08))
-        velocity = [rng.choice((0.5, 0.6))] * JOINTS
-        torque = [rng.choice((0.5, 0.6))] * JOINTS
-        ages = [0] * JOINTS
-        valid = [True] * JOINTS
-        changed_joint = rng.randrange(JOINTS)
+        velocity = [rng.choice((0.5, 0.6))] * JOINT_COUNT
+        torque = [rng.choice((0.5, 0.6))] * JOINT_COUNT
+        ages = [0] * JOINT_COUNT
+        valid = [True] * JOINT_COUNT
+        changed_joint = rng.randrange(JOINT_COUNT)
         match rng.choice(
             (
                 "angle",
@@ -572,7 +574,7 @@ def generate_states(
                 valid[changed_joint] = False
             case _:
                 pass
-        count = 0 if rng.random() < 0.02 else JOINTS
+        count = 0 if rng.random() < 0.02 else JOINT_COUNT
         joint_state = make_joint_state(
             ROBOT,
             angle[:count],

@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from snakesim_hal.safety.joint_limits import JointLimits
 from snakesim_hal.safety.stop_ramp import StopRamp
 from snakesim_hal.wire.messages import JointMode
-from snakesim_testing.hal.limiter_rig import ANGLE_STEP, JOINTS, TINY, before, every
+from snakesim_testing.hal.limiter_rig import (
+    ANGLE_STEP_RAD,
+    JOINT_COUNT,
+    TINY,
+    make_last_setpoints,
+    make_measured_state,
+)
 from snakesim_testing.hal.small_robots import make_description
 
 ROBOT = make_description(motor__damping_nm_s_per_rad=2.0)
@@ -19,7 +25,9 @@ def start_ramp(
     angle: float, velocity: float, torque: float, mode: JointMode, target: float
 ) -> StopRamp:
     """Start a ramp from a measured state and the last setpoint."""
-    return StopRamp.start(every(angle, velocity, torque), before(mode, target), LIMITS)
+    return StopRamp.start(
+        make_measured_state(angle, velocity, torque), make_last_setpoints(mode, target), LIMITS
+    )
 
 
 def list_targets(ramp: StopRamp, periods: int) -> list[float]:
@@ -52,13 +60,17 @@ def test_stop_ramp_in_position_mode_starts_at_the_target() -> None:
 
 def test_stop_ramp_after_another_mode_starts_from_present_torque() -> None:
     ramp = start_ramp(0.1, 1.0, 2.0, JointMode.VELOCITY, 1.0)
-    assert ramp.target_rad == pytest.approx(np.full(JOINTS, 0.1 + (2.0 + 2.0 * 1.0) / 40.0))
+    assert ramp.target_rad == pytest.approx(np.full(JOINT_COUNT, 0.1 + (2.0 + 2.0 * 1.0) / 40.0))
 
 
 def test_stop_ramp_starts_within_one_step_of_the_joint() -> None:
-    assert start_ramp(0.0, 0.0, 100.0, JointMode.TORQUE, 1.0).target_rad.tolist() == [0.3] * JOINTS
     assert (
-        start_ramp(0.0, 0.0, 0.0, JointMode.POSITION, -1.0).target_rad.tolist() == [-0.3] * JOINTS
+        start_ramp(0.0, 0.0, 100.0, JointMode.TORQUE, 1.0).target_rad.tolist()
+        == [0.3] * JOINT_COUNT
+    )
+    assert (
+        start_ramp(0.0, 0.0, 0.0, JointMode.POSITION, -1.0).target_rad.tolist()
+        == [-0.3] * JOINT_COUNT
     )
 
 
@@ -74,8 +86,8 @@ def test_stop_ramp_from_any_state_never_jumps_or_leaves_range(
 ) -> None:
     targets_rad = np.array(list_targets(start_ramp(angle, velocity, torque, mode, target), 60))
     assert np.abs(targets_rad).max() <= 1.5
-    assert np.abs(np.diff(targets_rad)).max() <= ANGLE_STEP + TINY
+    assert np.abs(np.diff(targets_rad)).max() <= ANGLE_STEP_RAD + TINY
     assert targets_rad[-1] == targets_rad[-2] == targets_rad[-10]
     rest_rad = np.clip(angle, -1.5, 1.5) + np.sign(velocity) * min(abs(velocity), 5.0) ** 2 / 200.0
     # The ramp decelerates in whole periods.
-    assert abs(targets_rad[-1] - np.clip(rest_rad, -1.5, 1.5)) <= ANGLE_STEP / 2
+    assert abs(targets_rad[-1] - np.clip(rest_rad, -1.5, 1.5)) <= ANGLE_STEP_RAD / 2

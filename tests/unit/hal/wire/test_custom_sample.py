@@ -10,13 +10,13 @@ from snakesim_hal.base.errors import ConfigError, WireError
 from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.custom_sample import make_message_schema, parse_custom_message
 from snakesim_hal.wire.messages import CustomSample
-from snakesim_testing.hal.custom_sample import GOOD, PLACE, SkinSample
+from snakesim_testing.hal.custom_sample import MOUNTING, VALID_VALUES, SkinSample
 from snakesim_testing.messages import raises_error
 
 
 def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
     kind = parse_custom_message(make_message_schema(SkinSample, "skin"))
-    sample = SkinSample(**PLACE, **GOOD)
+    sample = SkinSample(**MOUNTING, **VALID_VALUES)
     decoded = MessageDecoder(kind.message).decode(encode(sample), format_encoding(SkinSample))
     assert msgspec.to_builtins(decoded) == msgspec.to_builtins(sample)
     assert kind.units == {"pressed_n": "N", "flow_m_s": "m/s", "wet": "1", "count": "1"}
@@ -27,7 +27,7 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
     )
     assert MessageDecoder(CustomSample).decode(
         encode(sample), format_encoding(SkinSample)
-    ) == CustomSample(**PLACE)
+    ) == CustomSample(**MOUNTING)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_custom_sample_is_decoded_from_its_schema_alone() -> None:
     ids=lambda invalid: next(iter(invalid)),
 )
 def test_custom_sample_schema_refuses_the_same_values_as_class(invalid: dict[str, Any]) -> None:
-    payload = msgspec.msgpack.encode(PLACE | GOOD | invalid)
+    payload = msgspec.msgpack.encode(MOUNTING | VALID_VALUES | invalid)
     for message in (
         SkinSample,
         parse_custom_message(make_message_schema(SkinSample, "skin")).message,

@@ -18,7 +18,14 @@ from snakesim_operator.features.console.page.force_polygon import (
 )
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.scene.drawing import M_PER_N, MAX_FORCE_ARROW_M, draw
-from snakesim_testing.operator.drawn_samples import COUNT, ROBOT, contact, joints, pushing, world
+from snakesim_testing.operator.drawn_samples import (
+    JOINT_COUNT,
+    ROBOT,
+    make_contact,
+    make_control_state,
+    make_joints,
+    make_world_model,
+)
 
 
 def test_drawing_links_and_hinges_follow_base_pose_and_joint_angles():
@@ -26,7 +33,7 @@ def test_drawing_links_and_hinges_follow_base_pose_and_joint_angles():
     quarter_turn_rad = math.pi / 2
     base_x, base_y, base_z = 1.0, 2.0, 0.1
     base = (base_x, base_y, base_z), quaternion_from_yaw(quarter_turn_rad)
-    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(-quarter_turn_rad), base=base), None)
+    drawing = draw(RobotSnapshot(robot=ROBOT, body=make_joints(-quarter_turn_rad), base=base), None)
     assert drawing is not None
     first_m = ROBOT.links[0].length_m
     second_m = ROBOT.links[1].length_m
@@ -44,12 +51,14 @@ def test_without_joints_there_is_nothing_to_draw():
 
 
 def test_drawing_has_forces_and_their_resultant():
-    point = contact((0.0, 10.0, 0.0))
-    control = pushing([point], [20.0], propulsion_joint=ROBOT.joints[-1].name)
-    seen = world([point, point], [])
-    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=seen, control=control), None)
+    point = make_contact((0.0, 10.0, 0.0))
+    control = make_control_state([point], [20.0], propulsion_joint=ROBOT.joints[-1].name)
+    seen = make_world_model([point, point], [])
+    drawing = draw(
+        RobotSnapshot(robot=ROBOT, body=make_joints(), world=seen, control=control), None
+    )
     assert drawing is not None
-    assert drawing.propulsion_joint == COUNT - 1
+    assert drawing.propulsion_joint == JOINT_COUNT - 1
     assert drawing.pushed_obstacles == {"peg"}
     spans = [
         arrows[:, 1] - arrows[:, 0]
@@ -63,11 +72,11 @@ def test_drawing_has_forces_and_their_resultant():
 
 def test_drawing_requested_force_without_contact_is_no_contact_force():
     points = [
-        contact((0.0, 10.0, 0.0), peg, x_m=x_m) for peg, x_m in (("felt", 0.1), ("clear", 0.3))
+        make_contact((0.0, 10.0, 0.0), peg, x_m=x_m) for peg, x_m in (("felt", 0.1), ("clear", 0.3))
     ]
-    control = pushing(points, [20.0, 30.0], measured_force_n=[17.5, 0.0])
+    control = make_control_state(points, [20.0, 30.0], measured_force_n=[17.5, 0.0])
     snapshot = RobotSnapshot(
-        robot=ROBOT, body=joints(), world=world(points[:1], []), control=control
+        robot=ROBOT, body=make_joints(), world=make_world_model(points[:1], []), control=control
     )
     drawing = draw(snapshot, None)
     assert drawing is not None
@@ -84,8 +93,10 @@ def test_drawing_requested_force_without_contact_is_no_contact_force():
 
 
 def test_drawing_strong_force_has_arrow_of_limited_length():
-    point = contact((0.0, 500.0, 0.0))
-    drawing = draw(RobotSnapshot(robot=ROBOT, body=joints(), world=world([point], [])), None)
+    point = make_contact((0.0, 500.0, 0.0))
+    drawing = draw(
+        RobotSnapshot(robot=ROBOT, body=make_joints(), world=make_world_model([point], [])), None
+    )
     assert drawing is not None
     start, end = drawing.measured_forces[0]
     assert end - start == pytest.approx([0.0, MAX_FORCE_ARROW_M, 0.0])
@@ -95,13 +106,17 @@ def test_drawing_strong_force_has_arrow_of_limited_length():
 
 def test_the_force_polygon_names_every_force_and_their_resultant():
     later, first = (
-        contact((*at_n, 0.0), "<b>", body_s_m=s_m)
+        make_contact((*at_n, 0.0), "<b>", body_s_m=s_m)
         for s_m, at_n in ((0.3, (0.0, 4.0)), (0.1, (3.0, 0.0)))
     )
-    drawn = draw_force_polygon(RobotSnapshot(robot=ROBOT, world=world([later, first], [])))
+    drawn = draw_force_polygon(
+        RobotSnapshot(robot=ROBOT, world=make_world_model([later, first], []))
+    )
     assert "resultant 5.0 N" in drawn
     assert drawn.index(">3.0 N<") < drawn.index(">4.0 N<") < drawn.index(">5.0 N<")
-    assert "no contact force" in draw_force_polygon(RobotSnapshot(robot=ROBOT, world=world([], [])))
+    assert "no contact force" in draw_force_polygon(
+        RobotSnapshot(robot=ROBOT, world=make_world_model([], []))
+    )
 
 
 def test_what_a_map_tells_is_not_drawn_as_perceived():
@@ -109,7 +124,10 @@ def test_what_a_map_tells_is_not_drawn_as_perceived():
     found = KnownObstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
     felt = KnownObstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), touched=True)
     drawing = draw(
-        RobotSnapshot(robot=ROBOT, body=joints(), world=world([], [mapped, found, felt])), None
+        RobotSnapshot(
+            robot=ROBOT, body=make_joints(), world=make_world_model([], [mapped, found, felt])
+        ),
+        None,
     )
     assert drawing is not None
     assert [o.name for o in drawing.perceived] == ["b", "c"]
@@ -122,7 +140,7 @@ def test_a_camera_that_looks_along_its_link_looks_along_x():
         depth=bytes(16),
     )  # fmt: skip
     drawing = draw(
-        RobotSnapshot(robot=ROBOT, body=joints(), images={"sensor/depth/head": image}), None
+        RobotSnapshot(robot=ROBOT, body=make_joints(), images={"sensor/depth/head": image}), None
     )
     assert drawing is not None
     looks = rotation_from_quaternion(drawing.cameras[0].wxyz)

@@ -15,12 +15,12 @@ from snakesim_operator.features.figures.run_groups import (
 )
 from snakesim_operator.results.metrics.intervals import find_mean_and_half_width
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.operator.recorded_triplet import triplet
+from snakesim_testing.operator.triplet_report import simulate_triplet
 
 
 def make_run(folder: str, seed: int, duration_s: float = 10.0) -> RunRecord:
-    config = msgspec.structs.replace(triplet().config, seed=seed, duration_s=duration_s)
-    return dataclasses.replace(triplet(), path=Path(folder), config=config)
+    config = msgspec.structs.replace(simulate_triplet().config, seed=seed, duration_s=duration_s)
+    return dataclasses.replace(simulate_triplet(), path=Path(folder), config=config)
 
 
 def test_arguments_are_runs_and_then_signals(

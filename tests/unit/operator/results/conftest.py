@@ -3,9 +3,9 @@
 import pytest
 
 from snakesim_operator.results.run_log import RunRecord
-from snakesim_testing.operator.recorded_triplet import triplet
+from snakesim_testing.operator.triplet_report import simulate_triplet
 
 
 @pytest.fixture(scope="session")
 def record() -> RunRecord:
-    return triplet()
+    return simulate_triplet()

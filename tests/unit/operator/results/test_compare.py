@@ -23,7 +23,7 @@ from snakesim_operator.results.compare.table import format_comparison, make_json
 from snakesim_operator.results.compare.verdict import check_tolerance
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.messages import raises_error
-from snakesim_testing.operator.recorded_triplet import finished
+from snakesim_testing.operator.triplet_report import make_finished_host_record
 
 JOINTS = 13
 SPEED_M_S = 0.1
@@ -67,7 +67,7 @@ def made_up(
         path=Path("made-up"),
         config=run,
         description=describe_of(run),
-        host=finished(count),
+        host=make_finished_host_record(count),
         control_states=control,
         worlds=[],
         trajectories=[],

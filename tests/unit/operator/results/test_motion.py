@@ -11,7 +11,7 @@ from snakesim_operator.results.report.verdict import make_verdict
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.conclusion import print_summary
-from snakesim_testing.operator.recorded_triplet import SECONDS, changed
+from snakesim_testing.operator.triplet_report import DURATION_S, replace_fields
 
 
 def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
@@ -22,7 +22,7 @@ def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
         name: np.repeat(getattr(record, name)[:1], len(x_m), axis=0)
         for name in ("orientation_wxyz", "angle_rad")
     }
-    return changed(record, position_w_m=position, **still)
+    return replace_fields(record, position_w_m=position, **still)
 
 
 def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> None:
@@ -31,8 +31,8 @@ def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> N
     motion = find_stops(goes)
     assert motion is not None
     spans = [(span.start_s, span.end_s) for span in motion.stops]
-    assert np.array(spans) == pytest.approx(np.array([[2.0, 4.5], [7.0, SECONDS]]), abs=0.15)
-    assert motion.moving_fraction == pytest.approx(4.5 / SECONDS, abs=0.03)
+    assert np.array(spans) == pytest.approx(np.array([[2.0, 4.5], [7.0, DURATION_S]]), abs=0.15)
+    assert motion.moving_fraction == pytest.approx(4.5 / DURATION_S, abs=0.03)
     assert motion.final_stop == motion.stops[-1]
     assert [span.label for span in motion.all_intervals] == ["moving", "standing still"] * 2
 
@@ -48,7 +48,7 @@ def test_a_body_that_wriggles_in_place_does_not_locomote(
 
 
 def test_motion_without_pose_is_unknown(record: RunRecord) -> None:
-    blind = changed(record, position_w_m=record.position_w_m * np.nan, worlds=[])
+    blind = replace_fields(record, position_w_m=record.position_w_m * np.nan, worlds=[])
     assert find_stops(blind) is None
     reported = summarize_run(blind, "complete")
     assert reported.locomoting_fraction is reported.last_state is reported.last_reason is None
@@ -57,10 +57,10 @@ def test_motion_without_pose_is_unknown(record: RunRecord) -> None:
 
 def test_motion_uses_measured_pose_but_not_dead_reckoning(record: RunRecord) -> None:
     """The black box has no pose then; guidance's world model has."""
-    blind = changed(record, position_w_m=record.position_w_m * np.nan)
+    blind = replace_fields(record, position_w_m=record.position_w_m * np.nan)
     for source, fraction in (("sensor", pytest.approx(0.63, abs=0.03)), ("dead_reckoning", None)):
         worlds = [msgspec.structs.replace(world, pose_from=source) for world in record.worlds]
-        known = changed(blind, worlds=worlds)
+        known = replace_fields(blind, worlds=worlds)
         summary = summarize_run(known, "complete")
         assert summary.locomoting_fraction == fraction
         assert make_verdict(known, summary).text.startswith(
@@ -76,7 +76,7 @@ def test_hand_overs_are_counted_in_one_place(
         msgspec.structs.replace(state, propulsion_joint=names[i // 5 % 3])
         for i, state in enumerate(record.control_states)
     ]
-    many = changed(record, control_states=control)
+    many = replace_fields(record, control_states=control)
     summary = summarize_run(many, "complete")
     print_summary(summary)
     printed = re.search(r"\((\d+) hand-overs in all\)", capsys.readouterr().out)
@@ -99,7 +99,7 @@ def test_the_terminal_shows_both_directions_and_what_control_reported_besides(
         msgspec.structs.replace(one, state="Locomoting", reason="pushing")
         for one in record.control_states
     ]
-    summary = summarize_run(changed(record, control_states=claims), "complete")
+    summary = summarize_run(replace_fields(record, control_states=claims), "complete")
     sideways = msgspec.structs.replace(
         summary, energy_j_per_m=None, displacement_energy_j_per_m=50.4
     )

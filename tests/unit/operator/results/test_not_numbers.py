@@ -29,7 +29,7 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import CONFIG_FILENAME
 from snakesim_operator.results.signals import get_recorded_signals
 from snakesim_operator.results.summary import RunSummary, summarize_run
-from snakesim_testing.operator.recorded_triplet import ReportReader, triplet
+from snakesim_testing.operator.triplet_report import ReportReader, simulate_triplet
 
 FIRST, LAST = 240, 330  # rows of the made-up run that are kept: two joints propel in them
 FIRST_TICK = 37 + FIRST
@@ -87,7 +87,7 @@ def record_messages(folder: Path, payloads: list[tuple[str, bytes]], ticks: int)
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> RunRecord:
     folder = tmp_path_factory.mktemp("base")
-    whole = triplet()
+    whole = simulate_triplet()
     kept = {name: value[FIRST:LAST] for name, value in get_recorded_signals(whole).items()}
     begin_ns, end_ns = (round(kept["time_s"][i] * 1e9) for i in (0, -1))
     record = dataclasses.replace(

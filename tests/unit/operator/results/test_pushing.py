@@ -10,7 +10,7 @@ from snakesim_operator.results.report.pushing import make_pushing_section
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.in_process import simulate
-from snakesim_testing.operator.recorded_triplet import ReportReader, changed
+from snakesim_testing.operator.triplet_report import ReportReader, replace_fields
 
 SECONDS = 1.5
 MOVING = ("position_w_m", "orientation_wxyz", "angle_rad")
@@ -57,10 +57,10 @@ def test_pushing_stop_has_the_longest_reported_reason(record: RunRecord) -> None
         )
         for k, one in enumerate(record.control_states)
     ]
-    reported = make_pushing_section(changed(record, control_states=control))
+    reported = make_pushing_section(replace_fields(record, control_states=control))
     assert reported is not None and not reported.stops, "it moves, whatever is reported"
     held = {name: getattr(record, name)[:1].repeat(len(record.time_s), axis=0) for name in MOVING}
-    reported = make_pushing_section(changed(record, control_states=control, **held))
+    reported = make_pushing_section(replace_fields(record, control_states=control, **held))
     assert reported is not None
     assert [one.reason for one in reported.stops] == ["jam"]
     assert reported.stops[0].end_s - reported.stops[0].start_s == pytest.approx(SECONDS, abs=0.11)
@@ -78,7 +78,7 @@ def test_a_perceived_map_is_held_against_the_truth(record: RunRecord) -> None:
         for one in truth
     ]
     worlds = [msgspec.structs.replace(world, obstacles=shifted) for world in record.worlds]
-    reported = make_pushing_section(changed(record, config=config, worlds=worlds))
+    reported = make_pushing_section(replace_fields(record, config=config, worlds=worlds))
     assert reported is not None
     assert reported.map_score is not None
     assert reported.map_errors is not None
@@ -96,4 +96,4 @@ def test_the_page_has_the_section_only_for_such_a_controller(record: RunRecord) 
     one_joint = [
         msgspec.structs.replace(one, propulsion_joint="joint_5") for one in record.control_states
     ]
-    assert make_pushing_section(changed(record, control_states=one_joint)) is None
+    assert make_pushing_section(replace_fields(record, control_states=one_joint)) is None

@@ -24,7 +24,13 @@ from snakesim_operator.results.report.timeline import compute_reference_rad, fin
 from snakesim_operator.results.report.view import find_body_points_xy_w
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import RunSummary, summarize_run
-from snakesim_testing.operator.recorded_triplet import LOST, SECONDS, ReportReader, changed, read
+from snakesim_testing.operator.triplet_report import (
+    DURATION_S,
+    LOST_CONTACTS_REASON,
+    ReportReader,
+    render_and_check_report,
+    replace_fields,
+)
 
 HAND_OVERS_S = (0.0, 0.28, 1.28, 2.42, 3.56, 4.72, 5.78, 6.1)
 # 9 is joint_10.
@@ -34,7 +40,7 @@ DRAWING = r'<svg viewBox="[^"]*" class="figure" role.*?</svg>'
 
 @pytest.fixture(scope="module")
 def page(record: RunRecord) -> ReportReader:
-    return read(record)
+    return render_and_check_report(record)
 
 
 # --- a whole run -----------------------------------------------------------------------------------------------
@@ -47,7 +53,7 @@ def test_report_verdict_states_distance_and_hand_overs(page: ReportReader) -> No
     )
     assert said in page.text
     assert (
-        f"Locomotion ended at 6.3 s of 10.0 s: {LOST}; no three push-points on alternating sides."
+        f"Locomotion ended at 6.3 s of 10.0 s: {LOST_CONTACTS_REASON}; no three push-points on alternating sides."
         in page.text
     )
 
@@ -85,7 +91,7 @@ def test_report_alarming_tiles_have_a_reason(record: RunRecord) -> None:
 def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: ReportReader) -> None:
     frames = page.film["frames"]
     assert frames[0][0] == 0
-    assert frames[-1][0] == pytest.approx(SECONDS, abs=0.02)
+    assert frames[-1][0] == pytest.approx(DURATION_S, abs=0.02)
     assert 200 < len(frames) < 400
     assert all(len(nodes) == 2 * 15 for _, nodes, *_ in frames)
     propels = {joint for _, _, joint, *_ in frames}
@@ -96,7 +102,7 @@ def test_playback_moves_the_snake_over_a_map(record: RunRecord, page: ReportRead
     assert max(felt) >= 12
     assert not page.film["maps"]
     assert not page.film["paths"]  # its map is known, its route is the scene's
-    assert page.film["captions"][frames[-1][3]].startswith(f"not moving: {LOST}")
+    assert page.film["captions"][frames[-1][3]].startswith(f"not moving: {LOST_CONTACTS_REASON}")
 
 
 def test_every_series_of_the_run_is_a_chart(page: ReportReader) -> None:
@@ -184,10 +190,10 @@ def test_all_polygons_have_one_scale_and_show_the_commanded_force(
 def test_report_force_without_contact_is_drawn_as_requested(
     page: ReportReader, record: RunRecord
 ) -> None:
-    clear = changed(
+    clear = replace_fields(
         record, worlds=[msgspec.structs.replace(one, contacts=[]) for one in record.worlds]
     )
-    pages = page, read(clear)
+    pages = page, render_and_check_report(clear)
     kinds = [{kind for frame in one.film["frames"] for kind in frame[8]} for one in pages]
     assert {"solved", "resultant", "solved unmeasured", "resultant unmeasured"} == kinds[0]
     assert {"solved unmeasured", "resultant unmeasured"} == kinds[1]
@@ -245,9 +251,9 @@ def test_a_polygon_that_does_not_close_is_no_instant(record: RunRecord) -> None:
         msgspec.structs.replace(one, desired_force_n=[1.3 * f for f in one.desired_force_n])
         for one in record.control_states
     ]
-    wrong = changed(record, control_states=more)
+    wrong = replace_fields(record, control_states=more)
     assert find_snapshots_with_force_balance(wrong) == []
-    assert "whose forces balance" in read(wrong).text
+    assert "whose forces balance" in render_and_check_report(wrong).text
 
 
 def test_report_table_has_every_summary_number_with_unit(
@@ -255,11 +261,11 @@ def test_report_table_has_every_summary_number_with_unit(
 ) -> None:
     for field in msgspec.structs.fields(RunSummary):
         if field.name not in ELSEWHERE:
-            assert field.name in page.words, field.name
-    assert {"N·m", "m/s", "µs", "J", "Hz"} <= set(page.words)
-    assert "torque_rate" in page.words
-    assert "41" in page.words  # limited by the limiter
-    assert "stale" in page.words
+            assert field.name in page.text_parts, field.name
+    assert {"N·m", "m/s", "µs", "J", "Hz"} <= set(page.text_parts)
+    assert "torque_rate" in page.text_parts
+    assert "41" in page.text_parts  # limited by the limiter
+    assert "stale" in page.text_parts
 
 
 def test_report_contains_the_command_of_the_run(page: ReportReader, record: RunRecord) -> None:
@@ -280,7 +286,7 @@ def test_intervals_and_bands_follow_the_telemetry(record: RunRecord) -> None:
         "Locomoting",
         "NotLocomoting",
     ]
-    assert find_state_intervals(record)[-1].end_s == pytest.approx(SECONDS)
+    assert find_state_intervals(record)[-1].end_s == pytest.approx(DURATION_S)
 
 
 def test_report_reference_depends_on_mode_of_joint(

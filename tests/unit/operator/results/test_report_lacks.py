@@ -21,21 +21,21 @@ from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
 from snakesim_operator.run.conclusion import add_end_causes
 from snakesim_operator.run.ending import RunEnding
-from snakesim_testing.operator.recorded_triplet import (
+from snakesim_testing.operator.triplet_report import (
     ARMED_S,
-    LOST,
+    DURATION_S,
+    LOST_CONTACTS_REASON,
     RATE_HZ,
-    SECONDS,
     ReportReader,
-    changed,
-    first_seconds,
-    read,
+    cut_to_first_seconds,
+    render_and_check_report,
+    replace_fields,
 )
 
 
 @pytest.fixture(scope="module")
 def short_record(record: RunRecord) -> RunRecord:
-    return first_seconds(record, 2.0)
+    return cut_to_first_seconds(record, 2.0)
 
 
 MOVING = ("position_w_m", "orientation_wxyz", "angle_rad")
@@ -45,7 +45,7 @@ MOVING = ("position_w_m", "orientation_wxyz", "angle_rad")
 
 
 def test_report_without_recording_has_all_sections(short_record: RunRecord) -> None:
-    page = read(changed(short_record, control_states=[], worlds=[]))
+    page = render_and_check_report(replace_fields(short_record, control_states=[], worlds=[]))
     assert "recording holds no message of the controller" in page.text
     assert "No joint propelled" in page.text
     # The pose is known.
@@ -65,26 +65,30 @@ def test_report_of_a_long_run_is_not_larger(record: RunRecord) -> None:
     long["time_s"] = ARMED_S + np.arange(len(long["time_s"])) / RATE_HZ
     later = [
         [
-            msgspec.structs.replace(one, timestamp_ns=one.timestamp_ns + round(k * SECONDS * 1e9))
+            msgspec.structs.replace(
+                one, timestamp_ns=one.timestamp_ns + round(k * DURATION_S * 1e9)
+            )
             for k in range(times)
             for one in reported
         ]
         for reported in (record.control_states, record.worlds)
     ]
     # Holds the size against the limit.
-    page = read(changed(record, control_states=later[0], worlds=later[1], **long))
+    page = render_and_check_report(
+        replace_fields(record, control_states=later[0], worlds=later[1], **long)
+    )
     assert len(page.film["frames"]) <= 300
     assert "handed over 419 times among 7 joints" in page.text
 
 
 def test_report_without_pose_has_all_sections(short_record: RunRecord) -> None:
     count = len(short_record.time_s)
-    blind = changed(
+    blind = replace_fields(
         short_record,
         position_w_m=np.full((count, 3), np.nan),
         orientation_wxyz=np.full((count, 4), np.nan),
     )
-    page = read(blind)
+    page = render_and_check_report(blind)
     assert "No playback: no valid pose was recorded." in page.text
     assert "pose sensor" not in page.text
     # The robot has one.
@@ -97,8 +101,8 @@ def test_report_without_pose_has_all_sections(short_record: RunRecord) -> None:
 def test_report_without_route_has_all_sections(short_record: RunRecord) -> None:
     scene = msgspec.structs.replace(short_record.config.scene, route=None, pegs_along_route=[])
     start = StartPlacement(on_route=False, position_m=(-5.0, 0.0))
-    page = read(
-        changed(
+    page = render_and_check_report(
+        replace_fields(
             short_record,
             config=msgspec.structs.replace(short_record.config, scene=scene, start=start),
         )
@@ -115,8 +119,8 @@ def test_report_without_ticks_names_the_end(short_record: RunRecord) -> None:
         if isinstance(getattr(short_record, name), np.ndarray)
     }
     host = msgspec.structs.replace(short_record.host, ticks=0, armed_ticks=0, answered_ticks=0)
-    page = read(
-        changed(short_record, control_states=[], worlds=[], host=host, **empty),
+    page = render_and_check_report(
+        replace_fields(short_record, control_states=[], worlds=[], host=host, **empty),
         "the host never became ready",
     )
     assert (
@@ -128,8 +132,8 @@ def test_report_without_ticks_names_the_end(short_record: RunRecord) -> None:
 def test_report_without_contact_sensor_has_all_sections(short_record: RunRecord) -> None:
     """Whatever the robot file lists: its drives have none."""
     sensors = [sensor for sensor in short_record.description.sensors if sensor.key != keys.CONTACTS]
-    page = read(
-        changed(
+    page = render_and_check_report(
+        replace_fields(
             short_record,
             description=msgspec.structs.replace(short_record.description, sensors=sensors),
         )
@@ -149,7 +153,9 @@ def test_report_of_controller_without_push_points_has_all_sections(short_record:
         for state in short_record.control_states
     ]
     config_ = msgspec.structs.replace(short_record.config, controller="hold")
-    page = read(changed(short_record, control_states=plain, config=config_))
+    page = render_and_check_report(
+        replace_fields(short_record, control_states=plain, config=config_)
+    )
     assert "controller hold published no desired forces" in page.text
     assert "controller hold named no propulsion joint" in page.text
     assert re.search("measured contacts?, in sum", page.text)
@@ -164,16 +170,17 @@ def test_report_of_run_with_isolated_joint_names_it(record: RunRecord) -> None:
         joint="joint_3",
         scope="joint",
     )
-    page = read(
-        changed(
+    page = render_and_check_report(
+        replace_fields(
             record, host=msgspec.structs.replace(record.host, faults=[lost], isolated=["joint_3"])
         )
     )
     assert "went on without joint_3, 2 commands refused" in page.text
     assert "Stopped by a fault" not in page.text
     stop = Fault(tick=600, what="leak", cause="joint_4 reports water inside", joint="joint_4")
-    page = read(
-        changed(record, host=msgspec.structs.replace(record.host, faults=[lost, stop])), stop.cause
+    page = render_and_check_report(
+        replace_fields(record, host=msgspec.structs.replace(record.host, faults=[lost, stop])),
+        stop.cause,
     )
     assert "Stopped by a fault" in page.text
     assert "at joint_4: joint_4 reports water inside." in page.text
@@ -194,7 +201,7 @@ def test_report_of_harmless_fault_says_run_continued(
         )
     )
     host = msgspec.structs.replace(short_record.host, faults=noting.faults, ended="complete")
-    page = read(changed(short_record, host=host))
+    page = render_and_check_report(replace_fields(short_record, host=host))
     assert "Stopped by a fault" not in page.text
     assert "went on without" not in page.text
     assert "a fault (supply and heat are unknown, and ignored), 2 commands refused" in page.text
@@ -205,18 +212,19 @@ def test_report_of_harmless_fault_says_run_continued(
 
 def test_report_of_run_ended_by_fault_explains_it(record: RunRecord) -> None:
     fault = Fault(tick=537, what="diverged", cause="joint_3 at 1e9 rad/s", joint="joint_3")
-    page = read(
-        changed(record, host=msgspec.structs.replace(record.host, faults=[fault])), fault.cause
+    page = render_and_check_report(
+        replace_fields(record, host=msgspec.structs.replace(record.host, faults=[fault])),
+        fault.cause,
     )
     assert "Stopped by a fault after 5.0 s at joint_3: joint_3 at 1e9 rad/s." in page.text
-    assert "diverged" in page.words
+    assert "diverged" in page.text_parts
     marks = [shape for chart in page.charts.values() for shape in chart["layout"]["shapes"]]
     assert [mark["line"].get("color") for mark in marks].count("--bad") == 2 + 12 + 3
 
 
 @pytest.mark.slow
 def test_report_of_jammed_run_says_so(record: RunRecord) -> None:
-    page = read(stopped_at(record, 0.0, jammed=True, reason="jammed at peg_2"))
+    page = render_and_check_report(stopped_at(record, 0.0, jammed=True, reason="jammed at peg_2"))
     assert (
         "Jammed: jammed at peg_2. Moved 0.00 m along the path in 10.0 s; no fault, 2 commands refused"
         in page.text
@@ -232,7 +240,7 @@ def test_report_of_run_jammed_later_says_jammed(record: RunRecord) -> None:
         else state
         for state in record.control_states
     ]
-    page = read(changed(record, control_states=stuck))
+    page = render_and_check_report(replace_fields(record, control_states=stuck))
     assert "Jammed at 6.3 s of 10.0 s: wedged. Moved 0.62 m along the path" in page.text
 
 
@@ -247,7 +255,7 @@ def stopped_at(record: RunRecord, at_s: float, **state: Any) -> RunRecord:
         msgspec.structs.replace(one, **state) if one.timestamp_ns > since_ns else one
         for one in record.control_states
     ]
-    return changed(record, control_states=control, **held)
+    return replace_fields(record, control_states=control, **held)
 
 
 def judged(record: RunRecord) -> RunVerdict:
@@ -256,12 +264,12 @@ def judged(record: RunRecord) -> RunVerdict:
 
 def test_report_of_mostly_standing_run_is_not_good(record: RunRecord) -> None:
     assert judged(record).rating == "good"
-    lost = judged(stopped_at(record, 4.0, state="NotLocomoting", reason=LOST))
+    lost = judged(stopped_at(record, 4.0, state="NotLocomoting", reason=LOST_CONTACTS_REASON))
     assert lost.rating == "poor"
-    assert lost.text.startswith(f"Stopped at 4.0 s of 10.0 s: {LOST}. Moved 0.")
-    late = judged(stopped_at(record, 5.5, state="NotLocomoting", reason=LOST))
+    assert lost.text.startswith(f"Stopped at 4.0 s of 10.0 s: {LOST_CONTACTS_REASON}. Moved 0.")
+    late = judged(stopped_at(record, 5.5, state="NotLocomoting", reason=LOST_CONTACTS_REASON))
     assert late.rating == "good"
-    assert f"Locomotion ended at 5.4 s of 10.0 s: {LOST}" in late.text
+    assert f"Locomotion ended at 5.4 s of 10.0 s: {LOST_CONTACTS_REASON}" in late.text
 
 
 def test_report_of_jam_ignores_last_control_message(record: RunRecord) -> None:
@@ -271,7 +279,7 @@ def test_report_of_jam_ignores_last_control_message(record: RunRecord) -> None:
         *stuck.control_states[:-1],
         msgspec.structs.replace(stuck.control_states[-1], state="Locomoting", reason="pushing"),
     ]
-    found = judged(changed(stuck, control_states=trying))
+    found = judged(replace_fields(stuck, control_states=trying))
     assert found.rating == "poor"
     assert found.text.startswith("Jammed at 6.0 s of 10.0 s: wedged. Moved")
     claims = judged(stopped_at(record, 4.0, state="Locomoting", reason="pushing"))
@@ -304,10 +312,10 @@ def test_report_motion_is_measured_despite_control_reports(record: RunRecord) ->
         for one in record.control_states
     ]
     for control in (silent, [], claims):
-        reported = summarize_run(changed(record, control_states=control), "complete")
+        reported = summarize_run(replace_fields(record, control_states=control), "complete")
         assert reported.locomoting_fraction == whole.locomoting_fraction
         assert reported.last_state == "NotLocomoting"
-    moving = summarize_run(changed(record, control_states=[]), "complete")
+    moving = summarize_run(replace_fields(record, control_states=[]), "complete")
     assert moving.last_reason == "standing still: less than 20 mm in 1 s"
     assert moving.reported_state is None
 
@@ -332,7 +340,7 @@ def test_report_of_moving_run_contradicts_its_controller(record: RunRecord) -> N
         else one
         for one in record.control_states
     ]
-    found = judged(changed(record, control_states=lost))
+    found = judged(replace_fields(record, control_states=lost))
     assert found.rating == "good"
     assert found.text.startswith("Moved 0.62 m along the path in 10.0 s;")
     assert "Locomotion ended at 6.3 s of 10.0 s: contacts lost." in found.text
@@ -349,7 +357,7 @@ def test_report_of_run_moving_to_its_end_says_so(record: RunRecord) -> None:
         for name in fields
         if isinstance(getattr(record, name), np.ndarray)
     }
-    cut = changed(
+    cut = replace_fields(
         record,
         **short,
         control_states=[
@@ -372,7 +380,7 @@ def test_report_escapes_text_of_the_run(short_record: RunRecord) -> None:
     host = msgspec.structs.replace(
         short_record.host, faults=[Fault(tick=90, what=nasty, cause=nasty)]
     )
-    hurt = changed(short_record, config=config_, control_states=reported, host=host)
+    hurt = replace_fields(short_record, config=config_, control_states=reported, host=host)
     page = report_page(hurt, summarize_run(hurt, nasty))
     assert "<script>alert" not in page
     assert page.count("&lt;script&gt;alert") >= 5
@@ -396,7 +404,7 @@ def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> No
     ]
     scene = msgspec.structs.replace(short_record.config.scene, cylinder=pegs_)
     config_ = msgspec.structs.replace(short_record.config, scene=scene)
-    hurt = changed(
+    hurt = replace_fields(
         short_record,
         description=msgspec.json.decode(encoded, type=RobotDescription),
         control_states=reported,
@@ -412,7 +420,7 @@ def test_report_escapes_names_and_direction_marks(short_record: RunRecord) -> No
 
 def test_report_map_of_upward_snake_is_rotated(short_record: RunRecord) -> None:
     count = len(short_record.time_s)
-    up = changed(
+    up = replace_fields(
         short_record,
         position_w_m=short_record.position_w_m[:, [1, 0, 2]] * np.array([-1.0, 1.0, 1.0]),
         orientation_wxyz=np.tile(quaternion_from_yaw(math.pi / 2 + 0.4), (count, 1)),
@@ -421,7 +429,7 @@ def test_report_map_of_upward_snake_is_rotated(short_record: RunRecord) -> None:
     )
     sizes = [
         [float(n) for n in value.split()][2:]
-        for _, name, value in read(up).attributes
+        for _, name, value in render_and_check_report(up).attributes
         if name == "viewbox" and value and value.startswith("0 0 500 ")
     ]
     assert len(sizes) == 3

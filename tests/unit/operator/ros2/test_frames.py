@@ -13,7 +13,7 @@ from snakesim_operator.features.ros2.frames import OPTICAL_IN_CAMERA, RobotFrame
 from snakesim_operator.features.ros2.messages import RosTransform
 from snakesim_operator.features.ros2.urdf import make_urdf
 from snakesim_testing.hal.small_robots import make_joint_state, make_pose
-from snakesim_testing.operator.ros2_rig import of_robot
+from snakesim_testing.operator.ros2_robots import describe_shipped_robot
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -33,7 +33,7 @@ def walked(tree: list[RosTransform], to: str) -> Pair:
 
 @pytest.mark.parametrize("name", ["planar13", "mamba"])
 def test_ros_frame_tree_equals_kinematics(name: str) -> None:
-    robot = of_robot(name)
+    robot = describe_shipped_robot(name)
     frames = RobotFrames(robot, "lab/")
     random = np.random.default_rng(3)
     angles = random.uniform(-0.9, 0.9, len(robot.joints)).tolist()
@@ -72,7 +72,7 @@ def test_ros_frame_names_are_valid() -> None:
 
 @pytest.mark.parametrize("name", ["planar13", "mamba"])
 def test_the_urdf_is_read_by_mujoco(name: str) -> None:
-    robot = of_robot(name)
+    robot = describe_shipped_robot(name)
     document = make_urdf(robot, "lab/")
     assert "has neither inertia nor friction" in document, (
         "what a reader would miss is said in the document"

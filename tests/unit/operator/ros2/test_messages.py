@@ -17,7 +17,7 @@ from snakesim_operator.features.ros2 import robot_in_ros
 from snakesim_operator.features.ros2.graph import RosType
 from snakesim_operator.features.ros2.messages import RosMarker, RosTransform
 from snakesim_operator.features.ros2.steering import CmdVelSteering
-from snakesim_testing.hal.custom_sample import GOOD, PLACE, SkinSample
+from snakesim_testing.hal.custom_sample import MOUNTING, VALID_VALUES, SkinSample
 from snakesim_testing.hal.strategies import make_strategy
 from snakesim_testing.hypothesis_profiles import choose_trial_count
 
@@ -281,7 +281,7 @@ def test_ros_scan_contains_the_ranges(sent: m.RangeScan) -> None:
 
 def test_custom_sensor_numbers_have_field_and_unit() -> None:
     kind = parse_custom_message(make_message_schema(SkinSample, "skin"))
-    sample: Any = kind.message(**PLACE, **GOOD)
+    sample: Any = kind.message(**MOUNTING, **VALID_VALUES)
     seen = read(
         ros.FLOAT64_ARRAY, robot_in_ros.encode_numbers(kind, "pressed_n", STAMP_NS, "f", sample)
     )

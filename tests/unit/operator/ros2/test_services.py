@@ -15,7 +15,7 @@ from snakesim_operator.features.ros2.joint_commands import TARGET_LIFETIME_NS, R
 from snakesim_operator.features.ros2.parameters import NOT_SET, _encode_value, _make_descriptor
 from snakesim_operator.robot_commands.parameters import RobotParameter
 from snakesim_testing.hal import small_robots as rig
-from snakesim_testing.operator.ros2_rig import SERVICE_HASHES, of_robot
+from snakesim_testing.operator.ros2_robots import SERVICE_HASHES, describe_shipped_robot
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 # From docs/design.md of ros2/rmw_zenoh.
@@ -89,7 +89,7 @@ def test_a_parameter_is_described_with_unit_and_range() -> None:
 class TestJointTargets:
     """What JointState messages become."""
 
-    robot = of_robot("planar13")
+    robot = describe_shipped_robot("planar13")
 
     def said(self, names: list[str], *, stamp_s: float = 0.0, **numbers: Any) -> bytes:
         kinds: Any = JAZZY.types

@@ -1,4 +1,4 @@
-"""Shipped robots, as their hosts describe them, and what others know of ROS."""
+"""Describes shipped robots as their HAL hosts do, and lists the type hashes of ROS 2 services."""
 
 import msgspec
 
@@ -6,7 +6,8 @@ from snakesim_hal.model.files import read_table_with_base
 from snakesim_hal.model.robot import RobotFile, describe_robot
 from snakesim_hal.wire.messages import RobotDescription
 
-SERVICE_HASHES = {  # of ListParameters as `ros2 service info -v` prints it, else as other programs for ROS 2 have them
+# `ros2 service info -v` printed the hash of ListParameters. Other programs for ROS 2 contain the other hashes.
+SERVICE_HASHES = {
     "std_srvs/srv/Trigger": "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
     "rcl_interfaces/srv/ListParameters": "3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
     "rcl_interfaces/srv/GetParameters": "bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
@@ -17,9 +18,9 @@ SERVICE_HASHES = {  # of ListParameters as `ros2 service info -v` prints it, els
 }
 
 
-def of_robot(name: str) -> RobotDescription:
-    """Description of a shipped robot."""
-    file = msgspec.convert(read_table_with_base(name, "robots").values, RobotFile)
+def describe_shipped_robot(name: str) -> RobotDescription:
+    """Return the description that the HAL host of a shipped robot publishes in simulation."""
+    robot_file = msgspec.convert(read_table_with_base(name, "robots").values, RobotFile)
     return describe_robot(
-        file, backend="sim", period_ns=10_000_000, lease_ns=50_000_000, config_hash="0" * 16
+        robot_file, backend="sim", period_ns=10_000_000, lease_ns=50_000_000, config_hash="0" * 16
     )

@@ -1,7 +1,8 @@
-"""What `python -m benchmarks.forces` prints: every controller in the case study, and why solved forces differ.
+"""Compares the contact forces that controllers desire with those that the simulator computes.
 
-Runs of `triplet` and `peg_row` in this process. Contact forces are taken from the simulator in every physics step, so
-neither table depends on when the contact sensor looks.
+`python -m benchmarks.forces` runs this program. It simulates `triplet` and `peg_row`, and prints two tables: distance,
+energy and impulse of every controller, and the causes of differences between desired and measured forces. The forces
+come from the simulator in every physics step. Thus neither table depends on the times at which the sensor samples.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.state.contacts import GeomPair, ObstacleContactReader
 
 SCENARIOS = ("triplet", "peg_row")
-SHIPPED = (
+SHIPPED_CONTROLLERS = (
     "obstacle_aided",
     "obstacle_triplet",
     "path_following",
@@ -33,25 +34,28 @@ SHIPPED = (
     "compliant_undulation",
     "hold",
 )
-# A mission's speed does not change them.
-WITHOUT_PATH = "lateral_undulation", "compliant_undulation", "hold"
-AMPLITUDES_RAD = (0.2, 0.3, 0.4, 0.5, 0.6)  # of the wave
-FASTER_M_S = 0.3
+# The speed of the mission does not change these controllers.
+CONTROLLERS_WITHOUT_PATH = ("lateral_undulation", "compliant_undulation", "hold")
+WAVE_AMPLITUDES_RAD = (0.2, 0.3, 0.4, 0.5, 0.6)
+WAVE_LAG_RAD = 0.9  # between adjacent joints
+REFERENCE_AMPLITUDE_RAD = 0.3  # the table contains this wave and the fastest one
+HIGHER_SPEED_M_S = 0.3
 STEP_S = 0.002
-SHIFTS_S = np.arange(-0.1, 0.105, 0.01)  # from command to force
-CASES = "| scenario | controller | m in 8 s | J/m | N·s/m |\n|---|---|---|---|---|"
-CAUSES = (
+DURATION_S = 8
+SHIFTS_S = np.arange(-0.1, 0.105, 0.01)  # delay of the measured force after the state
+CASES_HEADER = "| scenario | controller | m in 8 s | J/m | N·s/m |\n|---|---|---|---|---|"
+CAUSES_HEADER = (
     "| scenario | controller | desired, N | measured, N | desired, but no contact | measured, not desired "
     "| too much or little in all | wrong share | correlation | at its best, after |\n"
     "|---|---|---|---|---|---|---|---|---|---|"
 )
 
-Forces = Mapping[str, Floats]  # of each obstacle, in every physics step
+Forces = Mapping[str, Floats]  # force on each obstacle in N, by its name, in every physics step
 
 
-def wave(amplitude_rad: float) -> Callable[[float, int], Floats]:
-    """A wave that grows from straight, wherever the joints are."""
-    lag_rad = 0.9 * np.arange(13)[::-1]
+def make_wave(amplitude_rad: float) -> Callable[[float, int], Floats]:
+    """Return a controller that moves a wave along the body, whose amplitude grows from 0 in the first second."""
+    lag_rad = WAVE_LAG_RAD * np.arange(13)[::-1]
     return lambda time_s, joints: (
         min(time_s, 1.0) * amplitude_rad * np.sin(np.pi * time_s - lag_rad)
     )
@@ -60,13 +64,18 @@ def wave(amplitude_rad: float) -> Callable[[float, int], Floats]:
 def run_and_measure_forces(
     scenario: str, controller: Any, **options: Any
 ) -> tuple[snakesim.Result, Forces]:
-    """A run of 8 s, and the forces of all obstacles in it."""
+    """Run a scenario for 8 s, and return its result and the forces on all obstacles.
+
+    Args:
+        scenario: Name of the scenario.
+        controller: Name or class of the controller, or a function.
+        **options: Changes of the scenario, by key, and a `duration` in s that replaces the 8 s.
+    """
+    duration_s = options.pop("duration", DURATION_S)
     with recording_contact_forces() as steps:
-        result = snakesim.run(
-            scenario, controller=controller, duration=options.pop("duration", 8), set=options
-        )
-    names = dict.fromkeys(name for found in steps for name in found)
-    return result, {name: np.array([found.get(name, 0.0) for found in steps]) for name in names}
+        result = snakesim.run(scenario, controller=controller, duration=duration_s, set=options)
+    names = dict.fromkeys(name for step in steps for name in step)
+    return result, {name: np.array([step.get(name, 0.0) for step in steps]) for name in names}
 
 
 @contextmanager
@@ -117,28 +126,43 @@ def measure_case(scenario: str, label: str, controller: Any, **options: Any) -> 
         options: Changes of the scenario, by key.
     """
     result, forces = run_and_measure_forces(scenario, controller, **options)
-    distance_m, joules = result.summary.advance_m or 0.0, result.summary.energy_j_per_m
-    impulse_ns = STEP_S * sum(float(force.sum()) for force in forces.values())
-    per_m = f"{joules:.1f} | {impulse_ns / distance_m:.0f}" if joules is not None else "- | -"
+    distance_m = result.summary.advance_m or 0.0
+    energy_j_per_m = result.summary.energy_j_per_m
+    if energy_j_per_m is None:
+        per_m = "- | -"
+    else:
+        impulse_ns = STEP_S * sum(float(force.sum()) for force in forces.values())
+        per_m = f"{energy_j_per_m:.1f} | {impulse_ns / distance_m:.0f}"
     return distance_m, f"| `{scenario}` | {label} | {distance_m:.2f} | {per_m} |"
 
 
 def iter_cases(scenario: str) -> Iterator[str]:
     """Yield rows of a table: bundled controllers at the mission's speed and at a higher one, and waves."""
-    for name in SHIPPED:
+    for name in SHIPPED_CONTROLLERS:
         yield measure_case(scenario, f"`{name}`", name)[1]
-    for name in SHIPPED if scenario == "triplet" else ():
-        if name not in WITHOUT_PATH:
-            label = f"`{name}`, {FASTER_M_S} m/s asked for"
-            yield measure_case(scenario, label, name, **{"mission.speed_m_s": FASTER_M_S})[1]
-    waves = [
-        (rad, *measure_case(scenario, f"wave, {rad} rad", wave(rad))) for rad in AMPLITUDES_RAD
-    ]
-    best = max(waves, key=lambda found: found[1])
-    yield next(row for rad, _, row in waves if rad == 0.3)
-    yield best[2].replace(
-        f"{best[0]} rad", f"{best[0]} rad (of {len(waves)} tried the one that goes furthest)"
-    )
+    if scenario == "triplet":
+        yield from _iter_cases_at_higher_speed(scenario)
+    yield from _iter_wave_cases(scenario)
+
+
+def _iter_cases_at_higher_speed(scenario: str) -> Iterator[str]:
+    for name in SHIPPED_CONTROLLERS:
+        if name not in CONTROLLERS_WITHOUT_PATH:
+            label = f"`{name}`, {HIGHER_SPEED_M_S} m/s asked for"
+            yield measure_case(scenario, label, name, **{"mission.speed_m_s": HIGHER_SPEED_M_S})[1]
+
+
+def _iter_wave_cases(scenario: str) -> Iterator[str]:
+    """Yield the row of the reference amplitude, and the row of the amplitude that advances furthest."""
+    distance_and_row_by_amplitude = {
+        rad: measure_case(scenario, f"wave, {rad} rad", make_wave(rad))
+        for rad in WAVE_AMPLITUDES_RAD
+    }
+    yield distance_and_row_by_amplitude[REFERENCE_AMPLITUDE_RAD][1]
+    best_rad = max(WAVE_AMPLITUDES_RAD, key=lambda rad: distance_and_row_by_amplitude[rad][0])
+    note = f"(of {len(WAVE_AMPLITUDES_RAD)} tried the one that goes furthest)"
+    best_row = distance_and_row_by_amplitude[best_rad][1]
+    yield best_row.replace(f"{best_rad} rad", f"{best_rad} rad {note}")
 
 
 def measure_difference_causes(scenario: str, controller: str, **options: Any) -> str:
@@ -243,26 +267,30 @@ def tabulate_forces(
 
 
 def compute_correlation(desired_n: Floats, measured_n: Floats) -> float:
-    """Over all push-points that are judged."""
-    judged = desired_n >= MIN_DESIRED_FORCE_N
-    if judged.sum() < 2 or desired_n[judged].std() == 0.0 or measured_n[judged].std() == 0.0:
+    """Return the correlation of desired and measured forces where a force was desired, or 0 if it is undefined."""
+    is_desired = desired_n >= MIN_DESIRED_FORCE_N
+    if is_desired.sum() < 2:
         return 0.0
-    return float(np.corrcoef(desired_n[judged], measured_n[judged])[0, 1])
+    desired_forces_n = desired_n[is_desired]
+    measured_forces_n = measured_n[is_desired]
+    if desired_forces_n.std() == 0.0 or measured_forces_n.std() == 0.0:
+        return 0.0
+    return float(np.corrcoef(desired_forces_n, measured_forces_n)[0, 1])
 
 
 def main() -> int:
-    """Print both tables, a row as soon as it is known."""
+    """Print both tables, each row as soon as its run has ended."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=("cases", "causes"), help="one of the two tables")
     only = parser.parse_args().only
     if only != "causes":
-        print(CASES, flush=True)
+        print(CASES_HEADER, flush=True)
         for scenario in SCENARIOS:
             for row in iter_cases(scenario):
                 print(row, flush=True)
         print()
     if only != "cases":
-        print(CAUSES, flush=True)
+        print(CAUSES_HEADER, flush=True)
         for scenario in SCENARIOS:
             for controller in ("obstacle_aided", "obstacle_triplet"):
                 print(measure_difference_causes(scenario, controller), flush=True)
