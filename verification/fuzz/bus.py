@@ -33,7 +33,7 @@ from verification.fuzz.text_mutations import flip_bits
 
 FRAMES_PER_TICK = 40
 FRAMES_PER_OPENING = 2000  # until the driver opens the bus again
-# The driver disarms and arms again in every such number of ticks, at these ticks of it.
+# In each such period, the robot is disarmed at one tick and armed again at another.
 ARMING_PERIOD_TICKS = 20
 DISARM_TICK = 10
 ARM_TICK = 15

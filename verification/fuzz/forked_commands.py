@@ -24,9 +24,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import NoReturn
 
-MAX_GROWTH_MB = (
-    1200  # of address space above that of the imports: the renderer of a film takes most of it
-)
+# Of address space, above that of the imports. The renderer of a film takes most of it.
+MAX_GROWTH_MB = 1200
 MAX_CPU_S = 30
 POLL_PERIOD_S = 0.005
 ENDLESS_COMMANDS = ("console",)  # which run until they are interrupted

@@ -16,7 +16,7 @@ from verification.fuzz.text_mutations import MAX_TEXT_BYTES, TextMaker
 MAX_DURATION_S = 10.0  # of one payload, on a machine that does something else as well
 MAX_REASON_CHARACTERS = 1500  # of a refusal, whatever it quotes
 MAX_QUOTED_BYTES = 300  # of a payload in an error
-MAX_INPUTS = 1000  # so that no two seeds share a payload
+MAX_INPUTS = 1000  # more than there are, so that no two seeds share a payload
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,8 @@ from verification.fuzz.recording_damages import DAMAGES
 
 DURATION_S = 0.6
 CHUNK_BYTES = 40_000  # which gives the recording about 16 chunks
-MAX_RECORDINGS_PER_SEED = (
-    100_000  # more than a campaign damages, so that no two seeds share a damage
-)
+# More than a campaign damages, so that no two seeds share a damage.
+MAX_RECORDINGS_PER_SEED = 100_000
 
 DAMAGED_FILENAME = "damaged.mcap"
 WHOLE_FILENAME = "whole.mcap"

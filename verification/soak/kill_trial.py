@@ -44,9 +44,8 @@ CLOCK_MODES = ("realtime", "realtime", "lockstep")
 ENDING_DURATION_S = 1.0
 REALTIME_DURATION_S = 8.0
 LOCKSTEP_DURATION_S = 60.0  # of robot time, which passes much faster
-RATE_HZ = (
-    50  # the lowest control rate, so that the lease is long: a busy machine must not fail a trial
-)
+# The lowest control rate, so that the lease is long: a busy machine must not fail a trial.
+RATE_HZ = 50
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ class KillOutcome:
 
     trial: KillTrial
     reached_moment: bool = False
-    kill_count: int = 0  # signals that were sent, without SIGCONT
+    kill_count: int = 0  # of signals that were sent, without SIGCONT
     exit_code: int | None = None
     interrupted: bool = False  # by a signal to the supervisor, of the trial or at its end
     printed: str = ""
