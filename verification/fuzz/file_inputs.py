@@ -18,6 +18,7 @@ from snakesim_hal.network.local_registry import LocalRobot, list_local_robots
 from snakesim_hal.network.router import read_router_settings
 from snakesim_operator.results.last_run import read_last_run
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_operator.results.run_reader import SUMMARY_FILENAME
 from verification.fuzz.inputs import DecoderInput
 from verification.fuzz.text_mutations import MAX_TEXT_BYTES
 
@@ -25,7 +26,9 @@ LAST_RUN_FILENAME = "snakesim/last-run.json"
 LIVE_ROBOT_FILENAME = "snakesim/live/4711.json"
 MAX_OPTION_BYTES = MAX_TEXT_BYTES // 8
 JOINT_COUNT = 13  # of the robot whose typed faults are parsed
-UNREAD_SUFFIXES = (".log", ".html")  # of files in a run's folder that no command reads
+# Files in a run's folder that no command reads: results are computed again from the others.
+UNREAD_SUFFIXES = (".log", ".html")
+UNREAD_FILENAMES = (SUMMARY_FILENAME,)
 SET_OPTIONS = [
     b"rate_hz=50",
     b"robot.limits.torque_nm=3.5",
@@ -162,8 +165,12 @@ def _make_live_robot() -> bytes:
 
 def list_run_inputs(run: Path) -> list[DecoderInput]:
     """List one input for each file in the folder of a run, which reads the run with that file damaged."""
-    paths = [path for path in sorted(run.iterdir()) if path.is_file()]
-    return [_make_run_input(run, path) for path in paths if path.suffix not in UNREAD_SUFFIXES]
+    return [_make_run_input(run, path) for path in sorted(run.iterdir()) if _is_read(path)]
+
+
+def _is_read(path: Path) -> bool:
+    is_unread = path.suffix in UNREAD_SUFFIXES or path.name in UNREAD_FILENAMES
+    return path.is_file() and not is_unread
 
 
 def _make_run_input(run: Path, path: Path) -> DecoderInput:
