@@ -37,9 +37,17 @@ PARTS = {
         ("verification.mutation", "--files", "lease.py", "lifecycle.py", "stop_ramp.py"),
     ),
     "decoders": CampaignPart(
-        "100,000 damaged payloads into every decoder",
+        "100,000 damaged payloads into every decoder, and damaged recordings into some commands each",
         1,
-        ("verification.fuzz", "--payloads", "100000"),
+        (
+            "verification.fuzz",
+            *("--payloads", "100000", "--recordings", "9", "--commands-per-recording", "2"),
+        ),
+    ),
+    "recordings": CampaignPart(
+        "damaged recordings into every command that reads one",
+        2,
+        ("verification.fuzz", "--payloads", "0", "--recordings", "10"),
     ),
     "sanitizers": CampaignPart(
         "physics tests with C libraries that check their memory accesses",

@@ -1,4 +1,4 @@
-"""Payloads that nobody should send: valid ones with one thing wrong, or with everything wrong."""
+"""Makes invalid payloads of wire messages: valid ones with one thing wrong, or with everything wrong."""
 
 import datetime
 import random
@@ -31,10 +31,11 @@ from snakesim_testing.hal.strategies import (
     make_plain_example,
     replace_at,
 )
-from verification.fuzz.texts import flipped
+from verification.fuzz.text_mutations import flip_bits
 
 ROBOT = make_description()
-REAL: dict[type[Message], list[Message]] = {
+# Messages that a HAL of ROBOT accepts or answers, in addition to the plain examples.
+REALISTIC_MESSAGES: dict[type[Message], list[Message]] = {
     JointState: [make_joint_state(ROBOT, 0.1)],
     JointCommand: [
         make_joint_command(ROBOT, 0.1, sequence=10**6),
@@ -49,8 +50,8 @@ REAL: dict[type[Message], list[Message]] = {
         for action in ("arm", "disarm", "reset", "finish")
     ],
 }
-LONG = 100_000
-WEIRD: list[Any] = [
+LONG = 100_000  # characters, bytes or elements of a long value
+UNUSUAL_VALUES: list[Any] = [
     None,
     True,
     -1,
@@ -85,11 +86,24 @@ WEIRD: list[Any] = [
     datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC),
     LEASE_NS,
 ]
-HEADS = [
+# First bytes in MessagePack of arrays, maps, strings, binaries and extensions whose length follows.
+SIZED_TYPE_CODES = [
     bytes([code])
     for code in (0xDC, 0xDD, 0xDE, 0xDF, 0xD9, 0xDA, 0xDB, 0xC4, 0xC5, 0xC6, 0xC7, 0xC8, 0xC9)
 ]
-NESTS = [
+HUGE_LENGTHS = (
+    b"\xff\xff\xff\xff",
+    b"\x7f\xff\xff\xff",
+    b"\x00\x10\x00\x00",
+    b"\xff\xff",
+    b"\xff",
+)
+ARRAY_32_CODE = b"\xdd"  # first byte of an array whose length has 32 bits
+NIL = b"\xc0"
+MAX_SHORT_MAP_ENTRIES = 15  # of a map whose first byte contains its length
+SHORT_MAP_CODE = 0x80
+# Beginnings of arrays and maps that contain what follows.
+NESTED_OPENINGS = [
     b"\x91",
     b"\x81\xa1a",
     b"\x81\xa5other",
@@ -98,131 +112,164 @@ NESTS = [
     b"\x92\xc0",
     b"\x81\xa8contacts\x91",
 ]
-RARE = 500  # one in so many is as large as a payload may be, or larger
+ARRAY_ENTRIES = (b"\xcb" + bytes(8), b"\xa1a", b"\xc3", b"\x90", b"\x80", b"\x00")
+UNKNOWN_FIELD = "other"
+USUAL_ENTRY_COUNTS = (2_000, 20_000)
+USUAL_DEPTHS = (10, 100, 1_000, 5_000)
+# Of a payload that is as large as payloads may be, or larger.
+MAX_SIZE_PROBABILITY = 1 / 500
+MAX_RANDOM_BYTES = 200
+MAX_SPLICED_BYTES = 60
+MAX_REMOVED_BYTES = 10
+KEPT_FIELD_PROBABILITY = 0.8
+WRONG_ENCODING_PROBABILITY = 0.02
 
 
 @dataclass(frozen=True)
 class SeedMessage:
-    """A valid message to start from."""
+    """A valid message that payloads are made from."""
 
     message: type[Message]
-    plain: dict[str, Any]
+    plain: dict[str, Any]  # its fields as plain values
     payload: bytes
-    places: list[tuple[Place, inspect.Type]]
+    places: list[tuple[Place, inspect.Type]]  # where a value can be replaced, and the type there
 
 
 @dataclass(frozen=True)
 class FuzzSample:
-    """What arrives at the decoder of a message."""
+    """A payload and its encoding for the decoder of one message."""
 
     message: type[Message]
-    kind: str  # what was done to a valid payload
+    mutation: str  # what was done to a valid payload
     payload: bytes
     encoding: str
 
 
-def seeds() -> list[SeedMessage]:
-    """At least one of every message that may stand alone on the wire."""
-    found: list[SeedMessage] = []
+def make_seed_messages() -> list[SeedMessage]:
+    """Make at least one valid message of every type that may be a payload of its own."""
+    seeds: list[SeedMessage] = []
     for message in VERSIONS:
         plain = make_plain_example(message)
-        found.append(
-            SeedMessage(
-                message, plain, encode(plain), list(iter_places(plain, inspect.type_info(message)))
-            )
-        )
-        for real in REAL.get(message, []):
-            plain: dict[str, Any] = {name: getattr(real, name) for name in real.__struct_fields__}
-            found.append(
-                SeedMessage(
-                    message, plain, encode(real), [((name,), inspect.AnyType()) for name in plain]
-                )
-            )
-    return found
+        places = list(iter_places(plain, inspect.type_info(message)))
+        seeds.append(SeedMessage(message, plain, encode(plain), places))
+        for realistic in REALISTIC_MESSAGES.get(message, []):
+            fields = {name: getattr(realistic, name) for name in realistic.__struct_fields__}
+            seeds.append(make_seed_of_fields(message, fields, encode(realistic)))
+    return seeds
+
+
+def make_seed_of_fields(
+    message: type[Message], fields: dict[str, Any], payload: bytes
+) -> SeedMessage:
+    """Make a seed in which only whole fields can be replaced, by values of any type."""
+    places: list[tuple[Place, inspect.Type]] = [((name,), inspect.AnyType()) for name in fields]
+    return SeedMessage(message, fields, payload, places)
 
 
 class SampleMaker:
-    """Makes one sample after the other; the same ones for the same random numbers."""
+    """Makes one sample after the other. The same random numbers give the same samples."""
 
-    def __init__(self, rng: random.Random, start_from: Sequence[SeedMessage] | None = None) -> None:
-        """start_from: valid messages to make others of; None: `seeds()`."""
+    def __init__(self, rng: random.Random, seeds: Sequence[SeedMessage] | None = None) -> None:
+        """Create the maker.
+
+        Args:
+            rng: The random numbers.
+            seeds: Valid messages that samples are made from; None for those of `make_seed_messages`.
+        """
         self._rng = rng
-        self._seeds = list(start_from or seeds())
-        self._kinds: dict[str, Callable[[SeedMessage], bytes]] = {
+        self._seeds = list(seeds or make_seed_messages())
+        self._mutations: dict[str, Callable[[SeedMessage], bytes]] = {
             "valid": lambda seed: seed.payload,
-            "random": lambda seed: rng.randbytes(rng.randrange(200)),
+            "random": lambda _seed: rng.randbytes(rng.randrange(MAX_RANDOM_BYTES)),
             "truncated": lambda seed: seed.payload[: rng.randrange(len(seed.payload))],
-            "bit-flipped": lambda seed: flipped(rng, seed.payload),
-            "spliced": self._spliced,
-            "type-confused": self._confused,
-            "fields lost": self._lost,
-            "huge length": self._huge_length,
-            "huge": self._huge,
-            "nested": self._nested,
-            "other message": lambda seed: rng.choice(self._seeds).payload,
+            "bit-flipped": lambda seed: flip_bits(rng, seed.payload),
+            "spliced": self._splice,
+            "type-confused": self._replace_value,
+            "fields lost": self._remove_fields,
+            "huge length": self._insert_huge_length,
+            "huge": self._make_field_huge,
+            "nested": self._nest,
+            "other message": lambda _seed: rng.choice(self._seeds).payload,
         }
 
-    def make(self) -> FuzzSample:
-        """The next sample."""
+    def make_sample(self) -> FuzzSample:
+        """Make the next sample."""
         rng = self._rng
         seed = rng.choice(self._seeds)
-        kind = rng.choice(list(self._kinds))
+        mutation = rng.choice(list(self._mutations))
         encoding = format_encoding(seed.message)
-        if rng.random() < 0.02:
-            at = rng.randrange(len(encoding))
-            encoding = rng.choice(
-                [encoding[:at], encoding + "0", encoding[:at] + chr(rng.randrange(1, 0xD800)), ""]
-            )
-        return FuzzSample(seed.message, kind, self._kinds[kind](seed), encoding)
+        if rng.random() < WRONG_ENCODING_PROBABILITY:
+            encoding = self._make_wrong_encoding(encoding)
+        return FuzzSample(seed.message, mutation, self._mutations[mutation](seed), encoding)
 
-    def _spliced(self, seed: SeedMessage) -> bytes:
-        one, other = seed.payload, self._rng.choice(self._seeds).payload
-        at, since = self._rng.randrange(len(one)), self._rng.randrange(len(other))
-        return (
-            one[:at]
-            + other[since : since + self._rng.randrange(60)]
-            + one[at + self._rng.randrange(10) :]
-        )
+    def _make_wrong_encoding(self, encoding: str) -> str:
+        position = self._rng.randrange(len(encoding))
+        random_character = chr(self._rng.randrange(1, 0xD800))
+        wrong_encodings = [
+            encoding[:position],
+            encoding + "0",
+            encoding[:position] + random_character,
+            "",
+        ]
+        return self._rng.choice(wrong_encodings)
 
-    def _confused(self, seed: SeedMessage) -> bytes:
-        at, info = self._rng.choice(seed.places)
-        wrong = list_invalid_values(info)
-        value = (
-            self._rng.choice(wrong)
-            if wrong and self._rng.random() < 0.5
-            else self._rng.choice(WEIRD)
-        )
-        return encode(replace_at(seed.plain, at, value))
+    def _splice(self, seed: SeedMessage) -> bytes:
+        """Replace a piece by one of another payload."""
+        payload = seed.payload
+        other = self._rng.choice(self._seeds).payload
+        position = self._rng.randrange(len(payload))
+        other_begin = self._rng.randrange(len(other))
+        other_end = other_begin + self._rng.randrange(MAX_SPLICED_BYTES)
+        rest = payload[position + self._rng.randrange(MAX_REMOVED_BYTES) :]
+        return payload[:position] + other[other_begin:other_end] + rest
 
-    def _lost(self, seed: SeedMessage) -> bytes:
-        return encode(
-            {name: value for name, value in seed.plain.items() if self._rng.random() < 0.8}
-        )
+    def _replace_value(self, seed: SeedMessage) -> bytes:
+        """Replace a value by one that its type forbids, or by an unusual one."""
+        place, value_type = self._rng.choice(seed.places)
+        invalid_values = list_invalid_values(value_type)
+        if invalid_values and self._rng.random() < 0.5:
+            value = self._rng.choice(invalid_values)
+        else:
+            value = self._rng.choice(UNUSUAL_VALUES)
+        return encode(replace_at(seed.plain, place, value))
 
-    def _huge_length(self, seed: SeedMessage) -> bytes:
-        at = self._rng.randrange(len(seed.payload))
-        length = self._rng.choice(
-            (b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\x00\x10\x00\x00", b"\xff\xff", b"\xff")
-        )
-        return seed.payload[:at] + self._rng.choice(HEADS) + length + seed.payload[at:]
+    def _remove_fields(self, seed: SeedMessage) -> bytes:
+        kept = {
+            name: value
+            for name, value in seed.plain.items()
+            if self._rng.random() < KEPT_FIELD_PROBABILITY
+        }
+        return encode(kept)
 
-    def _huge(self, seed: SeedMessage) -> bytes:
-        count = self._rng.choice((2_000, 20_000))
-        if self._rng.random() < 1 / RARE:
+    def _insert_huge_length(self, seed: SeedMessage) -> bytes:
+        """Insert the beginning of a value that states more content than follows."""
+        position = self._rng.randrange(len(seed.payload))
+        length = self._rng.choice(HUGE_LENGTHS)
+        beginning = self._rng.choice(SIZED_TYPE_CODES) + length
+        return seed.payload[:position] + beginning + seed.payload[position:]
+
+    def _make_field_huge(self, seed: SeedMessage) -> bytes:
+        """Replace or add a field that is an array of very many entries."""
+        count = self._rng.choice(USUAL_ENTRY_COUNTS)
+        if self._rng.random() < MAX_SIZE_PROBABILITY:
             count = self._rng.choice((MAX_PAYLOAD_BYTES // 9, MAX_PAYLOAD_BYTES))
-        entry = self._rng.choice((b"\xcb" + bytes(8), b"\xa1a", b"\xc3", b"\x90", b"\x80", b"\x00"))
-        body = b"\xdd" + count.to_bytes(4, "big") + entry * count
-        name = self._rng.choice(["other", *seed.plain])
-        rest = {key: value for key, value in seed.plain.items() if key != name}
-        head = bytes([0x80 + min(len(rest) + 1, 15)])
-        return head + encode(name) + body + encode(rest)[1:]
+        entry = self._rng.choice(ARRAY_ENTRIES)
+        array = ARRAY_32_CODE + count.to_bytes(4, "big") + entry * count
+        huge_field = self._rng.choice([UNKNOWN_FIELD, *seed.plain])
+        others = {name: value for name, value in seed.plain.items() if name != huge_field}
+        entry_count = min(len(others) + 1, MAX_SHORT_MAP_ENTRIES)
+        map_code = bytes([SHORT_MAP_CODE + entry_count])
+        # The first byte of the encoded map is its own code, which `map_code` replaces.
+        return map_code + encode(huge_field) + array + encode(others)[1:]
 
-    def _nested(self, seed: SeedMessage) -> bytes:
-        depth = self._rng.choice((10, 100, 1_000, 5_000))
-        if self._rng.random() < 1 / RARE:
+    def _nest(self, seed: SeedMessage) -> bytes:
+        """Nest arrays or maps deeply, as a payload of their own or in a field."""
+        depth = self._rng.choice(USUAL_DEPTHS)
+        if self._rng.random() < MAX_SIZE_PROBABILITY:
             depth = MAX_PAYLOAD_BYTES // 9
-        nest = self._rng.choice(NESTS) * depth
+        nested = self._rng.choice(NESTED_OPENINGS) * depth + NIL
         if self._rng.random() < 0.5:
-            return nest + b"\xc0"
-        name = self._rng.choice(["other", *seed.plain])
-        return b"\x82" + encode(name) + nest + b"\xc0" + seed.payload[1:]
+            return nested
+        field_name = self._rng.choice([UNKNOWN_FIELD, *seed.plain])
+        map_of_two = bytes([SHORT_MAP_CODE + 2])
+        return map_of_two + encode(field_name) + nested + seed.payload[1:]

@@ -1,4 +1,4 @@
-"""How the processes of a run are: memory, threads and open files of each, and what they complained of."""
+"""Measures the processes of a run from outside, and finds errors in their logs."""
 
 import re
 from dataclasses import dataclass
@@ -6,36 +6,39 @@ from pathlib import Path
 
 import psutil
 
-COMPLAINTS = re.compile(
+ERROR_PATTERN = re.compile(
     r"Traceback|Exception|panicked|RuntimeWarning|[A-Z]\w+Error\b", re.MULTILINE
 )
+MAX_LINE_CHARACTERS = 200
 
 
 @dataclass(frozen=True)
 class ProcessVitals:
-    """One process at one moment."""
+    """Memory, threads and open files of one process at one moment."""
 
     resident_mb: float
     threads: int
     files: int
 
 
-def vitals(pid: int) -> ProcessVitals | None:
-    """None when the process is gone."""
+def measure_process(pid: int) -> ProcessVitals | None:
+    """Measure a process. Returns None if it has ended."""
     try:
         process = psutil.Process(pid)
         return ProcessVitals(
-            process.memory_info().rss / 2**20, process.num_threads(), process.num_fds()
+            resident_mb=process.memory_info().rss / 2**20,
+            threads=process.num_threads(),
+            files=process.num_fds(),
         )
     except psutil.Error:
         return None
 
 
-def complaints(out: Path) -> list[str]:
-    """Lines in the logs of a run's parts that tell of an exception, with the name of the part."""
-    found: list[str] = []
+def find_error_lines(out: Path) -> list[str]:
+    """Find the lines in the logs of a run that report an error, each with the name of the log."""
+    errors: list[str] = []
     for log in sorted(out.glob("*.log")):
         for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
-            if COMPLAINTS.search(line):
-                found.append(f"{log.stem}: {line.strip()[:200]}")
-    return found
+            if ERROR_PATTERN.search(line):
+                errors.append(f"{log.stem}: {line.strip()[:MAX_LINE_CHARACTERS]}")
+    return errors

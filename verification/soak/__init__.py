@@ -1,7 +1,11 @@
-"""A long run in which things go wrong at random, and a person gets it going again each time.
+"""Long runs in which random faults occur, and in which random processes are killed.
 
     python -m verification.soak --minutes 30 [--seed 1] [--backend can]
+    python -m verification.soak.kills --trials 300 [--seed 1] [--backend can]
 
-One `snakesim run --stay` in real time. Faults come from the product's own injector; after each, the robot must say what
-happened, an operator's commands must bring it back, and memory, threads, files and processes must be as before.
+A soak is one `snakesim run --stay` in real time. Its faults come from the product's own injector. After each fault, the
+robot must report what happened, the commands of an operator must recover it, and memory, threads, files and processes
+must be as before (faults, watch, health).
+
+In kills, each trial is a run of its own (kills, killed_run).
 """

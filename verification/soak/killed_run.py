@@ -1,4 +1,4 @@
-"""One run whose processes are killed and frozen at a drawn moment: what is done to it, and what is left of it."""
+"""Carries out one trial: starts a run, sends the signals at the moment, waits for the end, and gathers what is left."""
 
 import contextlib
 import os
@@ -9,7 +9,6 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
 
 import msgspec
 
@@ -23,299 +22,275 @@ from snakesim_operator.results.run_reader import SUMMARY_FILENAME
 from snakesim_operator.results.summary import RunSummary
 from snakesim_testing.harness.command import running_snakesim
 from snakesim_testing.harness.processes import find_processes_with, find_run_processes
+from verification.soak.kill_trial import SUPERVISOR, KillTrial
 
-Moment = Literal[
-    "starting", "arm_session", "armed", "stopping", "resetting", "interrupted", "ending"
-]
-MOMENTS: tuple[Moment, ...] = get_args(Moment)
-SUPERVISOR = "supervisor"
 ROBOT = "planar13"
-# The longest lease there is: this is about processes that end, not about a busy machine.
-RATE_HZ = 50
-MOMENT_LIMIT_S = 60.0
-PATIENCE_S = 15.0  # for a run to end by itself; then it is interrupted
-STAYS_S = 1.5  # how long a run that stays is left alone
-END_LIMIT_S = 20.0
-GONE_LIMIT_S = 10.0
-# Until a process that is to be hit at the start is there: then it is hit at once.
-BORN_LIMIT_S = 3.0
-LOOK_S = 0.003
-MARK = "SNAKESIM_KILLS"  # in the environment of everything that descends from a trial
-
-
-@dataclass(frozen=True)
-class ProcessKill:
-    """A signal to one process, so long after the moment."""
-
-    victim: str
-    number: signal.Signals
-    after_s: float
-    # Of a SIGSTOP: so long until SIGCONT; None: until the run is to end.
-    thaw_s: float | None = None
-
-    def __str__(self) -> str:
-        thaw = "" if self.thaw_s is None else f" for {self.thaw_s:.2f} s"
-        return f"{self.number.name} to {self.victim} at +{self.after_s:.3f} s{thaw}"
-
-
-@dataclass(frozen=True)
-class KillTrial:
-    """What is drawn."""
-
-    number: int
-    backend: str
-    clock_mode: str
-    stay: bool
-    router: bool
-    asked_s: float
-    moment: Moment
-    by_datagram: bool  # how the emergency stop is asked for
-    hits: tuple[ProcessKill, ...]
-
-    def __str__(self) -> str:
-        kind = " ".join([self.backend, self.clock_mode, *self._flags])
-        return f"#{self.number} {kind}, {self.moment}: {', '.join(map(str, self.hits))}"
-
-    @property
-    def _flags(self) -> list[str]:
-        return ["--stay"] * self.stay + ["--with-router"] * self.router
-
-    def arguments(self) -> list[str]:
-        """Of `snakesim run`."""
-        fixed = ["triplet", "--controller", "hold", "--set", f"rate_hz={RATE_HZ}"]
-        return [
-            *fixed,
-            "--backend",
-            self.backend,
-            "--clock-mode",
-            self.clock_mode,
-            "--duration",
-            str(self.asked_s),
-            *self._flags,
-        ]
+REQUESTER = "kills"
+MAX_MOMENT_WAIT_S = 60.0
+CONNECT_TIMEOUT_S = 0.2
+STOP_ANSWER_WAIT_S = 5.0
+REQUEST_TIMEOUT_S = 3.0
+ENDING_FRACTION = 0.9  # of the requested ticks, after which a run counts as ending
+MAX_RUN_S = 15.0  # for a run to end by itself; then it is interrupted
+STAY_DURATION_S = 1.5  # until a run that stays is interrupted
+MAX_END_S = 20.0  # after the interrupt
+MAX_PROCESS_END_S = 10.0  # for all other processes, after the run
+# Until a process that gets a signal at the start exists; it then gets the signal at once.
+MAX_PROCESS_START_S = 3.0
+POLL_PERIOD_S = 0.003
+SWEEP_PERIOD_S = 0.02
+MARK = "SNAKESIM_KILLS"  # in the environment of all processes that descend from a trial
 
 
 @dataclass
 class KillOutcome:
-    """What became of it."""
+    """What was done to a run, and what is left of it."""
 
     trial: KillTrial
-    reached: bool = False  # the moment
-    hits: int = 0
-    code: int | None = None
-    interrupted: bool = False  # by a signal to the supervisor, whoever sent it
+    reached_moment: bool = False
+    kill_count: int = 0  # of signals that were sent, without SIGCONT
+    exit_code: int | None = None
+    interrupted: bool = False  # by a signal to the supervisor, of the trial or at its end
     printed: str = ""
     logs: dict[str, str] = field(default_factory=dict[str, str])
-    armed_ticks: int = 0  # as somebody on the network has counted them
-    record: HostRecord | None = None
+    armed_ticks: int = 0  # as counted on the network
+    host_record: HostRecord | None = None
     summary: RunSummary | None = None
     stop_answered: bool = False
-    reset_asked: bool = False
+    reset_requested: bool = False
     reset_answered: bool = False
-    stop_kept: bool = False
+    stop_kept: bool = False  # on the disk
     left_behind: list[str] = field(default_factory=list[str])
 
 
 class KilledRun:
-    """A run, and who watches it from its network."""
+    """A run whose processes get signals, and a session on its network that watches it."""
 
     def __init__(self, trial: KillTrial, folder: Path) -> None:
-        self._trial, self._folder, self._out = trial, folder, folder / "run"
+        """Prepare a trial.
+
+        Args:
+            trial: The trial.
+            folder: An empty folder for the run and for what outlives it.
+        """
+        self._trial = trial
+        self._folder = folder
+        self._out = folder / "run"
         self._outcome = KillOutcome(trial)
         self._mark = f"{os.getpid()}-{trial.number}-{time.monotonic_ns()}"
+        # What is known from the network. The session is None until the run has been joined.
+        self._session: Session | None = None
         self._status: RobotStatus | None = None
-        self._armed: set[tuple[int, int]] = set()  # epoch of the lease, tick
-        self._frozen: set[str] = set()
-        self._asking = ThreadPoolExecutor(2)
-        self._asked: list[Future[None]] = []
+        self._armed_ticks: set[tuple[int, int]] = set()  # epoch of the lease, tick
+        # Requests that are sent while signals are sent.
+        self._request_threads = ThreadPoolExecutor(2)
+        self._requests: list[Future[None]] = []
 
-    def go(self) -> KillOutcome:
-        """Carry it out, wait for the end, and gather what is left."""
-        with running_snakesim(
-            self._out, *self._trial.arguments(), extra_env={MARK: self._mark}
-        ) as run:
-            self._process, self._endpoint = run.process, run.endpoint
+    def carry_out(self) -> KillOutcome:
+        """Start the run, send the signals, wait for the end, and gather what is left."""
+        arguments = self._trial.list_arguments()
+        with running_snakesim(self._out, *arguments, extra_env={MARK: self._mark}) as run:
+            self._process = run.process
+            self._endpoint = run.endpoint
             try:
                 with contextlib.ExitStack() as stack:
-                    self._session: Session | None = None
-                    self._outcome.reached = self._await_moment(stack)
-                    self._hit()
+                    self._outcome.reached_moment = self._await_moment(stack)
+                    self._act_at_moment()
+                    self._send_signals()
                     self._await_end()
-                    for asked in self._asked:
-                        asked.result()
+                    for request in self._requests:
+                        request.result()
             finally:
-                self._outcome.code = self._process.poll()
-                self._asking.shutdown()
-                self._sweep()
+                self._outcome.exit_code = self._process.poll()
+                self._request_threads.shutdown()
+                self._end_remaining_processes()
             self._outcome.printed = run.printed()
-        self._gather()
+        self._gather_files()
         return self._outcome
 
     # --- until the moment -------------------------------------------------------------------------------------
 
     def _await_moment(self, stack: contextlib.ExitStack) -> bool:
-        if self._trial.moment == "starting":
+        """Wait for the moment of the trial. Returns whether the run has reached it."""
+        moment = self._trial.moment
+        if moment == "starting":
             return True
-        if not self._until(lambda: self._join(stack), MOMENT_LIMIT_S):
+        if not self._wait_until(lambda: self._join_network(stack), MAX_MOMENT_WAIT_S):
             return False
-        if self._trial.moment == "arm_session":
-            return self._until(lambda: self._status is not None, MOMENT_LIMIT_S)
-        if not self._until(lambda: bool(self._armed), MOMENT_LIMIT_S):
+        if moment == "arm_session":
+            return self._wait_until(lambda: self._status is not None, MAX_MOMENT_WAIT_S)
+        if not self._wait_until(lambda: bool(self._armed_ticks), MAX_MOMENT_WAIT_S):
             return False
-        if self._trial.moment == "resetting":
-            self._stop()
-            return self._until(lambda: self._outcome.stop_answered, 5.0)
-        if self._trial.moment == "ending":
-            wanted = 0.9 * self._trial.asked_s * RATE_HZ
-            return self._until(lambda: len(self._armed) >= wanted, MOMENT_LIMIT_S)
+        if moment == "resetting":
+            self._submit_request(self._request_stop)
+            return self._wait_until(lambda: self._outcome.stop_answered, STOP_ANSWER_WAIT_S)
+        if moment == "ending":
+            min_ticks = ENDING_FRACTION * self._trial.requested_ticks
+            return self._wait_until(lambda: len(self._armed_ticks) >= min_ticks, MAX_MOMENT_WAIT_S)
         return True
 
-    def _join(self, stack: contextlib.ExitStack) -> bool:
+    def _join_network(self, stack: contextlib.ExitStack) -> bool:
+        """Try to open a session, which the stack closes. Returns whether there is one."""
+        settings = ConnectionSettings(self._endpoint, ROBOT)
         with contextlib.suppress(NotConnectedError):
             session = stack.enter_context(
-                open_session(ConnectionSettings(self._endpoint, ROBOT), connect_timeout_s=0.2)
+                open_session(settings, connect_timeout_s=CONNECT_TIMEOUT_S)
             )
             self._statuses = session.declare_latched_reader(keys.STATUS, RobotStatus)
             self._clocks = session.declare_reader(keys.CLOCK, Clock)
             self._session = session
         return self._session is not None
 
-    def _look(self) -> None:
+    def _read_messages(self) -> None:
+        """Remember the newest status, and the ticks at which the robot was armed."""
         if self._session is None:
             return
-        self._status = (self._statuses.drain() or [self._status])[-1]
+        statuses = self._statuses.drain()
+        if statuses:
+            self._status = statuses[-1]
         for clock in self._clocks.drain():
             if clock.lifecycle == "armed":
-                self._armed.add((clock.lease_epoch, clock.tick))
+                self._armed_ticks.add((clock.lease_epoch, clock.tick))
 
-    def _until(self, condition: Callable[[], bool], limit_s: float) -> bool:
-        """Whether it came true before the run ended, and in time."""
-        deadline = time.monotonic() + limit_s
-        while self._process.poll() is None and time.monotonic() < deadline:
-            self._look()
+    def _wait_until(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Read messages until a condition holds. Returns False if the run ends before, or after the timeout."""
+        deadline_s = time.monotonic() + timeout_s
+        while self._process.poll() is None and time.monotonic() < deadline_s:
+            self._read_messages()
             if condition():
                 return True
-            time.sleep(LOOK_S)
+            time.sleep(POLL_PERIOD_S)
         return False
 
     # --- at the moment ----------------------------------------------------------------------------------------
 
-    def _hit(self) -> None:
-        began = time.monotonic()
-        acts: dict[Moment, Callable[[], None]] = {
-            "stopping": self._stop,
-            "resetting": self._reset,
-            "interrupted": self._interrupt,
-        }
-        if self._outcome.reached and self._trial.moment in acts:
-            acts[self._trial.moment]()
-        events: list[tuple[float, Callable[[], None]]] = []
-        for hit in self._trial.hits:
-            events.append((hit.after_s, lambda hit=hit: self._signal(hit.victim, hit.number)))
-            if hit.thaw_s is not None:
-                events.append(
-                    (
-                        hit.after_s + hit.thaw_s,
-                        lambda hit=hit: self._signal(hit.victim, signal.SIGCONT),
-                    )
-                )
-        for after_s, event in sorted(events, key=lambda pair: pair[0]):
-            while time.monotonic() < began + after_s and self._process.poll() is None:
-                self._look()
-                time.sleep(LOOK_S)
-            event()
+    def _act_at_moment(self) -> None:
+        """Send the request or the interrupt that the moment is named after."""
+        self._moment_s = time.monotonic()
+        if not self._outcome.reached_moment:
+            return
+        match self._trial.moment:
+            case "stopping":
+                self._submit_request(self._request_stop)
+            case "resetting":
+                self._outcome.reset_requested = True
+                self._submit_request(self._request_reset)
+            case "interrupted":
+                self._interrupt()
+            case _:
+                pass
 
-    def _signal(self, name: str, number: signal.Signals) -> None:
-        born_by = time.monotonic() + (BORN_LIMIT_S if self._trial.moment == "starting" else 0.0)
-        while (
-            (pid := self._pid(name)) is None
-            and time.monotonic() < born_by
-            and self._process.poll() is None
-        ):
-            time.sleep(LOOK_S)
+    def _send_signals(self) -> None:
+        """Send all signals of the trial, each when it is due, while the run has not ended."""
+        signals: list[tuple[float, str, signal.Signals]] = []  # delay in s, victim, signal
+        for kill in self._trial.kills:
+            signals.append((kill.delay_s, kill.victim, kill.signal_number))
+            if kill.freeze_duration_s is not None:
+                thaw_delay_s = kill.delay_s + kill.freeze_duration_s
+                signals.append((thaw_delay_s, kill.victim, signal.SIGCONT))
+        for delay_s, victim, number in sorted(signals, key=lambda entry: entry[0]):
+            while time.monotonic() < self._moment_s + delay_s and self._process.poll() is None:
+                self._read_messages()
+                time.sleep(POLL_PERIOD_S)
+            self._send_signal(victim, number)
+
+    def _send_signal(self, victim: str, number: signal.Signals) -> None:
+        """Send a signal to a process of the run, if it exists."""
+        pid = self._await_process(victim)
         if pid is None or self._process.poll() is not None:
             return
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, number)
-            self._outcome.hits += number is not signal.SIGCONT
-            self._outcome.interrupted |= name == SUPERVISOR and number in (
-                signal.SIGINT,
-                signal.SIGTERM,
-            )
+            if number is not signal.SIGCONT:
+                self._outcome.kill_count += 1
+            if victim == SUPERVISOR and number in (signal.SIGINT, signal.SIGTERM):
+                self._outcome.interrupted = True
 
-    def _pid(self, name: str) -> int | None:
-        return self._process.pid if name == SUPERVISOR else find_run_processes(self._out).get(name)
+    def _await_process(self, name: str) -> int | None:
+        """Return the id of a process. In a run that is just starting, wait until the process exists."""
+        deadline_s = time.monotonic()
+        if self._trial.moment == "starting":
+            deadline_s += MAX_PROCESS_START_S
+        while True:
+            pid = self._find_process(name)
+            if pid is not None or time.monotonic() >= deadline_s:
+                return pid
+            if self._process.poll() is not None:
+                return None
+            time.sleep(POLL_PERIOD_S)
+
+    def _find_process(self, name: str) -> int | None:
+        if name == SUPERVISOR:
+            return self._process.pid
+        return find_run_processes(self._out).get(name)
 
     def _interrupt(self) -> None:
-        self._signal(SUPERVISOR, signal.SIGCONT)
-        self._signal(SUPERVISOR, signal.SIGINT)
+        """Interrupt the supervisor, even if it is frozen."""
+        self._send_signal(SUPERVISOR, signal.SIGCONT)
+        self._send_signal(SUPERVISOR, signal.SIGINT)
 
-    def _stop(self) -> None:
-        self._asked.append(self._asking.submit(self._ask_to_stop))
+    def _submit_request(self, request: Callable[[], None]) -> None:
+        self._requests.append(self._request_threads.submit(request))
 
-    def _reset(self) -> None:
-        self._outcome.reset_asked = True
-        self._asked.append(self._asking.submit(self._ask_to_reset))
-
-    def _ask_to_stop(self) -> None:
+    def _request_stop(self) -> None:
+        """Request an emergency stop, by a datagram or by a query."""
         with contextlib.suppress(NotConnectedError):
             if self._trial.by_datagram:
                 host, _, port = self._endpoint.removeprefix("tcp/").rpartition(":")
-                self._outcome.stop_answered = (
-                    request_stop(host, int(port), "kills", 3.0) is not None
-                )
+                answer = request_stop(host, int(port), REQUESTER, REQUEST_TIMEOUT_S)
+                self._outcome.stop_answered = answer is not None
             elif self._session is not None:
-                answer = self._session.send_request(
-                    keys.ESTOP, EstopRequest(requester="kills"), 3.0
-                )
+                request = EstopRequest(requester=REQUESTER)
+                answer = self._session.send_request(keys.ESTOP, request, REQUEST_TIMEOUT_S)
                 self._outcome.stop_answered = answer.ok
 
-    def _ask_to_reset(self) -> None:
-        if self._session is not None:
-            with contextlib.suppress(NotConnectedError):
-                request = LifecycleRequest(action="reset", requester="kills")
-                self._outcome.reset_answered = self._session.send_request(
-                    keys.LIFECYCLE, request, 3.0
-                ).ok
+    def _request_reset(self) -> None:
+        if self._session is None:
+            return
+        with contextlib.suppress(NotConnectedError):
+            request = LifecycleRequest(action="reset", requester=REQUESTER)
+            answer = self._session.send_request(keys.LIFECYCLE, request, REQUEST_TIMEOUT_S)
+            self._outcome.reset_answered = answer.ok
 
-    # --- after it ---------------------------------------------------------------------------------------------
+    # --- after the moment -------------------------------------------------------------------------------------
 
     def _await_end(self) -> None:
-        self._until(lambda: False, STAYS_S if self._trial.stay else PATIENCE_S)
+        """Wait until the run ends, and interrupt it if it does not end by itself."""
+        self._wait_until(lambda: False, STAY_DURATION_S if self._trial.stay else MAX_RUN_S)
         if self._process.poll() is None:
             self._interrupt()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(END_LIMIT_S)
+            self._process.wait(MAX_END_S)
 
-    def _sweep(self) -> None:
-        """Everything that descends from this trial must be gone by itself; what is not is told, and killed."""
+    def _end_remaining_processes(self) -> None:
+        """Wait until all processes of the trial have ended. Note and kill those that do not end by themselves."""
         if self._process.poll() is None:
-            self._outcome.left_behind.append(
-                f"the run itself, {END_LIMIT_S:g} s after an interrupt"
-            )
+            self._outcome.left_behind.append(f"the run itself, {MAX_END_S:g} s after an interrupt")
             self._process.kill()
             self._process.wait()
-        deadline = time.monotonic() + GONE_LIMIT_S
-        while (
-            left := find_processes_with("environ", f"{MARK}={self._mark}\0")
-        ) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        for pid, line in left:
+        deadline_s = time.monotonic() + MAX_PROCESS_END_S
+        remaining = self._find_marked_processes()
+        while remaining and time.monotonic() < deadline_s:
+            time.sleep(SWEEP_PERIOD_S)
+            remaining = self._find_marked_processes()
+        for pid, line in remaining:
             self._outcome.left_behind.append(f"{pid} {line[:200]}".replace("\0", " "))
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
-    def _gather(self) -> None:
+    def _find_marked_processes(self) -> list[tuple[int, str]]:
+        return find_processes_with("environ", f"{MARK}={self._mark}\0")
+
+    def _gather_files(self) -> None:
+        """Read the logs and records of the run, as far as they exist."""
         outcome = self._outcome
-        outcome.armed_ticks = len(self._armed)
+        outcome.armed_ticks = len(self._armed_ticks)
         for log in sorted(self._out.glob("*.log")):
             outcome.logs[log.stem] = log.read_text(encoding="utf-8", errors="replace")
         with contextlib.suppress(FileNotFoundError):
-            outcome.record = msgspec.json.decode(
-                (self._out / HOST_RECORD).read_bytes(), type=HostRecord
-            )
+            host_record = (self._out / HOST_RECORD).read_bytes()
+            outcome.host_record = msgspec.json.decode(host_record, type=HostRecord)
         with contextlib.suppress(FileNotFoundError):
-            outcome.summary = msgspec.json.decode(
-                (self._out / SUMMARY_FILENAME).read_bytes(), type=RunSummary
-            )
+            summary = (self._out / SUMMARY_FILENAME).read_bytes()
+            outcome.summary = msgspec.json.decode(summary, type=RunSummary)
         outcome.stop_kept = any(self._folder.glob("snakesim/robots/*/estop.json"))

@@ -24,12 +24,12 @@ from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
 from snakesim_testing.operator.damaged_recordings import (
-    chunks,
-    flipped,
-    packed,
-    recorded,
-    spans,
-    written,
+    flip_bit,
+    list_chunks,
+    list_records,
+    make_chunk_record,
+    record_short_run,
+    write_file,
 )
 from snakesim_testing.runs.in_process_command import snakesim
 
@@ -38,13 +38,13 @@ INCOMPLETE = 3
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return recorded(tmp_path_factory.mktemp("recorded") / "run", 1.5, 100_000)
+    return record_short_run(tmp_path_factory.mktemp("recorded") / "run", 1.5, 100_000)
 
 
 @pytest.fixture(scope="module")
 def whole(run: Path) -> bytes:
     content = (run / RECORDING_FILENAME).read_bytes()
-    assert len(chunks(content)) >= 5
+    assert len(list_chunks(content)) >= 5
     return content
 
 
@@ -59,8 +59,8 @@ def lost(whole_path: Path, path: Path) -> Counter[str]:
 def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(
     run: Path, whole: bytes, tmp_path: Path
 ) -> None:
-    damaged, following = chunks(whole)[2:4]
-    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    damaged, following = list_chunks(whole)[2:4]
+    path = write_file(tmp_path / "a.mcap", flip_bit(whole, (damaged.begin + damaged.end) // 2))
     reader = RecordingReader(path)
     kept = list(reader.read_messages())
     truth = lost(run / RECORDING_FILENAME, path)
@@ -80,14 +80,14 @@ def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(
 
 @pytest.mark.slow  # one flipped bit in one of them below
 def test_each_chunk_may_be_the_damaged_one(run: Path, whole: bytes, tmp_path: Path) -> None:
-    for chunk in chunks(whole):
+    for chunk in list_chunks(whole):
         for at in (
             chunk.begin,
             chunk.begin + 2,
             chunk.begin + 45,
             chunk.end - 5,
         ):  # kind, length, name, data
-            path = written(tmp_path / "a.mcap", flipped(whole, at))
+            path = write_file(tmp_path / "a.mcap", flip_bit(whole, at))
             reader = RecordingReader(path)
             kept = list(reader.read_messages())
             ours = {
@@ -123,14 +123,14 @@ COMMANDS = [
 def test_every_command_tells_of_the_damage_and_ends_with_3(
     whole: bytes, tmp_path: Path, command: list[str], damage: str
 ) -> None:
-    second = chunks(whole)[1]
+    second = list_chunks(whole)[1]
     damaged = {
-        "flipped": flipped(whole, (second.begin + second.end) // 2),
+        "flipped": flip_bit(whole, (second.begin + second.end) // 2),
         "halved": whole[: len(whole) // 2],
         "taken out": whole[: second.begin] + whole[second.end :],
     }[damage]
-    written(tmp_path / "whole.mcap", whole)
-    written(tmp_path / "a.mcap", damaged)
+    write_file(tmp_path / "whole.mcap", whole)
+    write_file(tmp_path / "a.mcap", damaged)
     ended = snakesim(*command, cwd=tmp_path)
     assert ended.code == INCOMPLETE, ended
     # A busy computer.
@@ -148,7 +148,7 @@ def test_undamaged_recording_is_not_reported_and_names_its_command(
     whole: bytes, tmp_path: Path
 ) -> None:
     for name in ("whole.mcap", "a.mcap"):
-        written(tmp_path / name, whole)
+        write_file(tmp_path / name, whole)
     for command in COMMANDS:
         ended = snakesim(*command, cwd=tmp_path)
         # By a busy computer.
@@ -166,8 +166,8 @@ def test_undamaged_recording_is_not_reported_and_names_its_command(
 def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(
     run: Path, whole: bytes, tmp_path: Path
 ) -> None:
-    first = chunks(whole)[0]
-    written(tmp_path / "a.mcap", flipped(whole, (first.begin + first.end) // 2))
+    first = list_chunks(whole)[0]
+    write_file(tmp_path / "a.mcap", flip_bit(whole, (first.begin + first.end) // 2))
     ended = snakesim(
         "recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path
     )
@@ -184,7 +184,7 @@ def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(
 
 
 def test_tables_and_arrays_carry_what_is_lost(whole: bytes, tmp_path: Path) -> None:
-    written(tmp_path / "a.mcap", whole[: len(whole) // 2])
+    write_file(tmp_path / "a.mcap", whole[: len(whole) // 2])
     for form in ("csv", "npz"):
         snakesim(
             "recording", "export", "a.mcap", "--format", form, "--out", f"a.{form}", cwd=tmp_path
@@ -199,7 +199,7 @@ def test_tables_and_arrays_carry_what_is_lost(whole: bytes, tmp_path: Path) -> N
 
 def test_who_reads_parquet_and_datasets_finds_it_too(whole: bytes, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
-    written(tmp_path / "a.mcap", whole[: len(whole) // 2])
+    write_file(tmp_path / "a.mcap", whole[: len(whole) // 2])
     for form, out in (("parquet", "a.parquet"), ("lerobot", "set")):
         assert (
             snakesim(
@@ -220,8 +220,8 @@ def test_a_gap_ends_an_episode_of_a_dataset(
 ) -> None:
     """No frame gets a time that it did not have, and no reward is earned while nothing was recorded."""
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
-    damaged = chunks(whole)[len(chunks(whole)) // 2]
-    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    damaged = list_chunks(whole)[len(list_chunks(whole)) // 2]
+    path = write_file(tmp_path / "a.mcap", flip_bit(whole, (damaged.begin + damaged.end) // 2))
     (intact,), parts = (
         read_episodes([run], None, images=False),
         read_episodes([path], None, images=False),
@@ -255,8 +255,8 @@ def test_a_gap_ends_an_episode_of_a_dataset(
 def test_damaged_episode_after_a_gap_starts_with_an_image(whole: bytes, tmp_path: Path) -> None:
     """What a camera showed before the gap is not what the robot saw behind it."""
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
-    damaged = chunks(whole)[len(chunks(whole)) // 2]
-    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    damaged = list_chunks(whole)[len(list_chunks(whole)) // 2]
+    path = write_file(tmp_path / "a.mcap", flip_bit(whole, (damaged.begin + damaged.end) // 2))
     before, after = read_episodes([path], None, images=False)
     record = before.record
     first_tick, first_tick_after = int(record.ticks[0]), int(record.ticks[after.rows[0]])
@@ -272,8 +272,8 @@ def test_damaged_episode_after_a_gap_starts_with_an_image(whole: bytes, tmp_path
 
 
 def test_a_film_stands_still_in_a_gap(whole: bytes, tmp_path: Path) -> None:
-    damaged = chunks(whole)[len(chunks(whole)) // 2]
-    path = written(tmp_path / "a.mcap", flipped(whole, (damaged.begin + damaged.end) // 2))
+    damaged = list_chunks(whole)[len(list_chunks(whole)) // 2]
+    path = write_file(tmp_path / "a.mcap", flip_bit(whole, (damaged.begin + damaged.end) // 2))
     record = RunRecord.load(path)
     before, after = (
         int(rows[end]) for rows, end in zip(record.contiguous_rows, (-1, 0), strict=True)
@@ -287,8 +287,8 @@ def test_a_film_stands_still_in_a_gap(whole: bytes, tmp_path: Path) -> None:
 
 
 def test_truncated_recording_says_nothing_about_end_of_run(whole: bytes, tmp_path: Path) -> None:
-    written(tmp_path / "whole.mcap", whole)
-    written(tmp_path / "a.mcap", whole[: len(whole) // 2])
+    write_file(tmp_path / "whole.mcap", whole)
+    write_file(tmp_path / "a.mcap", whole[: len(whole) // 2])
     snakesim("recording", "report", "a.mcap", cwd=tmp_path)
     page = (tmp_path / "a.html").read_text()
     assert "How the run ended is not known: the recording breaks off after 0." in page
@@ -304,7 +304,7 @@ def test_truncated_recording_says_nothing_about_end_of_run(whole: bytes, tmp_pat
 
 
 def test_an_export_does_not_follow_a_link(whole: bytes, tmp_path: Path) -> None:
-    written(tmp_path / "a.mcap", whole)
+    write_file(tmp_path / "a.mcap", whole)
     for form in ("csv", "npz", "mcap"):
         out = tmp_path / ("b.mcap" if form == "mcap" else f"a.{form}")
         out.symlink_to(tmp_path / "elsewhere")
@@ -316,8 +316,8 @@ def test_an_export_does_not_follow_a_link(whole: bytes, tmp_path: Path) -> None:
 
 
 def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_path: Path) -> None:
-    end = next(span for span in spans(whole) if span.opcode == Opcode.METADATA)
-    path = written(tmp_path / "a.mcap", whole[: end.begin] + whole[end.end :])
+    end = next(span for span in list_records(whole) if span.opcode == Opcode.METADATA)
+    path = write_file(tmp_path / "a.mcap", whole[: end.begin] + whole[end.end :])
     reader = RecordingReader(path)
     assert list(reader.read_messages())
     assert reader.is_complete
@@ -325,17 +325,20 @@ def test_without_its_last_metadata_nothing_of_a_robot_is_lost(whole: bytes, tmp_
 
 
 def test_damaged_lz4_chunk_and_impossible_time_are_reported(whole: bytes, tmp_path: Path) -> None:
-    first, second = chunks(whole)[:2]
-    bad = packed(b"abc", "lz4", data=b"no lz4 at all")
+    first, second = list_chunks(whole)[:2]
+    bad = make_chunk_record(b"abc", "lz4", packed_content=b"no lz4 at all")
     reader = RecordingReader(
-        written(tmp_path / "a.mcap", whole[: first.end] + bad + whole[first.end :])
+        write_file(tmp_path / "a.mcap", whole[: first.end] + bad + whole[first.end :])
     )
     assert len(list(reader.read_messages())) > 500
     assert "a chunk that cannot be unpacked" in reader.missing[0]
     (channel,) = struct.unpack("<H", b"\x01\x00")
     late = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, channel, 10**6, 2**63, 0)
     reader = RecordingReader(
-        written(tmp_path / "a.mcap", whole[: second.begin] + packed(late) + whole[second.begin :])
+        write_file(
+            tmp_path / "a.mcap",
+            whole[: second.begin] + make_chunk_record(late) + whole[second.begin :],
+        )
     )
     assert max(one.robot_time_ns for one in reader.read_messages()) < 2**62
     assert reader.missing
@@ -343,11 +346,11 @@ def test_damaged_lz4_chunk_and_impossible_time_are_reported(whole: bytes, tmp_pa
 
 
 def test_a_record_of_absurd_length_is_damage(whole: bytes, tmp_path: Path) -> None:
-    second = chunks(whole)[1]
+    second = list_chunks(whole)[1]
     for opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.MESSAGE, Opcode.ATTACHMENT):
         absurd = struct.pack("<BQ", opcode, 2**63) + b"x" * 50
         reader = RecordingReader(
-            written(tmp_path / "a.mcap", whole[: second.begin] + absurd + whole[second.begin :])
+            write_file(tmp_path / "a.mcap", whole[: second.begin] + absurd + whole[second.begin :])
         )
         list(reader.read_messages())
         assert reader.is_complete
@@ -356,9 +359,9 @@ def test_a_record_of_absurd_length_is_damage(whole: bytes, tmp_path: Path) -> No
 
 
 def test_a_bomb_is_refused_in_one_line(tmp_path: Path) -> None:
-    bomb = packed(bytes(60_000_000))
+    bomb = make_chunk_record(bytes(60_000_000))
     assert len(bomb) < 10_000
-    written(tmp_path / "bomb.mcap", MCAP0_MAGIC + bomb * 20)
+    write_file(tmp_path / "bomb.mcap", MCAP0_MAGIC + bomb * 20)
     for command in (
         ["recording", "info", "bomb.mcap"],
         ["recording", "export", "bomb.mcap", "--format", "mcap", "--out", "o.mcap"],
@@ -426,8 +429,8 @@ def test_damaged_recording_is_reported_for_its_run_folder(
 ) -> None:
     for path in run.iterdir():
         if path.is_file():
-            written(tmp_path / path.name, path.read_bytes())
-    written(tmp_path / RECORDING_FILENAME, whole[: len(whole) // 2])
+            write_file(tmp_path / path.name, path.read_bytes())
+    write_file(tmp_path / RECORDING_FILENAME, whole[: len(whole) // 2])
     ended = snakesim("recording", "report", ".", cwd=tmp_path)
     assert ended.code == INCOMPLETE
     assert "its end: it breaks off" in ended.err
