@@ -31,16 +31,14 @@ from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_opti
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Imu, JointMode, JointState
+from snakesim_operator.features.commissioning.gear_rules import NO_BACKLASH
 from snakesim_operator.features.commissioning.identification import (
     MAX_CONSTANT_ERROR,
     JointIdentification,
     identify_joints,
 )
-from snakesim_operator.features.commissioning.judge import (
-    NO_BACKLASH,
-    JointVerdict,
-    judge_joints,
-)
+from snakesim_operator.features.commissioning.joint_verdict import JointVerdict
+from snakesim_operator.features.commissioning.judge import judge_joints
 from snakesim_operator.features.commissioning.measured import collect_measurements
 
 CHECK_MODULES = 5

@@ -32,12 +32,12 @@ from snakesim_operator.features.commissioning.capture import (
     TravelRange,
     compute_zero_offsets_rad,
 )
-from snakesim_operator.features.commissioning.judge import MAX_RATIO_ERROR
 from snakesim_operator.features.commissioning.robot_edit import (
     read_joints_with_drive_modes,
     require_own_robot_file,
     write_joint_fields,
 )
+from snakesim_operator.features.commissioning.tolerances import MAX_RATIO_ERROR
 
 ZERO_SAMPLING_S = 1.0  # samples for a zero are taken for that long
 MAX_SILENCE_S = 1.0  # without joint angles

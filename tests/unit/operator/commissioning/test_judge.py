@@ -9,7 +9,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import PROPERTIES
 from snakesim_hal.model.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.check import format_report
-from snakesim_operator.features.commissioning.judge import MATCHES_FILE, JointVerdict, judge_joints
+from snakesim_operator.features.commissioning.joint_verdict import MATCHES_FILE, JointVerdict
+from snakesim_operator.features.commissioning.judge import judge_joints
 from snakesim_operator.features.commissioning.measured import (
     CheckMeasurements,
     remove_clamped_targets,
