@@ -2,12 +2,13 @@
 
 import pytest
 
-from verification.commissioning_trials import NONE, check_trial, identify_trials
+from verification.commissioning_trials import identify_trials
+from verification.start_check_trials import NONE, check_trial
 
 
 @pytest.mark.parametrize("fault", ["backlash", NONE])
 def test_hidden_fault_is_named_without_blaming_sound_joints(fault: str) -> None:
-    trial = check_trial(4, fault, module_count=4)
+    trial = check_trial(4, fault, joint_count=4)
     assert not trial.blamed and not trial.unsure, (trial.blamed, trial.unsure)
     assert fault == NONE or trial.found, [row.summary for row in trial.rows]
 

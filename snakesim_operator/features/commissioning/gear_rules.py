@@ -9,6 +9,7 @@ from snakesim_operator.features.commissioning.lost_motion import LostMotion
 from snakesim_operator.features.commissioning.property_rules import NO_LINK
 from snakesim_operator.features.commissioning.tolerances import MAX_RATIO_ERROR
 
+IS_LOOSE = "its gear or coupling is loose"  # which of them is not clear
 MIN_SLIPPING_RATIO = 0.5  # of link and drive in the small motion; within backlash it is near 0
 CONFIRM_GEAR_BY_HAND = (
     NO_LINK
@@ -23,6 +24,8 @@ def judge_gear_by_links(
     small_motion_ratio: float | None,
     drive: JointDrive,
     allowed_backlash_rad: float,
+    *,
+    is_load_passed_on: bool,
 ) -> PropertyFinding:
     """Judge whether a joint's links turn as far as its encoder measures.
 
@@ -32,12 +35,20 @@ def judge_gear_by_links(
         small_motion_ratio: The same ratio as `motion_ratio` in the small motion; None if it is not known.
         drive: The drive as the robot file has it.
         allowed_backlash_rad: Largest backlash that is not judged as wrong.
+        is_load_passed_on: Whether the torque of other joints changes with the small motion of this one.
     """
     ratio = abs(motion_ratio)
     if ratio < MAX_RATIO_ERROR:
+        if is_load_passed_on:
+            return PropertyFinding(
+                "wrong",
+                "its coupling slips: its drive turns and no link does, but it passes a torque on; fasten the coupling, "
+                "and check the gear",
+            )
         return PropertyFinding(
             "wrong",
-            "its coupling slips: its drive turns and no link does; fasten the coupling, and check the gear",
+            f"{IS_LOOSE}: its drive turns and no link does. Either the coupling slips, or the backlash is wider than "
+            "the motion; fasten the coupling, and check the gear",
         )
     reasons: list[str] = []
     if lost_motion is not None and lost_motion.lost_rad > max(
@@ -95,7 +106,9 @@ def judge_gear_by_torque(
             )
         case "loose":
             return PropertyFinding(
-                "wrong", "its link is loose: coupling, a gear that slips, or backlash"
+                "wrong",
+                f"{IS_LOOSE}: its torque does not follow its angle. Either the coupling slips, or the gear has "
+                "backlash; fasten the coupling, and check the gear",
             )
         case "tight":
             return PropertyFinding(

@@ -21,7 +21,7 @@ import numpy as np
 
 from snakesim_hal.model.checked import JointProperty
 from snakesim_operator.features.commissioning.encoder_dead_zone import find_dead_zone_rad
-from snakesim_operator.features.commissioning.gear_play import judge_gear_plays
+from snakesim_operator.features.commissioning.gear_play import judge_gear_plays, passes_load
 from snakesim_operator.features.commissioning.gear_rules import (
     judge_gear_by_links,
     judge_gear_by_torque,
@@ -186,6 +186,7 @@ class _JointEvaluator:
 
     def _judge_gear(self, joint_index: int, motion_ratio: float) -> PropertyFinding:
         """Judge the gear of a joint: from the links if they were measured, otherwise from its torque."""
+        response = self._load_responses[joint_index]
         if not np.isnan(motion_ratio):
             return judge_gear_by_links(
                 motion_ratio,
@@ -193,8 +194,8 @@ class _JointEvaluator:
                 measure_small_motion_ratio(self._reordered_measurements, joint_index),
                 self._measurements.drives[joint_index],
                 self._allowed_backlash_rad,
+                is_load_passed_on=response is not None and passes_load(response),
             )
-        response = self._load_responses[joint_index]
         small_motion_rad = 0.0 if response is None else response.small_motion_rad
         return judge_gear_by_torque(
             self._gear_plays[joint_index], small_motion_rad, self._allowed_backlash_rad

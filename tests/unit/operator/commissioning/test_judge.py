@@ -9,6 +9,7 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import PROPERTIES
 from snakesim_hal.model.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.check import format_report
+from snakesim_operator.features.commissioning.gear_rules import IS_LOOSE, judge_gear_by_links
 from snakesim_operator.features.commissioning.joint_verdict import MATCHES_FILE, JointVerdict
 from snakesim_operator.features.commissioning.judge import judge_joints
 from snakesim_operator.features.commissioning.measured import (
@@ -148,6 +149,23 @@ def test_a_gear_of_another_ratio_is_no_backlash() -> None:
         MATCHES_FILE,
         MATCHES_FILE,
     ]
+
+
+def test_joint_whose_links_never_turn_slips_or_has_wide_backlash() -> None:
+    """Only a torque that passes through the gear tells a coupling that slips from backlash."""
+    summary = verdicts(measurements(backlash_rad=4 * WAY_RAD))[0]
+    assert summary.startswith(IS_LOOSE)
+    assert "the coupling slips, or the backlash" in summary
+    assert "its coupling slips" not in summary
+
+
+@pytest.mark.parametrize("is_load_passed_on", [True, False])
+def test_only_a_load_that_is_passed_on_names_the_coupling(is_load_passed_on: bool) -> None:
+    finding = judge_gear_by_links(
+        0.02, None, None, JointDrive(), 0.01, is_load_passed_on=is_load_passed_on
+    )
+    assert finding.state == "wrong"
+    assert finding.reason.startswith("its coupling slips" if is_load_passed_on else IS_LOOSE)
 
 
 def test_judge_gravity_reveals_zero_of_a_bent_pitch_joint() -> None:
