@@ -21,7 +21,7 @@ FAULT_HEADER = (
 )
 ALARM_HEADER = (
     "| drive type | robots | with a sound joint reported | at most (95 %) | sound joints | reported | at most (95 %) "
-    "| with backlash excluded |"
+    "| reported without backlash |"
 )
 
 
@@ -34,7 +34,7 @@ class RobotResult(msgspec.Struct, frozen=True, kw_only=True):
     settings: list[str]  # of the emulated drives that make the fault
     outcome: Outcome | None  # None if the robot has no fault
     is_at_end: bool  # whether the joint with the fault is the first or the last one
-    reported: list[str]  # summary of the verdict on each joint with the fault
+    reported: list[str]  # of each joint with the fault
     blamed: list[str]  # sound joints that were reported as wrong, with the verdict
     unsure: list[str]  # sound joints of which something is unknown
     sound_count: int  # of joints
@@ -50,9 +50,7 @@ def summarize_trial(trial: CheckTrial) -> RobotResult:
         settings=list(trial.settings),
         outcome=trial.outcome,
         is_at_end=trial.is_at_end,
-        reported=[
-            f"{trial.rows[joint].joint}: {trial.rows[joint].summary}" for joint in trial.joints
-        ],
+        reported=trial.reported,
         blamed=trial.blamed,
         unsure=trial.unsure,
         sound_count=len(trial.sound_rows),

@@ -102,6 +102,17 @@ class CheckTrial:
         return any(joint in (0, len(self.rows) - 1) for joint in self.joints)
 
     @property
+    def reported(self) -> list[str]:
+        """What the check reported of each joint with the fault, and why the property with the fault is unknown."""
+        texts: list[str] = []
+        for joint in self.joints:
+            row = self.rows[joint]
+            finding = row.findings[FAULTS[self.fault][0]]
+            reason = f" ({finding.reason})" if finding.state == "unknown" else ""
+            texts.append(f"{row.joint}: {row.summary}{reason}")
+        return texts
+
+    @property
     def sound_rows(self) -> list[JointVerdict]:
         """Verdicts on the joints without the fault."""
         return [row for joint, row in enumerate(self.rows) if joint not in self.joints]
