@@ -2,6 +2,7 @@
 
 import pytest
 
+from snakesim_operator.features.commissioning.gear_rules import IS_LOOSE
 from verification.commissioning_trials import identify_trials
 from verification.start_check_trials import NONE, check_trial
 
@@ -33,6 +34,16 @@ def test_hidden_fault_of_robot_without_imus_is_named(backend: str, number: int, 
     trial = check_trial(number, fault, backend=backend)
     assert trial.found, [row.summary for row in trial.rows]
     assert not trial.blamed
+
+
+@pytest.mark.slow
+def test_backlash_wider_than_the_motion_is_not_called_a_coupling() -> None:
+    wide = "backends.odrive.mounted.joint_4.backlash_rad=0.3"
+    trial = check_trial(5003, NONE, wide, backend="odrive")
+    gear = trial.rows[3].findings["gear"]
+    assert gear.state == "wrong"
+    assert gear.reason.startswith(IS_LOOSE)
+    assert "backlash" in gear.reason
 
 
 @pytest.mark.slow
