@@ -16,12 +16,12 @@ from snakesim_operator.features.evaluate.table import compute_wilson_interval
 from verification.start_check_trials import NONE, CheckTrial, Outcome
 
 FAULT_HEADER = (
-    "| drive type | hidden fault | robots | found by name | 95 % interval | of these, at an end | either cause "
-    "| wrong name | unknown | of these, at an end | not noticed |"
+    "| drive type | hidden fault | robots | found by name | 95 % interval | found at an end | both causes | wrong name "
+    "| unknown | unknown at an end | not noticed |"
 )
 ALARM_HEADER = (
-    "| drive type | robots | with a sound joint reported | at most (95 %) | sound joints | reported | at most (95 %) "
-    "| reported without backlash |"
+    "| drive type | robots | with a sound joint reported | at most (95 %) | with a sound joint unknown | sound joints "
+    "| reported | at most (95 %) | reported without backlash |"
 )
 
 
@@ -105,14 +105,15 @@ def _format_fault(label: str, fault: str, results: Sequence[RobotResult]) -> str
 
 def _format_alarms(label: str, results: Sequence[RobotResult]) -> str:
     robot_count = sum(bool(result.blamed) for result in results)
+    unsure_count = sum(bool(result.unsure) for result in results)
     joint_count = sum(len(result.blamed) for result in results)
     sound_count = sum(result.sound_count for result in results)
     tight_count = sum(result.tight_count for result in results)
     max_robots = compute_wilson_interval(robot_count, len(results))[1]
     max_joints = compute_wilson_interval(joint_count, sound_count)[1]
     return (
-        f"| {label} | {len(results)} | {robot_count} | {100 * max_robots:.1f} % | {sound_count} | {joint_count} "
-        f"| {100 * max_joints:.2f} % | {tight_count} |"
+        f"| {label} | {len(results)} | {robot_count} | {100 * max_robots:.1f} % | {unsure_count} | {sound_count} "
+        f"| {joint_count} | {100 * max_joints:.2f} % | {tight_count} |"
     )
 
 

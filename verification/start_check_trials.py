@@ -14,7 +14,11 @@ from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Imu
-from snakesim_operator.features.commissioning.gear_rules import IS_LOOSE, NO_BACKLASH
+from snakesim_operator.features.commissioning.gear_rules import (
+    CONFIRM_GEAR_BY_HAND,
+    IS_LOOSE,
+    NO_BACKLASH,
+)
 from snakesim_operator.features.commissioning.joint_verdict import JointVerdict
 from snakesim_operator.features.commissioning.judge import judge_joints
 from snakesim_operator.features.commissioning.measured import collect_measurements
@@ -108,7 +112,9 @@ class CheckTrial:
         for joint in self.joints:
             row = self.rows[joint]
             finding = row.findings[FAULTS[self.fault][0]]
-            reason = f" ({finding.reason})" if finding.state == "unknown" else ""
+            reason = ""
+            if finding.state == "unknown":
+                reason = f" ({finding.reason.removesuffix(f': {CONFIRM_GEAR_BY_HAND}')})"
             texts.append(f"{row.joint}: {row.summary}{reason}")
         return texts
 
