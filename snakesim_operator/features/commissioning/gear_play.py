@@ -6,12 +6,11 @@ robot are compared with each other, because the friction of the floor is unknown
     torque in the small motion   torque of the neighbors                            verdict
     follows the angle            any                                                tight
     does not follow it           changes only in the large motion                   backlash
-    does not follow it           changes a little, or alike in both motions         the coupling slips
-    does not follow it           does not change in the small motion                loose
+    does not follow it           hardly changes, or alike in both motions           the coupling slips, or loose
     does not follow it           between these                                      loose
 
-A coupling that slips passes its torque on also in the small motion. Backlash that is wider than both motions passes
-none on. So a gear that passes no load on in either motion is loose, for one of both reasons.
+A coupling that slips passes its torque on also in the small motion, and backlash does not. So the coupling is named
+only if the neighbors measure such a torque. Otherwise backlash that is wider than both motions is as likely.
 
 The joints at both ends carry only one link, which may slide without any such torque. So they may be found tight, but
 not loose. A pitch joint is not judged: the weight of its links presses the teeth to one side.

@@ -110,13 +110,13 @@ def _measure_passed_torque(angle_rad: Floats, neighbor_torque_nm: Floats) -> tup
     regressors = np.column_stack(
         (np.ones_like(ticks), ticks - np.mean(ticks), angle_rad - np.mean(angle_rad), direction)
     )
-    covariance = np.linalg.pinv(regressors.T @ regressors)
+    normalized_covariance = np.linalg.pinv(regressors.T @ regressors)
     estimates: list[tuple[float, float]] = []
     for torque_nm in neighbor_torque_nm.T:
-        coefficients = covariance @ regressors.T @ torque_nm
+        coefficients = normalized_covariance @ regressors.T @ torque_nm
         residual_nm = torque_nm - regressors @ coefficients
         variance = float(residual_nm @ residual_nm) / max(len(ticks) - regressors.shape[1], 1)
-        error_nm = float(np.sqrt(variance * covariance[-1, -1]))
+        error_nm = float(np.sqrt(variance * normalized_covariance[-1, -1]))
         estimates.append((abs(float(coefficients[-1])), error_nm))
     return max(estimates, key=lambda estimate: estimate[0] - estimate[1], default=(0.0, 0.0))
 
