@@ -55,7 +55,8 @@ FAULTS: Mapping[str, tuple[JointProperty, str]] = {
 FAULTS_OF_JOINT_MODULES = ("order", "dead motor")
 JOINT_MODULES = "can"  # the only backend whose drives report IMUs
 
-# "either": the check reports a loose gear or coupling, and cannot tell which. "unnoticed": the property was confirmed.
+# "either": the check reports a loose gear or coupling, and cannot tell which.
+# "unnoticed": it confirmed the property, or reported that it found no backlash.
 Outcome = Literal["named", "either", "misnamed", "unknown", "unnoticed"]
 
 
@@ -93,7 +94,9 @@ class CheckTrial:
             return "named"
         if row.list_properties("wrong"):
             return "misnamed"
-        return "unknown" if finding.state == "unknown" else "unnoticed"
+        if finding.state == "unknown" and NO_BACKLASH not in finding.reason:
+            return "unknown"
+        return "unnoticed"
 
     @property
     def found(self) -> bool:
