@@ -1,18 +1,18 @@
-"""Emulated robots with a hidden fault, and what the joint check and the system identification find of it.
+"""Emulated robots with a hidden fault, and what the start check and the system identification find of it.
 
     python -m verification.commissioning_trials check --first 1000 --trials 70 [--backend odrive]
     python -m verification.commissioning_trials identify --first 1000 --trials 70
 
-Every trial is a robot of its own, by its number, which is its seed: the joint, the size of its fault, the friction of
-the floor, how straight a person laid the robot, and what its motors are. It prints each trial in which something was
-missed or a sound joint was blamed, then a table.
+Every trial is a robot of its own, by its number, which is its seed. The trials of the start check are in
+`start_check_trials`, and those of the system identification are below.
 """
 
 import argparse
 import random
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -25,230 +25,30 @@ from snakesim_drivers.kit.drive_settings import BodySettings
 from snakesim_gnc.control.identify import Identification, IdentifyParameters
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.model.checked import JointProperty
 from snakesim_hal.model.robot import describe_robot
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
-from snakesim_hal.programs.single_process import InProcessRun
-from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import Imu, JointMode, JointState
+from snakesim_hal.wire.messages import JointMode, JointState
 from snakesim_operator.features.commissioning.identification import (
     MAX_CONSTANT_ERROR,
     JointIdentification,
     identify_joints,
 )
-from snakesim_operator.features.commissioning.judge import (
-    NO_BACKLASH,
-    JointVerdict,
-    judge_joints,
+from verification.start_check_results import (
+    RobotResult,
+    append_result,
+    format_tables,
+    read_results,
+    summarize_trial,
 )
-from snakesim_operator.features.commissioning.measured import collect_measurements
-
-CHECK_MODULES = 5
-SECONDS_PER_JOINT = 3.4  # of the joint check
-LAID_RAD = 0.03  # how straight a person lays a robot, at each joint
-OFFSET_RAD = 0.15
-GEARS = (0.5, 2 / 3, 0.8, 1.25, 1.5, 2.0)
-BACKLASHES_RAD = (0.0175, 0.025, 0.035, 0.045)  # 1 to 2.6 degrees
-DEAD_ZONES_RAD = (0.01, 0.015, 0.025, 0.035)  # 0.6 to 2 degrees
-# Below the load of a joint between others on a slippery floor; a coupling that slips at more may not slip in the check.
-SLIP_TORQUES_NM = (0.005, 0.04)  # lowest and highest
-NONE = "none"
-# Hidden fault -> the property that should be found wrong, and words of its verdict.
-FAULTS: Mapping[str, tuple[JointProperty, str]] = {
-    "sign": ("sign", "the other way"),
-    "order": ("order", "swapped"),
-    "zero": ("zero", "zero is off"),
-    "gear": ("gear", "as far as its drive measures"),
-    "backlash": ("gear", "backlash"),
-    "dead zone": ("drive", "dead zone"),
-    "coupling": ("gear", "coupling slips"),
-    "dead motor": ("drive", "did not move"),
-}
-# Of these, only emulated joint modules have a setting.
-FAULTS_OF_JOINT_MODULES = ("order", "dead motor")
-JOINT_MODULES = "can"  # the only backend whose drives report IMUs
-
-
-# --- the joint check -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class CheckTrial:
-    """One robot, and what was found of it."""
-
-    fault: str
-    joints: Sequence[int]  # that have the fault
-    rows: Sequence[JointVerdict]
-
-    @property
-    def found(self) -> bool:
-        """Whether the right property of every joint with the fault was found wrong, by the right name."""
-        if not self.joints:
-            return False
-        name, words = FAULTS[self.fault]
-        rows = [self.rows[joint] for joint in self.joints]
-        return all(
-            row.findings[name].state == "wrong" and words in row.findings[name].reason
-            for row in rows
-        )
-
-    @property
-    def undecided(self) -> bool:
-        """Whether the property of a joint with the fault is unknown, so that the robot cannot be armed."""
-        name, _ = FAULTS[self.fault]
-        return any(self.rows[joint].findings[name].state == "unknown" for joint in self.joints)
-
-    @property
-    def is_at_end(self) -> bool:
-        """Whether a joint with the fault is the first or the last one of the robot."""
-        return any(joint in (0, len(self.rows) - 1) for joint in self.joints)
-
-    @property
-    def tight_count(self) -> int:
-        """Number of sound joints of which the check reports that it found no backlash."""
-        rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
-        gears = [row.findings["gear"] for row in rows]
-        return sum(gear.state == "confirmed" or NO_BACKLASH in gear.reason for gear in gears)
-
-    @property
-    def blamed(self) -> list[str]:
-        """Sound joints of which something is wrong."""
-        rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
-        return [f"{row.joint}: {row.summary}" for row in rows if row.list_properties("wrong")]
-
-    @property
-    def unsure(self) -> list[str]:
-        """Sound joints of which something is unknown."""
-        rows = [row for joint, row in enumerate(self.rows) if joint not in self.joints]
-        return [f"{row.joint}: {row.summary}" for row in rows if row.list_properties("unknown")]
-
-
-def check_trial(
-    number: int,
-    fault: str,
-    *sets: str,
-    backend: str = JOINT_MODULES,
-    module_count: int = CHECK_MODULES,
-) -> CheckTrial:
-    """Check a robot with a hidden fault.
-
-    Args:
-        number: Number of the robot, which is its seed.
-        fault: The fault, of `FAULTS` or `NONE`.
-        *sets: As `--set` of a run.
-        backend: Backend of the run, which is the type of its drives.
-        module_count: Number of joints.
-    """
-    pick = random.Random(number)
-    zeros = [pick.uniform(-LAID_RAD, LAID_RAD) for _ in range(module_count)]
-    joint, other = pick.sample(range(module_count), 2)
-    faults: list[str] = []
-    match fault:
-        case "sign":
-            faults = [f"joint_{joint + 1}.sign=-1"]
-        case "order":
-            faults = [f"joint_{joint + 1}.id={other + 1}", f"joint_{other + 1}.id={joint + 1}"]
-        case "zero":
-            zeros[joint] += pick.choice((-OFFSET_RAD, OFFSET_RAD))
-        case "gear":
-            faults = [f"joint_{joint + 1}.gear={pick.choice(GEARS)}"]
-        case "backlash":
-            faults = [f"joint_{joint + 1}.backlash_rad={pick.choice(BACKLASHES_RAD)}"]
-        case "dead zone":
-            dead_zone_rad = pick.choice(DEAD_ZONES_RAD)
-            faults = [f"joint_{joint + 1}.encoder_dead_zone_rad={dead_zone_rad}"]
-        case "coupling":
-            faults = [f"joint_{joint + 1}.coupling_slip_nm={pick.uniform(*SLIP_TORQUES_NM)}"]
-        case "dead motor":
-            faults = [f"joint_{joint + 1}.connected=false"]
-        case _:
-            pass
-    truth = [*faults, *(f"joint_{i + 1}.zero_rad={zero}" for i, zero in enumerate(zeros))]
-    run = [
-        f"seed={number}",
-        f"scene.ground.friction={pick.uniform(0.2, 0.8)}",
-        f"robot.chain.modules={module_count}",
-    ]
-    seconds = SECONDS_PER_JOINT * module_count
-    run += [f"duration_s={seconds}", *(f"backends.{backend}.mounted.{text}" for text in truth)]
-    with_fault = {NONE: [], "order": [joint, other]}.get(fault, [joint])
-    return CheckTrial(fault, with_fault, _checked(f"backend={backend}", *sets, *run))
-
-
-def _checked(*sets: str) -> list[JointVerdict]:
-    """Run the joint check in this process, and judge it."""
-    config = load_scenario("joint_check", [parse_set_option(text) for text in sets]).config
-    imus: list[Imu] = []
-    with InProcessRun(config) as run:
-        reader = run.network.create_session().declare_reader(keys.IMU, Imu)
-        box = run.host.black_box
-        rows = b""
-        for _ in run.iterate_ticks():
-            imus += reader.drain()
-            rows += box.read_rows(len(rows) // box.layout.row_bytes)[1]
-        columns = box.layout.decode_rows(rows)
-        robot = run.host.description
-        config = run.config
-    ticks = columns.pop("tick").tolist()
-    return judge_joints(
-        collect_measurements(config, robot, ticks, columns, imus), was_laid_straight=True
-    )
-
-
-def list_possible_faults(backend: str) -> list[str]:
-    """Return the faults that drives of a backend can have, and `NONE`."""
-    kinds = [*FAULTS, NONE]
-    if backend != JOINT_MODULES:
-        kinds = [kind for kind in kinds if kind not in FAULTS_OF_JOINT_MODULES]
-    return kinds
-
-
-def check_table(
-    first: int,
-    trial_count: int,
-    *sets: str,
-    backend: str,
-    kinds: Sequence[str],
-    module_count: int = CHECK_MODULES,
-) -> list[str]:
-    """Return the table of trials with each of these faults in turn, of `list_possible_faults`."""
-    made: list[CheckTrial] = []
-    for number in range(first, first + trial_count):
-        fault = kinds[number % len(kinds)]
-        trial = check_trial(number, fault, *sets, backend=backend, module_count=module_count)
-        made.append(trial)
-        print(f"trial {number}, {fault}: {'found' if trial.found else 'not found'}", flush=True)
-        if trial.blamed or trial.unsure or (trial.joints and not trial.found):
-            said = [
-                f"{trial.rows[joint].joint}: {trial.rows[joint].summary}" for joint in trial.joints
-            ]
-            print(
-                f"trial {number}, {fault}: {said}; blamed {trial.blamed}; unsure {trial.unsure}",
-                flush=True,
-            )
-    lines = [
-        "| hidden fault | robots | found by name | undecided | of these at an end | robots with a sound joint blamed "
-        "| with one unknown | sound joints without backlash |"
-    ]
-    lines.append("|---|---|---|---|---|---|---|---|")
-    for fault in kinds:
-        those = [trial for trial in made if trial.fault == fault]
-        found = "- | - | -"
-        if fault != NONE:
-            undecided = [trial for trial in those if trial.undecided and not trial.found]
-            at_end = sum(trial.is_at_end for trial in undecided)
-            found = f"{sum(trial.found for trial in those)} | {len(undecided)} | {at_end}"
-        blamed, unsure = (
-            sum(bool(trial.blamed) for trial in those),
-            sum(bool(trial.unsure) for trial in those),
-        )
-        sound = sum(len(trial.rows) - len(trial.joints) for trial in those)
-        tight = f"{sum(trial.tight_count for trial in those)} of {sound}"
-        lines.append(f"| {fault} | {len(those)} | {found} | {blamed} | {unsure} | {tight} |")
-    return lines
-
-
-# --- system identification -------------------------------------------------------------------------------------
+from verification.start_check_trials import (
+    BACKLASHES_RAD,
+    FAULTS,
+    JOINT_COUNT,
+    JOINT_MODULES,
+    NONE,
+    check_trial,
+    list_possible_faults,
+)
 
 IDENTIFY_MODULES = 5
 FILE_CONSTANT_NM_PER_A = 0.5
@@ -490,6 +290,45 @@ def _identified_row(trials: Sequence[IdentifyTrial], *, backlash: bool) -> str:
     )
 
 
+def check_robots(
+    numbers: Iterable[int],
+    *sets: str,
+    backend: str,
+    faults: Sequence[str],
+    joint_count: int,
+    record: Path | None,
+) -> list[RobotResult]:
+    """Check robots with each of these faults in turn, print what was found, and return it.
+
+    Args:
+        numbers: Numbers of the robots. The number determines the fault, so that all faults are equally frequent.
+        *sets: As `--set` of a run.
+        backend: Backend of the runs, which is the type of the drives.
+        faults: Hidden faults, of `list_possible_faults`.
+        joint_count: Number of joints of each robot.
+        record: File to which each robot is appended; robots that it already contains are not checked again.
+    """
+    known_results: dict[int, RobotResult] = {}
+    if record is not None:
+        known_results = {r.number: r for r in read_results(record) if r.backend == backend}
+    results: list[RobotResult] = []
+    for number in numbers:
+        result = known_results.get(number)
+        if result is None:
+            fault = faults[number % len(faults)]
+            trial = check_trial(number, fault, *sets, backend=backend, joint_count=joint_count)
+            result = summarize_trial(trial)
+            if record is not None:
+                append_result(record, result)
+            print(
+                f"robot {number}, {fault}: {result.outcome}; {result.reported}; blamed {result.blamed}; "
+                f"unsure {result.unsure}",
+                flush=True,
+            )
+        results.append(result)
+    return results
+
+
 def main() -> int:
     """Print the table of the check or of the identification."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -507,26 +346,33 @@ def main() -> int:
     parser.add_argument(
         "--joints",
         type=int,
-        default=CHECK_MODULES,
-        help=f"number of joints of the checked robots (default: {CHECK_MODULES})",
+        default=JOINT_COUNT,
+        help=f"number of joints of the checked robots (default: {JOINT_COUNT})",
     )
     parser.add_argument(
         "--fault",
         action="append",
         choices=[*FAULTS, NONE],
         dest="faults",
-        help="hidden fault of the checked robots, repeatable; the default is each that the drives can have",
+        help="hidden fault of the checked robots, repeatable: each robot has the next one in turn; the default is "
+        "each that the drives can have",
+    )
+    parser.add_argument(
+        "--record",
+        type=Path,
+        help="file to which each checked robot is appended; robots that it already contains are not checked again",
     )
     arguments = parser.parse_args()
     if arguments.table == "check":
-        lines = check_table(
-            arguments.first,
-            arguments.trials,
+        results = check_robots(
+            range(arguments.first, arguments.first + arguments.trials),
             *arguments.sets,
             backend=arguments.backend,
-            kinds=arguments.faults or list_possible_faults(arguments.backend),
-            module_count=arguments.joints,
+            faults=arguments.faults or list_possible_faults(arguments.backend),
+            joint_count=arguments.joints,
+            record=arguments.record,
         )
+        lines = list(format_tables(results))
     else:
         lines = identify_table(arguments.first, arguments.trials, *arguments.sets)
     print("\n".join(lines))

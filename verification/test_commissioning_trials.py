@@ -2,12 +2,14 @@
 
 import pytest
 
-from verification.commissioning_trials import NONE, check_trial, identify_trials
+from snakesim_operator.features.commissioning.gear_rules import IS_LOOSE
+from verification.commissioning_trials import identify_trials
+from verification.start_check_trials import NONE, check_trial
 
 
 @pytest.mark.parametrize("fault", ["backlash", NONE])
 def test_hidden_fault_is_named_without_blaming_sound_joints(fault: str) -> None:
-    trial = check_trial(4, fault, module_count=4)
+    trial = check_trial(4, fault, joint_count=4)
     assert not trial.blamed and not trial.unsure, (trial.blamed, trial.unsure)
     assert fault == NONE or trial.found, [row.summary for row in trial.rows]
 
@@ -32,6 +34,16 @@ def test_hidden_fault_of_robot_without_imus_is_named(backend: str, number: int, 
     trial = check_trial(number, fault, backend=backend)
     assert trial.found, [row.summary for row in trial.rows]
     assert not trial.blamed
+
+
+@pytest.mark.slow
+def test_backlash_wider_than_the_motion_is_not_called_a_coupling() -> None:
+    wide = "backends.odrive.mounted.joint_4.backlash_rad=0.3"
+    trial = check_trial(5003, NONE, wide, backend="odrive")
+    gear = trial.rows[3].findings["gear"]
+    assert gear.state == "wrong"
+    assert gear.reason.startswith(IS_LOOSE)
+    assert "backlash" in gear.reason
 
 
 @pytest.mark.slow

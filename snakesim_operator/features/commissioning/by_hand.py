@@ -32,18 +32,16 @@ from snakesim_operator.features.commissioning.capture import (
     TravelRange,
     compute_zero_offsets_rad,
 )
-from snakesim_operator.features.commissioning.judge import MAX_RATIO_ERROR
 from snakesim_operator.features.commissioning.robot_edit import (
     read_joints_with_drive_modes,
     require_own_robot_file,
     write_joint_fields,
 )
+from snakesim_operator.features.commissioning.tolerances import MAX_RATIO_ERROR
+from snakesim_operator.features.commissioning.unknown_angles import UnknownAngleTimeout
 
 ZERO_SAMPLING_S = 1.0  # samples for a zero are taken for that long
 MAX_SILENCE_S = 1.0  # without joint angles
-MAX_UNKNOWN_S = (
-    1.0  # that a joint may not know its angle: its drive is starting, or the computer is busy
-)
 HOST_TIMEOUT_S = 3.0  # for configuration and status of a running host
 REDRAW_PERIOD_S = 0.2
 # Of what is ahead of the joint, seen towards the head.
@@ -123,7 +121,8 @@ class HandMovedRobot:
         Raises:
             RefusedError: The robot is armed, sends no angles, or does not know one.
         """
-        last_arrival_s = last_known_s = time.monotonic()
+        last_arrival_s = time.monotonic()
+        unknown_angle_timeout = UnknownAngleTimeout()
         is_last_pass = False
         while not is_last_pass:
             is_last_pass = should_stop()  # samples that arrived before that are still read
@@ -141,11 +140,10 @@ class HandMovedRobot:
                     code="network/no-answer",
                 )
             for state in states:
-                if all(state.valid):
-                    last_known_s = time.monotonic()
+                unknown_joints = self._list_unknown_joints(state)
+                unknown_angle_timeout.check(unknown_joints)
+                if not unknown_joints:
                     yield state.timestamp_ns * 1e-9, np.array(state.angle_rad)
-                elif time.monotonic() - last_known_s > MAX_UNKNOWN_S:
-                    raise self._make_unknown_angle_error(state)
             time.sleep(0.01)
 
     def _raise_if_armed(self) -> None:
@@ -160,14 +158,11 @@ class HandMovedRobot:
                     code="robot/not-disarmed",
                 )
 
-    def _make_unknown_angle_error(self, state: JointState) -> RefusedError:
-        unknown = [
+    def _list_unknown_joints(self, state: JointState) -> list[str]:
+        """Return the names of the joints whose angle is not known."""
+        return [
             joint.name for joint, valid in zip(self.joints, state.valid, strict=True) if not valid
         ]
-        return RefusedError(
-            f"{', '.join(unknown)}: the angle is not known; see `snakesim status`",
-            code="commissioning/not-possible",
-        )
 
 
 @contextmanager

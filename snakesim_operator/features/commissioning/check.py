@@ -15,13 +15,15 @@ from snakesim_hal.model.checked import (
     JointProperty,
     compute_mounting_digest,
 )
-from snakesim_operator.features.commissioning.judge import MIN_TORQUE_NM, JointVerdict, judge_joints
+from snakesim_operator.features.commissioning.joint_verdict import JointVerdict
+from snakesim_operator.features.commissioning.judge import judge_joints
 from snakesim_operator.features.commissioning.measured import (
     SIGNAL_NAMES,
     collect_measurements,
     compute_tick_numbers,
     read_imus,
 )
+from snakesim_operator.features.commissioning.property_rules import MIN_TORQUE_NM
 from snakesim_operator.features.commissioning.robot_edit import (
     make_check_record,
     read_joints_with_drive_modes,

@@ -18,6 +18,8 @@ def find_dead_zone_rad(measurements: CheckMeasurements, joint_index: int) -> flo
     steps_rad = np.diff(angle_rad)
     jumps_rad: list[float] = []
     for motion in measurements.list_motions(joint_index):
+        if motion.stop - motion.start < 2:
+            continue  # the angle jumped so far in the first tick that the motion was over
         max_target_step_rad = float(np.max(target_steps_rad[motion.start : motion.stop - 1]))
         min_jump_rad = max(MIN_JUMP_RAD, MIN_SPEED_RATIO * max_target_step_rad)
         for tick in range(max(motion.start, STICKING_TICKS), motion.stop - 1):

@@ -6,8 +6,11 @@ robot are compared with each other, because the friction of the floor is unknown
     torque in the small motion   torque of the neighbors                            verdict
     follows the angle            any                                                tight
     does not follow it           changes only in the large motion                   backlash
-    does not follow it           hardly changes, or alike in both motions           the coupling slips
+    does not follow it           hardly changes, or alike in both motions           the coupling slips, or loose
     does not follow it           between these                                      loose
+
+A coupling that slips passes its torque on also in the small motion, and backlash does not. So the coupling is named
+only if the neighbors measure such a torque. Otherwise backlash that is wider than both motions is as likely.
 
 The joints at both ends carry only one link, which may slide without any such torque. So they may be found tight, but
 not loose. A pitch joint is not judged: the weight of its links presses the teeth to one side.
@@ -35,6 +38,9 @@ MIN_SLIPPING_NEIGHBOR_RATIO = 0.4
 # that holds, it is larger.
 MAX_SLIPPING_LOAD_RATIO = 0.5
 NO_CLEAR_LOAD = "its torque hardly follows its angle"
+# Of the torque that a joint passes on to its neighbors in the direction of its small motion; less proves nothing.
+MIN_PASSED_NM = 0.003
+MIN_PASSED_ERRORS = 6.0  # standard deviations
 # "loose": it has backlash or slips, which of them is not clear.
 PlayKind = Literal["tight", "backlash", "slipping", "loose", "unknown"]
 
@@ -96,12 +102,17 @@ def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: 
     min_slipping_nm = MIN_SLIPPING_NEIGHBOR_RATIO * large_nm
     is_load_alike_in_both_motions = small_nm >= max(min_slipping_nm, response.noise_nm)
     if are_neighbors_never_loaded or is_load_alike_in_both_motions:
-        return GearPlay("slipping")
+        return GearPlay("slipping" if passes_load(response) else "loose")
     if _has_backlash(response, min_change_nm):
         return GearPlay("backlash")
     if response.noise_nm > MAX_LOOSE_FRACTION * typical_nm:
         return GearPlay("unknown", NO_CLEAR_LOAD)
     return GearPlay("loose")
+
+
+def passes_load(response: LoadResponse) -> bool:
+    """Return whether a torque passes through the gear in the small motion, as it does through a coupling that slips."""
+    return response.passed_nm >= max(MIN_PASSED_NM, MIN_PASSED_ERRORS * response.passed_error_nm)
 
 
 def _has_backlash(response: LoadResponse, min_change_nm: float) -> bool:

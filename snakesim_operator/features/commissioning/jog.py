@@ -38,6 +38,7 @@ from snakesim_hal.wire.messages import (
 from snakesim_hal.wire.setpoints import RequestedSetpoints
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S, RobotSelection, find_single_robot
 from snakesim_operator.features.commissioning.by_hand import load_running_joints, select_joints
+from snakesim_operator.features.commissioning.unknown_angles import UnknownAngleTimeout
 from snakesim_operator.robot_commands.command import request_while_commanding
 from snakesim_operator.robot_commands.teleop.keyboard import KeyReader
 
@@ -186,6 +187,7 @@ class _JogSession:
         # State.
         self._status = status
         self._jog_target: JogTarget | None = None  # None: the robot is not armed yet
+        self._unknown_angle_timeout = UnknownAngleTimeout()
         self._stop_requested = False
 
     def run(self, keyboard: KeyReader) -> None:
@@ -217,7 +219,7 @@ class _JogSession:
             RefusedError: The robot is not armed any more.
         """
         joint = self._robot.joints[self._joint_index]
-        target = JogTarget(self._request, joint, self._read_angle_rad())
+        target = JogTarget(self._request, joint, self._wait_for_angle_rad())
         self._jog_target = target
         print_line(
             f"{joint.name}: from {target.lower_rad:+.3f} to {target.upper_rad:+.3f} rad, at {target.target_rad:+.3f}. "
@@ -236,39 +238,55 @@ class _JogSession:
                     f"the robot is {clock.lifecycle}: {self._status.reason}", code="robot/not-armed"
                 )
             if was_moving and not target.is_moving:
-                print_line(f"{joint.name}: {self._read_angle_rad():+.3f} rad")
+                print_line(f"{joint.name}: {self._wait_for_angle_rad():+.3f} rad")
             was_moving = target.is_moving
 
     def _run_cycle(self) -> Clock:
         """Wait for the next tick, command the joint in it if this process holds the lease, and return the tick's clock.
 
-        The joint gets a position target with a reduced torque limit; the other joints are passive.
+        The joint gets a position target with a reduced torque limit; the other joints are passive. Without a target,
+        all joints are passive.
         """
         clock = self._command_client.wait_for_tick()
         if self._command_client.holds_lease:
             joints = self._robot.joints
             modes = [JointMode.PASSIVE] * len(joints)
             targets = [0.0] * len(joints)
-            modes[self._joint_index] = JointMode.POSITION
-            targets[self._joint_index] = self._advance_target_rad()
+            target_rad = self._advance_target_rad()
+            if target_rad is not None:
+                modes[self._joint_index] = JointMode.POSITION
+                targets[self._joint_index] = target_rad
             limits_nm = [self._request.torque_fraction * joint.torque_limit_nm for joint in joints]
             self._command_client.send_setpoints(RequestedSetpoints(modes, targets, limits_nm))
         return clock
 
-    def _advance_target_rad(self) -> float:
-        """Return the target of this tick; the measured angle before the user may move the joint."""
+    def _advance_target_rad(self) -> float | None:
+        """Return the target of this tick.
+
+        Before the user may move the joint, it is the measured angle, or None if that is unknown. Later, the target
+        stays where it is while the angle is unknown.
+        """
         angle_rad = self._read_angle_rad()
         if self._jog_target is None:
             return angle_rad
+        if angle_rad is None:
+            self._jog_target.on_key(STALE_KEY)
+            return self._jog_target.target_rad
         return self._jog_target.advance(self._robot.period_ns * 1e-9, angle_rad)
 
-    def _read_angle_rad(self) -> float:
+    def _wait_for_angle_rad(self) -> float:
+        """Run cycles until the angle of the joint is known, and return it. Raises RefusedError if it stays unknown."""
+        while (angle_rad := self._read_angle_rad()) is None:
+            self._run_cycle()
+        return angle_rad
+
+    def _read_angle_rad(self) -> float | None:
+        """Return the angle of the joint; None while it is unknown. Raises RefusedError if it stays unknown."""
         joints = self._command_client.read(keys.JOINTS)
         if not isinstance(joints, JointState) or not joints.valid[self._joint_index]:
-            raise RefusedError(
-                f"{self._request.joint}: the angle is not known; see `snakesim status`",
-                code="commissioning/not-possible",
-            )
+            self._unknown_angle_timeout.check([self._request.joint])
+            return None
+        self._unknown_angle_timeout.check([])
         return joints.angle_rad[self._joint_index]
 
     def _update_status(self) -> None:

@@ -6,8 +6,13 @@ The floor loads a joint through its gear. A motion that reverses unloads and loa
     backlash     a small motion stays within the backlash, so it needs only the torque of the drive's own friction
 
 Its neighbors are the nearest joints with the same axis. They hold the same load, and their torques do not contain the
-friction of the joint that moves. A drive that
-does not measure its torque is judged by the torque that its servo must exert at its distance from the target.
+friction of the joint that moves. A drive that does not measure its torque is judged by the torque that its servo must
+exert at its distance from the target.
+
+A coupling that slips passes on the torque at which it slips, in the direction of the motion. So the torque of the
+neighbors changes its sign when the motion reverses:
+
+    torque of a neighbor = offset + drift * time + stiffness * angle + passed torque * direction of the motion
 """
 
 from collections.abc import Sequence
@@ -35,6 +40,9 @@ class LoadResponse:
     neighbor_large_range_nm: float
     neighbor_small_range_nm: float
     noise_nm: float  # largest range while the robot rested, or resolution of the torque if that is coarser
+    # Torque that the joint passes on to a neighbor in the direction of its small motion.
+    passed_nm: float
+    passed_error_nm: float  # standard deviation of `passed_nm`
 
     @property
     def load_nm(self) -> float:
@@ -61,6 +69,12 @@ def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> 
     small_motion_rad = float(np.ptp(angle_rad))
     stiffness_nm_per_rad = _fit_slope(angle_rad, torque_nm[small, joint_index])
     neighbors = find_neighbors_of_same_axis(measurements.axes, joint_index)
+    small_ticks = np.flatnonzero(measurements.is_in_small_motion(joint_index))
+    both_small = slice(small_ticks[0], small_ticks[-1] + 1)
+    passed_nm, passed_error_nm = _measure_passed_torque(
+        measurements.angle_rad[both_small, joint_index],
+        estimated_torque_nm[both_small][:, neighbors],
+    )
     resolution_nm = max(
         _find_resolution_nm(measurements, estimated_torque_nm, i) for i in [joint_index, *neighbors]
     )
@@ -72,6 +86,8 @@ def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> 
         neighbor_large_range_nm=_find_max_range(torque_nm[large][:, neighbors]),
         neighbor_small_range_nm=_find_max_range(torque_nm[small][:, neighbors]),
         noise_nm=max(resolution_nm, _find_max_range(torque_nm[rest][:, [joint_index, *neighbors]])),
+        passed_nm=passed_nm,
+        passed_error_nm=passed_error_nm,
     )
 
 
@@ -80,6 +96,29 @@ def find_neighbors_of_same_axis(axes: Sequence[str], joint_index: int) -> list[i
     same = [i for i, axis in enumerate(axes) if axis == axes[joint_index]]
     position = same.index(joint_index)
     return [*same[max(position - 1, 0) : position], *same[position + 1 : position + 2]]
+
+
+def _measure_passed_torque(angle_rad: Floats, neighbor_torque_nm: Floats) -> tuple[float, float]:
+    """Return the torque that a joint passes on in the direction of its motion, and its standard deviation.
+
+    Args:
+        angle_rad: Angle of the joint in its small motion, (n,).
+        neighbor_torque_nm: Torque of each neighbor, (n, neighbors). The one that is most certainly large counts.
+    """
+    ticks = np.arange(len(angle_rad), dtype=np.float64)
+    direction = np.sign(np.gradient(_smooth(angle_rad[:, None])[:, 0]))
+    regressors = np.column_stack(
+        (np.ones_like(ticks), ticks - np.mean(ticks), angle_rad - np.mean(angle_rad), direction)
+    )
+    normalized_covariance = np.linalg.pinv(regressors.T @ regressors)
+    estimates: list[tuple[float, float]] = []
+    for torque_nm in neighbor_torque_nm.T:
+        coefficients = normalized_covariance @ regressors.T @ torque_nm
+        residual_nm = torque_nm - regressors @ coefficients
+        variance = float(residual_nm @ residual_nm) / max(len(ticks) - regressors.shape[1], 1)
+        error_nm = float(np.sqrt(variance * normalized_covariance[-1, -1]))
+        estimates.append((abs(float(coefficients[-1])), error_nm))
+    return max(estimates, key=lambda estimate: estimate[0] - estimate[1], default=(0.0, 0.0))
 
 
 def _estimate_torques_nm(measurements: CheckMeasurements) -> Floats:

@@ -29,7 +29,7 @@ from snakesim_operator.features.commissioning.by_hand import (
     is_enter_pressed,
 )
 from snakesim_operator.features.commissioning.capture import REST_S, RestDetector
-from snakesim_operator.features.commissioning.judge import PropertyState
+from snakesim_operator.features.commissioning.joint_verdict import PropertyState
 from snakesim_operator.features.commissioning.robot_edit import require_own_robot_file
 from snakesim_operator.features.commissioning.shape.decide import (
     SHAPE_PROPERTIES,

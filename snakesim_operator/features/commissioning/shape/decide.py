@@ -23,13 +23,13 @@ from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import JointProperty
 from snakesim_hal.model.joints import Joint, JointDrive
-from snakesim_operator.features.commissioning.judge import (
+from snakesim_operator.features.commissioning.joint_verdict import (
     CONFIRMED,
-    MAX_RATIO_ERROR,
     PropertyFinding,
     PropertyState,
 )
 from snakesim_operator.features.commissioning.shape.design import PLACEMENT_TOLERANCE_RAD, ShapePose
+from snakesim_operator.features.commissioning.tolerances import MAX_RATIO_ERROR
 
 # That drawn shapes decide.
 SHAPE_PROPERTIES: tuple[JointProperty, ...] = "order", "sign", "gear", "zero"

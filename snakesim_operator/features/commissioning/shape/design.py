@@ -20,7 +20,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.joints import Joint
 from snakesim_hal.wire.messages import Axis
-from snakesim_operator.features.commissioning.judge import MAX_RATIO_ERROR
+from snakesim_operator.features.commissioning.tolerances import MAX_RATIO_ERROR
 
 # 2.9 degrees: how far a joint of a well placed robot is from its drawn angle, at most.
 PLACEMENT_TOLERANCE_RAD = 0.05

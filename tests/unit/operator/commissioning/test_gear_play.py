@@ -8,6 +8,7 @@ from snakesim_operator.features.commissioning.gear_play import (
     MIN_CHANGE_NM,
     PlayKind,
     judge_gear_plays,
+    passes_load,
 )
 from snakesim_operator.features.commissioning.load_response import (
     LoadResponse,
@@ -25,6 +26,8 @@ TIGHT = LoadResponse(
     neighbor_large_range_nm=0.9,
     neighbor_small_range_nm=0.25,
     noise_nm=0.005,
+    passed_nm=0.0,
+    passed_error_nm=0.001,
 )
 BACKLASH = replace(TIGHT, small_range_nm=0.02, elastic_nm=-0.01, neighbor_small_range_nm=0.002)
 SLIPPING = replace(
@@ -34,6 +37,7 @@ SLIPPING = replace(
     elastic_nm=0.003,
     neighbor_large_range_nm=0.04,
     neighbor_small_range_nm=0.03,
+    passed_nm=0.013,
 )
 HARDLY_LOADED = replace(
     SLIPPING, elastic_nm=0.007, neighbor_large_range_nm=0.025, neighbor_small_range_nm=0.02
@@ -81,6 +85,21 @@ def test_joint_that_never_loads_its_neighbors_slips_also_if_their_torque_is_coar
         judge(replace(SLIPPING, neighbor_large_range_nm=0.09, neighbor_small_range_nm=0.0))
         == "slipping"
     )
+
+
+@pytest.mark.parametrize("large_nm", [0.008, 0.09])
+def test_joint_that_passes_no_load_on_may_slip_or_have_wide_backlash(large_nm: float) -> None:
+    """Backlash that is wider than the motion loads the neighbors at most once, when the teeth touch."""
+    response = replace(
+        SLIPPING, neighbor_large_range_nm=large_nm, neighbor_small_range_nm=0.007, passed_nm=0.0
+    )
+    assert not passes_load(response)
+    assert judge(response) == "loose"
+
+
+def test_load_of_a_slipping_coupling_must_be_clearer_than_noise() -> None:
+    assert passes_load(SLIPPING)
+    assert not passes_load(replace(SLIPPING, passed_error_nm=0.01))
 
 
 def test_joint_between_both_patterns_is_loose() -> None:

@@ -9,7 +9,9 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.checked import PROPERTIES
 from snakesim_hal.model.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.check import format_report
-from snakesim_operator.features.commissioning.judge import MATCHES_FILE, JointVerdict, judge_joints
+from snakesim_operator.features.commissioning.gear_rules import IS_LOOSE, judge_gear_by_links
+from snakesim_operator.features.commissioning.joint_verdict import MATCHES_FILE, JointVerdict
+from snakesim_operator.features.commissioning.judge import judge_joints
 from snakesim_operator.features.commissioning.measured import (
     CheckMeasurements,
     remove_clamped_targets,
@@ -149,6 +151,23 @@ def test_a_gear_of_another_ratio_is_no_backlash() -> None:
     ]
 
 
+def test_joint_whose_links_never_turn_slips_or_has_wide_backlash() -> None:
+    """Only a torque that passes through the gear tells a coupling that slips from backlash."""
+    summary = verdicts(measurements(backlash_rad=4 * WAY_RAD))[0]
+    assert summary.startswith(IS_LOOSE)
+    assert "the coupling slips, or the backlash" in summary
+    assert "its coupling slips" not in summary
+
+
+@pytest.mark.parametrize("is_load_passed_on", [True, False])
+def test_only_a_load_that_is_passed_on_names_the_coupling(is_load_passed_on: bool) -> None:
+    finding = judge_gear_by_links(
+        0.02, None, None, JointDrive(), 0.01, is_load_passed_on=is_load_passed_on
+    )
+    assert finding.state == "wrong"
+    assert finding.reason.startswith("its coupling slips" if is_load_passed_on else IS_LOOSE)
+
+
 def test_judge_gravity_reveals_zero_of_a_bent_pitch_joint() -> None:
     run = measurements(pitched_rad=0.2)  # the encoder says 0
     assert verdicts(run) == [
@@ -206,6 +225,15 @@ def test_encoder_with_dead_zone_is_named_and_its_gear_is_not_judged(has_imus: bo
         "gear": "unknown",
     }
     assert [rows[joint].findings["drive"].state for joint in (0, 2)] == ["confirmed"] * 2
+
+
+def test_motion_of_a_single_tick_does_not_end_the_judgment() -> None:
+    """A dead zone may jump as far as a small motion goes, so that the target turns back at once."""
+    run = measurements()
+    target_rad = run.target_rad.copy()
+    target_rad[REST + MOTION - 3, 0] = 0.001
+    rows = judge_joints(replace(run, target_rad=target_rad), was_laid_straight=True)
+    assert rows[0].findings["drive"].state == "confirmed"
 
 
 def test_few_late_samples_are_no_dead_zone() -> None:
