@@ -22,7 +22,7 @@ from mujoco.batch import Batch
 from benchmarks.physics import open_simulator
 from snakesim.environments import SnakeEnv, SnakeVectorEnv
 from snakesim_hal.backend import SafeSetpoints
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import load_scenario
 from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.laws.version import choose_laws

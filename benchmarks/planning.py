@@ -13,7 +13,7 @@ from snakesim_gnc.navigation.path_search.search_parameters import STEP_M, Search
 from snakesim_gnc.navigation.path_search.specified_growth import NumpyExpander
 from snakesim_gnc.navigation.plan import HORIZON_M
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.route import compute_yaw_segments_m
+from snakesim_hal.model.geometry.route import compute_yaw_segments_m
 from snakesim_hal.model.scenario import (
     compute_start_pose,
     load_scenario,

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.sensor_model import SensorModel
+from snakesim_hal.model.robot_file.sensor_model import SensorModel
 from snakesim_hal.wire.messages import RangeScan
 from snakesim_sim_backend.sensors.mount import SensorMount
 from snakesim_sim_backend.sensors.rays import RayBundle

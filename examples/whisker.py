@@ -16,7 +16,7 @@ from typing import Annotated
 import numpy as np
 
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.sensor_model import SensorModel
+from snakesim_hal.model.robot_file.sensor_model import SensorModel
 from snakesim_hal.wire.messages import CustomSample
 from snakesim_hal.wire.quantities import bounded, describe
 

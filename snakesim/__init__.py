@@ -42,7 +42,7 @@ if TYPE_CHECKING:
         make_position_setpoints,
     )
     from snakesim_hal.model.files import FileStruct as Parameters
-    from snakesim_hal.model.kinematics import compute_body_points_w
+    from snakesim_hal.model.geometry.kinematics import compute_body_points_w
 
 __all__ = [
     "ConfigError",
@@ -73,7 +73,7 @@ LAZY = {
     "Result": ("snakesim.result", "Result"),
     "Robot": ("snakesim.robot", "Robot"),
     "Telemetry": (CONTROLLER, "Telemetry"),
-    "compute_body_points_w": ("snakesim_hal.model.kinematics", "compute_body_points_w"),
+    "compute_body_points_w": ("snakesim_hal.model.geometry.kinematics", "compute_body_points_w"),
     "load": ("snakesim.runs", "load"),
     "make_position_setpoints": (CONTROLLER, "make_position_setpoints"),
     "run": ("snakesim.runs", "run"),

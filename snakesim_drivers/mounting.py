@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Joint, JointDrive
+from snakesim_hal.model.robot_file.joints import Joint, JointDrive
 from snakesim_hal.wire.messages import JointMode
 
 

@@ -37,8 +37,8 @@ from typing import Any, ClassVar
 import msgspec
 
 from snakesim_hal.model.fault_kinds import FaultInjection
-from snakesim_hal.model.joints import DriveMode
-from snakesim_hal.model.robot import RobotFile, restrict_drive_modes
+from snakesim_hal.model.robot_file.joints import DriveMode
+from snakesim_hal.model.robot_file.robot import RobotFile, restrict_drive_modes
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.codec import EncodedMessage
 from snakesim_hal.wire.messages import (
@@ -144,8 +144,8 @@ class Backend(ABC):
     def describe(self) -> RobotDescription:
         """Return the description of the robot: the same one at every call, at once.
 
-        `snakesim_hal.model.robot.describe_robot` makes it from the robot file. It lists exactly those sensors whose
-        samples `sample` returns.
+        `describe_robot` in `snakesim_hal.model.robot_file.robot` makes it from the robot file. It lists exactly those
+        sensors whose samples `sample` returns.
         """
 
     @abstractmethod

@@ -13,7 +13,7 @@ import msgspec
 
 from snakesim_hal.base.errors import ConfigError, shorten
 from snakesim_hal.model.files import ConfigTable, FileStruct, decode_table
-from snakesim_hal.model.kinematics import quaternion_from_yaw
+from snakesim_hal.model.geometry.kinematics import quaternion_from_yaw
 from snakesim_hal.model.plugins import CONTROLLERS, describe_plugin, load_plugin, require_base_class
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal, compute_start_pose
 from snakesim_hal.wire.messages import (

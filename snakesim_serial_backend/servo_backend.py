@@ -25,7 +25,7 @@ from snakesim_drivers.kit.drive_type import (
 )
 from snakesim_drivers.kit.drives import Drives
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_serial_backend.port_load import PortLoad
 from snakesim_serial_backend.wire import PseudoTerminal, SerialWire, is_emulated, open_log

@@ -23,8 +23,8 @@ import numpy as np
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import ModuleBody, RobotFile
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.robot_file.robot import ModuleBody, RobotFile
 from snakesim_hal.physics.motor import compute_torque_roll_off
 from snakesim_hal.wire.messages import JointMode
 

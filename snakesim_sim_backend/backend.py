@@ -10,7 +10,7 @@ from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.fault_plan import validate_faults_for_backend
-from snakesim_hal.model.robot import describe_robot
+from snakesim_hal.model.robot_file.robot import describe_robot
 from snakesim_hal.model.scenario import RunConfig, compute_config_hash
 from snakesim_hal.physics.motor import validate_position_gains
 from snakesim_hal.physics.thermal import ThermalModel

@@ -10,8 +10,8 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import BackendError
+from snakesim_hal.model.robot_file.sensors import ImuSensor, PoseSensor
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.sensors import ImuSensor, PoseSensor
 from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_sim_backend.actuators import ModelMotors

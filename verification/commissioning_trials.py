@@ -25,10 +25,10 @@ from snakesim_drivers.kit.drive_settings import BodySettings
 from snakesim_gnc.control.identify import Identification, IdentifyParameters
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.model.robot import describe_robot
+from snakesim_hal.model.robot_file.robot import describe_robot
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_hal.wire.messages import JointMode, JointState
-from snakesim_operator.features.commissioning.identification import (
+from snakesim_operator.features.commissioning.system_identification.identification import (
     MAX_CONSTANT_ERROR,
     JointIdentification,
     identify_joints,

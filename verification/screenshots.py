@@ -44,9 +44,9 @@ def main() -> None:
     is_recording = Path(options.run).is_dir()
     with open_console(options) as address, open_chromium() as browser:
         width, height = PHONE_SIZE if options.phone else DESKTOP_SIZE
-        tab = browser.open(address, width, height)
+        tab = browser.open_page(address, width, height)
         if options.phone:
-            tab.size(width, height, scale=PHONE_SCALE, mobile=True)
+            tab.set_window_size(width, height, scale=PHONE_SCALE, mobile=True)
         tab.wait_for(choose_first_text(options))
         time.sleep(options.after)
         prepare_page(tab, options)
@@ -54,7 +54,7 @@ def main() -> None:
             time.sleep(options.after)
         if not is_recording:
             wait_until(lambda: not shows_late_answer(tab), "an answer")
-        save_picture(tab.picture(), options.out)
+        save_picture(tab.capture_screenshot(), options.out)
 
 
 def _parse_arguments() -> argparse.Namespace:
@@ -144,7 +144,7 @@ def prepare_page(tab: BrowserTab, options: argparse.Namespace) -> None:
 
 def shows_late_answer(tab: BrowserTab) -> bool:
     """Return whether the page shows that an answer of the host is late."""
-    text = tab.text()
+    text = tab.read_text()
     return any(message in text for message in LATE_ANSWER_MESSAGES)
 
 

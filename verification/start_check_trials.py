@@ -9,19 +9,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from snakesim_hal.model.checked import JointProperty
+from snakesim_hal.model.robot_file.checked import JointProperty
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, Imu
-from snakesim_operator.features.commissioning.gear_rules import (
+from snakesim_operator.features.commissioning.joint_check.gear_rules import (
     CONFIRM_GEAR_BY_HAND,
     IS_LOOSE,
     NO_BACKLASH,
 )
-from snakesim_operator.features.commissioning.joint_verdict import JointVerdict
-from snakesim_operator.features.commissioning.judge import judge_joints
-from snakesim_operator.features.commissioning.measured import collect_measurements
+from snakesim_operator.features.commissioning.joint_check.joint_verdict import JointVerdict
+from snakesim_operator.features.commissioning.joint_check.judge import judge_joints
+from snakesim_operator.features.commissioning.joint_check.measurements import collect_measurements
 
 JOINT_COUNT = 5
 SECONDS_PER_JOINT = 3.4  # of the joint check, at most

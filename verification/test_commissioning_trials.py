@@ -2,7 +2,7 @@
 
 import pytest
 
-from snakesim_operator.features.commissioning.gear_rules import IS_LOOSE
+from snakesim_operator.features.commissioning.joint_check.gear_rules import IS_LOOSE
 from verification.commissioning_trials import identify_trials
 from verification.start_check_trials import NONE, check_trial
 

@@ -18,7 +18,7 @@ class Page:
 BACKEND_EXAMPLE = """\
 from snakesim_hal.backend import Backend, Samples
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.robot import describe_robot
+from snakesim_hal.model.robot_file.robot import describe_robot
 from snakesim_hal.wire.messages import JointState
 
 
@@ -91,7 +91,7 @@ class Watch(Service):
 SENSOR_EXAMPLE = """\
 from typing import Annotated
 
-from snakesim_hal.model.sensor_model import SensorModel
+from snakesim_hal.model.robot_file.sensor_model import SensorModel
 from snakesim_hal.wire.messages import CustomSample
 from snakesim_hal.wire.quantities import bounded, describe
 from snakesim_sim_backend.sensors.mount import SensorMount
@@ -242,7 +242,7 @@ PAGES = (
         BACKEND_EXAMPLE,
         {
             "snakesim_hal.backend": ("Backend", "Samples", "SafeSetpoints"),
-            "snakesim_hal.model.robot": ("describe_robot",),
+            "snakesim_hal.model.robot_file.robot": ("describe_robot",),
             "snakesim_hal.wire.messages": ("Fault",),
         },
         "snakesim_hal.backend",
@@ -265,7 +265,7 @@ PAGES = (
         "(../../how-to/custom-sensors.md) explains the steps.",
         SENSOR_EXAMPLE,
         {
-            "snakesim_hal.model.sensor_model": ("SensorModel",),
+            "snakesim_hal.model.robot_file.sensor_model": ("SensorModel",),
             "snakesim_hal.wire.messages": ("CustomSample",),
             "snakesim_hal.wire.quantities": ("bounded", "above", "from_zero", "describe"),
             "snakesim_sim_backend.sensors.scope": ("SensorScope",),
@@ -310,7 +310,7 @@ INTERNAL = {
         "is_motion_requested",
     ),
     "snakesim_hal.service": ("ServiceLoop",),
-    "snakesim_hal.model.sensor_model": ("NoSettings",),
+    "snakesim_hal.model.robot_file.sensor_model": ("NoSettings",),
     "snakesim_drivers.kit.drive_type": ("BusesBackend", "DriverTypePart"),
     "snakesim.environments": ("SCENARIOS",),
 }
@@ -320,7 +320,7 @@ COMPLETE_MODULES = (
     "snakesim_hal.backend",
     "snakesim_hal.controller",
     "snakesim_hal.service",
-    "snakesim_hal.model.sensor_model",
+    "snakesim_hal.model.robot_file.sensor_model",
     "snakesim_drivers.kit.drives",
     "snakesim_drivers.kit.drive_type",
 )

@@ -7,15 +7,15 @@ from pathlib import Path
 import msgspec
 from msgspec import inspect
 
-from snakesim_hal.model.field_docs import FieldDoc, document_fields, inspect_struct_type
-from snakesim_hal.model.field_types import list_union_members
-from snakesim_hal.model.field_words import format_value, list_item_types
+from snakesim_hal.model.fields.field_docs import FieldDoc, document_fields, inspect_struct_type
+from snakesim_hal.model.fields.field_types import list_union_members
+from snakesim_hal.model.fields.field_words import format_value, list_item_types
+from snakesim_hal.model.fields.json_schema import list_structs
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.json_schema import list_structs
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, PHYSICS_MODELS
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.scene import SceneFile
+from snakesim_hal.model.scene_file.scene import SceneFile
 from snakesim_operator.features.evaluate.suite import EvaluationSuite
 from snakesim_operator.features.lab.lab_file import LabFile
 from snakesim_operator.this_computer.plugin_sections import find_bundled_plugins, get_section_type

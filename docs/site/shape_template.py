@@ -1,7 +1,7 @@
 """The picture of the drawn shapes: the overview page that `snakesim robot shape draw planar13` writes."""
 
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_operator.features.commissioning.shape.design import design_poses
 from snakesim_operator.features.commissioning.shape.drawing import encode_svg
 from snakesim_operator.features.commissioning.shape.outline import compute_drawing_mark

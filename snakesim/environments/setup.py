@@ -13,8 +13,8 @@ from snakesim.environments.actions import ActionTargets, parse_corrected_control
 from snakesim.environments.rewards import fill_reward_weights
 from snakesim_gnc.control.observations import ObservationBuilder, select_observation_parts
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.randomization import parse_randomizations
 from snakesim_hal.model.scenario import KeyOverride, RunConfig, describe_run_robot
+from snakesim_hal.model.scene_file.randomization import parse_randomizations
 from snakesim_hal.wire.messages import RobotDescription
 
 RENDER_MODES = ["rgb_array"]

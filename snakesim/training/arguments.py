@@ -119,8 +119,8 @@ def _run_train(arguments: argparse.Namespace) -> int:
         extras.require_extra(extra, "`snakesim policy train`")
     from snakesim.training.search import SearchEffort
     from snakesim.training.trained import train_policy
-    from snakesim_hal.model.randomization import parse_randomize_option
     from snakesim_hal.model.scenario import parse_set_option
+    from snakesim_hal.model.scene_file.randomization import parse_randomize_option
 
     environment = {
         "scenario": arguments.scenario,

@@ -30,7 +30,7 @@ from snakesim_drivers.kit.drive_type import (
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import FAULT_KINDS
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
 

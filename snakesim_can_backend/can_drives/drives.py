@@ -22,7 +22,7 @@ from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import FaultInjection
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 REQUEST_PERIOD_S = 0.1  # from one request to the next one to the same drive in bring-up

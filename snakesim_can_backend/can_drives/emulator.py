@@ -11,7 +11,7 @@ from snakesim_can_backend.bus.bus import Wire
 from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.emulation.drive_emulator import DriveEmulator
 from snakesim_drivers.emulation.emulated_body import EmulatedBody
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 
 NO_BROADCAST = -1  # no frame has this address
 

@@ -12,7 +12,7 @@ from snakesim_can_backend.cia402.probe import NodeProbe
 from snakesim_can_backend.cia402.settings import Cia402Settings
 from snakesim_drivers.kit.drive_settings import make_joint_label
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
 

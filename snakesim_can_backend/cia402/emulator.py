@@ -75,7 +75,7 @@ from snakesim_can_backend.cia402.state_machine import (
     encode_statusword,
 )
 from snakesim_can_backend.protocol.definitions import CanFrame
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 BROADCAST = 0  # the node of NMT commands to all nodes, SYNC and heartbeats

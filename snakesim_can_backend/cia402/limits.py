@@ -20,7 +20,7 @@ from snakesim_can_backend.cia402.objects import (
 )
 from snakesim_can_backend.cia402.settings import Cia402Settings
 from snakesim_can_backend.cia402.state_machine import OperationMode
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 REVOLUTION_RAD = 2 * math.pi  # rad

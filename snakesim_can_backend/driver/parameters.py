@@ -7,8 +7,8 @@ from snakesim_can_backend.protocol.codec import load_layouts
 from snakesim_can_backend.protocol.definitions import ModuleParameter, Opcode, SafeMotion
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.model.joints import Joint, JointDrive
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.joints import Joint, JointDrive
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
 # In a watchdog's time: one setpoint may be lost, and the next be a little late.

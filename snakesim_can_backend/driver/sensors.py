@@ -16,7 +16,7 @@ from snakesim_drivers.motion_capture.mocap import MocapReceiver
 from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.backend import Samples
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_contact_tangents
+from snakesim_hal.model.geometry.kinematics import compute_contact_tangents
 from snakesim_hal.model.measured_force import MeasuredForce
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire import keys

@@ -8,7 +8,7 @@ The vocabulary is that of `snakesim_hal.model.fault_kinds`, with times since the
 from collections.abc import Mapping
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model import fault_kinds as injection
+from snakesim_hal.model import fault_kinds
 from snakesim_hal.model.fault_kinds import FAULT_KINDS, FaultInjection
 
 # What each kind does to a module.
@@ -30,7 +30,7 @@ def parse_fault(text: str, joint_count: int) -> FaultInjection:
     Raises:
         ConfigError: The text has another form, or modules of this robot do not support the fault.
     """
-    return validate_fault(injection.parse_injection(text), joint_count)
+    return validate_fault(fault_kinds.parse_injection(text), joint_count)
 
 
 def validate_fault(fault: FaultInjection, joint_count: int) -> FaultInjection:
@@ -41,7 +41,9 @@ def validate_fault(fault: FaultInjection, joint_count: int) -> FaultInjection:
             f"kinds into the scenario's `faults`",
             code="injection/unknown-fault",
         )
-    injection.validate_injection_targets([fault], services=(), joint_count=joint_count, bus_count=0)
+    fault_kinds.validate_injection_targets(
+        [fault], services=(), joint_count=joint_count, bus_count=0
+    )
     return fault
 
 

@@ -22,7 +22,7 @@ from snakesim_can_backend.emulator.frames import (
 )
 from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.physics.physics_model import LinkLoad, PhysicsModel
 from snakesim_hal.wire.messages import Imu
 

@@ -6,8 +6,8 @@ from snakesim_can_backend.emulator.firmware import ModuleFirmware, MotorDemand
 from snakesim_can_backend.protocol.definitions import CanFrame, Opcode, checksum, parse_opcode
 from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.robot_file.robot import RobotFile
 
 SAGGED_FRACTION = 2 / 3  # of the minimum voltage, at an injected undervoltage
 

@@ -13,7 +13,7 @@ from snakesim_can_backend.emulator.module_slot import assign_node_ids
 from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import build_actual_joints
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig, compute_start_pose
 from snakesim_native.compile import CannotCompileError
 from snakesim_native.programs import JOINT_MODULES, get_program

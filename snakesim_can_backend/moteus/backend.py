@@ -14,7 +14,7 @@ from snakesim_can_backend.moteus.probe import ControllerProbe
 from snakesim_can_backend.moteus.protocol import BROADCAST_ID, HOST_ID, LAST_ID
 from snakesim_can_backend.moteus.settings import MoteusSettings
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
 GAIN_TOLERANCE_FACTOR = 1.001  # factor: people round the gains that they copy

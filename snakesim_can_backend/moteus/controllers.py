@@ -32,7 +32,7 @@ from snakesim_can_backend.moteus.protocol import (
 from snakesim_can_backend.moteus.settings import MoteusSettings
 from snakesim_can_backend.protocol.definitions import CanFrame
 from snakesim_drivers.kit.drive_states import DriveCommand
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 REVOLUTION_RAD = 2 * math.pi  # rad

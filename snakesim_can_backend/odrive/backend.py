@@ -19,7 +19,7 @@ from snakesim_can_backend.odrive.protocol import LAST_NODE
 from snakesim_can_backend.odrive.settings import OdriveSettings
 from snakesim_drivers.kit.drive_settings import make_joint_label
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
 

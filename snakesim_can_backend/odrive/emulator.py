@@ -36,7 +36,7 @@ from snakesim_can_backend.odrive.protocol import (
 )
 from snakesim_can_backend.odrive.settings import MountedAxis, OdriveSettings
 from snakesim_can_backend.protocol.definitions import CanFrame
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 HEARTBEAT_US = 100_000.0  # ODrive's default period

@@ -8,7 +8,7 @@ from snakesim_drivers.emulation.shared_physics import MAX_CATCH_UP_US, SharedPhy
 from snakesim_drivers.mounting import to_joint_target
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 BOOT_US = 500_000.0  # in which a drive that restarts neither receives nor sends; a guess

@@ -11,7 +11,7 @@ import msgspec
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.joints import (
+from snakesim_hal.model.robot_file.joints import (
     Backlash,
     DeadZone,
     Friction,
@@ -28,7 +28,7 @@ from snakesim_hal.model.joints import (
     Viscosity,
     Zero,
 )
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
 

@@ -13,7 +13,7 @@ from snakesim_drivers.kit.drive_guard import RESET_GRACE_CYCLES, DriveGuard
 from snakesim_drivers.kit.drives import BusCommand, Drives
 from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 
 # After a longer pause of the driver, as a fraction of the watchdog timeout, watchdogs of drives may have expired.
 MAX_PAUSE_WATCHDOG_FRACTION = 0.5

@@ -22,7 +22,7 @@ from snakesim_drivers.motion_capture.mocap import MocapReceiver
 from snakesim_hal.backend import Backend, SafeSetpoints, Samples
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
-from snakesim_hal.model.robot import add_drive_identities
+from snakesim_hal.model.robot_file.robot import add_drive_identities
 from snakesim_hal.model.scenario import RunConfig, describe_run_robot
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (

@@ -14,7 +14,7 @@ from snakesim_drivers.motion_capture.mocap import validate_pose_settings
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_plan import validate_faults_for_backend
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 
 # Control periods that a bus waits for responses: the rest is for the controller.

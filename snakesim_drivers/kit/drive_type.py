@@ -26,8 +26,8 @@ from snakesim_drivers.kit.drives import Drives
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_drivers.motion_capture.mocap import make_receiver
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint, Measurement
-from snakesim_hal.model.robot import RobotFile, remove_measurements
+from snakesim_hal.model.robot_file.joints import Joint, Measurement
+from snakesim_hal.model.robot_file.robot import RobotFile, remove_measurements
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motor import validate_position_gains
 from snakesim_hal.wire.messages import ClockMode

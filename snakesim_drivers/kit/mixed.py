@@ -12,9 +12,9 @@ import msgspec
 from snakesim_drivers.kit.drive_settings import BodySettings
 from snakesim_drivers.kit.drive_type import BusesBackend, DriverTypeBackend, DriverTypePart
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint, JointExceptions
 from snakesim_hal.model.plugins import BACKENDS, decode_plugin_settings, load_plugin
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.joints import Joint, JointExceptions
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 
 

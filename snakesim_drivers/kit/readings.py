@@ -12,7 +12,7 @@ import numpy as np
 
 from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import JointState, Power
 
 NEVER = -1  # the time of a value that no drive has sent yet

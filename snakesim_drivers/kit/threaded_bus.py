@@ -19,7 +19,7 @@ from snakesim_drivers.kit.drive_guard import NO_DRIVES
 from snakesim_drivers.kit.drives import BusCommand
 from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 WAIT_SLICES = 6  # remaining_slices of the time that the host waits: a computer that pauses then loses one slice only

@@ -9,7 +9,7 @@ import numpy as np
 
 from snakesim_drivers.motion_capture.mocap_sample import MocapSample
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.sensors import PoseSensor
+from snakesim_hal.model.robot_file.sensors import PoseSensor
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.quantities import Quaternion
 

@@ -24,7 +24,7 @@ from snakesim_drivers.kit.findings import FaultFinding
 from snakesim_drivers.kit.readings import DriveReadings
 from snakesim_hal.base.errors import BackendError
 from snakesim_hal.model.fault_kinds import FaultInjection
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import JointMode
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Task
-from snakesim_hal.model.kinematics import ForwardKinematics
+from snakesim_hal.model.geometry.kinematics import ForwardKinematics
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import JointState, Pose, RobotDescription
 

@@ -13,7 +13,7 @@ from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_gnc.geometry.planar_body import JointAngleHistory, PlanarBody, get_pose_time_ns
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import Trajectory, WorldModel
 from snakesim_hal.wire.quantities import from_zero
 

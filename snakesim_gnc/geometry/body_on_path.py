@@ -9,7 +9,7 @@ import numpy as np
 
 from snakesim_gnc.control.climb import compute_path_height_m
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.route import Route, find_arc_length_at_distance
+from snakesim_hal.model.geometry.route import Route, find_arc_length_at_distance
 from snakesim_hal.wire.messages import PathRise
 
 POSE_SPACING_M = 0.01  # of the cached poses; the interpolation error is 0.005 rad on paths that bend once in 0.15 m

@@ -14,9 +14,9 @@ from snakesim_gnc.geometry.body_on_path import (
     compute_heading_rad,
 )
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_body_points_w
-from snakesim_hal.model.route import compute_yaw_segments_m
-from snakesim_hal.model.solids import GRAVITY_M_S2
+from snakesim_hal.model.geometry.kinematics import compute_body_points_w
+from snakesim_hal.model.geometry.route import compute_yaw_segments_m
+from snakesim_hal.model.scene_file.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import RobotDescription, WorldModel
 
 MAX_HISTORY_TICKS = 128  # of joint angles: more than the latency of any pose

@@ -6,8 +6,8 @@ from snakesim_gnc.guidance.perceived_world import PerceivedWorld
 from snakesim_gnc.guidance.pose.localization import PoseNoise
 from snakesim_gnc.guidance.ranging.scan import RangeNoise, RangingSample
 from snakesim_gnc.guidance.world_source import WorldSource, make_start_pose
+from snakesim_hal.model.robot_file.sensors import DepthCamera, DistanceSensor
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.sensors import DepthCamera, DistanceSensor
 from snakesim_hal.network.client import HostClient
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (

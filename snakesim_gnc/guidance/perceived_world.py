@@ -18,7 +18,10 @@ from snakesim_gnc.guidance.ranging.ground import fit_plane_under_body
 from snakesim_gnc.guidance.ranging.scan import AzimuthScan, RangeNoise, RangingSample, make_scan
 from snakesim_gnc.guidance.surveyed_world import transform_contact
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import quaternion_from_rotation, rotation_from_quaternion
+from snakesim_hal.model.geometry.kinematics import (
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from snakesim_hal.wire.messages import (
     Contacts,
     DepthImage,

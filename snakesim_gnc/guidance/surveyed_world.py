@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.kinematics import compute_link_frames, rotation_from_quaternion
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import (
     Contact,
     Contacts,

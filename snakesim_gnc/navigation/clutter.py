@@ -43,8 +43,8 @@ from snakesim_gnc.navigation.plan import (
 )
 from snakesim_gnc.navigation.planning_goal import PlanningGoal
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import ObstacleOutlines
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.model.scenario import HeadingGoal, WaypointGoal
 from snakesim_hal.wire.messages import KnownObstacle, Trajectory, WorldModel
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_gnc.navigation.intents import DesiredMotion
-from snakesim_hal.model.outlines import compute_outline_distance_m
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.outlines import compute_outline_distance_m
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import KnownObstacle, Trajectory, WorldModel
 
 # The body can push on an obstacle whose outline is nearer to the path than this.

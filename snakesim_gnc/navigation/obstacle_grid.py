@@ -16,7 +16,7 @@ from snakesim_gnc.navigation.path_search.native_library import (
     load_library,
 )
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle
 
 Ints = NDArray[np.int64]

@@ -17,7 +17,7 @@ from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearchSteps
 from snakesim_gnc.navigation.path_search.search_parameters import MIN_PUSH, STEP_M, SearchParameters
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import KnownObstacle
 
 # Reasons for a plan; `Trajectory.searching` shows them.

@@ -5,8 +5,8 @@ from itertools import groupby
 
 import numpy as np
 
-from snakesim_hal.model.outlines import ObstacleOutlines
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import KnownObstacle, PathRise
 
 SAMPLE_SPACING_M = 0.01  # of the points of the path that are checked

@@ -11,7 +11,7 @@ from snakesim_gnc.navigation.intents import DesiredMotion, IntentTracker
 from snakesim_gnc.navigation.known_path import KnownPath
 from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
 from snakesim_gnc.navigation.platform_rises import PlatformRises
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.model.scenario import (
     HeadingGoal,
     RunConfig,
@@ -19,7 +19,7 @@ from snakesim_hal.model.scenario import (
     compute_start_pose,
     get_noisy_obstacle_map,
 )
-from snakesim_hal.model.scene import make_route
+from snakesim_hal.model.scene_file.scene import make_route
 from snakesim_hal.network.client import HostClient
 from snakesim_hal.service import Service
 from snakesim_hal.wire import keys

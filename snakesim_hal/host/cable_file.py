@@ -17,7 +17,7 @@ import msgspec
 
 from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.host.outbox import SerialWorker
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.safety.cables import REVOLUTION_RAD, CableJoint, CableTracker
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import JointState, RobotDescription

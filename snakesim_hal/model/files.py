@@ -12,7 +12,7 @@ from typing import Any, ClassVar, TypeVar
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError, find_nearest_word, shorten, suggest_word
-from snakesim_hal.model.field_types import (
+from snakesim_hal.model.fields.field_types import (
     TypeViolation,
     describe_type_in_words,
     find_declared_unit,

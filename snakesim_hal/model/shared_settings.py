@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.quantities import MAX_SHARED_SETTINGS
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import WireError
-from snakesim_hal.model.route import is_polyline
+from snakesim_hal.model.geometry.route import is_polyline
 from snakesim_hal.wire.messages import (
     ColorImage,
     Contacts,

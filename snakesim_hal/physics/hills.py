@@ -3,7 +3,7 @@
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.scene import Heightfield
+from snakesim_hal.model.scene_file.scene import Heightfield
 
 SAMPLES_PER_WAVE = 12  # in one direction, so that hills are smooth
 MIN_SAMPLES = 16  # along an edge

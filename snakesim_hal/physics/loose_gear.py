@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Joint, JointExceptions
+from snakesim_hal.model.robot_file.joints import Joint, JointExceptions
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.physics.wrapped_model import WrappedModel

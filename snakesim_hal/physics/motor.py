@@ -6,8 +6,8 @@ The torque of a joint follows its demand as a first-order lag, is clipped to a l
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import ModuleBody, RobotFile
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.robot_file.robot import ModuleBody, RobotFile
 
 # With this slope, full torque is available up to 9/10 of the speed limit, and none at the limit.
 STEEPEST_ROLL_OFF = 10.0

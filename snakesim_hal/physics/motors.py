@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.physics.motor import compute_torque_roll_off
 from snakesim_hal.wire.messages import JointMode
 

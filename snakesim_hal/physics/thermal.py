@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 
 MIN_TORQUE_FRACTION = 0.2  # fraction of its torque that the hottest winding may still use
 INJECTED_ABOVE_STOP_K = 5.0  # how far above its `stop_at_c` an injected fault heats a winding

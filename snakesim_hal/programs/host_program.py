@@ -32,8 +32,8 @@ from snakesim_hal.host.cable_file import open_cable_file
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host, HostOptions
 from snakesim_hal.host.latch import EstopLatch
-from snakesim_hal.model.checked import START_CHECK_CONTROLLER, find_unchecked_reason
 from snakesim_hal.model.fault_plan import validate_faults_without_supervisor
+from snakesim_hal.model.robot_file.checked import START_CHECK_CONTROLLER, find_unchecked_reason
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.what_moves import describe_what_moves
 from snakesim_hal.network.local_registry import LocalRobot, get_robot_state_folder, register_robot

@@ -20,7 +20,7 @@ from snakesim_hal.model.plugins import (
     load_plugin_unless_file,
     require_base_class,
 )
-from snakesim_hal.model.robot import describe_joints
+from snakesim_hal.model.robot_file.robot import describe_joints
 from snakesim_hal.model.scenario import RunConfig, describe_run_robot
 from snakesim_hal.service import Service
 from snakesim_hal.wire.messages import JointDescription, JointMode

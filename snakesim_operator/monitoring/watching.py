@@ -15,8 +15,8 @@ from snakesim_hal.programs.arguments import (
 )
 from snakesim_hal.programs.commands import Command, CommandGroup, Commands
 from snakesim_operator.base.robot_selection import select_robots
+from snakesim_operator.recording.log_clock import LOG_TIME_CLOCK_HELP, LOG_TIME_CLOCKS
 from snakesim_operator.recording.message import RAW_ONLY_HELP
-from snakesim_operator.recording.stamps import LOG_TIME_CLOCK_HELP, LOG_TIME_CLOCKS
 
 MAX_TASK_CHARACTERS = 200
 

@@ -18,7 +18,7 @@ from snakesim_hal.programs.arguments import (
     make_number_parser,
 )
 from snakesim_hal.programs.commands import Command, CommandGroup, Commands
-from snakesim_operator.recording.stamps import LOG_TIME_CLOCK_HELP, LOG_TIME_CLOCKS
+from snakesim_operator.recording.log_clock import LOG_TIME_CLOCK_HELP, LOG_TIME_CLOCKS
 
 
 def add_span_options(parser: argparse.ArgumentParser) -> None:

@@ -19,8 +19,8 @@ from snakesim_hal.base.terminal import PrintLine, escape_invisible
 from snakesim_hal.model.textfiles import export_atomically
 from snakesim_operator.playback.episodes import describe_gaps, read_episodes
 from snakesim_operator.playback.lerobot import write_lerobot
+from snakesim_operator.recording.log_clock import LogTimeClock
 from snakesim_operator.recording.recover import recover_recording
-from snakesim_operator.recording.stamps import LogTimeClock
 from snakesim_operator.results.missing_data import report_missing_data
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.run_reader import find_recording_path

@@ -12,9 +12,9 @@ from snakesim_hal.base.process import call_on_stop_signals, list_stop_signals
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.wire.codec import MAX_IMAGE_BYTES
 from snakesim_operator.base.targets import RobotSelection, find_single_robot
-from snakesim_operator.recording.live import FoxgloveLiveServer
+from snakesim_operator.recording.foxglove_messages.live_server import FoxgloveLiveServer
+from snakesim_operator.recording.log_clock import LogTimeClock
 from snakesim_operator.recording.recorder_process import record_to_file
-from snakesim_operator.recording.stamps import LogTimeClock
 
 
 def record_robot(

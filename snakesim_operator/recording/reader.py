@@ -17,19 +17,20 @@ from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.wire.keys import find_row_key
-from snakesim_operator.recording.chunks import (
+from snakesim_operator.recording.log_clock import read_log_time_clock
+from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, RecordingLosses
+from snakesim_operator.recording.mcap_format.chunks import (
     CorruptFileError,
     parse_chunk,
     parse_record,
     unpack_chunk,
 )
-from snakesim_operator.recording.losses import MAX_GAPS, UNKNOWN_KEYS, RecordingLosses
-from snakesim_operator.recording.mcap_file import (
+from snakesim_operator.recording.mcap_format.file_writer import (
     EARLIER_LOSSES_ENTRY,
     METADATA_NAME,
     SNAKESIM_PROFILE,
 )
-from snakesim_operator.recording.mcap_records import (
+from snakesim_operator.recording.mcap_format.records import (
     OPCODES_TO_READ,
     TRUNCATED,
     RawRecord,
@@ -38,7 +39,6 @@ from snakesim_operator.recording.mcap_records import (
     read_summary,
 )
 from snakesim_operator.recording.message import RecordedMessage
-from snakesim_operator.recording.stamps import read_log_time_clock
 
 MAX_ROBOT_TIME_NS = 2**62  # 146 years: no robot time is later
 NO_SCHEMA = 0  # MCAP's number for a channel without a schema

@@ -44,9 +44,9 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.roles import RECORDER
+from snakesim_operator.recording.foxglove_messages.file_writer import OnViewerMessage
+from snakesim_operator.recording.log_clock import LogTimeClock
 from snakesim_operator.recording.message import RAW_ONLY_HELP, RECORDING_FILENAME
-from snakesim_operator.recording.shown_messages import OnViewerMessage
-from snakesim_operator.recording.stamps import LogTimeClock
 from snakesim_operator.recording.tap import MessageTap
 from snakesim_operator.recording.writer import RecordingWriter
 

@@ -6,20 +6,20 @@ from pathlib import Path
 from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.recording.disk import GrowingFile
-from snakesim_operator.recording.mcap_file import (
-    EARLIER_LOSSES_ENTRY,
-    METADATA_NAME,
-    McapFileWriter,
-)
-from snakesim_operator.recording.reader import RecordingReader
-from snakesim_operator.recording.shown_messages import ViewerMessageWriter
-from snakesim_operator.recording.stamps import (
+from snakesim_operator.recording.buffered_file import GrowingFile
+from snakesim_operator.recording.foxglove_messages.file_writer import ViewerMessageWriter
+from snakesim_operator.recording.log_clock import (
     LogTimeClock,
     order_times,
     read_log_time_clock,
     with_log_time_clock,
 )
+from snakesim_operator.recording.mcap_format.file_writer import (
+    EARLIER_LOSSES_ENTRY,
+    METADATA_NAME,
+    McapFileWriter,
+)
+from snakesim_operator.recording.reader import RecordingReader
 
 FLUSH_BYTES = 4 * 1024 * 1024  # bounds the memory that waiting messages take
 

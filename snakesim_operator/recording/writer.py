@@ -20,11 +20,14 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
 from snakesim_hal.wire.custom_sample import CustomMessage, find_custom_messages
 from snakesim_hal.wire.messages import RobotDescription
-from snakesim_operator.recording.disk import GrowingFile
-from snakesim_operator.recording.mcap_file import METADATA_NAME, McapFileWriter
+from snakesim_operator.recording.buffered_file import GrowingFile
+from snakesim_operator.recording.foxglove_messages.file_writer import (
+    OnViewerMessage,
+    ViewerMessageWriter,
+)
+from snakesim_operator.recording.log_clock import LogTimeClock, order_times, with_log_time_clock
+from snakesim_operator.recording.mcap_format.file_writer import METADATA_NAME, McapFileWriter
 from snakesim_operator.recording.robot_time import MessageClock
-from snakesim_operator.recording.shown_messages import OnViewerMessage, ViewerMessageWriter
-from snakesim_operator.recording.stamps import LogTimeClock, order_times, with_log_time_clock
 
 FLUSH_S = 0.5
 # Of custom sensors before the description; further ones get no schema of their own.

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.kinematics import compute_body_points_w
-from snakesim_hal.model.placement import PlacedObstacle
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.kinematics import compute_body_points_w
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
-from snakesim_hal.model.scene import make_route
+from snakesim_hal.model.scene_file.placement import PlacedObstacle
+from snakesim_hal.model.scene_file.scene import make_route
 from snakesim_hal.run_log.host_record import HostRecord
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE

@@ -73,7 +73,7 @@ def _run_scenario(arguments: argparse.Namespace) -> int:
     check_network(arguments)
     if arguments.in_process:
         # Before anything large is loaded.
-        from snakesim_operator.run.guarded_process import run_in_guarded_child
+        from snakesim_operator.run.processes.guarded_process import run_in_guarded_child
 
         return run_in_guarded_child(
             lambda step_times: _run_scenario_in_process(arguments, step_times),

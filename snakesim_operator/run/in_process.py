@@ -49,7 +49,7 @@ from snakesim_operator.run.conclusion import (
     write_results,
 )
 from snakesim_operator.run.ending import RunEnding, end_run_on_signals
-from snakesim_operator.run.pinned_process import call_in_pinned_process
+from snakesim_operator.run.processes.pinned_process import call_in_pinned_process
 from snakesim_operator.run.progress import RunProgress
 from snakesim_operator.run.run import open_run_files, require_recorder
 from snakesim_operator.run.run_files import RunFiles

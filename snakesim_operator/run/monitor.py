@@ -20,12 +20,12 @@ from snakesim_hal.wire.messages import (
 )
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.results.run_ending import GOAL_REQUESTER
+from snakesim_operator.run.arming_timeout import StartupTimeout
 from snakesim_operator.run.ending import RunEnding
-from snakesim_operator.run.patience import StartupTimeout
-from snakesim_operator.run.process_faults import ProcessFaults
-from snakesim_operator.run.processor_waits import ProcessorWaits
+from snakesim_operator.run.processes.process_faults import ProcessFaults
+from snakesim_operator.run.processes.processor_waits import ProcessorWaits
+from snakesim_operator.run.processes.supervisor import HOST, RunSupervisor
 from snakesim_operator.run.progress import RunProgress
-from snakesim_operator.run.supervisor import HOST, RunSupervisor
 
 # The host continues for so long after a fault, so that the safe stop is in the record.
 RUN_ON_AFTER_FAULT_S = 1.5

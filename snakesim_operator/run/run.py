@@ -26,13 +26,13 @@ from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.base import extras
 from snakesim_operator.results.run_reader import CONFIG_FILENAME
-from snakesim_operator.run.console_child import require_console, run_console
 from snakesim_operator.run.ending import RunEnding, end_run_on_signals
 from snakesim_operator.run.folder import choose_default_folder, lock_run_folder
-from snakesim_operator.run.meeting import check_no_other_robot, reserve_endpoint
 from snakesim_operator.run.monitor import RUN_ON_AFTER_FAULT_S, RunMonitor
+from snakesim_operator.run.processes.console_child import require_console, run_console
+from snakesim_operator.run.processes.supervisor import HOST, RunSupervisor
+from snakesim_operator.run.run_endpoint import check_no_other_robot, reserve_endpoint
 from snakesim_operator.run.run_files import RunFiles
-from snakesim_operator.run.supervisor import HOST, RunSupervisor
 
 CONNECT_TIMEOUT_S = 0.5
 # Between two lines on the terminal while the host has not opened its network.

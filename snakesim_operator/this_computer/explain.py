@@ -5,7 +5,7 @@ from typing import Any
 
 from snakesim_hal.base.errors import ConfigError, find_nearest_word, shorten
 from snakesim_hal.base.terminal import align_columns, print_json, print_line
-from snakesim_hal.model.field_words import format_value
+from snakesim_hal.model.fields.field_words import format_value
 from snakesim_hal.model.scenario import CHOSEN_PREFIXES, LoadedScenario, RunConfig
 from snakesim_hal.programs.preflight import validate_and_complete_config
 from snakesim_operator.this_computer.scenario_keys import ScenarioKey, collect_keys

@@ -7,9 +7,9 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from snakesim_hal.model.field_docs import FieldDoc, document_fields
-from snakesim_hal.model.field_types import list_union_members
-from snakesim_hal.model.field_words import list_item_types
+from snakesim_hal.model.fields.field_docs import FieldDoc, document_fields
+from snakesim_hal.model.fields.field_types import list_union_members
+from snakesim_hal.model.fields.field_words import list_item_types
 from snakesim_hal.model.files import iterate_leaves
 from snakesim_hal.model.plugins import (
     BACKENDS,

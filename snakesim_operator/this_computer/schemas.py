@@ -8,12 +8,12 @@ from typing import Any
 import msgspec
 
 from snakesim_hal.base.errors import ConfigError
+from snakesim_hal.model.fields.json_schema import make_schema
 from snakesim_hal.model.files import SCHEMAS_DIR
-from snakesim_hal.model.json_schema import make_schema
 from snakesim_hal.model.plugins import BACKENDS, CONTROLLERS, FILES, PHYSICS_MODELS
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.scene import SceneFile
+from snakesim_hal.model.scene_file.scene import SceneFile
 from snakesim_hal.model.textfiles import read_text, write_text
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import format_encoding

@@ -7,7 +7,7 @@ from snakesim_drivers.emulation.emulated_body import EmulatedBody
 from snakesim_drivers.kit.drive_backend import DriverClock
 from snakesim_drivers.kit.drive_settings import make_joint_label
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_serial_backend.dynamixel import registers
 from snakesim_serial_backend.dynamixel.emulator import (

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.physics.thermal import MIN_TORQUE_FRACTION
 
 

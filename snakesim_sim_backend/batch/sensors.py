@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
+from snakesim_hal.model.robot_file.sensors import SensorSections
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.sensors import SensorSections
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 from snakesim_sim_backend.batch.noise import NoiseStreams
 from snakesim_sim_backend.batch.samples import DelayedValues, Mask, SamplingTicks, Ticks

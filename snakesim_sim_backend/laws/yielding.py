@@ -19,7 +19,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.placement import PlacedObstacle
+from snakesim_hal.model.scene_file.placement import PlacedObstacle
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_sim_backend.laws.flat_ground import DAMPING_RATIO, MAX_PHASE_RAD
 

@@ -14,12 +14,12 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.links import Link
-from snakesim_hal.model.placement import PlacedObstacle
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.robot_file.links import Link
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
-from snakesim_hal.model.scene import compute_gravity_w, compute_normal_gravity_m_s2
+from snakesim_hal.model.scene_file.placement import PlacedObstacle
+from snakesim_hal.model.scene_file.scene import compute_gravity_w, compute_normal_gravity_m_s2
 from snakesim_hal.physics.motor import validate_position_gains
 from snakesim_hal.wire.messages import Axis
 from snakesim_hal.wire.quantities import Vector

@@ -5,7 +5,7 @@ Gravity itself stays as it is: the law of flat ground divides by it, and IMUs me
 
 import mujoco
 
-from snakesim_hal.model.fluid import Fluid
+from snakesim_hal.model.scene_file.fluid import Fluid
 
 ELLIPSOID = 1.0  # MjsGeom.fluid_ellipsoid: on
 

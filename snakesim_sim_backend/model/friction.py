@@ -2,15 +2,15 @@
 
 import mujoco
 
-from snakesim_hal.model.friction import (
+from snakesim_hal.model.robot_file.robot import RobotFile
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scene_file.friction import (
     DirectionalFriction,
     Surface,
     compute_link_factors,
     compute_surface_friction,
 )
-from snakesim_hal.model.placement import PlacedObstacle
-from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scene_file.placement import PlacedObstacle
 from snakesim_sim_backend.model.obstacles import make_geom_name
 from snakesim_sim_backend.model.pipes import get_pipe_geom_names
 

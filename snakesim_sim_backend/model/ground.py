@@ -2,7 +2,7 @@
 
 import mujoco
 
-from snakesim_hal.model.scene import Ground, Heightfield
+from snakesim_hal.model.scene_file.scene import Ground, Heightfield
 from snakesim_hal.physics.hills import make_heights
 from snakesim_sim_backend.model.surface import ContactParameters
 

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.placement import PlacedObstacle
+from snakesim_hal.model.geometry.kinematics import quaternion_from_yaw
+from snakesim_hal.model.scene_file.placement import PlacedObstacle
 from snakesim_sim_backend.laws.yielding import JOINT_TYPE_BY_AXIS, compute_mass_kg, compute_spring
 from snakesim_sim_backend.model.ground import GROUND_GROUP, SAND
 from snakesim_sim_backend.model.surface import ContactParameters

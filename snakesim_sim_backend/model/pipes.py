@@ -11,8 +11,8 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.model.pipes import get_pipe_name
-from snakesim_hal.model.terrain import Pipe
+from snakesim_hal.model.scene_file.pipes import get_pipe_name
+from snakesim_hal.model.scene_file.terrain import Pipe
 from snakesim_sim_backend.model.ground import GROUND_GROUP, SAND
 from snakesim_sim_backend.model.surface import ContactParameters
 

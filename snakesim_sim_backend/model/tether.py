@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_sim_backend.settings import TetherSettings
 
 ROPE_LENGTH_M = 50.0  # long enough for the accuracy above

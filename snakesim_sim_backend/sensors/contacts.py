@@ -4,8 +4,8 @@ import math
 
 import mujoco
 
-from snakesim_hal.model.kinematics import compute_contact_tangents
-from snakesim_hal.model.sensors import ContactSensor
+from snakesim_hal.model.geometry.kinematics import compute_contact_tangents
+from snakesim_hal.model.robot_file.sensors import ContactSensor
 from snakesim_hal.wire.messages import Contact, Contacts
 from snakesim_hal.wire.quantities import MAX_CONTACTS
 from snakesim_sim_backend.model.build import SimModel

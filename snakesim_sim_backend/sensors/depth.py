@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from snakesim_hal.model.sensor_model import NoSettings, SensorModel
-from snakesim_hal.model.sensors import DepthCamera
+from snakesim_hal.model.robot_file.sensor_model import NoSettings, SensorModel
+from snakesim_hal.model.robot_file.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage
 from snakesim_sim_backend.sensors.mount import SensorMount
 from snakesim_sim_backend.sensors.rays import RayBundle

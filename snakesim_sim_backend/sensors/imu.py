@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from snakesim_hal.model.sensors import ImuSensor
+from snakesim_hal.model.robot_file.sensors import ImuSensor
 from snakesim_hal.wire.messages import Imu
 from snakesim_sim_backend.sensors.scope import Normal
 

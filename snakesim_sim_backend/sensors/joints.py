@@ -5,7 +5,7 @@ from collections import deque
 import mujoco
 import numpy as np
 
-from snakesim_hal.model.sensors import JointSensor
+from snakesim_hal.model.robot_file.sensors import JointSensor
 from snakesim_hal.wire.messages import JointState
 from snakesim_sim_backend.actuators import ModelMotors
 from snakesim_sim_backend.model.build import view_joint_states

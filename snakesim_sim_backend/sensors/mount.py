@@ -3,8 +3,8 @@
 import math
 from typing import Any
 
-from snakesim_hal.model.kinematics import rotation_from_quaternion
-from snakesim_hal.model.sensors import DepthCamera, MountedSensor
+from snakesim_hal.model.geometry.kinematics import rotation_from_quaternion
+from snakesim_hal.model.robot_file.sensors import DepthCamera, MountedSensor
 from snakesim_hal.wire.quantities import Quaternion, Vector
 from snakesim_sim_backend.sensors.scope import Floats, SensorScope
 

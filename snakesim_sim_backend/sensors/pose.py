@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.model.sensors import PoseSensor
+from snakesim_hal.model.robot_file.sensors import PoseSensor
 from snakesim_hal.wire.messages import Pose
 from snakesim_hal.wire.quantities import Quaternion
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.physics.thermal import ThermalModel
 from snakesim_hal.wire.messages import Power
 from snakesim_sim_backend.actuators import ModelMotors

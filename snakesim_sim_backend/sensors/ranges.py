@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from snakesim_hal.model.sensor_model import NoSettings, SensorModel
-from snakesim_hal.model.sensors import RangeSensor
+from snakesim_hal.model.robot_file.sensor_model import NoSettings, SensorModel
+from snakesim_hal.model.robot_file.sensors import RangeSensor
 from snakesim_hal.wire.messages import RangeScan
 from snakesim_sim_backend.sensors.mount import SensorMount
 from snakesim_sim_backend.sensors.rays import RayBundle

@@ -9,8 +9,8 @@ from msgspec import Meta
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import FileStruct, expand_home
-from snakesim_hal.model.sensor_model import SensorModel
-from snakesim_hal.model.sensors import DepthCamera
+from snakesim_hal.model.robot_file.sensor_model import SensorModel
+from snakesim_hal.model.robot_file.sensors import DepthCamera
 from snakesim_hal.wire.messages import DepthImage
 from snakesim_sim_backend.sensors.scope import SensorScope
 

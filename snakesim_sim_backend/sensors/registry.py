@@ -19,9 +19,9 @@ from snakesim_hal.model.plugins import (
     load_plugin_unless_file,
     require_base_class,
 )
-from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.sensor_model import SensorModel
-from snakesim_hal.model.sensors import (
+from snakesim_hal.model.robot_file.robot import RobotFile
+from snakesim_hal.model.robot_file.sensor_model import SensorModel
+from snakesim_hal.model.robot_file.sensors import (
     AnyMounted,
     BodySensor,
     ContactSensor,

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.sensor_model import NoSettings, SensorModel
-from snakesim_hal.model.sensors import DepthCamera
+from snakesim_hal.model.robot_file.sensor_model import NoSettings, SensorModel
+from snakesim_hal.model.robot_file.sensors import DepthCamera
 from snakesim_hal.wire.messages import ColorImage, DepthImage
 from snakesim_sim_backend.model.ground import PLANE_GROUP
 from snakesim_sim_backend.sensors.depth import make_depth_image

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 
 from snakesim_hal.backend import Samples
+from snakesim_hal.model.robot_file.sensors import AnyMounted, AnySensor, MountedSensor
 from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.sensors import AnyMounted, AnySensor, MountedSensor
 from snakesim_hal.physics.thermal import ThermalModel
 from snakesim_hal.wire.messages import Message
 from snakesim_sim_backend.actuators import ModelMotors

@@ -5,7 +5,7 @@ import math
 import mujoco
 import numpy as np
 
-from snakesim_hal.model.kinematics import (
+from snakesim_hal.model.geometry.kinematics import (
     compute_link_frames,
     quaternion_from_yaw,
     rotation_from_quaternion,

@@ -23,7 +23,7 @@ from snakesim_drivers.template.minimal_driver import (
     MinimalEmulator,
     Report,
 )
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import JointMode
 
 HOMING_RAD_S = 0.05

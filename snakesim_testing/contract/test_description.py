@@ -4,7 +4,7 @@ from collections import Counter
 
 import msgspec
 
-from snakesim_hal.model.robot import compute_layout_hash
+from snakesim_hal.model.robot_file.robot import compute_layout_hash
 from snakesim_hal.model.scenario import describe_run_robot
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding

@@ -11,13 +11,13 @@ from snakesim_gnc.guidance.pose.body_history import BasePose
 from snakesim_gnc.guidance.pose.localization import PoseNoise
 from snakesim_gnc.guidance.ranging.scan import RangeNoise
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import (
+from snakesim_hal.model.geometry.kinematics import (
     compute_link_frames,
     quaternion_from_yaw,
     rotation_from_quaternion,
 )
-from snakesim_hal.model.outlines import compute_outline_distance_m
-from snakesim_hal.model.route import (
+from snakesim_hal.model.geometry.outlines import compute_outline_distance_m
+from snakesim_hal.model.geometry.route import (
     Route,
     compute_yaw_segments_m,
     place_chain_on_route,

@@ -7,8 +7,8 @@ import numpy as np
 
 from snakesim_gnc.geometry.body_on_path import compute_chain_points
 from snakesim_hal.controller import Observation
-from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.route import (
+from snakesim_hal.model.geometry.kinematics import quaternion_from_yaw
+from snakesim_hal.model.geometry.route import (
     Route,
     compute_yaw_segments_m,
     expand_yaw_angles,

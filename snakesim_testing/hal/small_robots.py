@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from snakesim_hal.model.robot import RobotFile, describe_robot
+from snakesim_hal.model.robot_file.robot import RobotFile, describe_robot
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import (
     Clock,

@@ -12,8 +12,9 @@ from mcap.records import Chunk
 from mcap.writer import MCAP0_MAGIC
 
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
-from snakesim_operator.recording import mcap_file, writer
-from snakesim_operator.recording.chunks import RECORD_HEADER
+from snakesim_operator.recording import writer
+from snakesim_operator.recording.mcap_format import file_writer
+from snakesim_operator.recording.mcap_format.chunks import RECORD_HEADER
 from snakesim_operator.run.in_process import simulate
 
 FLIPPED_BIT = 0x10  # of the byte in which `flip_bit` changes a bit
@@ -64,7 +65,7 @@ def record_short_run(folder: Path, duration_s: float, chunk_bytes: int) -> Path:
     duration = parse_set_option(f"duration_s={duration_s}")
     config = load_scenario("peg_row", [duration]).config
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(mcap_file, "CHUNK_BYTES", chunk_bytes)
+        patched.setattr(file_writer, "CHUNK_BYTES", chunk_bytes)
         # Only the size ends a chunk then, however busy the machine is.
         patched.setattr(writer, "FLUSH_S", NEVER_FLUSH_S)
         simulate(config, folder)

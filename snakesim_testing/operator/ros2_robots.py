@@ -3,7 +3,7 @@
 import msgspec
 
 from snakesim_hal.model.files import read_table_with_base
-from snakesim_hal.model.robot import RobotFile, describe_robot
+from snakesim_hal.model.robot_file.robot import RobotFile, describe_robot
 from snakesim_hal.wire.messages import RobotDescription
 
 # `ros2 service info -v` printed the hash of ListParameters. Other programs for ROS 2 contain the other hashes.

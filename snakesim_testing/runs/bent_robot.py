@@ -13,7 +13,7 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_operator.features.commissioning.shape.design import (
     PLACEMENT_TOLERANCE_RAD,
     design_poses,

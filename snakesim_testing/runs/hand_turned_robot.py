@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_testing.benches.workbench import read_example_from_docs
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.bench_host import write_lab_folder

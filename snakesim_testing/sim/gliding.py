@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.friction import DirectionalFriction
+from snakesim_hal.model.scene_file.friction import DirectionalFriction
 from snakesim_hal.wire.quantities import Vector
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import G, make_config, make_resting_body, merge_tables

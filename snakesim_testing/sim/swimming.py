@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.fluid import Fluid
-from snakesim_hal.model.links import compute_capsule_inertia
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.links import compute_capsule_inertia
+from snakesim_hal.model.robot_file.robot import RobotFile
+from snakesim_hal.model.scene_file.fluid import Fluid
 from snakesim_sim_backend.laws.chain import FREE_DOFS
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config, make_resting_body

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.friction import DirectionalFriction
+from snakesim_hal.model.scene_file.friction import DirectionalFriction
 from snakesim_operator.features.reproduce.gait_motion import GroundFriction, find_friction_per_load
 from snakesim_operator.features.reproduce.planar_chain import PlanarChain
 from snakesim_sim_backend.model.build import FREE_DOFS, FREE_QPOS, SimModel, build_sim_model

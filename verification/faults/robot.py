@@ -13,8 +13,8 @@ from typing import Any
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario, write_config
 from snakesim_hal.network.session import ConnectionSettings, open_session
-from snakesim_operator.run import children
-from snakesim_operator.run.children import ChildProcess
+from snakesim_operator.run.processes import children
+from snakesim_operator.run.processes.children import ChildProcess
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from verification.faults.host_watch import HostWatch, raise_priority
 from verification.faults.observer import Observer, TrialError

@@ -11,9 +11,9 @@ from snakesim_drivers.emulation.emulator_control import parse_typed_fault
 from snakesim_hal.host.latch import ESTOP, EstopLatch
 from snakesim_hal.model import files
 from snakesim_hal.model.fault_kinds import parse_injection
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
-from snakesim_hal.model.scene import SceneFile
+from snakesim_hal.model.scene_file.scene import SceneFile
 from snakesim_hal.network.local_registry import LocalRobot, list_local_robots
 from snakesim_hal.network.router import read_router_settings
 from snakesim_operator.results.last_run import read_last_run

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from snakesim_operator.recording.chunks import RECORD_HEADER, unpack_chunk
+from snakesim_operator.recording.mcap_format.chunks import RECORD_HEADER, unpack_chunk
 from snakesim_testing.operator.damaged_recordings import (
     flip_bit,
     list_chunks,

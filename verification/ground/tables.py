@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.friction import DirectionalFriction
+from snakesim_hal.model.scene_file.friction import DirectionalFriction
 from snakesim_testing.sim.gliding import FRICTION, SURFACES, GlidingSnake, glide_without_mujoco
 from snakesim_testing.sim.simulator_rig import G
 from snakesim_testing.sim.waves import JointWave, integrate_momentum_balance, simulate_wave

@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_operator.features.commissioning.identification import (
+from snakesim_operator.features.commissioning.system_identification.identification import (
     JointIdentification,
     identify_joints,
 )

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_link_frames
+from snakesim_hal.model.geometry.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import Axis, RobotDescription
 
 GROUP_LINKS = 6  # links that are fitted together: three yaw and three pitch joints

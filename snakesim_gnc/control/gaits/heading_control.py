@@ -28,7 +28,7 @@ import numpy as np
 
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import Observation
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_hal.wire.quantities import above, from_zero
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from snakesim_gnc.geometry.planar import cross_2d
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import (
+from snakesim_hal.model.geometry.outlines import (
     LINK_FRACTIONS,
     ObstacleOutlines,
     find_nearest_points_on_chain,

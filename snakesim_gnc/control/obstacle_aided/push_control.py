@@ -22,7 +22,7 @@ from snakesim_gnc.control.progress import BodyLocation
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.controller import Observation
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 
 # Fraction of a push that may be unbalanced; it turns the body a little, until it touches other obstacles.
 MAX_UNBALANCED_RATIO = 0.3

@@ -14,8 +14,8 @@ import numpy as np
 
 from snakesim_gnc.geometry.body_on_path import PathBodyPose
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import ObstacleOutlines
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import KnownObstacle
 
 Planar = tuple[float, float]

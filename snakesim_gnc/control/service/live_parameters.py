@@ -13,7 +13,7 @@ from snakesim_gnc.control.service.guarded import GuardedController
 from snakesim_hal.base.errors import ConfigError, ControllerError, WireError
 from snakesim_hal.base.terminal import print_stderr
 from snakesim_hal.controller import Controller, decode_parameters, load_controller
-from snakesim_hal.model.json_schema import make_schema
+from snakesim_hal.model.fields.json_schema import make_schema
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.client import HostClient
 from snakesim_hal.network.mailbox import Mailbox

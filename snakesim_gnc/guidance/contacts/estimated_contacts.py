@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from snakesim_gnc.guidance.contacts.contact_estimate import EstimatedPush, estimate_pushes
-from snakesim_hal.model.kinematics import compute_contact_tangents
+from snakesim_hal.model.geometry.kinematics import compute_contact_tangents
 from snakesim_hal.wire.messages import (
     Contact,
     Contacts,

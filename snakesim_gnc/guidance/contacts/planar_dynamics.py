@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
-from snakesim_hal.model.solids import GRAVITY_M_S2
+from snakesim_hal.model.geometry.kinematics import compute_link_frames, rotation_from_quaternion
+from snakesim_hal.model.scene_file.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose, RobotDescription
 
 FRICTION_SLIP_SPEED_M_S = 0.01  # a slower link is held by friction as much as it is braked

@@ -29,7 +29,7 @@ from snakesim_gnc.guidance.mapping.tracks import (
 )
 from snakesim_gnc.guidance.ranging.scan import MAX_RANGE_M, AzimuthScan
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle
 
 Indices = NDArray[np.intp]

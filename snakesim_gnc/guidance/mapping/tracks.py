@@ -16,7 +16,7 @@ from snakesim_gnc.guidance.mapping.box_fit import FittedBoxes, fit_boxes
 from snakesim_gnc.guidance.mapping.circle_fit import PRIOR_RADIUS_M, FittedCircles, fit_circles
 from snakesim_gnc.guidance.mapping.surfaces import SurfaceCells, stack_surfaces
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle
 
 # Circle or box.

@@ -19,7 +19,7 @@ import numpy as np
 from snakesim_gnc.guidance.pose.body_history import BodyFrames
 from snakesim_gnc.guidance.pose.localization import PoseLocalizer
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import Contact, KnownObstacle, RobotDescription
 
 MIN_FORCE_N = 1.0  # a weaker push may be noise

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_link_frames
+from snakesim_hal.model.geometry.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import RobotDescription
 
 HISTORY_NS = 1_000_000_000

@@ -15,7 +15,7 @@ from snakesim_gnc.guidance.pose.anchoring import (
 )
 from snakesim_gnc.guidance.pose.body_history import BasePose
 from snakesim_gnc.guidance.pose.localization import PoseLocalizer, PoseNoise, compute_confidence
-from snakesim_hal.model.kinematics import quaternion_from_rotation
+from snakesim_hal.model.geometry.kinematics import quaternion_from_rotation
 from snakesim_hal.wire.messages import (
     Contacts,
     JointState,

@@ -19,7 +19,7 @@ from snakesim_gnc.guidance.pose.body_history import (
 )
 from snakesim_gnc.guidance.pose.odometry import ChainOdometry, OdometryStep
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
+from snakesim_hal.model.geometry.kinematics import rotation_from_quaternion, yaw_from_rotation
 from snakesim_hal.wire.messages import Contacts, Imu, JointState, Pose, RobotDescription
 
 MessageT = TypeVar("MessageT", Contacts, Imu)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_link_frames
+from snakesim_hal.model.geometry.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import Contact, Contacts, Imu, JointState, RobotDescription
 
 # Standard deviations of speeds.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from snakesim_gnc.guidance.mapping.tracks import ObstacleTrack, get_position_sds_m, make_outlines
 from snakesim_gnc.guidance.ranging.scan import AzimuthScan
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 
 # Obstacles that the scan is matched to.
 MIN_LOG_ODDS = 1.0  # seen a few times

@@ -19,7 +19,6 @@ from snakesim_hal.model.files import (
     read_table_with_base,
     resolve_file_path,
 )
-from snakesim_hal.model.fitting import compute_scaled_scene_values
 from snakesim_hal.model.scenario.run_config import (
     POLICY,
     POLICY_CONTROLLER,
@@ -27,6 +26,7 @@ from snakesim_hal.model.scenario.run_config import (
     get_section_name,
 )
 from snakesim_hal.model.scenario.start_pose import validate_start_pose
+from snakesim_hal.model.scene_file.fitting import compute_scaled_scene_values
 from snakesim_hal.model.textfiles import parse_toml
 
 # Prefixes of --set keys: `control.x` is a parameter of the chosen controller, `backend.x` one of the chosen backend.

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.outlines import Clearance, Heading, Point, Size
+from snakesim_hal.model.geometry.outlines import Clearance, Heading, Point, Size
 
 
 class StartPlacement(FileStruct, frozen=True, kw_only=True):

@@ -11,9 +11,9 @@ from msgspec import Meta
 from snakesim_hal.base.atomic_write import write_atomically
 from snakesim_hal.model.fault_kinds import CONTROL
 from snakesim_hal.model.files import FileStruct, decode_table, read_table
-from snakesim_hal.model.robot import RobotFile, describe_robot
+from snakesim_hal.model.robot_file.robot import RobotFile, describe_robot
 from snakesim_hal.model.scenario.mission import Mission, StartPlacement
-from snakesim_hal.model.scene import SceneFile
+from snakesim_hal.model.scene_file.scene import SceneFile
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ClockMode, RobotDescription
 from snakesim_hal.wire.quantities import above

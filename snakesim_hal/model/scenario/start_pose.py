@@ -7,21 +7,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.kinematics import (
+from snakesim_hal.model.geometry.kinematics import (
     compute_link_frames,
     quaternion_from_yaw,
     rotation_from_quaternion,
 )
-from snakesim_hal.model.outlines import CapsuleOutline
-from snakesim_hal.model.placement import (
+from snakesim_hal.model.geometry.outlines import CapsuleOutline
+from snakesim_hal.model.geometry.route import (
+    compute_yaw_segments_m,
+    expand_yaw_angles,
+    place_chain_on_route,
+)
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.scenario.run_config import RunConfig
+from snakesim_hal.model.scene_file.placement import (
     PlacedObstacle,
     place_scene_obstacles,
     validate_start_clearance,
 )
-from snakesim_hal.model.route import compute_yaw_segments_m, expand_yaw_angles, place_chain_on_route
-from snakesim_hal.model.scenario.run_config import RunConfig
-from snakesim_hal.model.scene import make_route
+from snakesim_hal.model.scene_file.scene import make_route
 from snakesim_hal.wire.messages import KnownObstacle
 
 # Second part of the seed of the map errors, so that they differ from other random numbers of the run's seed.

@@ -11,20 +11,8 @@ With drawn shapes:
 
 `shape`        the person bends the robot into shapes on paper, which decide sign, order, gear and zero of every joint
 
-Joint check, from a run in which each joint moved by its motor:
+From recorded runs:
 
-`check`        prints whether each joint matches its file, and records the check in that file
-`measured`     collects the measurements of that run
-`judge`        judges which properties of each joint are confirmed, wrong or unknown; pure
-`link_shares`  how far links turned with a joint, and whose module is in whose place; pure
-`lost_motion`  backlash; pure
-
-System identification, from a run in which the controller `identify` shook a suspended robot:
-
-`identify`        prints, draws (`identified_page`) and writes what was identified
-`identification`  identifies all joints; pure
-`torque_balance`  friction, rotor inertia and torque constant of a joint; pure
-`servo_response`  stiffness, damping, response time and latency of a joint; pure
-`suspended_load`  the torque that the links need; `followed_links`: whether they move as the encoders measure; pure
-`least_squares`   values with 95 % intervals; `smoothing`: derivatives of noisy signals; pure
+`joint_check`            a run in which each joint moved by its motor shows whether the joints match the robot file
+`system_identification`  a run in which a suspended robot was shaken shows what its joints are
 """

@@ -188,7 +188,10 @@ def _run_calibrate_gear(arguments: argparse.Namespace) -> int:
 
 
 def _run_check(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.features.commissioning.check import CheckStatement, report_joint_check
+    from snakesim_operator.features.commissioning.joint_check.check import (
+        CheckStatement,
+        report_joint_check,
+    )
 
     request = CheckStatement(
         straight=arguments.straight,
@@ -200,7 +203,9 @@ def _run_check(arguments: argparse.Namespace) -> int:
 
 
 def _run_identify(arguments: argparse.Namespace) -> int:
-    from snakesim_operator.features.commissioning.identify import identify_and_report
+    from snakesim_operator.features.commissioning.system_identification.identify import (
+        identify_and_report,
+    )
 
     return identify_and_report(
         arguments.run, arguments.write, arguments.out, as_json=arguments.json

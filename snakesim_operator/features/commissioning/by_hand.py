@@ -19,7 +19,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError, RefusedError
 from snakesim_hal.base.terminal import overwrite_lines, print_line
-from snakesim_hal.model.joints import Joint, JointDrive
+from snakesim_hal.model.robot_file.joints import Joint, JointDrive
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.network.session import Session, open_session
 from snakesim_hal.wire import keys

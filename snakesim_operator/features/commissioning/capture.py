@@ -11,7 +11,7 @@ import numpy as np
 
 from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 
 STILLNESS_TOLERANCE_RAD = 0.01  # a joint that is not touched moves less, noise included
 MIN_TURN_RAD = 0.15  # about 9 degrees; a smaller turn may be a shake of the hand

@@ -13,10 +13,14 @@ from tomlkit.items import Table
 from snakesim_hal.base.atomic_write import write_atomically, write_through
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import get_user_name
-from snakesim_hal.model.checked import JointProperty, StartCheckRecord, compute_mounting_digest
 from snakesim_hal.model.files import decode_table, read_table_with_base, resolve_file_path
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile, list_serial_numbers
+from snakesim_hal.model.robot_file.checked import (
+    JointProperty,
+    StartCheckRecord,
+    compute_mounting_digest,
+)
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.robot_file.robot import RobotFile, list_serial_numbers
 from snakesim_hal.model.textfiles import read_text
 from snakesim_hal.wire.messages import RobotDescription
 

@@ -13,7 +13,7 @@ from snakesim_hal.base.process import call_on_stop_signals, raise_open_file_limi
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.base.workers import start_restarting_thread
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import read_config
 from snakesim_hal.network.local_registry import list_local_robots
 from snakesim_hal.network.session import ConnectionSettings
@@ -26,8 +26,8 @@ from snakesim_hal.programs.service_program import read_process_options
 from snakesim_operator.base import extras
 from snakesim_operator.base.console_port import ConsolePorts, open_console_ports
 from snakesim_operator.base.targets import RobotSelection, find_single_robot
-from snakesim_operator.run import children
-from snakesim_operator.run.console_front import start_console_front
+from snakesim_operator.run.processes import children
+from snakesim_operator.run.processes.console_front import start_console_front
 
 MAX_OPEN_FILES = 4096  # far more than connections of browsers may use
 

@@ -143,7 +143,7 @@ def _run_guarded_if_single_case(
     _require_train_extra()
     if arguments.only is None:
         return run_command(arguments, None)
-    from snakesim_operator.run.guarded_process import run_in_guarded_child
+    from snakesim_operator.run.processes.guarded_process import run_in_guarded_child
 
     return run_in_guarded_child(
         lambda step_times: run_command(arguments, step_times), owns_process=arguments.owns_process

@@ -45,7 +45,6 @@ from snakesim_hal.model.files import (
     read_table,
     resolve_file_path,
 )
-from snakesim_hal.model.randomization import Randomization
 from snakesim_hal.model.scenario import (
     KeyOverride,
     RunConfig,
@@ -53,6 +52,7 @@ from snakesim_hal.model.scenario import (
     encode_config,
     validate_start_pose,
 )
+from snakesim_hal.model.scene_file.randomization import Randomization
 from snakesim_hal.model.textfiles import parse_toml
 from snakesim_hal.programs.preflight import validate_and_complete_config
 from snakesim_operator.features.evaluate.case import EvaluationCase, make_case_id

@@ -7,7 +7,7 @@ from matplotlib.patches import Circle, Polygon
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.placement import outline_pipes
+from snakesim_hal.model.scene_file.placement import outline_pipes
 from snakesim_operator.results.report.top_view import find_outline_w
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.sampling import choose_even_indices

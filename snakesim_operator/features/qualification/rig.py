@@ -32,8 +32,8 @@ from snakesim_operator.features.qualification.protocol.torque_timeline import (
     make_timeline,
 )
 from snakesim_operator.features.qualification.setup import Setup
-from snakesim_operator.run import children
-from snakesim_operator.run.children import ChildProcess
+from snakesim_operator.run.processes import children
+from snakesim_operator.run.processes.children import ChildProcess
 
 START_TIMEOUT_S = 30.0
 REQUEST_TIMEOUT_S = 15.0

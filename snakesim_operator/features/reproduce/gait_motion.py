@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.friction import (
+from snakesim_hal.model.geometry.kinematics import ForwardKinematics
+from snakesim_hal.model.scenario import RunConfig
+from snakesim_hal.model.scene_file.friction import (
     DirectionalFriction,
     ViscousFriction,
     compute_surface_friction,
 )
-from snakesim_hal.model.kinematics import ForwardKinematics
-from snakesim_hal.model.scenario import RunConfig
-from snakesim_hal.model.solids import GRAVITY_M_S2
+from snakesim_hal.model.scene_file.solids import GRAVITY_M_S2
 from snakesim_operator.results.metrics.advance import compute_center_of_mass_w
 from snakesim_operator.results.metrics.effort import get_body_length_m, get_weight_n
 from snakesim_operator.results.run_log import RunRecord

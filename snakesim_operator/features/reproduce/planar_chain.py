@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.solids import GRAVITY_M_S2
+from snakesim_hal.model.robot_file.robot import RobotFile
+from snakesim_hal.model.scene_file.solids import GRAVITY_M_S2
 from snakesim_operator.features.reproduce.gait_motion import (
     GroundFriction,
     find_foot_loads_n,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
 from snakesim_operator.base.worker_pool import WorkerPool
 from snakesim_operator.features.reproduce.gait_motion import (

@@ -11,7 +11,7 @@ import numpy as np
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable
-from snakesim_hal.model.links import compute_capsule_inertia
+from snakesim_hal.model.robot_file.links import compute_capsule_inertia
 from snakesim_operator.features.robots.imported import (
     VECTOR_BY_UP_AXIS,
     ImportOptions,

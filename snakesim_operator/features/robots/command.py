@@ -5,7 +5,7 @@ from pathlib import Path
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import escape_invisible, print_json, print_line
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.textfiles import write_text
 from snakesim_operator.features.robots.exporting import format_urdf, list_values_beside_urdf
 from snakesim_operator.features.robots.imported import ImportOptions

@@ -12,8 +12,8 @@ from xml.sax.saxutils import quoteattr
 
 import msgspec
 
-from snakesim_hal.model.links import Link
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.links import Link
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_operator.features.robots.urdf_sensors import format_gazebo_elements
 
 # Which links, joints and the robot's own name contain.

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from snakesim_hal.base.errors import shorten
 from snakesim_hal.model.files import ConfigTable, decode_table
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_operator.features.robots.xml_tree import XmlElement
 
 VECTOR_BY_UP_AXIS = {

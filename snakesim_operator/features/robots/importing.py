@@ -22,7 +22,7 @@ from snakesim_hal.model.files import (
     list_shipped_names,
     read_table_with_base,
 )
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.textfiles import read_bytes
 from snakesim_operator.features.robots.body import convert_body
 from snakesim_operator.features.robots.exporting import GEOMETRY_SECTIONS, MATERIAL_ELEMENT

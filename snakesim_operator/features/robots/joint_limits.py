@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from snakesim_hal.model.files import decode_table
-from snakesim_hal.model.joints import MAX_TURN_RAD
-from snakesim_hal.model.joints import Joint as BuiltJoint
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.joints import MAX_TURN_RAD
+from snakesim_hal.model.robot_file.joints import Joint as BuiltJoint
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_operator.features.robots.imported import ImportResult
 from snakesim_operator.features.robots.urdf_tree import UrdfJoint
 from snakesim_operator.features.robots.xml_tree import XmlElement
@@ -28,7 +28,7 @@ class JointQuantity:
     section: str
     key: str
     unit: str
-    maximum: float  # as in snakesim_hal.model.joints
+    maximum: float  # as in snakesim_hal.model.robot_file.joints
     usual: float  # a larger one is allowed, and reported as doubtful
     other_unit: str  # in which it is often written by mistake
 

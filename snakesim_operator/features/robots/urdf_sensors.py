@@ -12,8 +12,8 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import shorten
-from snakesim_hal.model.robot import RobotFile
-from snakesim_hal.model.sensors import DepthCamera, RangeSensor
+from snakesim_hal.model.robot_file.robot import RobotFile
+from snakesim_hal.model.robot_file.sensors import DepthCamera, RangeSensor
 from snakesim_operator.features.robots.imported import ImportResult
 from snakesim_operator.features.robots.urdf_tree import BodyChain, make_rotation_from_rpy
 from snakesim_operator.features.robots.xml_tree import XmlElement
@@ -27,7 +27,7 @@ DEFAULT_BEAMS = "one beam"  # of a lidar without <horizontal>, as the report of 
 DEFAULT_LIDAR_RANGE = "0.02 to 5 m"
 MAX_ROLL_RAD = 0.01  # about the viewing direction; more is reported
 POSE_DIGITS = 9  # decimals, which removes the noise of multiplying transforms
-# As in snakesim_hal.model.sensors.
+# As in snakesim_hal.model.robot_file.sensors.
 DEFAULT_RATE_HZ_BY_SECTION = {"imu": 100.0, "contacts": 100.0, "depth": 20.0, "range": 20.0}
 
 

@@ -18,7 +18,7 @@ from snakesim_operator.features.robots.xml_tree import XmlElement
 
 ROTARY_JOINT_TYPES = ("revolute", "continuous")
 MAX_COORDINATE = 1e6  # of an origin, in the file's unit of length
-MAX_MASS_KG = 100.0  # of a link; as in snakesim_hal.model.links
+MAX_MASS_KG = 100.0  # of a link; as in snakesim_hal.model.robot_file.links
 MAX_INERTIA_KG_M2 = 100.0
 MOMENT_ATTRIBUTES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.model.kinematics import compute_body_points_w
+from snakesim_hal.model.geometry.kinematics import compute_body_points_w
 from snakesim_hal.network.robot_mismatch import find_mismatch
 from snakesim_hal.network.session import Session
 from snakesim_hal.wire import keys

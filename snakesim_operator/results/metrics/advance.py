@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_body_points_w
+from snakesim_hal.model.geometry.kinematics import compute_body_points_w
 from snakesim_hal.model.locomotion import MOVING_M, WINDOW_S
 from snakesim_hal.model.scenario import HeadingGoal, RunConfig, WaypointGoal
 from snakesim_hal.run_log.black_box import BlackBox

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import ForwardKinematics
+from snakesim_hal.model.geometry.kinematics import ForwardKinematics
 from snakesim_operator.results.metrics.advance import (
     MIN_DISTANCE_M,
     SAMPLE_PERIOD_S,

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.friction import compute_surface_friction
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
+from snakesim_hal.model.scene_file.friction import compute_surface_friction
 from snakesim_operator.results.metrics.advance import (
     MIN_DISTANCE_M,
     ForwardProgress,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_body_points_w
+from snakesim_hal.model.geometry.kinematics import compute_body_points_w
 from snakesim_hal.wire.messages import WorldModel
 from snakesim_operator.results.run_log import RunRecord
 

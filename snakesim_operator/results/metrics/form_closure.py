@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import ObstacleOutlines, find_nearest_points_on_chain
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines, find_nearest_points_on_chain
 
 MAX_GAP_M = 0.02  # an obstacle at most this far from the body counts as a contact
 SINGULARITY_TOLERANCE = 1e-6  # norm of the twist of two contacts whose normals are on one line

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle
 
 MAX_RANGE_M = 1.0

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.friction import compute_surface_friction
-from snakesim_hal.model.scene import compute_normal_gravity_m_s2
+from snakesim_hal.model.scene_file.friction import compute_surface_friction
+from snakesim_hal.model.scene_file.scene import compute_normal_gravity_m_s2
 from snakesim_hal.wire.messages import WorldContact
 from snakesim_operator.results.metrics.map_score import MapScore, score_map
 from snakesim_operator.results.metrics.motion import find_stops

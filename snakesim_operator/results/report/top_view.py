@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.placement import PlacedObstacle, outline_pipes
-from snakesim_hal.model.scene import compute_normal_gravity_m_s2
+from snakesim_hal.model.scene_file.placement import PlacedObstacle, outline_pipes
+from snakesim_hal.model.scene_file.scene import compute_normal_gravity_m_s2
 from snakesim_hal.wire.messages import KnownObstacle, WorldContact
 from snakesim_operator.results.page.svg import (
     draw_arrow,

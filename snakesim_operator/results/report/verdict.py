@@ -5,8 +5,8 @@ from typing import Literal
 
 import numpy as np
 
-from snakesim_hal.model.checked import START_CHECK_CONTROLLER
 from snakesim_hal.model.locomotion import STANDING_STILL
+from snakesim_hal.model.robot_file.checked import START_CHECK_CONTROLLER
 from snakesim_hal.wire.messages import Fault
 from snakesim_operator.results.metrics.motion import StopIntervals, find_stops
 from snakesim_operator.results.report.phrases import (

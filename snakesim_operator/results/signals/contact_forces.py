@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
+from snakesim_hal.model.geometry.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_operator.results.contact_log import ContactLog
 from snakesim_operator.results.run_log import RunRecord
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import ForwardKinematics
+from snakesim_hal.model.geometry.kinematics import ForwardKinematics
 from snakesim_operator.results.run_log import RunRecord
 
 # Between the two positions of a velocity: poses may come at only 20 Hz, and are noisy.

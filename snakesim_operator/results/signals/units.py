@@ -1,6 +1,6 @@
 """Defines the names and units of signals."""
 
-from snakesim_hal.model.field_words import find_unit_in_name
+from snakesim_hal.model.fields.field_words import find_unit_in_name
 from snakesim_hal.wire.custom_sample import find_custom_messages
 from snakesim_operator.results.recording_contents import CONTROLLER_SUFFIX
 from snakesim_operator.results.run_log import RunRecord

@@ -12,7 +12,7 @@ from pathlib import Path
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.process import call_on_stop_signals, get_user_name
 from snakesim_hal.base.terminal import overwrite_lines, print_line
-from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
+from snakesim_hal.model.geometry.kinematics import rotation_from_quaternion, yaw_from_rotation
 from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import (

@@ -20,8 +20,8 @@ import snakesim
 import snakesim.environments
 from snakesim.environments import SCENARIOS, SnakeEnv, SnakeVectorEnv
 from snakesim.environments.rewards import REWARD_TERMS
-from snakesim_hal.model.randomization import Randomization
 from snakesim_hal.model.scenario import write_config
+from snakesim_hal.model.scene_file.randomization import Randomization
 from snakesim_operator.base.extras import PACKAGES_BY_EXTRA
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY, parse_sections

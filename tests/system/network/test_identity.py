@@ -159,7 +159,7 @@ def test_one_robot_is_one_folder_whatever_its_name(
 
 
 def test_identity_runs_started_together_have_separate_endpoints() -> None:
-    from snakesim_operator.run.meeting import reserve_endpoint
+    from snakesim_operator.run.run_endpoint import reserve_endpoint
 
     first, its_port = reserve_endpoint(None, None, "worm")
     second, other_port = reserve_endpoint(None, None, "worm")

@@ -11,7 +11,7 @@ import zenoh
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.host.guarded_backend import GuardedBackend
 from snakesim_hal.host.host import Host
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.network import robot_mismatch
 from snakesim_hal.network.client import Commander, HostClient
 from snakesim_hal.network.robot_mismatch import find_mismatch

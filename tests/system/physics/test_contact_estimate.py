@@ -12,7 +12,7 @@ import pytest
 
 from snakesim_gnc.guidance.contacts.contact_estimate import EstimatedPush, estimate_pushes
 from snakesim_hal.backend import Samples
-from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
+from snakesim_hal.model.geometry.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_hal.model.plugins import BACKENDS, register_plugin_temporarily
 from snakesim_hal.model.scenario import KeyOverride, load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun

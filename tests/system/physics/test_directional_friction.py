@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.friction import DirectionalFriction
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
+from snakesim_hal.model.scene_file.friction import DirectionalFriction
 from snakesim_operator.run.in_process import simulate
 from snakesim_sim_backend.physics import PhysicsStepper
 from snakesim_sim_backend.settings import SimSettings

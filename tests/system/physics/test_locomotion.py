@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.model.scene import Cylinder, make_route
+from snakesim_hal.model.scene_file.scene import Cylinder, make_route
 from snakesim_hal.safety.limiter import compute_bumpless_target
 from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.gnc.stage import require_value

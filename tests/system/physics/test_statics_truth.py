@@ -21,10 +21,10 @@ from snakesim_gnc.control.obstacle_triplet import (
 from snakesim_gnc.control.obstacle_triplet.statics import add_tether_force
 from snakesim_hal.backend import SafeSetpoints
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import JointMotor, MotionLimits
-from snakesim_hal.model.route import Route, place_chain_on_route, sample_sine_curve
+from snakesim_hal.model.geometry.route import Route, place_chain_on_route, sample_sine_curve
+from snakesim_hal.model.robot_file.joints import JointMotor, MotionLimits
 from snakesim_hal.model.scenario import RunConfig, StartPlacement
-from snakesim_hal.model.scene import Cylinder, Ground, SceneFile, WaypointRoute
+from snakesim_hal.model.scene_file.scene import Cylinder, Ground, SceneFile, WaypointRoute
 from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.settings import SimSettings, TetherSettings

@@ -7,7 +7,7 @@ left over is a force that no ground has.
 import numpy as np
 import pytest
 
-from snakesim_hal.model.friction import DirectionalFriction
+from snakesim_hal.model.scene_file.friction import DirectionalFriction
 from snakesim_testing.sim.waves import BodyTrack, JointWave, integrate_momentum_balance
 from snakesim_testing.sim.waves import simulate_wave as swim_on
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.friction import DirectionalFriction
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
+from snakesim_hal.model.scene_file.friction import DirectionalFriction
 from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate

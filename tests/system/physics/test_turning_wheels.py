@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.friction import DirectionalFriction
+from snakesim_hal.model.scene_file.friction import DirectionalFriction
 from snakesim_testing.sim.gliding import GlidingSnake
 from snakesim_testing.sim.simulator_rig import G
 from snakesim_testing.sim.waves import JointWave, integrate_momentum_balance, simulate_wave

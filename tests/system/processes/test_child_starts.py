@@ -61,7 +61,7 @@ OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
     "snakesim_hal/base/process.py": "the same program again, with its own options",
 }
 # Copies of a process, which import nothing.
-FORKS = {"snakesim_operator/run/guarded_process.py"}
+FORKS = {"snakesim_operator/run/processes/guarded_process.py"}
 
 
 def dotted(node: ast.expr) -> str:

@@ -11,11 +11,11 @@ from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.network.session import ConnectionSettings
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.recorder_process import record_to_file
-from snakesim_operator.run import children
-from snakesim_operator.run.children import start_child, stop_children
 from snakesim_operator.run.ending import RunEnding
+from snakesim_operator.run.processes import children
+from snakesim_operator.run.processes.children import start_child, stop_children
+from snakesim_operator.run.processes.supervisor import RunSupervisor
 from snakesim_operator.run.run_files import RunFiles
-from snakesim_operator.run.supervisor import RunSupervisor
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error

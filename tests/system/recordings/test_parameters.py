@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from snakesim_hal.controller import load_controller
-from snakesim_hal.model.json_schema import make_schema
+from snakesim_hal.model.fields.json_schema import make_schema
 from snakesim_hal.model.plugins import CONTROLLERS, list_installed_plugins
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun

@@ -14,7 +14,7 @@ from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
-from snakesim_operator.recording.decoder import DecoderFactory
+from snakesim_operator.recording.mcap_format.decoder import DecoderFactory
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.writer import RecordingWriter

@@ -4,7 +4,7 @@ from snakesim_gnc.control.hold import HoldPose
 from snakesim_gnc.control.service.guarded import GuardedController
 from snakesim_hal.base.errors import ControllerError
 from snakesim_hal.controller import NoParameters, Observation
-from snakesim_hal.model.robot import describe_robot
+from snakesim_hal.model.robot_file.robot import describe_robot
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.run.in_process import simulate

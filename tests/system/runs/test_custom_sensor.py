@@ -13,7 +13,7 @@ from snakesim_hal.network.session import ConnectionSettings, open_session
 from snakesim_hal.wire import keys
 from snakesim_operator.features.console.page.custom_sensors import format_sensor_table
 from snakesim_operator.features.console.robot_data.live_robot import LiveRobot
-from snakesim_operator.recording.decoder import DecoderFactory
+from snakesim_operator.recording.mcap_format.decoder import DecoderFactory
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as in_process
 from snakesim_testing.runs.command import (

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.guidance.service import GuidanceService
-from snakesim_hal.model.outlines import compute_outline_distance_m
+from snakesim_hal.model.geometry.outlines import compute_outline_distance_m
 from snakesim_hal.model.plugins import SERVICES, register_plugin_temporarily
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option
-from snakesim_hal.model.scene import Cylinder
+from snakesim_hal.model.scene_file.scene import Cylinder
 from snakesim_hal.network.client import HostClient
 from snakesim_hal.wire.messages import WorldModel
 from snakesim_operator.results.metrics.map_score import score_map

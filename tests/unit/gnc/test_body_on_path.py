@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from snakesim_gnc.control.progress import BodyLocation, PathProgress
 from snakesim_gnc.geometry.body_on_path import BodyOnPath, compute_chain_points, compute_heading_rad
 from snakesim_gnc.geometry.planar_body import PlanarBody
-from snakesim_hal.model.kinematics import (
+from snakesim_hal.model.geometry.kinematics import (
     compute_link_frames,
     quaternion_from_yaw,
     rotation_from_quaternion,
 )
-from snakesim_hal.model.route import place_chain_on_route
+from snakesim_hal.model.geometry.route import place_chain_on_route
 from snakesim_testing.gnc.stage import (
     PERIOD_S,
     compute_body_points,

@@ -8,8 +8,8 @@ import pytest
 from snakesim_gnc.control.climb import CLEARANCE_M, PlatformClimb, compute_path_height_m
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
 from snakesim_gnc.navigation.platform_rises import PlatformRises
-from snakesim_hal.model.kinematics import compute_link_frames
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.kinematics import compute_link_frames
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import KnownObstacle, PathRise
 from snakesim_testing.gnc.stage import make_robot
 

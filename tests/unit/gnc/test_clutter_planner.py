@@ -13,8 +13,8 @@ from snakesim_gnc.navigation.obstacle_grid import MAX_DISTANCE_M, NO_OBSTACLE, O
 from snakesim_gnc.navigation.path_search.beam import BeamSearch, PathSearchSteps
 from snakesim_gnc.navigation.path_search.search_parameters import SearchParameters
 from snakesim_gnc.navigation.path_search.search_task import SearchedPath
-from snakesim_hal.model.outlines import compute_outline_distance_m
-from snakesim_hal.model.route import Route, compute_yaw_segments_m
+from snakesim_hal.model.geometry.outlines import compute_outline_distance_m
+from snakesim_hal.model.geometry.route import Route, compute_yaw_segments_m
 from snakesim_hal.model.scenario import (
     HeadingGoal,
     WaypointGoal,

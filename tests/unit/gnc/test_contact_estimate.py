@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.guidance.contacts.contact_estimate import EstimatedPush, estimate_pushes
-from snakesim_hal.model.kinematics import compute_link_frames
-from snakesim_hal.model.solids import GRAVITY_M_S2
+from snakesim_hal.model.geometry.kinematics import compute_link_frames
+from snakesim_hal.model.scene_file.solids import GRAVITY_M_S2
 from snakesim_hal.wire.messages import Imu, Pose
 from snakesim_testing.gnc.stage import make_robot
 from snakesim_testing.hal.small_robots import make_pose

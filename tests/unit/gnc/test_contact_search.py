@@ -14,7 +14,7 @@ from snakesim_gnc.control.obstacle_aided.force_feedback_wave import ForceFeedbac
 from snakesim_gnc.control.policy import POLICY_FOLDER
 from snakesim_gnc.geometry.planar_body import PlanarBody
 from snakesim_hal.controller import ControllerCommand
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.stage import ObservationStage, make_contact, make_stage
 

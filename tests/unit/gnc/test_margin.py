@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from snakesim_gnc.control.obstacle_aided.push import BodyContacts, find_body_contacts, solve_push
 from snakesim_gnc.geometry.planar import compute_wrenches
 from snakesim_gnc.navigation.path_search.margin import MAX_CONTACT_FORCE_N, compute_margins_n
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, compute_body_points, make_stage
 from snakesim_testing.hypothesis_profiles import choose_trial_count

@@ -6,7 +6,7 @@ import pytest
 
 from snakesim_gnc.navigation.intents import MAX_VALIDITY_NS, DesiredMotion, IntentTracker
 from snakesim_gnc.navigation.known_path import KnownPath
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import KnownObstacle, LocomotionIntent, WorldModel
 from snakesim_testing.gnc.stage import make_world
 

@@ -12,7 +12,7 @@ from snakesim_gnc.control.obstacle_aided.push_report import (
     make_push_point_messages,
 )
 from snakesim_gnc.geometry.planar_body import PlanarBody
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.stage import make_robot, make_world
 

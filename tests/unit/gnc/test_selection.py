@@ -18,7 +18,7 @@ from snakesim_gnc.control.obstacle_triplet.selection import (
     solve_triplets,
 )
 from snakesim_gnc.geometry.body_on_path import BodyOnPath
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.route import Route
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.stage import (
     BODY_RADIUS_M,

@@ -16,7 +16,7 @@ from snakesim_gnc.control.undulation import (
     LateralUndulation,
     LateralUndulationParameters,
 )
-from snakesim_hal.model.route import Route
+from snakesim_hal.model.geometry.route import Route
 from snakesim_testing.gnc.stage import make_stage
 
 TAIL_S_M = 0.3

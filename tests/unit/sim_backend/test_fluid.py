@@ -8,7 +8,7 @@ from mujoco import MjData
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable, decode_table
-from snakesim_hal.model.scene import SceneFile
+from snakesim_hal.model.scene_file.scene import SceneFile
 from snakesim_hal.wire.messages import Imu
 from snakesim_sim_backend.laws.version import LawsVersion
 from snakesim_sim_backend.model.build import build_sim_model

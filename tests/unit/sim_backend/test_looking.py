@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_hal.model.geometry.kinematics import rotation_from_quaternion
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import ColorImage, DepthImage, RangeScan

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.outlines import compute_outline_distance_m
+from snakesim_hal.model.geometry.outlines import compute_outline_distance_m
 from snakesim_hal.model.scenario import place_obstacles
 from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from snakesim_hal.base.errors import BackendError
-from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_hal.model.geometry.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import compute_start_pose, load_scenario
 from snakesim_hal.physics.physics_model import PhysicsModel
 from snakesim_hal.wire.messages import JointMode

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
+from snakesim_hal.model.geometry.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Contacts, Imu, JointMode, Pose
 from snakesim_sim_backend.sensors.timing import SamplingSchedule

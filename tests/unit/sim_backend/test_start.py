@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import compute_link_frames, rotation_from_quaternion
+from snakesim_hal.model.geometry.kinematics import compute_link_frames, rotation_from_quaternion
 from snakesim_hal.model.scenario import compute_start_pose, load_scenario
 from snakesim_hal.wire.messages import JointMode
 from snakesim_sim_backend.laws.flat_ground import SINK_M

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.scenario import RunConfig, write_config
 from snakesim_hal.programs.preflight import validate_and_complete_config
-from snakesim_operator.run import children
+from snakesim_operator.run.processes import children
 from snakesim_testing.harness.wait import wait_until
 from verification.faults.drives_process import READY
 from verification.faults.observer import Observer, TrialError

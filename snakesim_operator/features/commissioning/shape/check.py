@@ -15,8 +15,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import RefusedError
 from snakesim_hal.base.terminal import overwrite_lines, print_line
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.network.session import open_session
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import RobotDescription
@@ -29,7 +29,7 @@ from snakesim_operator.features.commissioning.by_hand import (
     is_enter_pressed,
 )
 from snakesim_operator.features.commissioning.capture import REST_S, RestDetector
-from snakesim_operator.features.commissioning.joint_verdict import PropertyState
+from snakesim_operator.features.commissioning.joint_check.joint_verdict import PropertyState
 from snakesim_operator.features.commissioning.robot_edit import require_own_robot_file
 from snakesim_operator.features.commissioning.shape.decide import (
     SHAPE_PROPERTIES,

@@ -21,9 +21,9 @@ import numpy as np
 
 from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.checked import JointProperty
-from snakesim_hal.model.joints import Joint, JointDrive
-from snakesim_operator.features.commissioning.joint_verdict import (
+from snakesim_hal.model.robot_file.checked import JointProperty
+from snakesim_hal.model.robot_file.joints import Joint, JointDrive
+from snakesim_operator.features.commissioning.joint_check.joint_verdict import (
     CONFIRMED,
     PropertyFinding,
     PropertyState,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.wire.messages import Axis
 from snakesim_operator.features.commissioning.tolerances import MAX_RATIO_ERROR
 

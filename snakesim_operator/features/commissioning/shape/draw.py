@@ -8,7 +8,7 @@ import numpy as np
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import print_line
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.textfiles import export_atomically
 from snakesim_operator.features.commissioning.shape.decide import judge_shapes
 from snakesim_operator.features.commissioning.shape.design import (

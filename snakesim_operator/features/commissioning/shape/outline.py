@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_operator.features.commissioning.shape.design import ShapePose
 from snakesim_operator.features.commissioning.shape.drawing import GRAY, Drawing, Label, Stroke
 

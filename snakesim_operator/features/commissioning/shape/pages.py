@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_operator.features.commissioning.shape.design import ShapePose
 from snakesim_operator.features.commissioning.shape.drawing import (
     GRAY,

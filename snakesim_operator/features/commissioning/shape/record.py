@@ -6,15 +6,15 @@ from pathlib import Path
 import msgspec
 
 from snakesim_hal.base.terminal import print_line
-from snakesim_hal.model.checked import (
+from snakesim_hal.model.files import decode_table, read_table_with_base
+from snakesim_hal.model.robot_file.checked import (
     PROPERTIES,
     JointProperty,
     StartCheckRecord,
     find_change_since_check,
 )
-from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_operator.features.commissioning.robot_edit import (
     make_check_record,

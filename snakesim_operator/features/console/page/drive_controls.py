@@ -7,7 +7,7 @@ from typing import Literal
 
 import viser
 
-from snakesim_hal.model.kinematics import rotation_from_quaternion, yaw_from_rotation
+from snakesim_hal.model.geometry.kinematics import rotation_from_quaternion, yaw_from_rotation
 from snakesim_operator.features.console.operations import BUTTON_VALIDITY_NS, KEY_VALIDITY_NS
 from snakesim_operator.features.console.robot_data.snapshot import RobotSnapshot
 from snakesim_operator.features.console.web.admission import MAX_HOLD_AGE_S, ControlAdmission

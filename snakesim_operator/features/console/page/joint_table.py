@@ -5,8 +5,8 @@ Also what each drive reports about itself. Pure; everything that comes from the 
 
 from collections.abc import Sequence
 
-from snakesim_hal.model.checked import StartCheckRecord
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.checked import StartCheckRecord
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import JointDescription
 from snakesim_operator.features.console.page.page_html import BAD, escape_text

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.field_words import find_unit_in_name
+from snakesim_hal.model.fields.field_words import find_unit_in_name
 from snakesim_hal.run_log.black_box import summarize_contacts
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.custom_sample import find_custom_messages

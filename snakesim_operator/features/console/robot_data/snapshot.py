@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.robot import describe_robot
+from snakesim_hal.model.geometry.kinematics import quaternion_from_yaw
+from snakesim_hal.model.robot_file.robot import describe_robot
 from snakesim_hal.model.scenario import RunConfig, compute_config_hash, compute_start_pose
 from snakesim_hal.wire.messages import (
     AppliedCommand,

@@ -11,13 +11,13 @@ from functools import cached_property
 import numpy as np
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import (
+from snakesim_hal.model.geometry.kinematics import (
     compute_link_frames,
     quaternions_from_rotations,
     rotation_from_quaternion,
 )
 from snakesim_hal.model.scenario import RunConfig, place_obstacles
-from snakesim_hal.model.terrain import Pipe
+from snakesim_hal.model.scene_file.terrain import Pipe
 from snakesim_hal.physics.hills import make_heights
 from snakesim_hal.wire.messages import (
     ColorImage,

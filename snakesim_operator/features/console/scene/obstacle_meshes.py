@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from snakesim_hal.model.kinematics import quaternion_from_yaw
+from snakesim_hal.model.geometry.kinematics import quaternion_from_yaw
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_operator.features.console.scene.batches import add_batch, to_float32
 from snakesim_operator.features.console.scene.drawing import SnapshotDrawing

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import viser
 
-from snakesim_hal.model.kinematics import quaternion_from_yaw
-from snakesim_hal.model.pipes import get_pipe_name
-from snakesim_hal.model.terrain import Pipe
+from snakesim_hal.model.geometry.kinematics import quaternion_from_yaw
+from snakesim_hal.model.scene_file.pipes import get_pipe_name
+from snakesim_hal.model.scene_file.terrain import Pipe
 from snakesim_operator.features.console.scene import scene_colors
 from snakesim_operator.features.console.scene.meshes import Mesh, make_capsule, make_tube
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from snakesim_hal.model.friction import DirectionalFriction
-from snakesim_hal.model.solids import GRAVITY_M_S2
+from snakesim_hal.model.scene_file.friction import DirectionalFriction
+from snakesim_hal.model.scene_file.solids import GRAVITY_M_S2
 from snakesim_operator.features.reproduce.endless_curve import find_endless_motion
 from snakesim_operator.features.reproduce.experiment import (
     Experiment,

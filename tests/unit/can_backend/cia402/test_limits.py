@@ -24,7 +24,7 @@ from snakesim_can_backend.cia402.objects import (
 from snakesim_can_backend.cia402.sdo import ReadStep, WriteStep
 from snakesim_can_backend.cia402.settings import Cia402Settings
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.joints import Joint
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_testing.can.driver_loop import make_can_config
 from snakesim_testing.messages import raises_error
 

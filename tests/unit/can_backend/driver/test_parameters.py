@@ -23,8 +23,8 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_drivers.emulation.mounted import MountedDrive, validate_mounting_overrides
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
-from snakesim_hal.model.joints import JointExceptions
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.joints import JointExceptions
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import load_scenario
 from snakesim_testing.messages import raises_error
 

@@ -14,7 +14,7 @@ from snakesim_gnc.control.gaits.backbones import (
 )
 from snakesim_gnc.control.gaits.chain_fit import BackboneCurve, ChainFit, KeyframeWaves
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.kinematics import compute_link_frames
+from snakesim_hal.model.geometry.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_testing.gnc.stage import make_robot
 from snakesim_testing.messages import raises_error

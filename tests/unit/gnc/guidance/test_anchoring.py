@@ -10,7 +10,7 @@ from snakesim_gnc.guidance.pose.anchoring import (
 )
 from snakesim_gnc.guidance.pose.body_history import BasePose
 from snakesim_gnc.guidance.pose.localization import PoseLocalizer, PoseNoise
-from snakesim_hal.model.kinematics import compute_link_frames
+from snakesim_hal.model.geometry.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import Contact, KnownObstacle
 from snakesim_testing.gnc.stage import BODY_RADIUS_M, make_robot
 from snakesim_testing.hal.small_robots import make_link_contact

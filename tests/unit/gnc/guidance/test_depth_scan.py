@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from snakesim_gnc.guidance.ranging.depth_scan import DepthScanner, decode_depth_m
 from snakesim_gnc.guidance.ranging.ground import fit_plane_under_body, refine_plane
 from snakesim_gnc.guidance.ranging.scan import AzimuthScan, RangeNoise, make_scan
-from snakesim_hal.model.outlines import compute_outline_distance_m
+from snakesim_hal.model.geometry.outlines import compute_outline_distance_m
 from snakesim_testing.gnc.rendered import (
     INTRINSICS,
     SensorErrors,

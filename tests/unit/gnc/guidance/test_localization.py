@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from snakesim_gnc.guidance.pose.body_history import BasePose, BodyHistory
-from snakesim_hal.model.kinematics import quaternion_from_rotation, rotation_from_quaternion
+from snakesim_hal.model.geometry.kinematics import (
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from snakesim_testing.gnc.rendered import make_rotation
 from snakesim_testing.gnc.sliding_snake import STEP_NS, SlidingSnake, make_random_obstacles
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from snakesim_gnc.guidance.mapping import obstacle_map
 from snakesim_gnc.guidance.mapping.obstacle_map import FORGET_DISTANCE_M, ObstacleMap
-from snakesim_hal.model.outlines import compute_outline_distance_m
+from snakesim_hal.model.geometry.outlines import compute_outline_distance_m
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.rendered import make_box, make_cylinder, make_lidar_scan
 from snakesim_testing.hypothesis_profiles import choose_trial_count

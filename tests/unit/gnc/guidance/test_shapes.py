@@ -11,7 +11,7 @@ from snakesim_gnc.guidance.mapping.clusters import find_clusters
 from snakesim_gnc.guidance.mapping.obstacle_map import ObstacleMap
 from snakesim_gnc.guidance.mapping.surfaces import MAX_CELLS, MAX_INFORMATION, SurfaceCells
 from snakesim_gnc.guidance.mapping.tracks import ObstacleTrack, fit_shapes
-from snakesim_hal.model.outlines import compute_outline_distance_m
+from snakesim_hal.model.geometry.outlines import compute_outline_distance_m
 from snakesim_testing.gnc.rendered import make_box, make_cylinder, make_lidar_scan
 from snakesim_testing.hypothesis_profiles import choose_trial_count
 

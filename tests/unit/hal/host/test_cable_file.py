@@ -16,8 +16,8 @@ from snakesim_hal.host.cable_file import (
     open_cable_file,
 )
 from snakesim_hal.model.files import SHIPPED_FILES_DIR, decode_table, read_table_with_base
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile, describe_robot
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.robot_file.robot import RobotFile, describe_robot
 from snakesim_hal.wire.messages import RobotDescription
 from snakesim_testing.hal.small_robots import make_joint_state
 from snakesim_testing.harness.wait import wait_until

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.model.checked import (
+from snakesim_hal.model.robot_file.checked import (
     PROPERTIES,
     StartCheckRecord,
     compute_mounting_digest,

@@ -8,12 +8,16 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from snakesim_hal.model.field_docs import FieldDoc, collect_field_descriptions, document_fields
-from snakesim_hal.model.field_words import find_unit, format_value
+from snakesim_hal.model.fields.field_docs import (
+    FieldDoc,
+    collect_field_descriptions,
+    document_fields,
+)
+from snakesim_hal.model.fields.field_words import find_unit, format_value
+from snakesim_hal.model.fields.json_schema import list_structs, make_schema
 from snakesim_hal.model.files import FileStruct
-from snakesim_hal.model.joints import JointExceptions, MotionLimits
-from snakesim_hal.model.json_schema import list_structs, make_schema
 from snakesim_hal.model.plugins import CONTROLLERS, load_plugin
+from snakesim_hal.model.robot_file.joints import JointExceptions, MotionLimits
 from snakesim_hal.wire.quantities import above, describe
 
 

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from snakesim_hal.model.fitting import compute_joint_spacing_m
 from snakesim_hal.model.scenario import (
     RunConfig,
     load_scenario,
@@ -12,7 +11,8 @@ from snakesim_hal.model.scenario import (
     place_obstacles,
     write_config,
 )
-from snakesim_hal.model.scene import SineRoute
+from snakesim_hal.model.scene_file.fitting import compute_joint_spacing_m
+from snakesim_hal.model.scene_file.scene import SineRoute
 
 
 def load_clutter(*options: str) -> RunConfig:

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from snakesim_hal.model.friction import (
+from snakesim_hal.model.scene_file.friction import (
     PassiveWheels,
     Skin,
     Surface,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.kinematics import (
+from snakesim_hal.model.geometry.kinematics import (
     compute_joint_rotation,
     compute_link_frames,
     quaternion_from_yaw,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import ForwardKinematics, compute_body_points_w
+from snakesim_hal.model.geometry.kinematics import ForwardKinematics, compute_body_points_w
 from snakesim_hal.model.scenario import describe_run_robot, load_scenario
 
 ROUNDS = 50

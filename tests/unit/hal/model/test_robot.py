@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
-from snakesim_hal.model.joints import (
+from snakesim_hal.model.robot_file.joints import (
     JointDrive,
     JointExceptions,
     JointMotor,
@@ -16,7 +16,7 @@ from snakesim_hal.model.joints import (
     MotionLimits,
     MotorHeat,
 )
-from snakesim_hal.model.robot import RobotFile, compute_layout_hash, describe_robot
+from snakesim_hal.model.robot_file.robot import RobotFile, compute_layout_hash, describe_robot
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import MessageDecoder, encode, format_encoding
 from snakesim_hal.wire.messages import JointMode, RobotDescription

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.route import (
+from snakesim_hal.model.geometry.route import (
     Route,
     compute_yaw_segments_m,
     expand_yaw_angles,

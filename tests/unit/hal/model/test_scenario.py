@@ -14,12 +14,12 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.host.participants import LockstepParticipants
 from snakesim_hal.model.fault_plan import parse_and_validate_planned_faults
 from snakesim_hal.model.files import list_shipped_names
-from snakesim_hal.model.kinematics import (
+from snakesim_hal.model.geometry.kinematics import (
     compute_link_frames,
     quaternion_from_yaw,
     rotation_from_quaternion,
 )
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.model.scenario import (
     KeyOverride,
     LoadedScenario,
@@ -35,7 +35,7 @@ from snakesim_hal.model.scenario import (
     read_config,
     write_config,
 )
-from snakesim_hal.model.scene import make_route
+from snakesim_hal.model.scene_file.scene import make_route
 from snakesim_testing.hal.small_robots import (
     ROBOT_TOML,
     SCENARIO_TOML,

@@ -12,13 +12,17 @@ from hypothesis import strategies as st
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable, decode_table
-from snakesim_hal.model.outlines import CapsuleOutline, ObstacleOutlines, compute_outline_distance_m
-from snakesim_hal.model.placement import (
+from snakesim_hal.model.geometry.outlines import (
+    CapsuleOutline,
+    ObstacleOutlines,
+    compute_outline_distance_m,
+)
+from snakesim_hal.model.scene_file.placement import (
     PlacedObstacle,
     place_scene_obstacles,
     validate_start_clearance,
 )
-from snakesim_hal.model.scene import SceneFile, make_route
+from snakesim_hal.model.scene_file.scene import SceneFile, make_route
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.hal.small_robots import SCENE
 from snakesim_testing.hypothesis_profiles import choose_trial_count

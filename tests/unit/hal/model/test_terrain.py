@@ -8,13 +8,13 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import ConfigTable, decode_table
-from snakesim_hal.model.outlines import CapsuleOutline, ObstacleOutlines
-from snakesim_hal.model.placement import (
+from snakesim_hal.model.geometry.outlines import CapsuleOutline, ObstacleOutlines
+from snakesim_hal.model.scene_file.placement import (
     outline_pipes,
     place_scene_obstacles,
     validate_start_clearance,
 )
-from snakesim_hal.model.scene import SceneFile
+from snakesim_hal.model.scene_file.scene import SceneFile
 from snakesim_testing.hal.small_robots import SCENE
 from snakesim_testing.messages import raises_error
 

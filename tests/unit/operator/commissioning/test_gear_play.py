@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from snakesim_operator.features.commissioning.gear_play import (
+from snakesim_operator.features.commissioning.joint_check.gear_play import (
     MIN_CHANGE_NM,
     PlayKind,
     judge_gear_plays,
     passes_load,
 )
-from snakesim_operator.features.commissioning.load_response import (
+from snakesim_operator.features.commissioning.joint_check.load_response import (
     LoadResponse,
     find_neighbors_of_same_axis,
 )

@@ -6,13 +6,19 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.checked import PROPERTIES
-from snakesim_hal.model.joints import JointDrive, JointMotor
-from snakesim_operator.features.commissioning.check import format_report
-from snakesim_operator.features.commissioning.gear_rules import IS_LOOSE, judge_gear_by_links
-from snakesim_operator.features.commissioning.joint_verdict import MATCHES_FILE, JointVerdict
-from snakesim_operator.features.commissioning.judge import judge_joints
-from snakesim_operator.features.commissioning.measured import (
+from snakesim_hal.model.robot_file.checked import PROPERTIES
+from snakesim_hal.model.robot_file.joints import JointDrive, JointMotor
+from snakesim_operator.features.commissioning.joint_check.check import format_report
+from snakesim_operator.features.commissioning.joint_check.gear_rules import (
+    IS_LOOSE,
+    judge_gear_by_links,
+)
+from snakesim_operator.features.commissioning.joint_check.joint_verdict import (
+    MATCHES_FILE,
+    JointVerdict,
+)
+from snakesim_operator.features.commissioning.joint_check.judge import judge_joints
+from snakesim_operator.features.commissioning.joint_check.measurements import (
     CheckMeasurements,
     remove_clamped_targets,
 )

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.checked import PROPERTIES, StartCheckRecord
 from snakesim_hal.model.files import SHIPPED_FILES_DIR, decode_table, read_table_with_base
-from snakesim_hal.model.robot import RobotFile, restrict_drive_modes
+from snakesim_hal.model.robot_file.checked import PROPERTIES, StartCheckRecord
+from snakesim_hal.model.robot_file.robot import RobotFile, restrict_drive_modes
 from snakesim_operator.features.commissioning.robot_edit import (
     read_joints_with_drive_modes,
     write_check_record,

@@ -11,10 +11,10 @@ import pytest
 
 from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.base.arrays import Floats
-from snakesim_hal.model.checked import JointProperty
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.joints import Joint
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.checked import JointProperty
+from snakesim_hal.model.robot_file.joints import Joint
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.wire.messages import Axis
 from snakesim_operator.features.commissioning.shape.decide import (
     SHAPE_PROPERTIES,

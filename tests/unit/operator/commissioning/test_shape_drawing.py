@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_operator.features.commissioning.shape.design import (
     MAX_SHAPE_ANGLE_RAD,
     PLACEMENT_TOLERANCE_RAD,

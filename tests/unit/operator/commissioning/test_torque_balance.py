@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from snakesim_operator.features.commissioning.smoothing import (
+from snakesim_operator.features.commissioning.system_identification.smoothing import (
     smooth,
     smooth_derivative,
     smooth_second_derivative,
 )
-from snakesim_operator.features.commissioning.torque_balance import (
+from snakesim_operator.features.commissioning.system_identification.torque_balance import (
     JointRecord,
     TorqueBalance,
     fit_torque_balance,

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import (
+from snakesim_hal.model.geometry.kinematics import (
     quaternion_from_yaw,
     quaternions_from_rotations,
     rotation_from_quaternion,

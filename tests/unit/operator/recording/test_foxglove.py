@@ -17,19 +17,19 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from snakesim_hal.model.kinematics import rotation_from_quaternion
+from snakesim_hal.model.geometry.kinematics import rotation_from_quaternion
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
 from snakesim_hal.wire.messages import Contacts, ControlState, DepthImage
-from snakesim_operator.recording import shapes
-from snakesim_operator.recording.body_frames import BodyMessageEncoder
-from snakesim_operator.recording.foxglove import FoxgloveConverter
+from snakesim_operator.recording.foxglove_messages import shapes
+from snakesim_operator.recording.foxglove_messages.body_frames import BodyMessageEncoder
+from snakesim_operator.recording.foxglove_messages.converter import FoxgloveConverter
+from snakesim_operator.recording.foxglove_messages.state_messages import StateMessages
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recover import recover_recording
-from snakesim_operator.recording.state_messages import StateMessages
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate

@@ -13,10 +13,10 @@ from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
 from snakesim_hal.wire.messages import Contacts
+from snakesim_operator.recording.log_clock import CLOCK_ENTRY
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.recording.recover import recover_recording
-from snakesim_operator.recording.stamps import CLOCK_ENTRY
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.run.in_process import simulate

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from snakesim_hal.model.friction import DirectionalFriction
+from snakesim_hal.model.scene_file.friction import DirectionalFriction
 from snakesim_operator.features.reproduce.endless_curve import find_axis_ratio, find_endless_motion
 from snakesim_operator.features.reproduce.experiment import explain_by_steps, fit_exponent
 from snakesim_operator.features.reproduce.experiments.gray_hancock import find_published_ratio

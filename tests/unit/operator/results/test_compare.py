@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_hal.model.robot import add_drive_identities, describe_robot
+from snakesim_hal.model.robot_file.robot import add_drive_identities, describe_robot
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option, write_config
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, JointMode

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from snakesim_hal.model.outlines import ObstacleOutlines
+from snakesim_hal.model.geometry.outlines import ObstacleOutlines
 from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_operator.results.metrics.form_closure import (
     compute_form_closure_margin,

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import quaternion_from_yaw
+from snakesim_hal.model.geometry.kinematics import quaternion_from_yaw
 from snakesim_hal.model.scenario import StartPlacement
 from snakesim_hal.safety.authority import CommandAuthority
 from snakesim_hal.wire import keys

@@ -9,7 +9,7 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode_table, list_shipped_names, read_table_with_base
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import KeyOverride, RunConfig, load_scenario, parse_set_option
 from snakesim_operator.cli import main
 from snakesim_operator.features.robots.command import export_robot, import_robot

@@ -19,8 +19,8 @@ import pytest
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import decode_table, read_table_with_base
-from snakesim_hal.model.joints import JointMotor, MotionLimits
-from snakesim_hal.model.robot import RobotFile
+from snakesim_hal.model.robot_file.joints import JointMotor, MotionLimits
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_operator.features.robots.command import import_robot
 from snakesim_operator.features.robots.exporting import format_urdf
 from snakesim_operator.features.robots.imported import ImportOptions, ImportResult

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from snakesim_hal.model.kinematics import (
+from snakesim_hal.model.geometry.kinematics import (
     compute_link_frames,
     rotation_from_quaternion,
     yaw_from_rotation,

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from snakesim_hal.wire.messages import RobotStatus
-from snakesim_operator.run.patience import StartupTimeout
+from snakesim_operator.run.arming_timeout import StartupTimeout
 from snakesim_testing.hal import small_robots as rig
 
 ALL = ("guidance", "control")

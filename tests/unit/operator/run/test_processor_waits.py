@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from snakesim_operator.run.processor_waits import ProcessorWaits, ThreadUsage, read_usages
+from snakesim_operator.run.processes.processor_waits import ProcessorWaits, ThreadUsage, read_usages
 
 HOST, CONTROL, RECEIVER = 1, 2, 3  # the last is a thread of control
 PIDS = {"host": HOST, "control": CONTROL}

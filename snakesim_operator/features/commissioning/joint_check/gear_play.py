@@ -1,0 +1,141 @@
+"""Judges from torques alone whether the gear of a joint is tight, has backlash, or slips in its coupling. Pure.
+
+In the small motion, the torque of a tight joint follows its angle, because the floor holds the links. The joints of a
+robot are compared with each other, because the friction of the floor is unknown:
+
+    torque in the small motion   torque of the neighbors                            verdict
+    follows the angle            any                                                tight
+    does not follow it           changes only in the large motion                   backlash
+    does not follow it           hardly changes, or alike in both motions           the coupling slips, or loose
+    does not follow it           between these                                      loose
+
+A coupling that slips passes its torque on also in the small motion, and backlash does not. So the coupling is named
+only if the neighbors measure such a torque. Otherwise backlash that is wider than both motions is as likely.
+
+The joints at both ends carry only one link, which may slide without any such torque. So they may be found tight, but
+not loose. A pitch joint is not judged: the weight of its links presses the teeth to one side.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from snakesim_operator.features.commissioning.joint_check.load_response import LoadResponse
+
+# Limits on the torques of emulated joints on a floor. A smaller change of a torque does not prove a load.
+MIN_CHANGE_NM = 0.03
+NOISE_FACTOR = 2.0  # times the range of the torque at rest, because a smaller change may be noise
+# Of the elastic torque of a typical joint between others. Sound joints have a third of it or more, loose ones a
+# thirtieth or less.
+MIN_TIGHT_FRACTION = 0.2
+MAX_LOOSE_FRACTION = 0.1
+# The neighbors' range of torque in the small motion, divided by that in the large one.
+MAX_BACKLASH_NEIGHBOR_RATIO = 0.25
+MIN_SLIPPING_NEIGHBOR_RATIO = 0.4
+# The neighbors' range of torque in the large motion, divided by the elastic torque of a typical joint. Behind a gear
+# that holds, it is larger.
+MAX_SLIPPING_LOAD_RATIO = 0.5
+NO_CLEAR_LOAD = "its torque hardly follows its angle"
+# Of the torque that a joint passes on to its neighbors in the direction of its small motion; less proves nothing.
+MIN_PASSED_NM = 0.003
+MIN_PASSED_ERRORS = 6.0  # standard deviations
+# "loose": it has backlash or slips, which of them is not clear.
+PlayKind = Literal["tight", "backlash", "slipping", "loose", "unknown"]
+
+
+@dataclass(frozen=True)
+class GearPlay:
+    """The verdict on the gear of a joint."""
+
+    kind: PlayKind
+    reason: str = ""  # why it is unknown
+
+
+def judge_gear_plays(
+    responses: Sequence[LoadResponse | None], axes: Sequence[str]
+) -> list[GearPlay]:
+    """Judge the gears of all joints, tail to head.
+
+    Args:
+        responses: Response of the torques to the motions of each joint; None if it was not measured.
+        axes: Axis of each joint, "yaw" or "pitch".
+    """
+    return [_judge_gear_play(responses, axes, joint) for joint in range(len(responses))]
+
+
+def _judge_gear_play(
+    responses: Sequence[LoadResponse | None], axes: Sequence[str], joint_index: int
+) -> GearPlay:
+    response = responses[joint_index]
+    if response is None:
+        return GearPlay("unknown", "it made no small motion, or the robot did not rest before")
+    if axes[joint_index] != "yaw":
+        return GearPlay(
+            "unknown", "the weight of its links presses the teeth of its gear to one side"
+        )
+    typical_nm = _compute_typical_elastic_nm(responses, axes, joint_index)
+    min_change_nm = max(MIN_CHANGE_NM, NOISE_FACTOR * response.noise_nm)
+    if typical_nm < min_change_nm:
+        return GearPlay("unknown", "the floor hardly loads the joints")
+    if response.elastic_nm >= max(MIN_TIGHT_FRACTION * typical_nm, min_change_nm):
+        return GearPlay("tight")
+    if joint_index in (0, len(responses) - 1):
+        return GearPlay("unknown", "the floor hardly loads its only link")
+    if response.elastic_nm > MAX_LOOSE_FRACTION * typical_nm:
+        return GearPlay("unknown", NO_CLEAR_LOAD)
+    return _judge_loose_gear(response, typical_nm, min_change_nm)
+
+
+def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: float) -> GearPlay:
+    """Judge a joint between others whose torque does not follow its angle in the small motion.
+
+    Args:
+        response: Response of the torques to its motions.
+        typical_nm: Elastic torque of a typical joint.
+        min_change_nm: Change of a torque that proves a load.
+    """
+    large_nm, small_nm = response.neighbor_large_range_nm, response.neighbor_small_range_nm
+    max_slipping_nm = MAX_SLIPPING_LOAD_RATIO * typical_nm
+    are_neighbors_never_loaded = max(large_nm, response.noise_nm) <= max_slipping_nm
+    min_slipping_nm = MIN_SLIPPING_NEIGHBOR_RATIO * large_nm
+    is_load_alike_in_both_motions = small_nm >= max(min_slipping_nm, response.noise_nm)
+    if are_neighbors_never_loaded or is_load_alike_in_both_motions:
+        return GearPlay("slipping" if passes_load(response) else "loose")
+    if _has_backlash(response, min_change_nm):
+        return GearPlay("backlash")
+    if response.noise_nm > MAX_LOOSE_FRACTION * typical_nm:
+        return GearPlay("unknown", NO_CLEAR_LOAD)
+    return GearPlay("loose")
+
+
+def passes_load(response: LoadResponse) -> bool:
+    """Return whether a torque passes through the gear in the small motion, as it does through a coupling that slips."""
+    return response.passed_nm >= max(MIN_PASSED_NM, MIN_PASSED_ERRORS * response.passed_error_nm)
+
+
+def _has_backlash(response: LoadResponse, min_change_nm: float) -> bool:
+    """Return whether the load of a joint is missing in the small motion, and comes in the large one."""
+    large_nm = response.neighbor_large_range_nm
+    is_loaded_in_large_motion = min(large_nm, response.load_nm) >= min_change_nm
+    max_small_nm = MAX_BACKLASH_NEIGHBOR_RATIO * large_nm
+    # Noise as large as this could hide a load.
+    is_load_missing_in_small_motion = (
+        max(response.neighbor_small_range_nm, response.noise_nm) <= max_small_nm
+    )
+    return is_loaded_in_large_motion and is_load_missing_in_small_motion
+
+
+def _compute_typical_elastic_nm(
+    responses: Sequence[LoadResponse | None], axes: Sequence[str], joint_index: int
+) -> float:
+    """Return the median elastic torque of the other yaw joints, without those at the ends; 0 if there are none."""
+    elastic_nm = [
+        response.elastic_nm
+        for joint, (response, axis) in enumerate(zip(responses, axes, strict=True))
+        if response is not None
+        and axis == "yaw"
+        and joint not in (0, joint_index, len(responses) - 1)
+    ]
+    return float(np.median(elastic_nm)) if elastic_nm else 0.0

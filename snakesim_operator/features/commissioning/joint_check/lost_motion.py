@@ -1,0 +1,216 @@
+"""Measures how much motion of a drive is lost in its gear when its load reverses: backlash. Pure.
+
+    rate of the link = ratio * rate of the drive       while the teeth of the gear touch
+
+A gear of another ratio loses a fraction of every motion: the link's rate is proportional to the drive's all the time.
+Backlash loses the same angle at each reversal, however long the motion: the rates are proportional except while the
+drive crosses the backlash. So the ratio is the one that most samples agree on. With that ratio, the range of the
+drive angle minus the link angle is the backlash. A delay between IMU and encoder is estimated along with the ratio.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from snakesim_hal.base.arrays import Floats
+from snakesim_operator.features.commissioning.joint_check.link_shares import MIN_SAMPLES
+from snakesim_operator.features.commissioning.joint_check.measurements import CheckMeasurements
+
+# Rates are slopes over that time to either side, so that noisy angles give no noisy rates.
+SLOPE_HALF_WINDOW_S = 0.04
+MOTION_MARGIN_S = 0.1  # before and after a joint's motion
+FAST_FRACTION = 0.3  # of the highest rate; slower samples tell no ratio
+# Of the highest rate; a sample that is nearer to a ratio agrees with it.
+MAX_DISAGREEMENT_FRACTION = 0.06
+# A link behind a slower gear has slower rates, so the agreement scales with the ratio.
+MIN_ASSUMED_RATIO = 0.5
+MAX_RATIO = 4.0
+MIN_RATIO = 0.12  # of a link that turns at all
+RATIO_STEP = 0.01
+MIN_AGREEING_FRACTION = 0.2  # fraction of the fast samples
+MAX_DELAY_S = 0.03  # between IMU and encoder
+NOISE_FACTOR = 4.0  # standard deviations; less lost motion may be noise
+MIN_SQUARES = 1e-12  # of a drive that does not move at all
+MAD_TO_SD = 1.4826  # standard deviation of a normal distribution, of its median absolute deviation
+
+
+@dataclass(frozen=True)
+class LostMotion:
+    """The motion that was lost between a joint's drive and its link."""
+
+    lost_rad: float  # by which the drive turned further than the link, from end to end
+    # That much would be measured without any backlash, by the noise of gyros and encoder.
+    noise_rad: float
+    ratio: float  # of the link's rate to the drive's, while the teeth touch
+
+
+def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> LostMotion | None:
+    """Measure the backlash of a joint that moved back and forth.
+
+    Fits the ratio of the link's rate to the drive's rate and the delay between their sensors. The backlash is the range
+    of the drive angle minus the link angle divided by that ratio.
+
+    Args:
+        measurements: Measurements of the check.
+        joint_index: Index of the joint.
+
+    Returns:
+        The backlash and its noise; None if the joint moved too little, or no gyro measured its link.
+    """
+    moved_rows = np.flatnonzero(measurements.is_in_large_motion(joint_index))
+    link_angle = _integrate_link_angle(measurements, joint_index)
+    if link_angle is None or len(moved_rows) < MIN_SAMPLES:
+        return None
+    link_rad, drift_rad_per_sqrt_s = link_angle
+    encoder_rad = measurements.angle_rad[:, joint_index]
+
+    # The part of the record in which the joint moved, where the slopes are valid.
+    half_window = max(round(SLOPE_HALF_WINDOW_S / measurements.period_s), 1)
+    margin = round(MOTION_MARGIN_S / measurements.period_s)
+    start = max(moved_rows[0] - margin, 2 * half_window)
+    end = min(moved_rows[-1] + margin, len(encoder_rad) - 2 * half_window)
+    window = slice(start, end)
+
+    # Ratio and delay.
+    all_drive_rates = _compute_slopes(encoder_rad, half_window, measurements.period_s)
+    drive_rate = all_drive_rates[window]
+    acceleration = _compute_slopes(all_drive_rates, half_window, measurements.period_s)[window]
+    link_rate = _compute_slopes(link_rad, half_window, measurements.period_s)[window]
+    approximate_ratio = _find_ratio(drive_rate, link_rate)
+    if approximate_ratio is None:
+        return None
+    ratio, delay_s = _refine_ratio(approximate_ratio, drive_rate, link_rate, acceleration)
+
+    # Difference of drive and link, as a moving average, and its noise.
+    difference_rad = encoder_rad[window] - delay_s * drive_rate - link_rad[window] / ratio
+    mean_window = np.full(2 * half_window - 1, 1 / (2 * half_window - 1))
+    difference_rad = np.convolve(difference_rad, mean_window, "valid")
+    duration_s = len(difference_rad) * measurements.period_s
+    gyro_drift_rad = drift_rad_per_sqrt_s * np.sqrt(duration_s) / abs(ratio)
+    encoder_noise_rad = _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
+    noise_rad = NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
+    return LostMotion(float(np.ptp(difference_rad)), noise_rad, ratio)
+
+
+def measure_small_motion_ratio(measurements: CheckMeasurements, joint_index: int) -> float | None:
+    """Return the motion of a joint's links divided by that of its drive, in the second cycle of its small motion.
+
+    Returns:
+        The ratio, which is near 0 within backlash; None if the joint made no small motion, or a link was not measured.
+    """
+    small = measurements.find_second_small_cycle(joint_index)
+    link_angle = _integrate_link_angle(measurements, joint_index)
+    if small is None or link_angle is None:
+        return None
+    link_rad = link_angle[0][small]
+    drive_rad = measurements.angle_rad[small, joint_index]
+    centered_rad = drive_rad - np.mean(drive_rad)
+    return float(link_rad @ centered_rad / max(float(centered_rad @ centered_rad), MIN_SQUARES))
+
+
+def _measure_encoder_noise(measurements: CheckMeasurements, joint_index: int) -> float:
+    """Return the standard deviation of the noise of a joint's encoder in rad, measured while the robot was at rest."""
+    differences_rad = np.diff(measurements.angle_rad[measurements.is_at_rest(), joint_index])
+    return float(np.std(differences_rad)) / np.sqrt(2)
+
+
+def _find_ratio(drive_rate: Floats, link_rate: Floats) -> float | None:
+    """Return the ratio on which most of the fast samples agree; None if too few do."""
+    max_rate = float(np.max(np.abs(drive_rate)))
+    is_fast = np.abs(drive_rate) > FAST_FRACTION * max_rate
+    magnitudes = np.arange(MIN_RATIO, MAX_RATIO, RATIO_STEP)
+    candidates = np.concatenate((magnitudes, -magnitudes))
+    # (samples, candidates).
+    distances = np.abs(link_rate[is_fast, None] - candidates * drive_rate[is_fast, None])
+    max_distances = (
+        MAX_DISAGREEMENT_FRACTION * max_rate * np.maximum(np.abs(candidates), MIN_ASSUMED_RATIO)
+    )
+    agreeing_fractions = np.mean(distances < max_distances, axis=0)
+    best_index = int(np.argmax(agreeing_fractions))
+    if agreeing_fractions[best_index] < MIN_AGREEING_FRACTION:
+        return None
+    return float(candidates[best_index])
+
+
+def _refine_ratio(
+    ratio: float, drive_rate: Floats, link_rate: Floats, acceleration: Floats
+) -> tuple[float, float]:
+    """Return the ratio by least squares over the samples that agree with it, and the link's delay in seconds.
+
+    link rate = ratio * (drive rate - delay * acceleration)
+    """
+    max_rate = float(np.max(np.abs(drive_rate)))
+    distances = np.abs(link_rate - ratio * drive_rate)
+    # The first ratio is one of a grid, so more samples are accepted than for the grid.
+    agrees = distances < 1.5 * MAX_DISAGREEMENT_FRACTION * max_rate * max(
+        abs(ratio), MIN_ASSUMED_RATIO
+    )
+    regressors = np.column_stack((drive_rate[agrees], acceleration[agrees]))
+    coefficients = np.linalg.lstsq(regressors, link_rate[agrees], rcond=None)[0]
+    delay_s = float(np.clip(-coefficients[1] / coefficients[0], -MAX_DELAY_S, MAX_DELAY_S))
+    return float(coefficients[0]), delay_s
+
+
+def _integrate_link_angle(
+    measurements: CheckMeasurements, joint_index: int
+) -> tuple[Floats, float] | None:
+    """Return a joint's angle by the gyros of its two links, and the drift of that angle by the gyros' noise.
+
+    For the joint at the tail, motion capture may replace a missing gyro on the tail link.
+
+    Args:
+        measurements: Measurements of the check.
+        joint_index: Index of the joint.
+
+    Returns:
+        (ticks,) angle in rad up to a constant, and the standard deviation of its drift after one second in rad, which
+        grows with the square root of time; None if a link was not measured.
+    """
+    component = measurements.find_axis_component(joint_index)
+    gyro_behind = _read_gyro(measurements, joint_index, component)
+    gyro_ahead = _read_gyro(measurements, joint_index + 1, component)
+    if gyro_ahead is None:
+        return None
+    rate_ahead, drift_ahead = gyro_ahead
+    if gyro_behind is not None:
+        rate_behind, drift_behind = gyro_behind
+        angle_rad = _integrate_rate(rate_ahead - rate_behind, measurements.period_s)
+        return angle_rad, float(np.hypot(drift_ahead, drift_behind))
+    base_rad = measurements.base_rotation_rad[:, component]
+    if joint_index == 0 and not np.isnan(base_rad).all():
+        known_rows = np.flatnonzero(~np.isnan(base_rad))
+        base_rad = np.interp(np.arange(len(base_rad)), known_rows, base_rad[known_rows])
+        return _integrate_rate(rate_ahead, measurements.period_s) - base_rad, drift_ahead
+    return None
+
+
+def _read_gyro(
+    measurements: CheckMeasurements, link_index: int, component: int
+) -> tuple[Floats, float] | None:
+    """Return a link's rate at every tick, (n,), without its bias, and its drift after a second; None without a gyro."""
+    rate = measurements.link_rate_rad_s[:, link_index, component]
+    known = np.flatnonzero(~np.isnan(rate))
+    at_rest = known[measurements.is_at_rest()[known]]
+    if len(at_rest) < MIN_SAMPLES:
+        return None
+    bias = np.median(rate[at_rest])
+    noise = MAD_TO_SD * np.median(np.abs(rate[at_rest] - bias))  # a few outliers do not change it
+    sample_period_s = float(np.median(np.diff(known))) * measurements.period_s
+    rate_at_ticks = np.interp(np.arange(len(rate)), known, rate[known] - bias)
+    return rate_at_ticks, float(noise * np.sqrt(sample_period_s))
+
+
+def _integrate_rate(rate: Floats, period_s: float) -> Floats:
+    """Return the integral of a rate from the first tick, by trapezoids, (n,)."""
+    steps = (rate[1:] + rate[:-1]) * period_s / 2
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+def _compute_slopes(signal: Floats, half_window: int, period_s: float) -> Floats:
+    """Return the slope of the line through the samples around each sample, (n,); not valid near the ends.
+
+    slope = sum(k * signal[i + k]) / sum(k^2) / period       for k from -half_window to half_window
+    """
+    offsets = np.arange(-half_window, half_window + 1)
+    kernel = offsets / (offsets @ offsets) / period_s
+    return np.convolve(signal, kernel[::-1], "same")
