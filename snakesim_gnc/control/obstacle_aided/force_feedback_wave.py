@@ -8,7 +8,8 @@ For joint i, with phase phi, and with n = 0, 1, 2, ... counted from the head ove
                  angle gain * q + velocity gain * q' + torque gain * tau)
 
 F_c are the contact forces on the links behind and ahead of the joint. feedback_i changes by at most
-MAX_FEEDBACK_RAD_S. bend_i turns the body towards the goal.
+MAX_FEEDBACK_RAD_S. bend_i turns the body towards the goal. The contact-search gait begins with smoothed angles, because
+the feedback oscillates at about 22 Hz through the delay between a measurement and the motion that it causes.
 
 Source: the shipped policy `lab` (`snakesim policy train`, `docs/development/shipped-policies.md`), with its numbers,
 and with measured or estimated contacts. The policy was trained with one action every 50 ms. If feedback were applied
@@ -65,12 +66,21 @@ def compute_joint_spacing_ratio(robot: RobotDescription) -> float:
 class ForceFeedbackWave(LateralUndulation):
     """A wave that bends towards the goal and yields to measured forces; its amplitude is largest at the head."""
 
-    def __init__(self, robot: RobotDescription, *, time_scale: float = 1.0) -> None:
+    def __init__(
+        self,
+        robot: RobotDescription,
+        *,
+        time_scale: float = 1.0,
+        amplitude_scale: float = 1.0,
+        smoothing_s: float = 0.0,
+    ) -> None:
         """Scale a wave that was trained on one robot to the size and torque of another.
 
         Args:
             robot: Description of the robot.
             time_scale: Factor on all times; 2 moves at half the speed.
+            amplitude_scale: Factor on the amplitude without contact forces.
+            smoothing_s: Time constant of a low-pass filter of the reference angles; 0 for no filter.
         """
         scale = compute_joint_spacing_ratio(robot)
         super().__init__(
@@ -79,7 +89,8 @@ class ForceFeedbackWave(LateralUndulation):
         )
         joint_count = len(self._body.yaw_joints)
         x = np.arange(joint_count)[::-1] / max(joint_count - 1, 1)  # 0 at the head, 1 at the tail
-        self._base_amplitude_rad = scale * (AMPLITUDE_RAD + GROWTH_RAD * x)
+        trained_amplitude_rad = AMPLITUDE_RAD + GROWTH_RAD * x
+        self._base_amplitude_rad = scale * amplitude_scale * trained_amplitude_rad
         self._steering_rad = (STEERING_RAD + HEAD_STEERING_RAD * (1.0 - x)) / joint_count
         # Feedback.
         self._feedback_gains = (ANGLE_GAINS / scale, VELOCITY_GAINS / scale, TORQUE_GAINS)
@@ -88,14 +99,19 @@ class ForceFeedbackWave(LateralUndulation):
         self._max_feedback_rad_s = scale * MAX_FEEDBACK_RAD_S / time_scale
         # Of the last tick; None if the next is not limited.
         self._feedback_rad: NDArray[np.float64] | None = None
+        # Low-pass filter of the reference.
+        self._smoothing_s = smoothing_s
+        # Of the last tick; None if the next is not filtered.
+        self._smooth_reference_rad: NDArray[np.float64] | None = None
 
     def match_phase_to_angles(self, angles_rad: NDArray[np.float64]) -> None:
         """Set the phase at which the wave is most similar to measured joint angles, (n_joints,) in rad.
 
-        The feedback of the next tick is applied without a rate limit, because the change to a wave is smooth anyway.
+        The next tick has neither rate limit nor low-pass filter, because the change to a wave is smooth anyway.
         """
         super().match_phase_to_angles(angles_rad)
         self._feedback_rad = None
+        self._smooth_reference_rad = None
 
     def compute_reference_rad(
         self, observation: Observation, elapsed_s: float
@@ -104,7 +120,7 @@ class ForceFeedbackWave(LateralUndulation):
 
         Args:
             observation: The inputs of this tick.
-            elapsed_s: Time since the last call, which limits the change of the feedback.
+            elapsed_s: Time since the last call, which limits the change of the feedback and of the smoothed angles.
 
         Returns:
             (n_joints,) angles in rad, tail to head.
@@ -117,7 +133,18 @@ class ForceFeedbackWave(LateralUndulation):
             feedback_rad = self._feedback_rad + change_rad
         self._feedback_rad = feedback_rad
         reference[self._body.yaw_joints] += feedback_rad
-        return reference
+        return self._smooth(reference, elapsed_s)
+
+    def _smooth(self, reference_rad: NDArray[np.float64], elapsed_s: float) -> NDArray[np.float64]:
+        """Return the reference behind a first-order low-pass filter with the time constant `smoothing_s`."""
+        if self._smoothing_s == 0.0:
+            return reference_rad
+        last_rad = self._smooth_reference_rad
+        if last_rad is not None:
+            alpha = 1.0 - math.exp(-elapsed_s / self._smoothing_s)
+            reference_rad = last_rad + alpha * (reference_rad - last_rad)
+        self._smooth_reference_rad = reference_rad
+        return reference_rad.copy()
 
     def _compute_feedback_rad(self, observation: Observation) -> NDArray[np.float64]:
         """Return MAX_FEEDBACK_RAD tanh(sum of gains x measurements), (n_bends,)."""

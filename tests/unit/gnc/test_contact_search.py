@@ -44,10 +44,22 @@ def targets(commands: list[ControllerCommand]) -> np.ndarray:
     return np.array([command.setpoints.target for command in commands])
 
 
+FORWARD_WAVE_S = pytest.approx(0.8, rel=0.05)  # periods
+FEEDBACK_WAVE_S = pytest.approx(math.tau / 5.39, rel=0.15)
+
+
 def period_s(commands: list[ControllerCommand]) -> float:
-    """Of the wave, at the head."""
+    """Period of the sine that fits the targets of the head best."""
     head = targets(commands)[:, -1]
-    return len(head) * 0.01 / int(np.argmax(np.abs(np.fft.rfft(head - head.mean()))))
+    times_s = 0.01 * np.arange(len(head))
+    periods_s = np.arange(0.4, 4.0, 0.02)
+    errors: list[float] = []
+    for period in periods_s:
+        phase_rad = math.tau * times_s / period
+        basis = np.column_stack([np.sin(phase_rad), np.cos(phase_rad), np.ones_like(phase_rad)])
+        fitted = basis @ np.linalg.lstsq(basis, head, rcond=None)[0]
+        errors.append(float(np.sum((head - fitted) ** 2)))
+    return float(periods_s[int(np.argmin(errors))])
 
 
 def test_contact_search_of_standing_body_ends_with_path_retried() -> None:
@@ -71,8 +83,10 @@ def test_contact_search_fruitless_wave_is_replaced_by_the_other(among_pegs: bool
     stage, controller = searching(among_pegs=among_pegs, shape_nm_per_rad=0.0)
     seen = stands(controller, stage, range(1010))
     periods = [period_s(seen[first : first + 240]) for first in (150, 450, 750)]
-    felt, to_head = pytest.approx(math.tau / 5.39, rel=0.15), pytest.approx(0.8, rel=0.05)
-    assert periods == ([felt, to_head, felt] if among_pegs else [to_head, felt, to_head])
+    first, second = FORWARD_WAVE_S, FEEDBACK_WAVE_S
+    if among_pegs:
+        first, second = second, first
+    assert periods == [first, second, first]
     assert np.abs(np.diff(targets(seen), axis=0)).max() < JUMP_RAD
 
 
@@ -98,9 +112,7 @@ def test_a_wave_that_leads_to_the_goal_goes_on() -> None:
         for tick in range(110, 900)
     ]
     assert all(SEARCHES in command.telemetry.reason for command in led)
-    assert [period_s(led[first : first + 240]) for first in (60, 300, 540)] == [
-        pytest.approx(0.8, rel=0.05)
-    ] * 3
+    assert [period_s(led[first : first + 240]) for first in (60, 300, 540)] == [FORWARD_WAVE_S] * 3
 
 
 def test_contact_search_detects_standing_body_despite_pose_noise() -> None:
@@ -212,6 +224,44 @@ def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
     assert np.max(np.diff(apart, axis=0)) < 0.11
     assert np.max(apart[0]) < 0.11
     assert np.max(apart[-1]) > 0.3  # rad
+
+
+def test_smoothed_wave_does_not_follow_vibrating_torques() -> None:
+    stage = make_stage()
+    swings: list[float] = []
+    for smoothing_s in (0.0, 0.1):
+        wave = ForceFeedbackWave(stage.robot, smoothing_s=smoothing_s)
+        angles: list[np.ndarray] = []
+        for tick in range(100):
+            torque_nm = 3.0 * math.copysign(1.0, math.sin(math.tau * 22.0 * 0.01 * tick))
+            observation = stage.make_observation(tick, TAIL_S_M, torque_nm=torque_nm)
+            angles.append(wave.compute_reference_rad(observation, 0.0 if tick == 0 else 0.01))
+        swings.append(float(np.abs(np.diff(angles, n=2, axis=0))[20:].mean()))
+    unsmoothed, smoothed = swings
+    assert smoothed < 0.25 * unsmoothed
+
+
+def test_smoothed_wave_starts_at_its_reference_and_follows_its_own_curve() -> None:
+    stage = make_stage()
+    smoothed = ForceFeedbackWave(stage.robot, smoothing_s=0.1)
+    unsmoothed = ForceFeedbackWave(stage.robot)
+    observation = stage.make_observation(0, TAIL_S_M)
+    first = smoothed.compute_reference_rad(observation, 0.01)
+    assert first == pytest.approx(unsmoothed.compute_reference_rad(observation, 0.01))
+    lagging = smoothed.compute_reference_rad(observation, 0.01)
+    expected = unsmoothed.compute_reference_rad(observation, 0.01)
+    assert np.abs(lagging - first).max() < np.abs(expected - first).max()
+
+
+def test_amplitude_scale_changes_the_wave_and_not_the_bend() -> None:
+    stage = make_stage()
+    observation = stage.make_observation(0, TAIL_S_M)
+    quarter_s = 0.25 * math.tau / 5.391202  # the wave of the head is at its maximum
+    narrow = ForceFeedbackWave(stage.robot).compute_reference_rad(observation, quarter_s)
+    wide = ForceFeedbackWave(stage.robot, amplitude_scale=1.3).compute_reference_rad(
+        observation, quarter_s
+    )
+    assert wide[-1] - narrow[-1] == pytest.approx(0.3 * 0.637896, rel=1e-3)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.2, -0.2])
