@@ -7,7 +7,6 @@ that process which step is too long.
 
 import ctypes
 import mmap
-import struct
 import threading
 import time
 import traceback
@@ -15,8 +14,7 @@ from typing import Self
 
 WATCH_PERIOD_S = 0.25  # between two checks of the current step
 INTERRUPT_AGAIN_S = 2.0  # until a step that has caught the error is interrupted again
-# Start and deadline of the current step; zeros between steps.
-STEP_TIMES_FORMAT = struct.Struct("dd")
+STEP_TIMES_BYTES = 16  # start and deadline of the current step, two floats
 
 
 class StepTooLongError(BaseException):
@@ -26,24 +24,28 @@ class StepTooLongError(BaseException):
 class SharedStepTimes:
     """Start time and deadline of the current step, in memory that a forked process shares.
 
-    Times are on the monotonic clock.
+    Times are on the monotonic clock. Between steps, the start time is zero. Each time is stored as a whole, but another
+    process may read between the two stores. It then sees a deadline before the start, and must not judge the step.
     """
 
     def __init__(self) -> None:
-        self._memory = mmap.mmap(-1, STEP_TIMES_FORMAT.size)
+        # Start and deadline. `struct.pack_into` would clear the memory first, so that a reader could see zeros.
+        self._times_s = memoryview(mmap.mmap(-1, STEP_TIMES_BYTES)).cast("d")
 
     def record_step_start(self, now_s: float, deadline_s: float) -> None:
         """Store the start time and the deadline of a step that starts now."""
-        STEP_TIMES_FORMAT.pack_into(self._memory, 0, now_s, deadline_s)
+        self._times_s[1] = deadline_s
+        self._times_s[0] = now_s
 
     def record_step_end(self) -> None:
         """Store that no step is running."""
-        STEP_TIMES_FORMAT.pack_into(self._memory, 0, 0.0, 0.0)
+        self._times_s[0] = 0.0
 
     def read_step_times(self) -> tuple[float, float] | None:
         """Return the start time and the deadline of the current step, or None between steps."""
-        start_s, deadline_s = STEP_TIMES_FORMAT.unpack_from(self._memory, 0)
-        if not start_s:
+        start_s = self._times_s[0]
+        deadline_s = self._times_s[1]
+        if start_s == 0.0 or deadline_s < start_s:
             return None
         return start_s, deadline_s
 
