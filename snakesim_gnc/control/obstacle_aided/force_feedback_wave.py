@@ -8,8 +8,9 @@ For joint i, with phase phi, and with n = 0, 1, 2, ... counted from the head ove
                  angle gain * q + velocity gain * q' + torque gain * tau)
 
 F_c are the contact forces on the links behind and ahead of the joint. feedback_i changes by at most
-MAX_FEEDBACK_RAD_S. bend_i turns the body towards the goal. The contact-search gait begins with smoothed angles, because
-the feedback oscillates at about 22 Hz through the delay between a measurement and the motion that it causes.
+MAX_FEEDBACK_RAD_S. bend_i turns the body towards the goal. After a push, the contact-search gait begins with smoothed
+angles, because the feedback oscillates at about 22 Hz through the delay between a measurement and the motion that it
+causes.
 
 Source: the shipped policy `lab` (`snakesim policy train`, `docs/development/shipped-policies.md`), with its numbers,
 and with measured or estimated contacts. The policy was trained with one action every 50 ms. If feedback were applied

@@ -38,6 +38,7 @@ class PushControl:
     """Decides how hard the body pushes along its path, and with which joint torques.
 
     Attributes:
+        measured_contacts: Measured contact forces; the controller adds each world model to them.
         snapshot: Contacts of the newest world model and the push that they allow; None while nothing is known.
         force_n: Commanded force along the path.
         max_force_n: Largest force that the contacts and the torque limits allow.

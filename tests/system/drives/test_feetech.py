@@ -31,7 +31,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Where everything runs, with servos on `./servos`."""
     folder = tmp_path_factory.mktemp("servos")
     write_servo_row(folder, "feetech", "servos")
-    first = REAL_TIME_PRIORITY if os.geteuid() == 0 else ()  # real servos wait for nobody
+    first = (
+        REAL_TIME_PRIORITY if os.geteuid() == 0 else ()
+    )  # real servos do not wait for a busy computer
     printed = folder / "servos.log"
     with printed.open("wb") as file:
         servos = subprocess.Popen(

@@ -118,7 +118,7 @@ def test_run_files_on_hanging_disk_block_nobody_within_bounded_memory(
         files.append("a.log", b"x" * 100)
     assert sum(len(task.content) for task in files._tasks) <= 10_000
     assert files.close() == f"{tmp_path}: the disk has not answered for 0.3 s"
-    assert time.monotonic() - began < HANG_S / 2  # nobody waited until the disk went on
+    assert time.monotonic() - began < HANG_S / 2  # no caller waited for the disk
     disk.goes_on.set()
 
 
