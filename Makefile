@@ -40,8 +40,8 @@ demo: $(stamp) ## Run the simulated snake along a row of pegs, into runs/demo, w
 	  '  $(bin)/snakesim run triplet --console --clock-mode realtime      the paper'\''s case study: one joint at a time pushes' \
 	  '  docs/tutorials/write-a-controller.md                          push it your way'
 
-# The virtual machine of the CAN tests waits for half of its time. The unit tests wait for nothing, so they fill its
-# pauses, with less priority. The output of the CAN tests follows that of the unit tests.
+# The CAN tests may need a second kernel, which waits for half of its time. The unit tests wait for nothing, so they
+# fill its pauses, with less priority. The output of the CAN tests follows that of the unit tests.
 test: compiled ## Run the tests that every change must pass (5 minutes on two cores)
 	@mkdir -p build; \
 	$(MAKE) --no-print-directory test-can > build/test-can.log 2>&1 & can=$$!; \
@@ -60,7 +60,7 @@ test-contract: compiled ## Run the contracts of backends and drives
 test-system: compiled ## Run the tests with real processes, but those on a CAN bus
 	$(pytest) tests/system --ignore tests/system/can -n $(SYSTEM_WORKERS) --dist worksteal $(ARGS)
 
-test-can: compiled ## Run the CAN tests on real SocketCAN, in a small VM where the kernel has none
+test-can: compiled ## Run the CAN tests on real SocketCAN, on a second kernel if this one has no CAN
 	SNAKESIM_NEED_VCAN=1 $(bin)/python deploy/vm/with_vcan.py -- $(pytest) tests/system/can --timeout 900 $(ARGS)
 
 coverage: compiled ## Print the lines and branches that the tests miss (FOLDERS="tests/unit tests/contract")

@@ -16,7 +16,9 @@ from snakesim_hal.base.process import make_child_environment, make_python_comman
 from verification.mutation.trial import TESTS_BY_FILE
 
 ROOT = Path(__file__).parents[1]
-WITH_VCAN = ("deploy/vm/with_vcan.py", "--", sys.executable, "-m")
+WITH_VCAN = "deploy/vm/with_vcan.py"
+PYTHON_MODULE = (sys.executable, "-m")
+JOYSTICK_TESTS = "tests/system/can/test_joystick.py"
 PYTEST = ("pytest", "-q", "--timeout", "1800")
 
 
@@ -85,7 +87,16 @@ PARTS = {
     "can": CampaignPart(
         "all CAN tests, and the contract on virtual CAN interfaces of the kernel",
         7,
-        (*WITH_VCAN, *PYTEST, "tests/system/can", "tests/contract", "-m", ""),
+        (
+            *(WITH_VCAN, "--", *PYTHON_MODULE, *PYTEST),
+            *("tests/system/can", "tests/contract", "-m", ""),
+        ),
+        is_script=True,
+    ),
+    "joystick": CampaignPart(
+        "a joystick that the kernel of a virtual machine emulates",
+        1,
+        (*(WITH_VCAN, "--joystick", "--", *PYTHON_MODULE, *PYTEST), JOYSTICK_TESTS),
         is_script=True,
     ),
     "documents": CampaignPart(

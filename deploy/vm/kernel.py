@@ -1,6 +1,7 @@
 """Prepares a kernel for the guest: its image, the modules that a guest needs, and a static busybox.
 
-The files come from packages of the distribution, and are kept in `$XDG_CACHE_HOME/snakesim/vm`. Remove that folder to
+There are two kernels: that of the distribution, which QEMU boots, and user-mode Linux, a kernel that is a program. The
+files come from packages of the distribution, and are kept in `$XDG_CACHE_HOME/snakesim/vm`. Remove that folder to
 download them again.
 """
 
@@ -9,18 +10,22 @@ import json
 import lzma
 import os
 import re
+import shutil
 import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from deploy.vm import cpio
 from deploy.vm.packages import (
+    USER_MODE_PACKAGE,
     PreparationError,
     find_kernel_version,
+    find_user_mode_version,
     list_kernel_packages,
     require_tool,
     unpack_package,
@@ -28,6 +33,7 @@ from deploy.vm.packages import (
 
 # Modules that init.sh needs, then modules that a caller can request. The module files name their dependencies.
 BOOT_MODULES = ("9p", "9pnet_virtio", "virtio_pci", "virtio_console", "overlay")
+USER_MODE_BOOT_MODULES = ("overlay",)
 CAN_MODULES = (
     "can",
     "can_raw",
@@ -40,8 +46,10 @@ CONTROLLER_MODULES = ("kvaser_pci",)
 NETWORK_MODULES = ("virtio_net",)
 
 # Increase this number if the contents of the cache change, so that an older cache is not used.
-CACHE_LAYOUT = "2"
+CACHE_LAYOUT = "3"
 PVH_ENTRY_NOTE = 18  # type of the ELF note that marks a kernel with a PVH entry
+# Names of the image in the cache: uncompressed, compressed, and the program of user-mode Linux.
+IMAGE_NAMES = ("vmlinux", "vmlinuz", "linux.uml")
 # First bytes of compressed data.
 XZ_MAGIC = b"\xfd7zXZ\x00"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -67,13 +75,29 @@ def find_cache_folder() -> Path:
 
 
 def prepare_kernel() -> Kernel:
-    """Return the kernel in the cache, and download it first if there is none."""
-    folder = find_cache_folder()
+    """Return the distribution's kernel from the cache, and download it first if it is not there."""
+    return _prepare("distribution", _download_kernel)
+
+
+def prepare_user_mode_kernel() -> Kernel:
+    """Return user-mode Linux from the cache, and download it first if it is not there."""
+    return _prepare("user-mode", _download_user_mode_kernel)
+
+
+def _prepare(name: str, download: Callable[[Path], Path]) -> Kernel:
+    """Return a kernel from its folder in the cache.
+
+    Args:
+        name: Name of the folder.
+        download: Downloads the kernel into a new folder in that folder, and returns the new one.
+    """
+    folder = find_cache_folder() / name
+    folder.mkdir(exist_ok=True)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # a second run waits until the first one has downloaded
-        home = next(folder.glob("[0-9]*/"), None) or _download_kernel(folder)
+        home = next(folder.glob("[0-9]*/"), None) or download(folder)
     modules = json.loads((home / "modules.json").read_text())
-    image = next(home / name for name in ("vmlinux", "vmlinuz") if (home / name).exists())
+    image = next(path for file in IMAGE_NAMES if (path := home / file).exists())
     return Kernel(home.name, image, home / "initramfs", modules["depends"], modules["built_in"])
 
 
@@ -141,38 +165,73 @@ def decompress(content: bytes) -> bytes:
 
 
 def _download_kernel(folder: Path) -> Path:
-    """Download a kernel into a new folder, and return it. The folder appears only when it is complete."""
+    """Download the distribution's kernel into a new folder, and return that folder."""
     version = find_kernel_version()
+    with _unpacked_packages(folder, version, list_kernel_packages(version)) as (files, prepared):
+        image = _find_file(files, "boot/vmlinuz-*").read_bytes()
+        plain = extract_plain_kernel(image)
+        (prepared / ("vmlinux" if plain else "vmlinuz")).write_bytes(plain or image)
+        _store_modules(files, prepared)
+    return folder / version
+
+
+def _download_user_mode_kernel(folder: Path) -> Path:
+    """Download user-mode Linux into a new folder, and return that folder."""
+    version = find_user_mode_version()
+    with _unpacked_packages(folder, version, [USER_MODE_PACKAGE]) as (files, prepared):
+        shutil.copy(_find_file(files, "**/bin/linux.uml"), prepared / "linux.uml")
+        _store_modules(files, prepared)
+    return folder / version
+
+
+@contextmanager
+def _unpacked_packages(
+    folder: Path, version: str, packages: Iterable[str]
+) -> Iterator[tuple[Path, Path]]:
+    """Unpack packages and busybox, and let the caller prepare the kernel that they contain.
+
+    Args:
+        folder: Folder of this kind of kernel in the cache.
+        version: Version of the kernel. The prepared files appear in a folder of this name, all at once.
+        packages: The packages to download.
+
+    Yields:
+        The folder of the unpacked files, and the folder in which the caller puts the prepared files.
+    """
     print(f"with_vcan: downloading kernel {version} into {folder} (once)", file=sys.stderr)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".download-") as scratch:
         files = Path(scratch, "files")
         prepared = Path(scratch, "prepared")
         prepared.mkdir()
-        for package in (*list_kernel_packages(version), "busybox-static"):
+        for package in (*packages, "busybox-static"):
             unpack_package(package, files)
-        try:
-            busybox = next(files.glob("**/bin/busybox")).read_bytes()
-            image = next(files.glob("boot/vmlinuz-*")).read_bytes()
-        except StopIteration:
-            raise PreparationError(
-                f"the packages of kernel {version} contain no kernel, or busybox-static contains no busybox"
-            ) from None
-        plain = extract_plain_kernel(image)
-        (prepared / ("vmlinux" if plain else "vmlinuz")).write_bytes(plain or image)
-        modules = _collect_modules(
-            {parse_module_name(path.name): path for path in files.glob("**/*.ko*")}
-        )
-        built_in = {
-            parse_module_name(line)
-            for path in files.glob("**/modules.builtin")
-            for line in path.read_text().split()
-        }
-        depends = {name: find_dependencies(module) for name, module in modules.items()}
-        listing = {"depends": depends, "built_in": sorted(built_in)}
-        (prepared / "modules.json").write_text(json.dumps(listing))
-        (prepared / "initramfs").write_bytes(_make_common_archive(busybox, modules))
+        yield files, prepared
         prepared.rename(folder / version)
-    return folder / version
+
+
+def _find_file(files: Path, pattern: str) -> Path:
+    """Return the file of the unpacked packages that a pattern matches."""
+    path = next(files.glob(pattern), None)
+    if path is None:
+        raise PreparationError(f"the downloaded packages contain no file {pattern}")
+    return path
+
+
+def _store_modules(files: Path, prepared: Path) -> None:
+    """Store the modules that a guest can load, a list of their dependencies, and the first file system."""
+    modules = _collect_modules(
+        {parse_module_name(path.name): path for path in files.glob("**/*.ko*")}
+    )
+    built_in = {
+        parse_module_name(line)
+        for path in files.glob("**/modules.builtin")
+        for line in path.read_text().split()
+    }
+    depends = {name: find_dependencies(module) for name, module in modules.items()}
+    listing = {"depends": depends, "built_in": sorted(built_in)}
+    (prepared / "modules.json").write_text(json.dumps(listing))
+    busybox = _find_file(files, "**/bin/busybox").read_bytes()
+    (prepared / "initramfs").write_bytes(_make_common_archive(busybox, modules))
 
 
 def _collect_modules(files: Mapping[str, Path]) -> dict[str, bytes]:

@@ -1,8 +1,9 @@
-"""Boots a virtual machine (the guest), runs one command in it, and prints the output of the command.
+"""Boots a second Linux (the guest), runs one command in it, and prints the output of the command.
 
-The guest's root is the file system of the host, read-only. Files that the guest writes stay in its memory, except in
-folders that are shared writable. The guest caches files: it may miss a change that the host makes while it runs. The
-guest reaches no network. The host reaches the guest through forwarded ports.
+The guest is a virtual machine of QEMU, or user-mode Linux: a kernel that runs as a program. The guest's root is the
+file system of the host, read-only. Files that the guest writes stay in its memory, except in folders that are shared
+writable. The guest caches files: it may miss a change that the host makes while it runs. The guest reaches no network.
+The host reaches a virtual machine through forwarded ports.
 """
 
 import ctypes
@@ -10,14 +11,17 @@ import os
 import re
 import selectors
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from types import FrameType
 
@@ -28,6 +32,7 @@ from deploy.vm.kernel import (
     CONTROLLER_MODULES,
     INPUT_MODULES,
     NETWORK_MODULES,
+    USER_MODE_BOOT_MODULES,
     Kernel,
     order_modules,
 )
@@ -45,6 +50,9 @@ CONTROLLER_QUEUE_LENGTH = 1000  # frames
 # mitigations=off and nokaslr: a test's guest needs no defense against attacks, and system calls take half the time.
 # no_timer_check: on a busy host, the emulated timer is late, and the kernel would panic at its check during the boot.
 KERNEL_OPTIONS = "console=ttyS0 quiet loglevel=3 panic=-1 no_timer_check mitigations=off nokaslr cryptomgr.notests"
+USER_MODE_KERNEL_OPTIONS = ("quiet", "loglevel=3")
+SHARED_MEMORY = Path("/dev/shm")
+BYTES_BY_UNIT = {"M": 2**20, "G": 2**30}
 EMULATION = ("-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max")
 VIRTUALIZATION = ("-accel", "kvm", "-cpu", "host")
 
@@ -61,6 +69,14 @@ PR_SET_PDEATHSIG = 1  # from <linux/prctl.h>
 LIBC = ctypes.CDLL(None)  # loaded here, because a forked child must not load anything before `exec`
 
 
+class GuestKind(Enum):
+    """How a guest runs. The values are those of the option `--guest`."""
+
+    KVM = "kvm"  # a virtual machine on the processor itself
+    USER_MODE = "user-mode"  # user-mode Linux: one processor, and no devices but CAN
+    EMULATED = "emulated"  # a virtual machine whose processor is emulated, about ten times slower
+
+
 class GuestError(RuntimeError):
     """Raised if the guest did not boot, or ended before the command did."""
 
@@ -74,8 +90,9 @@ class GuestRequest:
     writable: Sequence[Path] = ()  # folders of the host that the guest may write
     channels: Sequence[str] = ("vcan0",)  # virtual CAN interfaces
     controllers: bool = False  # whether there are two emulated CAN controllers
+    input_devices: bool = False  # whether programs may create input devices (uinput)
     forward: Sequence[tuple[int, int]] = ()  # (port of the host, port of the guest)
-    cpus: int = 2
+    cpus: int = 2  # user-mode Linux always has one
     memory: str = "2G"
     verbose: bool = False  # whether to print the messages of the guest's kernel
 
@@ -141,7 +158,9 @@ def make_qemu_command(
         initramfs: Path of the guest's first file system.
         ports: File descriptor of an open socket for each of PORTS.
     """
-    modules = [*BOOT_MODULES, *CAN_MODULES, *INPUT_MODULES]
+    modules = [*BOOT_MODULES, *CAN_MODULES]
+    if request.input_devices:
+        modules += INPUT_MODULES
     shares = ["-fsdev", "local,id=root,path=/,security_model=none,readonly=on,multidevs=remap"]
     shares += ["-device", "virtio-9p-pci,fsdev=root,mount_tag=root"]
     for number, path in enumerate(request.writable):
@@ -193,16 +212,63 @@ def make_qemu_command(
     ]
 
 
+def make_user_mode_command(
+    request: GuestRequest,
+    kernel: Kernel,
+    initramfs: str,
+    ports: Mapping[str, int],
+    state_folder: str,
+) -> list[str]:
+    """Return the command line of user-mode Linux, in a process namespace of its own.
+
+    The processes of the guest are processes of the host. The namespace ends all of them together with the kernel that
+    controls them. Without it, they would go on as programs of the host if that kernel was killed.
+
+    Args:
+        request: The command and the guest that it needs.
+        kernel: User-mode Linux.
+        initramfs: Path of the guest's first file system.
+        ports: File descriptor of an open socket for each of PORTS.
+        state_folder: Folder in which the kernel keeps its process id and a socket.
+    """
+    modules = order_modules([*USER_MODE_BOOT_MODULES, *CAN_MODULES], kernel)
+    as_root = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
+    return [
+        *(require_tool("unshare"), *as_root, "--pid", "--fork", "--kill-child"),
+        str(kernel.image),
+        *(f"mem={request.memory}", f"initrd={initramfs}", f"uml_dir={state_folder}"),
+        *USER_MODE_KERNEL_OPTIONS,
+        *("con=null", f"con0=null,fd:{ports['console']}"),
+        *(f"con1=fd:{ports['out']}", f"con2=fd:{ports['err']}", f"con3=fd:{ports['control']}"),
+        *("snakesim_files=hostfs", f"snakesim_modules={','.join(modules)}"),
+    ]
+
+
+def find_memory_folder(request: GuestRequest) -> str:
+    """Return the folder for the file that is the memory of user-mode Linux.
+
+    It is in memory itself, if there is room. Some containers allow very small files there.
+    """
+    needed_bytes = parse_memory_size(request.memory)
+    space = shutil.disk_usage(SHARED_MEMORY)
+    return str(SHARED_MEMORY) if space.free >= needed_bytes else tempfile.gettempdir()
+
+
+def parse_memory_size(text: str) -> int:
+    """Return the bytes in a size such as `2G` or `512M`."""
+    return int(text[:-1]) * BYTES_BY_UNIT[text[-1].upper()]
+
+
 class Guest:
     """A running guest. `close` ends it."""
 
-    def __init__(self, request: GuestRequest, kernel: Kernel, kvm: bool) -> None:
+    def __init__(self, request: GuestRequest, kernel: Kernel, kind: GuestKind) -> None:
         """Start the guest. It boots in the background.
 
         Args:
             request: The command and the guest that it needs.
-            kernel: The kernel to boot.
-            kvm: Whether to use KVM; otherwise QEMU emulates the processor.
+            kernel: The kernel to boot. It must fit the kind.
+            kind: How the guest runs.
         """
         self._request = request
         self._console_tail = b""  # last output of the guest's kernel
@@ -227,10 +293,23 @@ class Guest:
             inherited.callback(os.close, initramfs)
             with os.fdopen(os.dup(initramfs), "wb") as file:
                 file.write(kernel.initramfs.read_bytes() + make_run_archive(request, os.environ))
+            initramfs_path = f"/proc/self/fd/{initramfs}"
+            environment = dict(os.environ)
+            match kind:
+                case GuestKind.USER_MODE:
+                    folder = self._resources.enter_context(tempfile.TemporaryDirectory())
+                    command = make_user_mode_command(
+                        request, kernel, initramfs_path, guest_descriptors, folder
+                    )
+                    environment["TMPDIR"] = find_memory_folder(request)
+                case GuestKind.KVM | GuestKind.EMULATED:
+                    kvm = kind is GuestKind.KVM
+                    command = make_qemu_command(
+                        request, kernel, kvm, initramfs_path, guest_descriptors
+                    )
             self._process = subprocess.Popen(
-                make_qemu_command(
-                    request, kernel, kvm, f"/proc/self/fd/{initramfs}", guest_descriptors
-                ),
+                command,
+                env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=guest_descriptors["console"],
                 stderr=guest_descriptors["console"],
@@ -352,7 +431,7 @@ def set_parent_death_signal() -> None:
 
 
 def _make_child_setup(parent_pid: int) -> Callable[[], None]:
-    """Return a function that a child calls before it becomes QEMU, so that it ends with its parent."""
+    """Return a function that a child calls before it becomes the guest, so that it ends with its parent."""
 
     def before_exec() -> None:
         set_parent_death_signal()

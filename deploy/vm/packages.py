@@ -10,6 +10,8 @@ from pathlib import Path
 PACKAGES_BY_TOOL = {"qemu-system-x86_64": "qemu-system-x86", "ip": "iproute2"}
 # The kernel packages of Debian and Ubuntu. Their kernels for the cloud have no CAN.
 KERNEL_PACKAGES = ("linux-image-amd64", "linux-image-generic")
+USER_MODE_PACKAGE = "user-mode-linux"
+PACKAGE_LISTS = Path("/var/lib/apt/lists")
 APT_TIMEOUT_S = 900
 MAX_MESSAGE_CHARACTERS = 2000
 
@@ -79,6 +81,21 @@ def find_kernel_version() -> str:
     raise PreparationError(
         f"apt has no package {' or '.join(KERNEL_PACKAGES)}: the guest needs Debian or Ubuntu on x86-64"
     )
+
+
+def find_user_mode_version() -> str:
+    """Return the version of the distribution's package of user-mode Linux.
+
+    Raises:
+        PreparationError: The distribution has no such package.
+    """
+    if not any(PACKAGE_LISTS.glob("*Packages*")):
+        update_lists()
+    policy = _run_apt(["apt-cache", "policy", USER_MODE_PACKAGE]).stdout
+    match = re.search(r"Candidate: (\d\S*)", policy)
+    if match is None:
+        raise PreparationError(f"apt has no package {USER_MODE_PACKAGE}")
+    return match[1]
 
 
 def list_kernel_packages(version: str) -> list[str]:

@@ -1,11 +1,22 @@
 #!/bin/sh
 # The rest of the guest's first process: brings the interfaces up, runs the command, passes its output and exit code
-# on, and switches the guest off. The host listens on three virtio ports: out, err and control.
+# on, and switches the guest off. The host listens on three ports: out, err and control. In QEMU, they are virtio ports;
+# in user-mode Linux, they are the terminals tty1 to tty3, in raw mode.
 bb=/run/snakesim/busybox
 own=/run/snakesim
 export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 
 port() {
+  # shellcheck disable=SC2154
+  if [ "$snakesim_files" = hostfs ]; then
+    case $1 in
+      out) terminal=/dev/tty1 ;;
+      err) terminal=/dev/tty2 ;;
+      control) terminal=/dev/tty3 ;;
+    esac
+    $bb stty raw -echo <$terminal && $bb echo $terminal
+    return
+  fi
   for entry in /sys/class/virtio-ports/*; do
     read -r name <"$entry/name"
     [ "$name" = "$1" ] && $bb echo "/dev/${entry##*/}"
@@ -13,7 +24,7 @@ port() {
 }
 
 give_up() {
-  $bb echo "snakesim: $1" >/dev/ttyS0
+  $bb echo "snakesim: $1" >/dev/console
   $bb poweroff -f
 }
 
@@ -30,7 +41,7 @@ $bb ip link set lo up
 
 # interfaces.sh is written for each run: which channels, controllers and network there are.
 # The host's shell runs it, because busybox would take its own `ip`, which knows nothing of bit rates.
-/bin/sh -ex $own/interfaces.sh >/dev/ttyS0 2>&1 || give_up "an interface cannot be brought up; see the last line"
+/bin/sh -ex $own/interfaces.sh >/dev/console 2>&1 || give_up "an interface cannot be brought up; see the last line"
 
 exec 3<>"$(port control)" || give_up "the guest has no control port"
 $bb mkfifo $own/out $own/err

@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Runs a command with virtual CAN interfaces, on this kernel or in a small virtual machine.
+"""Runs a command with virtual CAN interfaces, on this kernel or on a second one.
 
     python deploy/vm/with_vcan.py -- .venv/bin/python -m pytest tests/system/can
 
-If this kernel has CAN, the command runs in a separate network namespace. Otherwise it runs in a virtual machine, the
-guest. The guest has the files of the host. It may write this checkout; other changes stay in the guest. The variable
-SNAKESIM_VCAN is set to `native` or `guest`. The guest needs Debian or Ubuntu on x86-64.
+If this kernel has CAN, the command runs in a separate network namespace. Otherwise it runs in a guest: a virtual
+machine with KVM, user-mode Linux, or a virtual machine with an emulated processor. The first of them that can do what
+is requested, and that boots, is used. The guest has the files of the host. It may write this checkout; other changes
+stay in the guest. The variable SNAKESIM_VCAN is set to `native` or `guest`. The guest needs Debian or Ubuntu on x86-64.
 
 virtme-ng 1.42 is not used. It boots the same kernel without KVM, but needs its modules and kmod on the host. It does
 not load Debian's virtio_console, so output and exit code of the command were lost ("cannot find script I/O ports"). A
@@ -16,6 +17,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import shlex
 import socket
 import subprocess
@@ -26,15 +28,25 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))  # so that `deploy.vm` is the same package here and in the tests
 
-from deploy.vm.kernel import Kernel, find_cache_folder, prepare_kernel  # noqa: E402
-from deploy.vm.machine import Guest, GuestError, GuestRequest, set_parent_death_signal  # noqa: E402
+from deploy.vm.kernel import (  # noqa: E402
+    Kernel,
+    find_cache_folder,
+    prepare_kernel,
+    prepare_user_mode_kernel,
+)
+from deploy.vm.machine import (  # noqa: E402
+    Guest,
+    GuestError,
+    GuestKind,
+    GuestRequest,
+    set_parent_death_signal,
+)
 from deploy.vm.packages import PreparationError, find_tool, require_tool  # noqa: E402
 
-BOOT_TIMEOUT_WITH_KVM_S = 30.0
-BOOT_TIMEOUT_WITHOUT_KVM_S = 120.0
+BOOT_TIMEOUTS_S = {GuestKind.KVM: 30.0, GuestKind.USER_MODE: 60.0, GuestKind.EMULATED: 120.0}
 KVM_TEST_TIMEOUT_S = 20.0
 MAX_PORT = 65535
-MAX_ATTEMPTS = 2
+ANY_KIND = "any"
 
 # Exit codes, as shells and env(1) have them.
 CANNOT_START = 125
@@ -52,7 +64,12 @@ def main() -> int:
     set_parent_death_signal()
     try:
         require_tool("ip")
-        needs_guest = arguments.guest or arguments.controllers or arguments.forward
+        needs_guest = bool(
+            arguments.guest
+            or arguments.controllers
+            or arguments.forward
+            or (arguments.joystick and not os.access("/dev/uinput", os.W_OK))
+        )
         prefix = None if needs_guest else make_native_prefix(arguments.channels)
         if prefix is None:
             return run_in_guest(arguments)
@@ -109,39 +126,92 @@ def make_native_prefix(channels: list[str]) -> list[str] | None:
 
 
 def run_in_guest(arguments: argparse.Namespace) -> int:
-    """Boot a guest, run the command in it, and return its exit code. A boot that fails is repeated once."""
+    """Boot a guest, run the command in it, and return its exit code.
+
+    If a guest cannot be prepared or does not boot, the next kind of guest is used.
+    """
     if platform.machine() != "x86_64":
         raise PreparationError(
             f"this kernel has no CAN, and a guest needs x86-64, but this is {platform.machine()}"
         )
-    require_tool("qemu-system-x86_64")
-    kernel = prepare_kernel()
     request = GuestRequest(
         command=arguments.command,
         folder=Path.cwd(),
         writable=[ROOT, *(path.resolve(strict=True) for path in arguments.rwdir)],
         channels=arguments.channels,
         controllers=arguments.controllers,
+        input_devices=arguments.joystick,
         forward=arguments.forward,
         cpus=arguments.cpus,
         memory=arguments.memory,
         verbose=arguments.verbose,
     )
-    kvm = check_kvm(kernel)
-    for attempt in range(1, MAX_ATTEMPTS + 1):
-        with closing(Guest(request, kernel, kvm)) as guest:
-            try:
-                guest.wait_until_ready(
-                    BOOT_TIMEOUT_WITH_KVM_S if kvm else BOOT_TIMEOUT_WITHOUT_KVM_S
-                )
-            except GuestError as error:
-                if attempt == MAX_ATTEMPTS:
-                    raise
-                print(f"with_vcan: {error}\nwith_vcan: the guest is started again", file=sys.stderr)
-                kvm = False  # KVM may be the reason
-                continue
-            return guest.run()
-    raise AssertionError("the last attempt returns or raises")
+    requested_kind = None if arguments.guest in (None, ANY_KIND) else GuestKind(arguments.guest)
+    *kinds, last_kind = choose_guest_kinds(request, requested_kind)
+    for kind in kinds:
+        try:
+            guest = boot_guest(request, kind)
+        except (PreparationError, GuestError) as error:
+            print(f"with_vcan: {error}\nwith_vcan: trying another guest", file=sys.stderr)
+        else:
+            break
+    else:
+        guest = boot_guest(request, last_kind)
+    with closing(guest):
+        return guest.run()
+
+
+def choose_guest_kinds(request: GuestRequest, requested: GuestKind | None) -> list[GuestKind]:
+    """Return the kinds of guest to try, in this order.
+
+    Args:
+        request: What the guest must offer.
+        requested: The only kind to try; None for any.
+
+    Raises:
+        GuestError: The requested kind does not offer what the request needs.
+    """
+    needs_machine = bool(request.controllers or request.forward or request.input_devices)
+    match requested:
+        case GuestKind.USER_MODE if needs_machine:
+            raise GuestError(
+                "user-mode Linux has no CAN controllers, no forwarded ports and no input devices. "
+                "Use --guest kvm or --guest emulated"
+            )
+        case GuestKind():
+            return [requested]
+        case None:
+            kinds: list[GuestKind] = []
+            if os.access("/dev/kvm", os.R_OK | os.W_OK) and read_kvm_result() is not False:
+                kinds.append(GuestKind.KVM)
+            if not needs_machine:
+                kinds.append(GuestKind.USER_MODE)
+            # Twice: on a busy computer, the boot of an emulated processor sometimes fails at its late timer.
+            return [*kinds, GuestKind.EMULATED, GuestKind.EMULATED]
+
+
+def boot_guest(request: GuestRequest, kind: GuestKind) -> Guest:
+    """Prepare the kernel, start a guest, and wait until it runs the command.
+
+    Raises:
+        PreparationError: A tool or package is missing, and cannot be installed.
+        GuestError: The guest did not boot.
+    """
+    match kind:
+        case GuestKind.USER_MODE:
+            kernel = prepare_user_mode_kernel()
+        case GuestKind.KVM | GuestKind.EMULATED:
+            require_tool("qemu-system-x86_64")
+            kernel = prepare_kernel()
+    if kind is GuestKind.KVM and not check_kvm(kernel):
+        raise GuestError("a virtual machine with KVM does not boot on this computer")
+    guest = Guest(request, kernel, kind)
+    try:
+        guest.wait_until_ready(BOOT_TIMEOUTS_S[kind])
+    except GuestError:
+        guest.close()
+        raise
+    return guest
 
 
 def check_kvm(kernel: Kernel) -> bool:
@@ -149,22 +219,32 @@ def check_kvm(kernel: Kernel) -> bool:
 
     The test runs once for each start of the computer. Its result is kept in the cache.
     """
-    if not os.access("/dev/kvm", os.R_OK | os.W_OK):
-        return False
-    cache = find_cache_folder() / "kvm.json"
-    boot_id = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    results = json.loads(cache.read_text()) if cache.exists() else {}
-    if boot_id not in results:
+    works = read_kvm_result()
+    if works is None:
+        request = GuestRequest(command=["true"], folder=Path("/"), channels=[])
         try:
-            request = GuestRequest(command=["true"], folder=Path("/"), channels=[])
-            with closing(Guest(request, kernel, kvm=True)) as guest:
+            with closing(Guest(request, kernel, GuestKind.KVM)) as guest:
                 guest.wait_until_ready(KVM_TEST_TIMEOUT_S)
             works = True
         except GuestError:
             works = False
-        results = {boot_id: works}
-        cache.write_text(json.dumps(results))
-    return results[boot_id]
+        _find_kvm_results().write_text(json.dumps({_read_boot_id(): works}))
+    return works
+
+
+def read_kvm_result() -> bool | None:
+    """Return the result of the last test of KVM; None if there was none since this computer started."""
+    path = _find_kvm_results()
+    results: dict[str, bool] = json.loads(path.read_text()) if path.exists() else {}
+    return results.get(_read_boot_id())
+
+
+def _find_kvm_results() -> Path:
+    return find_cache_folder() / "kvm.json"
+
+
+def _read_boot_id() -> str:
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def _parse_arguments() -> argparse.Namespace:
@@ -178,7 +258,11 @@ def _parse_arguments() -> argparse.Namespace:
         help="names of the interfaces, such as vcan0,vcan1 (vcan0)",
     )
     parser.add_argument(
-        "--guest", action="store_true", help="use a guest even if this kernel has CAN"
+        "--guest",
+        nargs="?",
+        const=ANY_KIND,
+        choices=[ANY_KIND, *(kind.value for kind in GuestKind)],
+        help="use a guest even if this kernel has CAN, of this kind (any)",
     )
     parser.add_argument(
         "--verbose", action="store_true", help="show the messages of the guest's kernel"
@@ -188,6 +272,11 @@ def _parse_arguments() -> argparse.Namespace:
         "--controllers",
         action="store_true",
         help="emulate two CAN controllers on one bus, can0 and can1",
+    )
+    guest.add_argument(
+        "--joystick",
+        action="store_true",
+        help="let programs create input devices such as joysticks (uinput)",
     )
     guest.add_argument(
         "--forward",
@@ -204,8 +293,12 @@ def _parse_arguments() -> argparse.Namespace:
         default=[],
         help="folder that the guest may write; may be repeated",
     )
-    guest.add_argument("--cpus", type=int, default=2, help="number of processors (2)")
-    guest.add_argument("--memory", default="2G", help="size of the memory (2G)")
+    guest.add_argument(
+        "--cpus", type=int, default=2, help="number of processors (2); user-mode Linux has one"
+    )
+    guest.add_argument(
+        "--memory", type=parse_memory, default="2G", help="size of the memory, such as 512M (2G)"
+    )
     parser.usage = "with_vcan.py [options] -- COMMAND ..."
     # The first `--` separates options and command. The command may contain another one.
     words = sys.argv[1:]
@@ -225,6 +318,13 @@ def parse_interface_names(text: str) -> list[str]:
             f"{text!r}: interface names of up to 15 letters and digits, with commas between"
         )
     return names
+
+
+def parse_memory(text: str) -> str:
+    """Return a size of the memory such as `2G` or `512M`, if it is valid."""
+    if not re.fullmatch(r"[1-9]\d*[MG]", text):
+        raise argparse.ArgumentTypeError(f"{text!r}: a size such as 512M or 2G")
+    return text
 
 
 def parse_ports(text: str) -> tuple[int, int]:

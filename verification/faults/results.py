@@ -43,8 +43,19 @@ class FaultResults:
 def describe_machine() -> str:
     """Return the number of cores, the kernel and the interpreter of this machine as text."""
     is_guest = os.environ.get("SNAKESIM_VCAN") == "guest"
-    suffix = ", emulated in a guest" if is_guest else ""
+    suffix = f", in a guest ({_describe_processor()})" if is_guest else ""
     return (
         f"{os.cpu_count()} cores, {platform.machine()}, Linux {platform.release()}, "
         f"Python {platform.python_version()}{suffix}"
     )
+
+
+def _describe_processor() -> str:
+    """Return the processor's name, which shows whether a guest is emulated or user-mode Linux."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    names = [
+        line.partition(":")[2].strip()
+        for line in lines
+        if line.startswith(("model name", "vendor_id"))
+    ]
+    return " ".join(names[:2]) or "unknown processor"
