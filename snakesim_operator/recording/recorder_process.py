@@ -51,7 +51,10 @@ from snakesim_operator.recording.tap import MessageTap
 from snakesim_operator.recording.writer import RecordingWriter
 
 CYCLE_S = 0.02
-LAST_MESSAGES_TIMEOUT_S = 2.0  # at the end, for messages that are on their way
+# At the end, messages are on their way. After this time without one, none is expected, whether a host has left or not.
+LAST_MESSAGE_TIMEOUT_S = 2.0
+# At the end, for all messages. A run kills its recorder after 15 s, and until then the file must be closed.
+LAST_MESSAGES_LIMIT_S = 10.0
 QUIET_CYCLES_AT_END = 2  # at the end: after so many cycles without a message, none is on its way
 NICENESS = 10  # a robot's own processes have precedence
 MAX_HOSTS = 100  # files: one for each host that a robot had
@@ -319,18 +322,22 @@ def _track_present_hosts(session: Session) -> set[str]:
 def _write_last_messages(tap: MessageTap, recorder: RobotRecorder, present_hosts: set[str]) -> None:
     """Write the last messages of a run, until the host has left and no message is on its way.
 
-    In a run the recorder ends last, so messages of the other processes may still be queued in the network.
+    In a run the recorder ends last, so messages of the other processes may still be queued in the network. On a busy
+    computer, there may be more than it can write within seconds.
 
     Args:
         tap: Has the messages that have arrived.
         recorder: Writes the messages.
         present_hosts: Liveliness keys of the hosts on the network; other threads update the set.
     """
-    deadline_s = time.monotonic() + LAST_MESSAGES_TIMEOUT_S
+    limit_s = time.monotonic() + LAST_MESSAGES_LIMIT_S
+    deadline_s = time.monotonic() + LAST_MESSAGE_TIMEOUT_S
     quiet_cycles = 0
-    while quiet_cycles < QUIET_CYCLES_AT_END and time.monotonic() < deadline_s:
-        arrival_count = _write_arrivals(tap, recorder)
-        if arrival_count > 0 or present_hosts:
+    while quiet_cycles < QUIET_CYCLES_AT_END and time.monotonic() < min(deadline_s, limit_s):
+        if _write_arrivals(tap, recorder) > 0:
+            quiet_cycles = 0
+            deadline_s = time.monotonic() + LAST_MESSAGE_TIMEOUT_S
+        elif present_hosts:
             quiet_cycles = 0
         else:
             quiet_cycles += 1
