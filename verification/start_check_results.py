@@ -1,19 +1,21 @@
 """Results of the start check trials: a file with one line for each robot, and the tables of all robots in it.
 
-    python -m verification.start_check_results runs/start-check-trials.jsonl
+    python -m verification.start_check_results runs/start-check-trials.jsonl [--judge-again]
 
-prints the tables, and then each robot whose fault was not found by name, or with a sound joint reported as wrong.
+prints the tables, and then each robot whose fault was not found by name, or with a sound joint reported as wrong. With
+`--judge-again`, the present check judges the recorded signals again. The file stays as it is.
 """
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
 
 from snakesim_operator.features.evaluate.table import compute_wilson_interval
-from verification.start_check_trials import NONE, CheckTrial, Outcome
+from verification.start_check_signals import find_signals_path, load_signals, save_signals
+from verification.start_check_trials import NONE, CheckTrial, Outcome, judge_trial
 
 FAULT_HEADER = (
     "| drive type | hidden fault | robots | found by name | 95 % interval | found at an end | both causes | wrong name "
@@ -32,6 +34,7 @@ class RobotResult(msgspec.Struct, frozen=True, kw_only=True):
     number: int  # of the robot, which is its seed
     fault: str
     settings: list[str]  # of the emulated drives that make the fault
+    joints: list[int]  # that have the fault
     outcome: Outcome | None  # None if the robot has no fault
     is_at_end: bool  # whether the joint with the fault is the first or the last one
     reported: list[str]  # of each joint with the fault
@@ -48,6 +51,7 @@ def summarize_trial(trial: CheckTrial) -> RobotResult:
         number=trial.number,
         fault=trial.fault,
         settings=list(trial.settings),
+        joints=list(trial.joints),
         outcome=trial.outcome,
         is_at_end=trial.is_at_end,
         reported=trial.reported,
@@ -58,10 +62,31 @@ def summarize_trial(trial: CheckTrial) -> RobotResult:
     )
 
 
-def append_result(path: Path, result: RobotResult) -> None:
-    """Append a robot to the results file."""
+def append_trial(path: Path, trial: CheckTrial) -> None:
+    """Write the signals of a robot, and append it to the results file."""
+    save_signals(find_signals_path(path, trial.backend, trial.number), trial.measurements)
     with path.open("ab") as file:
-        file.write(msgspec.json.encode(result) + b"\n")
+        file.write(msgspec.json.encode(summarize_trial(trial)) + b"\n")
+
+
+def judge_again(path: Path, results: Iterable[RobotResult]) -> Iterator[RobotResult]:
+    """Yield what the present check finds in the recorded signals of robots. Raises FileNotFoundError without signals.
+
+    Args:
+        path: Path of the results file, next to which the signals are.
+        results: The robots of this file.
+    """
+    for result in results:
+        measurements = load_signals(find_signals_path(path, result.backend, result.number))
+        trial = judge_trial(
+            result.backend,
+            result.number,
+            result.fault,
+            result.settings,
+            result.joints,
+            measurements,
+        )
+        yield summarize_trial(trial)
 
 
 def read_results(path: Path) -> list[RobotResult]:
@@ -132,7 +157,15 @@ def main() -> int:
     """Print the tables and the failures of a results file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("path", type=Path)
-    results = read_results(parser.parse_args().path)
+    parser.add_argument(
+        "--judge-again",
+        action="store_true",
+        help="judge the recorded signals with the present check, and leave the file as it is",
+    )
+    arguments = parser.parse_args()
+    results = read_results(arguments.path)
+    if arguments.judge_again:
+        results = list(judge_again(arguments.path, results))
     print("\n".join(format_tables(results)))
     print()
     print("\n".join(format_failures(results)))

@@ -21,7 +21,10 @@ from snakesim_operator.features.commissioning.joint_check.gear_rules import (
 )
 from snakesim_operator.features.commissioning.joint_check.joint_verdict import JointVerdict
 from snakesim_operator.features.commissioning.joint_check.judge import judge_joints
-from snakesim_operator.features.commissioning.joint_check.measurements import collect_measurements
+from snakesim_operator.features.commissioning.joint_check.measurements import (
+    CheckMeasurements,
+    collect_measurements,
+)
 
 JOINT_COUNT = 5
 SECONDS_PER_JOINT = 3.4  # of the joint check, at most
@@ -71,6 +74,7 @@ class CheckTrial:
         str
     ]  # of the emulated drives that make the fault, such as "joint_1.backlash_rad=0.025"
     joints: Sequence[int]  # that have the fault
+    measurements: CheckMeasurements
     rows: Sequence[JointVerdict]
 
     @property
@@ -198,12 +202,25 @@ def check_trial(
     seconds = SECONDS_PER_JOINT * joint_count
     run += [f"duration_s={seconds}", *(f"backends.{backend}.mounted.{text}" for text in truth)]
     with_fault = {NONE: [], "order": [joint, other]}.get(fault, [joint])
-    rows = run_start_check(f"backend={backend}", *sets, *run)
-    return CheckTrial(backend, number, fault, settings, with_fault, rows)
+    measurements = run_start_check(f"backend={backend}", *sets, *run)
+    return judge_trial(backend, number, fault, settings, with_fault, measurements)
 
 
-def run_start_check(*sets: str) -> list[JointVerdict]:
-    """Run the joint check in this process until every joint was moved, and judge it. `sets`: as `--set` of a run."""
+def judge_trial(
+    backend: str,
+    number: int,
+    fault: str,
+    settings: Sequence[str],
+    joints: Sequence[int],
+    measurements: CheckMeasurements,
+) -> CheckTrial:
+    """Judge the measurements of one robot, which the person laid straight. The arguments: see `CheckTrial`."""
+    rows = judge_joints(measurements, was_laid_straight=True)
+    return CheckTrial(backend, number, fault, settings, joints, measurements, rows)
+
+
+def run_start_check(*sets: str) -> CheckMeasurements:
+    """Run the joint check in this process until every joint was moved. `sets`: as `--set` of a run."""
     config = load_scenario("joint_check", [parse_set_option(text) for text in sets]).config
     imus: list[Imu] = []
     remaining_ticks: int | None = None  # None while joints are still moved
@@ -227,9 +244,7 @@ def run_start_check(*sets: str) -> list[JointVerdict]:
         robot = run.host.description
         config = run.config
     ticks = columns.pop("tick").tolist()
-    return judge_joints(
-        collect_measurements(config, robot, ticks, columns, imus), was_laid_straight=True
-    )
+    return collect_measurements(config, robot, ticks, columns, imus)
 
 
 def list_possible_faults(backend: str) -> list[str]:
