@@ -9,9 +9,11 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot_file.checked import PROPERTIES
 from snakesim_hal.model.robot_file.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.joint_check.check import format_report
+from snakesim_operator.features.commissioning.joint_check.gear_play import GearPlay
 from snakesim_operator.features.commissioning.joint_check.gear_rules import (
     IS_LOOSE,
     judge_gear_by_links,
+    judge_gear_by_torque,
 )
 from snakesim_operator.features.commissioning.joint_check.joint_verdict import (
     MATCHES_FILE,
@@ -255,9 +257,39 @@ def test_drawn_shapes_do_not_confirm_a_gear_whose_backlash_is_unknown() -> None:
     run = without_imus(measurements(), *range(JOINTS + 1))
     row = judge_joints(run, was_laid_straight=True)[0]
     assert "backlash and ratio unknown, as it made no small motion" in row.findings["gear"].reason
-    row = row.confirm_by_shape(["order", "sign", "gear", "zero"])
-    assert states(row) == {"gear": "unknown"}
-    assert row.confirm_by_hand(["gear"]).all_confirmed
+    seen = row.confirm_by_shape(["order", "sign", "gear", "zero"], was_shaken=False)
+    assert states(seen) == {"gear": "unknown"}
+    assert seen.confirm_by_hand(["gear"]).all_confirmed
+    assert row.confirm_by_shape(["order", "sign", "gear", "zero"], was_shaken=True).all_confirmed
+
+
+@pytest.mark.parametrize(
+    ("play", "state", "excludes_backlash"),
+    [
+        (GearPlay("tight", max_backlash_rad=0.006), "unknown", True),
+        (GearPlay("tight", max_backlash_rad=0.012), "unknown", False),
+        (GearPlay("backlash", min_backlash_rad=0.012), "wrong", False),
+        (GearPlay("backlash", min_backlash_rad=0.008), "unknown", False),
+        (GearPlay("unknown", "the floor hardly loads the joints"), "unknown", False),
+    ],
+)
+def test_only_a_computed_bound_within_the_allowed_backlash_lets_shapes_confirm_a_gear(
+    play: GearPlay, state: str, excludes_backlash: bool
+) -> None:
+    finding = judge_gear_by_torque(play, allowed_backlash_rad=0.01)
+    assert finding.state == state
+    assert finding.excludes_backlash == excludes_backlash
+    verdict = JointVerdict("joint_1", {"gear": finding})
+    seen = verdict.confirm_by_shape(["gear"], was_shaken=False).findings["gear"]
+    assert (seen.state == "confirmed") == excludes_backlash
+
+
+def test_shaking_does_not_confirm_a_gear_that_was_found_wrong() -> None:
+    finding = judge_gear_by_torque(
+        GearPlay("backlash", min_backlash_rad=0.012), allowed_backlash_rad=0.01
+    )
+    verdict = JointVerdict("joint_1", {"gear": finding})
+    assert verdict.confirm_by_shape(["gear"], was_shaken=True).findings["gear"].state == "wrong"
 
 
 def test_judge_two_imus_cannot_separate_joints_of_equal_effect() -> None:
