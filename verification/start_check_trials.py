@@ -59,7 +59,8 @@ FAULTS_OF_JOINT_MODULES = ("order", "dead motor")
 JOINT_MODULES = "can"  # the only backend whose drives report IMUs
 
 # "either": the check reports a loose gear or coupling, and cannot tell which.
-# "unnoticed": it confirmed the property, or reported that it found no backlash.
+# "unnoticed": it confirmed the property, or reported that it found no backlash above an angle. All hidden backlash is
+# larger than any such angle.
 Outcome = Literal["named", "either", "misnamed", "unknown", "unnoticed"]
 
 
@@ -132,9 +133,9 @@ class CheckTrial:
 
     @property
     def tight_count(self) -> int:
-        """Number of sound joints of which the check reports that it found no backlash."""
+        """Number of sound joints whose gear was confirmed, or in which the torque excludes backlash."""
         gears = [row.findings["gear"] for row in self.sound_rows]
-        return sum(gear.state == "confirmed" or NO_BACKLASH in gear.reason for gear in gears)
+        return sum(gear.state == "confirmed" or gear.excludes_backlash for gear in gears)
 
     @property
     def blamed(self) -> list[str]:
