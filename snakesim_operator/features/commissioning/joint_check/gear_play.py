@@ -43,8 +43,8 @@ MIN_SLIPPING_NEIGHBOR_RATIO = 0.4
 # The neighbors' range of torque in the large motion, divided by the elastic torque of a typical joint. Behind a gear
 # that holds, it is larger.
 MAX_SLIPPING_LOAD_RATIO = 0.5
-# Of the small stroke, at one of its ends, without a load. Sound joints have 0.15 or less, and loose ones whose teeth
-# touch at one end only have 0.44 or more.
+# Of the small stroke, at one of its ends, without a load. On emulated drives that report a torque, sound joints have
+# 0.12 or less, and loose ones whose teeth touch at the other end have 0.40 or more.
 MIN_UNLOADED_FRACTION = 0.3
 # The load at the other end, divided by the smallest torque that proves a load.
 MIN_LOAD_RATIO = 2.0

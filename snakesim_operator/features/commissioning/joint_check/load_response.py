@@ -141,7 +141,9 @@ def _get_motion(
 
 
 def _find_directions(angle_rad: Floats) -> Floats:
-    """Return the direction in which a joint moves, +1 or -1 at each tick, (n,)."""
+    """Return the direction in which a joint moves, +1 or -1 at each tick, (n,); 0 if there is only one tick."""
+    if len(angle_rad) < 2:
+        return np.zeros(len(angle_rad))
     return np.sign(np.gradient(_smooth(angle_rad[:, None])[:, 0]))
 
 

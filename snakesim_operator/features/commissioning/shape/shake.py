@@ -1,6 +1,6 @@
 """Asks a person to shake every link, because drawn shapes do not show whether a gear is loose.
 
-The motors stay off. Within backlash, a link moves while the drive behind it rests, which a person feels.
+The motors stay off. Within backlash, a person can move a link while the drive behind it rests.
 """
 
 from collections.abc import Mapping, Sequence

@@ -235,11 +235,13 @@ def test_encoder_with_dead_zone_is_named_and_its_gear_is_not_judged(has_imus: bo
     assert [rows[joint].findings["drive"].state for joint in (0, 2)] == ["confirmed"] * 2
 
 
-def test_motion_of_a_single_tick_does_not_end_the_judgment() -> None:
+@pytest.mark.parametrize("ticks", [(3,), (3, 5), (3, 5, 7, 9)])
+def test_motion_of_a_single_tick_does_not_end_the_judgment(ticks: tuple[int, ...]) -> None:
     """A dead zone may jump as far as a small motion goes, so that the target turns back at once."""
     run = measurements()
     target_rad = run.target_rad.copy()
-    target_rad[REST + MOTION - 3, 0] = 0.001
+    for tick in ticks:
+        target_rad[REST + MOTION - tick, 0] = 0.001
     rows = judge_joints(replace(run, target_rad=target_rad), was_laid_straight=True)
     assert rows[0].findings["drive"].state == "confirmed"
 
