@@ -95,7 +95,8 @@ def measure_tooth_contact(
 def estimate_friction_nm(motion: JointMotion) -> float:
     """Return an upper limit of a drive's friction: half the smallest difference between both directions.
 
-    The stroke is divided into bins of the angle. 0 if no bin contains both directions.
+    The stroke is divided into bins of the angle. Infinite if no bin contains both directions, so that no torque proves
+    a load.
     """
     edges_rad = np.linspace(np.min(motion.angle_rad), np.max(motion.angle_rad), FRICTION_BINS + 1)
     bins = np.clip(np.digitize(motion.angle_rad, edges_rad) - 1, 0, FRICTION_BINS - 1)
@@ -105,7 +106,7 @@ def estimate_friction_nm(motion: JointMotion) -> float:
         backward_nm = motion.torque_nm[(bins == number) & (motion.direction < 0)]
         if min(len(forward_nm), len(backward_nm)) >= MIN_BIN_TICKS:
             differences_nm.append(float(np.mean(forward_nm) - np.mean(backward_nm)))
-    return max(0.0, min(differences_nm, default=0.0)) / 2
+    return max(0.0, min(differences_nm, default=float("inf"))) / 2
 
 
 def measure_reversal_rad(
@@ -124,7 +125,7 @@ def measure_reversal_rad(
     sides = np.where(np.abs(motion.torque_nm) >= min_load_nm, np.sign(motion.torque_nm), 0.0)
     loaded_ticks = np.flatnonzero(sides)
     largest_rad = {1.0: 0.0, -1.0: 0.0}  # by the sign of the load after the reversal
-    is_reversed = {1.0: False, -1.0: False}
+    has_reversed = {1.0: False, -1.0: False}
     for last_tick, tick in pairwise(loaded_ticks.tolist()):
         side = float(sides[tick])
         if side == sides[last_tick]:
@@ -132,8 +133,8 @@ def measure_reversal_rad(
         start = max(last_tick - margin_ticks, 0)
         angle_rad = float(np.ptp(motion.angle_rad[start : tick + margin_ticks + 1]))
         largest_rad[side] = max(largest_rad[side], angle_rad)
-        is_reversed[side] = True
-    if not all(is_reversed.values()):
+        has_reversed[side] = True
+    if not all(has_reversed.values()):
         return None
     return max(largest_rad.values())
 

@@ -122,6 +122,18 @@ def test_friction_is_never_estimated_too_low() -> None:
         assert estimate_friction_nm(motion) >= friction_nm - ROUNDING_NM
 
 
+def test_friction_that_cannot_be_estimated_bounds_nothing() -> None:
+    angle_rad = make_motion(SMALL_MOVE_RAD, STEP_RAD, 2)
+    torque_nm = compute_torques(angle_rad, 0.0, 0.0, 0.0)
+    unknown_direction = np.zeros(len(angle_rad))
+    motion = JointMotion(angle_rad, angle_rad, torque_nm, unknown_direction)
+    contact = measure_tooth_contact(
+        motion, motion, motion, noise_nm=0.0, angle_step_rad=0.0, window_ticks=5
+    )
+    assert contact.reversal_rad is None
+    assert contact.min_load_nm == float("inf")
+
+
 @pytest.mark.parametrize("friction_nm", [0.0, 0.05])
 @pytest.mark.parametrize("contact_rad", [-0.002, 0.0, 0.002])
 def test_load_at_one_end_only_is_measured(contact_rad: float, friction_nm: float) -> None:
