@@ -35,7 +35,7 @@ from snakesim_operator.features.commissioning.system_identification.identificati
 )
 from verification.start_check_results import (
     RobotResult,
-    append_result,
+    append_trial,
     format_tables,
     read_results,
     summarize_trial,
@@ -306,7 +306,8 @@ def check_robots(
         backend: Backend of the runs, which is the type of the drives.
         faults: Hidden faults, of `list_possible_faults`.
         joint_count: Number of joints of each robot.
-        record: File to which each robot is appended; robots that it already contains are not checked again.
+        record: File to which each robot is appended, with its signals in a folder next to it. Robots that it already
+            contains are not checked again.
     """
     known_results: dict[int, RobotResult] = {}
     if record is not None:
@@ -319,7 +320,7 @@ def check_robots(
             trial = check_trial(number, fault, *sets, backend=backend, joint_count=joint_count)
             result = summarize_trial(trial)
             if record is not None:
-                append_result(record, result)
+                append_trial(record, trial)
             print(
                 f"robot {number}, {fault}: {result.outcome}; {result.reported}; blamed {result.blamed}; "
                 f"unsure {result.unsure}",
@@ -360,7 +361,8 @@ def main() -> int:
     parser.add_argument(
         "--record",
         type=Path,
-        help="file to which each checked robot is appended; robots that it already contains are not checked again",
+        help="file to which each checked robot is appended, with its signals in a folder next to it; robots that it "
+        "already contains are not checked again",
     )
     arguments = parser.parse_args()
     if arguments.table == "check":

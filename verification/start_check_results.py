@@ -1,19 +1,28 @@
 """Results of the start check trials: a file with one line for each robot, and the tables of all robots in it.
 
-    python -m verification.start_check_results runs/start-check-trials.jsonl
+    python -m verification.start_check_results runs/start-check-trials.jsonl [--judge-again]
 
-prints the tables, and then each robot whose fault was not found by name, or with a sound joint reported as wrong.
+prints what `docs/development/start-check-trials.md` contains:
+
+    numbers of the robots, and how many faults of joints between two others were found
+    table of hidden faults
+    table of sound joints
+    table of the robots whose fault was not found by name, or with a sound joint that was reported as wrong
+
+With `--judge-again`, the present check judges the recorded signals again, and the robots come first whose outcome has
+changed. The file stays as it is.
 """
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
 
 from snakesim_operator.features.evaluate.table import compute_wilson_interval
-from verification.start_check_trials import NONE, CheckTrial, Outcome
+from verification.start_check_signals import find_signals_path, load_signals, save_signals
+from verification.start_check_trials import JOINT_MODULES, NONE, CheckTrial, Outcome, judge_trial
 
 FAULT_HEADER = (
     "| drive type | hidden fault | robots | found by name | 95 % interval | found at an end | both causes | wrong name "
@@ -21,8 +30,10 @@ FAULT_HEADER = (
 )
 ALARM_HEADER = (
     "| drive type | robots | with a sound joint reported | at most (95 %) | with a sound joint unknown | sound joints "
-    "| reported | at most (95 %) | reported without backlash |"
+    "| reported | at most (95 %) | backlash excluded |"
 )
+
+FAILURE_HEADER = "| robot | hidden fault | settings | outcome | what the check reported | sound joints reported |"
 
 
 class RobotResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,13 +43,16 @@ class RobotResult(msgspec.Struct, frozen=True, kw_only=True):
     number: int  # of the robot, which is its seed
     fault: str
     settings: list[str]  # of the emulated drives that make the fault
+    joints: list[int]  # that have the fault
     outcome: Outcome | None  # None if the robot has no fault
     is_at_end: bool  # whether the joint with the fault is the first or the last one
     reported: list[str]  # of each joint with the fault
     blamed: list[str]  # sound joints that were reported as wrong, with the verdict
     unsure: list[str]  # sound joints of which something is unknown
     sound_count: int  # of joints
-    tight_count: int  # of sound joints of which the check reports that it found no backlash
+    tight_count: (
+        int  # of sound joints whose gear was confirmed, or in which the torque excludes backlash
+    )
 
 
 def summarize_trial(trial: CheckTrial) -> RobotResult:
@@ -48,6 +62,7 @@ def summarize_trial(trial: CheckTrial) -> RobotResult:
         number=trial.number,
         fault=trial.fault,
         settings=list(trial.settings),
+        joints=list(trial.joints),
         outcome=trial.outcome,
         is_at_end=trial.is_at_end,
         reported=trial.reported,
@@ -58,10 +73,31 @@ def summarize_trial(trial: CheckTrial) -> RobotResult:
     )
 
 
-def append_result(path: Path, result: RobotResult) -> None:
-    """Append a robot to the results file."""
+def append_trial(path: Path, trial: CheckTrial) -> None:
+    """Write the signals of a robot, and append it to the results file."""
+    save_signals(find_signals_path(path, trial.backend, trial.number), trial.measurements)
     with path.open("ab") as file:
-        file.write(msgspec.json.encode(result) + b"\n")
+        file.write(msgspec.json.encode(summarize_trial(trial)) + b"\n")
+
+
+def judge_again(path: Path, results: Iterable[RobotResult]) -> Iterator[RobotResult]:
+    """Yield what the present check finds in the recorded signals of robots. Raises FileNotFoundError without signals.
+
+    Args:
+        path: Path of the results file, next to which the signals are.
+        results: The robots of this file.
+    """
+    for result in results:
+        measurements = load_signals(find_signals_path(path, result.backend, result.number))
+        trial = judge_trial(
+            result.backend,
+            result.number,
+            result.fault,
+            result.settings,
+            result.joints,
+            measurements,
+        )
+        yield summarize_trial(trial)
 
 
 def read_results(path: Path) -> list[RobotResult]:
@@ -118,21 +154,82 @@ def _format_alarms(label: str, results: Sequence[RobotResult]) -> str:
 
 
 def format_failures(results: Sequence[RobotResult]) -> Iterator[str]:
-    """Yield each robot whose fault was not found by name, or with a sound joint that was reported as wrong."""
+    """Yield the table of robots whose fault was not found by name, or with a sound joint that was reported as wrong.
+
+    Faults at an end of a robot that stay unknown are left out, because the check does not judge these joints.
+    """
+    yield FAILURE_HEADER
+    yield "|" + "---|" * FAILURE_HEADER.count(" |")
     for result in results:
-        if result.outcome in ("named", None) and not result.blamed:
+        is_unknown_at_end = result.outcome == "unknown" and result.is_at_end
+        if (result.outcome in ("named", None) or is_unknown_at_end) and not result.blamed:
             continue
         yield (
-            f"{result.backend} {result.number}, {result.fault} {result.settings}: {result.outcome}; "
-            f"reported {result.reported}; sound joints reported {result.blamed}"
+            f"| {result.backend} {result.number} | {result.fault} | {', '.join(result.settings)} | {result.outcome} "
+            f"| {'; '.join(result.reported)} | {'; '.join(result.blamed) or '-'} |"
         )
+
+
+def format_summary(results: Sequence[RobotResult]) -> Iterator[str]:
+    """Yield the numbers of the robots of each drive type, and the faults that were found between two other joints."""
+    yield f"{len(results)} robots"
+    for backend in dict.fromkeys(result.backend for result in results):
+        numbers = sorted(result.number for result in results if result.backend == backend)
+        yield f"{backend}: {len(numbers)} robots, {_format_ranges(numbers)}"
+    for fault in dict.fromkeys(result.fault for result in results if result.fault != NONE):
+        between = [r for r in results if r.fault == fault and not r.is_at_end]
+        without_imus = [r for r in between if r.backend != JOINT_MODULES]
+        yield (
+            f"{fault} between two other joints: {_count_named(between)} named, without IMUs "
+            f"{_count_named(without_imus)}"
+        )
+
+
+def _count_named(results: Sequence[RobotResult]) -> str:
+    named = sum(result.outcome == "named" for result in results)
+    return f"{named} of {len(results)}"
+
+
+def _format_ranges(numbers: Sequence[int]) -> str:
+    """Return sorted numbers as text, with consecutive ones as a range, such as "9000 to 9007, 9010"."""
+    ranges: list[tuple[int, int]] = []
+    for number in numbers:
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1] = (ranges[-1][0], number)
+        else:
+            ranges.append((number, number))
+    return ", ".join(
+        str(first) if first == last else f"{first} to {last}" for first, last in ranges
+    )
+
+
+def format_changes(before: Sequence[RobotResult], after: Sequence[RobotResult]) -> Iterator[str]:
+    """Yield each robot for which a second judgment has another outcome, or reports other sound joints."""
+    for old, new in zip(before, after, strict=True):
+        if (old.outcome, old.blamed) != (new.outcome, new.blamed):
+            yield (
+                f"{new.backend} {new.number}, {new.fault}: {old.outcome} -> {new.outcome}; sound joints reported "
+                f"{old.blamed} -> {new.blamed}"
+            )
 
 
 def main() -> int:
     """Print the tables and the failures of a results file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("path", type=Path)
-    results = read_results(parser.parse_args().path)
+    parser.add_argument(
+        "--judge-again",
+        action="store_true",
+        help="judge the recorded signals with the present check, and leave the file as it is",
+    )
+    arguments = parser.parse_args()
+    results = read_results(arguments.path)
+    if arguments.judge_again:
+        recorded_results = results
+        results = list(judge_again(arguments.path, recorded_results))
+        print("\n".join(format_changes(recorded_results, results)))
+    print("\n".join(format_summary(results)))
+    print()
     print("\n".join(format_tables(results)))
     print()
     print("\n".join(format_failures(results)))

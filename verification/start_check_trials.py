@@ -21,7 +21,10 @@ from snakesim_operator.features.commissioning.joint_check.gear_rules import (
 )
 from snakesim_operator.features.commissioning.joint_check.joint_verdict import JointVerdict
 from snakesim_operator.features.commissioning.joint_check.judge import judge_joints
-from snakesim_operator.features.commissioning.joint_check.measurements import collect_measurements
+from snakesim_operator.features.commissioning.joint_check.measurements import (
+    CheckMeasurements,
+    collect_measurements,
+)
 
 JOINT_COUNT = 5
 SECONDS_PER_JOINT = 3.4  # of the joint check, at most
@@ -56,7 +59,8 @@ FAULTS_OF_JOINT_MODULES = ("order", "dead motor")
 JOINT_MODULES = "can"  # the only backend whose drives report IMUs
 
 # "either": the check reports a loose gear or coupling, and cannot tell which.
-# "unnoticed": it confirmed the property, or reported that it found no backlash.
+# "unnoticed": it confirmed the property, or reported that it found no backlash above an angle. All hidden backlash is
+# larger than any such angle.
 Outcome = Literal["named", "either", "misnamed", "unknown", "unnoticed"]
 
 
@@ -71,6 +75,7 @@ class CheckTrial:
         str
     ]  # of the emulated drives that make the fault, such as "joint_1.backlash_rad=0.025"
     joints: Sequence[int]  # that have the fault
+    measurements: CheckMeasurements
     rows: Sequence[JointVerdict]
 
     @property
@@ -128,9 +133,9 @@ class CheckTrial:
 
     @property
     def tight_count(self) -> int:
-        """Number of sound joints of which the check reports that it found no backlash."""
+        """Number of sound joints whose gear was confirmed, or in which the torque excludes backlash."""
         gears = [row.findings["gear"] for row in self.sound_rows]
-        return sum(gear.state == "confirmed" or NO_BACKLASH in gear.reason for gear in gears)
+        return sum(gear.state == "confirmed" or gear.excludes_backlash for gear in gears)
 
     @property
     def blamed(self) -> list[str]:
@@ -198,12 +203,25 @@ def check_trial(
     seconds = SECONDS_PER_JOINT * joint_count
     run += [f"duration_s={seconds}", *(f"backends.{backend}.mounted.{text}" for text in truth)]
     with_fault = {NONE: [], "order": [joint, other]}.get(fault, [joint])
-    rows = run_start_check(f"backend={backend}", *sets, *run)
-    return CheckTrial(backend, number, fault, settings, with_fault, rows)
+    measurements = run_start_check(f"backend={backend}", *sets, *run)
+    return judge_trial(backend, number, fault, settings, with_fault, measurements)
 
 
-def run_start_check(*sets: str) -> list[JointVerdict]:
-    """Run the joint check in this process until every joint was moved, and judge it. `sets`: as `--set` of a run."""
+def judge_trial(
+    backend: str,
+    number: int,
+    fault: str,
+    settings: Sequence[str],
+    joints: Sequence[int],
+    measurements: CheckMeasurements,
+) -> CheckTrial:
+    """Judge the measurements of one robot, which the person laid straight. The arguments: see `CheckTrial`."""
+    rows = judge_joints(measurements, was_laid_straight=True)
+    return CheckTrial(backend, number, fault, settings, joints, measurements, rows)
+
+
+def run_start_check(*sets: str) -> CheckMeasurements:
+    """Run the joint check in this process until every joint was moved. `sets`: as `--set` of a run."""
     config = load_scenario("joint_check", [parse_set_option(text) for text in sets]).config
     imus: list[Imu] = []
     remaining_ticks: int | None = None  # None while joints are still moved
@@ -227,9 +245,7 @@ def run_start_check(*sets: str) -> list[JointVerdict]:
         robot = run.host.description
         config = run.config
     ticks = columns.pop("tick").tolist()
-    return judge_joints(
-        collect_measurements(config, robot, ticks, columns, imus), was_laid_straight=True
-    )
+    return collect_measurements(config, robot, ticks, columns, imus)
 
 
 def list_possible_faults(backend: str) -> list[str]:

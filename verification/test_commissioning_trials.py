@@ -1,17 +1,58 @@
 """Hidden faults of emulated robots, one trial of each kind; `python -m verification.commissioning_trials` has more."""
 
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from snakesim_hal.model.robot_file.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.joint_check.gear_rules import IS_LOOSE
+from snakesim_operator.features.commissioning.joint_check.measurements import CheckMeasurements
 from verification.commissioning_trials import identify_trials
+from verification.start_check_results import append_trial, judge_again, read_results
+from verification.start_check_signals import load_signals, save_signals
 from verification.start_check_trials import NONE, check_trial
 
 
 @pytest.mark.parametrize("fault", ["backlash", NONE])
-def test_hidden_fault_is_named_without_blaming_sound_joints(fault: str) -> None:
+def test_hidden_fault_is_named_without_blaming_sound_joints(tmp_path: Path, fault: str) -> None:
     trial = check_trial(4, fault, joint_count=4)
+    results_path = tmp_path / "trials.jsonl"
+    append_trial(results_path, trial)
+    recorded = read_results(results_path)
+    assert list(judge_again(results_path, recorded)) == recorded
     assert not trial.blamed and not trial.unsure, (trial.blamed, trial.unsure)
     assert fault == NONE or trial.found, [row.summary for row in trial.rows]
+
+
+def test_recorded_signals_are_read_without_a_rounding_error(tmp_path: Path) -> None:
+    random = np.random.default_rng(1).standard_normal
+    motor = JointMotor(
+        stiffness_nm_per_rad=60.0,
+        damping_nm_s_per_rad=1.5,
+        velocity_gain_nm_s_per_rad=1.5,
+        response_time_s=0.01,
+        armature_kg_m2=0.005,
+    )
+    written = CheckMeasurements(
+        period_s=0.01,
+        joint_names=["joint_1", "joint_2"],
+        axes=["yaw", "pitch"],
+        drives=[JointDrive(gear=1 / 3), JointDrive(sign=-1)],
+        motors=[motor, motor],
+        angle_rad=random((9, 2)),
+        velocity_rad_s=random((9, 2)),
+        torque_nm=random((9, 2)),
+        target_rad=random((9, 2)),
+        link_rate_rad_s=np.full((9, 3, 3), np.nan),
+        link_force_m_s2=random((9, 3, 3)),
+        base_rotation_rad=np.full((9, 3), np.nan),
+    )
+    save_signals(tmp_path / "signals" / "robot.npz", written)
+    read = load_signals(tmp_path / "signals" / "robot.npz")
+    for field in fields(CheckMeasurements):
+        np.testing.assert_array_equal(getattr(read, field.name), getattr(written, field.name))
 
 
 @pytest.mark.slow
@@ -26,6 +67,7 @@ def test_wrong_torque_constants_are_reported_and_no_right_one() -> None:
     ("backend", "number", "fault"),
     [
         ("feetech", 30, "backlash"),  # which do not measure their torque
+        ("odrive", 112, "backlash"),  # whose teeth touch at one end of the small motion
         ("odrive", 6, "dead zone"),
         ("odrive", 40, "coupling"),
     ],

@@ -68,7 +68,11 @@ class ScriptedOperator:
     """Bends the emulated robot as `snakesim robot shape check` asks, within the tolerance of a person."""
 
     def __init__(
-        self, home: Path, endpoint: str, drive_order: Sequence[int] = range(JOINT_COUNT)
+        self,
+        home: Path,
+        endpoint: str,
+        drive_order: Sequence[int] = range(JOINT_COUNT),
+        shake_answers: Sequence[str] = ("no",) * JOINT_COUNT,
     ) -> None:
         """Prepare to check the robot of a folder.
 
@@ -76,10 +80,12 @@ class ScriptedOperator:
             home: The folder.
             endpoint: Endpoint of the robot's host.
             drive_order: For each drive, the index of the joint on which it really is.
+            shake_answers: Answers in order to the question whether a link moves before its drive does.
         """
         self._home = home
         self._endpoint = endpoint
         self._drive_order = list(drive_order)
+        self._shake_answers = list(shake_answers)
         robot = decode_table(read_table_with_base(str(home / "snake.toml"), "robots"), RobotFile)
         self._poses = {pose.name: pose for pose in design_poses(robot.joint_table)}
         self._rng = np.random.default_rng(1)
@@ -97,6 +103,9 @@ class ScriptedOperator:
                     pose_name = "straight" if shape is None else shape[1]
                     self._bend_robot(self._poses[pose_name].angle_rad)
                     process.stdin.write("\n")
+                    process.stdin.flush()
+                elif "press Enter" in line:
+                    process.stdin.write(f"{self._shake_answers.pop(0)}\n")
                     process.stdin.flush()
             return process.wait(20), "".join(printed_lines)
 

@@ -57,6 +57,9 @@ class StartCheckRecord(FileStruct, frozen=True, kw_only=True):
     by_shape: Annotated[list[JointProperty], Meta(max_length=len(PROPERTIES))] = []
     """Properties that drawn shapes confirmed for every joint (`snakesim robot shape check`)."""
 
+    shaken: JointNames = []
+    """Joints whose link a person shook, and found that it does not move before its drive. Shapes do not show that."""
+
     straight: bool = False
     """True: a person laid the robot straight, and the zeros were judged from that pose."""
 

@@ -266,11 +266,12 @@ COMMANDS: Commands = (
     ),
     Command(
         name="robot shape check",
-        help="Judge order, sign, gear and zero of every joint while you lay the robot into its shapes.",
+        help="Judge order, sign, gear and zero of every joint while you lay the robot into its shapes and shake its "
+        "links.",
         add=_add_robot_file_argument,
         run=_run_shape_check,
-        details="Exit code 0: all were confirmed, and recorded in the robot file. 1: one is wrong or unknown. 2: wrong "
-        "input.",
+        details="Exit code 0: all were confirmed, and recorded in the robot file. 1: one is wrong or unknown, or you "
+        "do not know whether a link is loose. 2: wrong input.",
         examples=(
             "robot shape check snake.toml",
             "robot shape check snake.toml --namespace snake_2",

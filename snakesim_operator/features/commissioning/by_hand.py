@@ -445,13 +445,23 @@ def select_joints(joints: Sequence[Joint], names: Sequence[str], path: Path) -> 
 
 def is_enter_pressed() -> bool:
     """Return whether the person has pressed Enter. Raises RefusedError if the terminal is gone."""
+    return read_typed_line() is not None
+
+
+def read_typed_line() -> str | None:
+    """Return the next line that the person has typed, without spaces around it; None if there is none yet.
+
+    Raises:
+        RefusedError: The terminal is gone.
+    """
     if not select.select([sys.stdin], [], [], 0.0)[0]:
-        return False
-    if not sys.stdin.readline():
+        return None
+    line = sys.stdin.readline()
+    if not line:
         raise RefusedError(
             "the terminal is gone; nothing was written", code="commissioning/not-possible"
         )
-    return True
+    return line.strip()
 
 
 def _write_joint_values(path: Path, values: dict[str, dict[str, Any]], origin: str) -> None:

@@ -65,35 +65,64 @@ def start(home: Path, out: str, *words: str) -> CompletedRun:
     return run_snakesim("run", "bench.toml", *flags, *words, cwd=home)
 
 
-def test_robot_without_imus_can_be_armed_after_shapes_and_start_check(tmp_path: Path) -> None:
+def test_robot_without_imus_can_be_armed_after_shapes_shaking_and_start_check(
+    tmp_path: Path,
+) -> None:
     home = make_bent_folder(tmp_path, "Real")
+    robot_file = home / "snake.toml"
+
+    # The person does not know whether one of the links is loose.
     with running_bench_host(home, "./real.py:Real") as endpoint:
-        code, printed = ScriptedOperator(home, endpoint).check()
-    assert code == 0, printed
+        answers = ("no", "perhaps", "unknown", "no", "No")
+        code, printed = ScriptedOperator(home, endpoint, shake_answers=answers).check()
+    assert code == 1, printed
     assert (
         f"{JOINT_COUNT} of {JOINT_COUNT} joints match the robot file; 0 wrong; 0 unknown" in printed
     )
-    assert 'by_shape = ["order", "sign", "gear", "zero"]' in (home / "snake.toml").read_text()
+    assert "type no, yes or unknown" in printed
+    assert "gear of joint_2 unknown: you do not know" in printed
+    text = robot_file.read_text()
+    assert 'by_shape = ["order", "sign", "gear", "zero"]' in text
+    assert 'confirmed = ["order", "sign", "zero"]' in text
+    assert 'shaken = ["joint_1", "joint_3", "joint_4"]' in text
     refused = start(home, "never", "--duration", "0.1")
     assert refused.code == 1
-    assert "did not confirm of every joint: drive" in refused.out
+    assert "did not confirm of every joint: drive, gear" in refused.out
 
     checking = start(home, "check", "--controller", "joint_check", "--duration", "14")
     assert checking.code == 0, checking.out
     evaluate = ("robot", "check", "check", "--write", "snake.toml")
     unknown = snakesim(*evaluate, cwd=home)
     assert unknown.code == 1
-    assert "gear of every joint: backlash and ratio unknown, as the floor hardly" in unknown.out
+    assert "gear of joint_2: backlash and ratio unknown, as the floor hardly" in unknown.out
     assert "nothing was written" in unknown.out
-    judged = snakesim(*evaluate, "--gear-by-hand", cwd=home)
+
+    # The person shakes all links.
+    with running_bench_host(home, "./real.py:Real") as endpoint:
+        code, printed = ScriptedOperator(home, endpoint).check()
+    assert code == 0, printed
+    assert "no link moves before its drive does" in printed
+    judged = snakesim(*evaluate, cwd=home)
     assert judged.code == 0, judged.out
     assert f"{JOINT_COUNT} with properties that drawn shapes confirmed" in judged.out
+    assert 'shaken = ["joint_1", "joint_2", "joint_3", "joint_4"]' in robot_file.read_text()
     assert start(home, "moves", "--duration", "0.1").code == 0
 
     # The shapes count for the mounting that was checked.
-    text = (home / "snake.toml").read_text()
-    (home / "snake.toml").write_text(f"{text}\n[joints.joint_2]\nsign = -1\n")
+    robot_file.write_text(f"{robot_file.read_text()}\n[joints.joint_2]\nsign = -1\n")
     assert "was changed in its file since" in start(home, "changed", "--duration", "0.1").out
+
+
+def test_link_that_a_person_finds_loose_is_wrong_and_nothing_is_written(tmp_path: Path) -> None:
+    home = make_bent_folder(tmp_path, "Real")
+    with running_bench_host(home, "./real.py:Real") as endpoint:
+        answers = ("no", "no", "yes", "unknown")
+        code, printed = ScriptedOperator(home, endpoint, shake_answers=answers).check()
+    assert code == 1, printed
+    assert "gear of joint_3 wrong: the link moves before its drive" in printed
+    assert "gear of joint_4 unknown" in printed
+    assert "nothing was written: correct it" in printed
+    assert "[checked]" not in (home / "snake.toml").read_text()
 
 
 def test_drawing_of_shapes_is_printable_and_names_what_stays_unknown(tmp_path: Path) -> None:

@@ -30,7 +30,10 @@ from snakesim_operator.features.commissioning.robot_edit import (
     require_own_robot_file,
     write_check_record,
 )
-from snakesim_operator.features.commissioning.shape.record import read_shape_properties
+from snakesim_operator.features.commissioning.shape.record import (
+    ShapeEvidence,
+    read_shape_evidence,
+)
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 from snakesim_operator.results.run_log import RunRecord
 
@@ -89,19 +92,25 @@ def report_joint_check(
         allowed_backlash_rad=statement.allowed_backlash_rad,
     )
     verdicts = [verdict.confirm_by_hand(statement.by_hand) for verdict in verdicts]
+    shape_evidence = ShapeEvidence()
     if robot_file is not None:
         # What drawn shapes confirmed needs no IMU. It counts as long as neither file nor drives have changed.
-        by_shape = read_shape_properties(
+        shape_evidence = read_shape_evidence(
             robot_file, record.config.robot.joint_table, record.description
         )
-        verdicts = [verdict.confirm_by_shape(by_shape) for verdict in verdicts]
+    verdicts = [
+        verdict.confirm_by_shape(
+            shape_evidence.properties, was_shaken=verdict.joint in shape_evidence.shaken_joints
+        )
+        for verdict in verdicts
+    ]
     if as_json:
         print_json({"joints": verdicts})
     else:
         for line in format_report(verdicts):
             print_line(line)
     if robot_file is not None:
-        _write_check_record(robot_file, record, verdicts, statement)
+        _write_check_record(robot_file, record, verdicts, statement, shape_evidence.shaken_joints)
     return 0 if all(verdict.all_confirmed for verdict in verdicts) else 1
 
 
@@ -183,7 +192,11 @@ def _join_joint_names(joints: Sequence[str], verdicts: Sequence[JointVerdict]) -
 
 
 def _write_check_record(
-    path: Path, record: RunRecord, verdicts: Sequence[JointVerdict], statement: CheckStatement
+    path: Path,
+    record: RunRecord,
+    verdicts: Sequence[JointVerdict],
+    statement: CheckStatement,
+    shaken_joints: Sequence[str],
 ) -> None:
     """Mark a robot file as checked, if every property of every joint was confirmed; otherwise print why not.
 
@@ -192,6 +205,7 @@ def _write_check_record(
         record: The run of the joint check.
         verdicts: The verdict on each joint.
         statement: Statements of a person about the robot.
+        shaken_joints: Joints whose link a person shook before, and found tight.
 
     Raises:
         ConfigError: The drives were emulated, or the file is not that of the checked robot.
@@ -219,6 +233,7 @@ def _write_check_record(
         make_check_record(joints, robot, PROPERTIES),
         by_hand=_group_joints_confirmed_by_hand(verdicts),
         by_shape=_list_properties_confirmed_by_shape(verdicts),
+        shaken=list(shaken_joints),
         straight=statement.straight,
         allowed_backlash_rad=statement.allowed_backlash_rad,
     )

@@ -3,11 +3,16 @@
 In the small motion, the torque of a tight joint follows its angle, because the floor holds the links. The joints of a
 robot are compared with each other, because the friction of the floor is unknown:
 
-    torque in the small motion   torque of the neighbors                            verdict
-    follows the angle            any                                                tight
-    does not follow it           changes only in the large motion                   backlash
-    does not follow it           hardly changes, or alike in both motions           the coupling slips, or loose
-    does not follow it           between these                                      loose
+    torque in the small motion          torque of the neighbors                       verdict
+    follows the angle, and reverses     any                                           tight, up to a computed angle
+    missing at one end of the stroke    any                                           backlash
+    follows the angle, never reverses   any                                           unknown
+    does not follow it                  changes only in the large motion              backlash
+    does not follow it                  hardly changes, or alike in both motions      the coupling slips, or loose
+    does not follow it                  between these                                 loose
+
+A torque that follows the angle excludes backlash only if the load reverses, because teeth that touch on one side carry
+any other load. `tooth_contact` computes how much backlash a reversal could still hide.
 
 A coupling that slips passes its torque on also in the small motion, and backlash does not. So the coupling is named
 only if the neighbors measure such a torque. Otherwise backlash that is wider than both motions is as likely.
@@ -23,6 +28,7 @@ from typing import Literal
 import numpy as np
 
 from snakesim_operator.features.commissioning.joint_check.load_response import LoadResponse
+from snakesim_operator.features.commissioning.joint_check.tooth_contact import ToothContact
 
 # Limits on the torques of emulated joints on a floor. A smaller change of a torque does not prove a load.
 MIN_CHANGE_NM = 0.03
@@ -37,7 +43,13 @@ MIN_SLIPPING_NEIGHBOR_RATIO = 0.4
 # The neighbors' range of torque in the large motion, divided by the elastic torque of a typical joint. Behind a gear
 # that holds, it is larger.
 MAX_SLIPPING_LOAD_RATIO = 0.5
+# Of the small stroke, at one of its ends, without a load. On emulated drives that report a torque, sound joints have
+# 0.12 or less, and loose ones whose teeth touch at the other end have 0.40 or more.
+MIN_UNLOADED_FRACTION = 0.3
+# The load at the other end, divided by the smallest torque that proves a load.
+MIN_LOAD_RATIO = 2.0
 NO_CLEAR_LOAD = "its torque hardly follows its angle"
+NO_REVERSAL = "the load of its gear does not reverse in the small motion"
 # Of the torque that a joint passes on to its neighbors in the direction of its small motion; less proves nothing.
 MIN_PASSED_NM = 0.003
 MIN_PASSED_ERRORS = 6.0  # standard deviations
@@ -51,6 +63,8 @@ class GearPlay:
 
     kind: PlayKind
     reason: str = ""  # why it is unknown
+    min_backlash_rad: float = 0.0  # of "backlash": it is about that large or larger
+    max_backlash_rad: float = float("inf")  # of "tight": the torque excludes more than that
 
 
 def judge_gear_plays(
@@ -79,13 +93,26 @@ def _judge_gear_play(
     min_change_nm = max(MIN_CHANGE_NM, NOISE_FACTOR * response.noise_nm)
     if typical_nm < min_change_nm:
         return GearPlay("unknown", "the floor hardly loads the joints")
-    if response.elastic_nm >= max(MIN_TIGHT_FRACTION * typical_nm, min_change_nm):
-        return GearPlay("tight")
+    contact = response.contact
+    follows_angle = response.elastic_nm >= max(MIN_TIGHT_FRACTION * typical_nm, min_change_nm)
+    if follows_angle and contact.reversal_rad is not None:
+        return GearPlay("tight", max_backlash_rad=contact.reversal_rad)
     if joint_index in (0, len(responses) - 1):
         return GearPlay("unknown", "the floor hardly loads its only link")
+    if _leaves_teeth_at_one_end(contact):
+        return GearPlay("backlash", min_backlash_rad=contact.unloaded_travel_rad)
+    if follows_angle:
+        return GearPlay("unknown", NO_REVERSAL)
     if response.elastic_nm > MAX_LOOSE_FRACTION * typical_nm:
         return GearPlay("unknown", NO_CLEAR_LOAD)
     return _judge_loose_gear(response, typical_nm, min_change_nm)
+
+
+def _leaves_teeth_at_one_end(contact: ToothContact) -> bool:
+    """Return whether a joint is loaded at one end of its small stroke, and not at all at the other."""
+    is_loaded_at_one_end = contact.max_load_nm >= MIN_LOAD_RATIO * contact.min_load_nm
+    is_unloaded_at_other_end = contact.unloaded_fraction >= MIN_UNLOADED_FRACTION
+    return is_loaded_at_one_end and is_unloaded_at_other_end and contact.reversal_rad is None
 
 
 def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: float) -> GearPlay:
@@ -104,7 +131,7 @@ def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: 
     if are_neighbors_never_loaded or is_load_alike_in_both_motions:
         return GearPlay("slipping" if passes_load(response) else "loose")
     if _has_backlash(response, min_change_nm):
-        return GearPlay("backlash")
+        return GearPlay("backlash", min_backlash_rad=response.small_motion_rad)
     if response.noise_nm > MAX_LOOSE_FRACTION * typical_nm:
         return GearPlay("unknown", NO_CLEAR_LOAD)
     return GearPlay("loose")

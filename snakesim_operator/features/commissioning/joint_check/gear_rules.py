@@ -18,7 +18,7 @@ CONFIRM_GEAR_BY_HAND = (
     NO_LINK
     + "measure it with `snakesim robot calibrate gear`, shake the link, then add --gear-by-hand"
 )
-NO_BACKLASH = "no backlash found"
+NO_BACKLASH = "no backlash above"  # and then the angle above which the torque excludes it
 
 
 def judge_gear_by_links(
@@ -84,22 +84,21 @@ def judge_gear_by_links(
     return CONFIRMED
 
 
-def judge_gear_by_torque(
-    play: GearPlay, small_motion_rad: float, allowed_backlash_rad: float
-) -> PropertyFinding:
+def judge_gear_by_torque(play: GearPlay, allowed_backlash_rad: float) -> PropertyFinding:
     """Judge a gear whose links were not measured. Its ratio stays unknown.
 
     Args:
         play: What the torques show.
-        small_motion_rad: Range of the joint's small motion.
         allowed_backlash_rad: Largest backlash that is not judged as wrong.
     """
+    allowed = f"{allowed_backlash_rad:g} rad are allowed"
+    backlash = f"backlash of about {play.min_backlash_rad:.3f} rad or more"
     match play.kind:
-        case "backlash" if small_motion_rad > allowed_backlash_rad:
+        case "backlash" if play.min_backlash_rad > allowed_backlash_rad:
             return PropertyFinding(
                 "wrong",
-                f"backlash of {small_motion_rad:.3f} rad or more: within it, its drive turns without the load of its "
-                f"link, {allowed_backlash_rad:g} rad are allowed; repair the gear, or allow more with --allow-backlash",
+                f"{backlash}: within it, its drive turns without the load of its link, {allowed}; repair the gear, or "
+                "allow more with --allow-backlash",
             )
         case "slipping":
             return PropertyFinding(
@@ -113,18 +112,19 @@ def judge_gear_by_torque(
                 f"{IS_LOOSE}: its torque does not follow its angle. Either the coupling slips, or the gear has "
                 "backlash; fasten the coupling, and check the gear",
             )
+        case "tight" if play.max_backlash_rad <= allowed_backlash_rad:
+            return PropertyFinding(
+                "unknown",
+                f"{NO_BACKLASH} {play.max_backlash_rad:.3f} rad found, ratio unknown: {CONFIRM_GEAR_BY_HAND}",
+                excludes_backlash=True,
+            )
         case "tight":
-            return PropertyFinding(
-                "unknown", f"{NO_BACKLASH}, ratio unknown: {CONFIRM_GEAR_BY_HAND}"
-            )
+            reason = f"{NO_BACKLASH} {play.max_backlash_rad:.3f} rad found, but only {allowed}"
+            return PropertyFinding("unknown", f"{reason}: {CONFIRM_GEAR_BY_HAND}")
         case "backlash":
-            reason = f"backlash of {small_motion_rad:.3f} rad or more, and {allowed_backlash_rad:g} rad are allowed"
-            return PropertyFinding(
-                "unknown", f"{reason}: {CONFIRM_GEAR_BY_HAND}", shapes_suffice=False
-            )
+            return PropertyFinding("unknown", f"{backlash}, and {allowed}: {CONFIRM_GEAR_BY_HAND}")
         case "unknown":
             return PropertyFinding(
                 "unknown",
                 f"backlash and ratio unknown, as {play.reason}: {CONFIRM_GEAR_BY_HAND}",
-                shapes_suffice=False,
             )

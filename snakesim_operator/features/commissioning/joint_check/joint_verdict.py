@@ -19,8 +19,8 @@ class PropertyFinding:
     reason: str = ""
     by_hand: bool = False  # confirmed by a person
     by_shape: bool = False  # confirmed by drawn shapes
-    # False: unknown because of backlash, which drawn shapes do not show.
-    shapes_suffice: bool = True
+    # Of a gear: the torque excludes more backlash than is allowed, so that only its ratio is unknown.
+    excludes_backlash: bool = False
 
 
 CONFIRMED = PropertyFinding("confirmed")
@@ -64,13 +64,21 @@ class JointVerdict:
         """
         return self._confirm_unknown(properties, PropertyFinding("confirmed", by_hand=True))
 
-    def confirm_by_shape(self, properties: Iterable[JointProperty]) -> "JointVerdict":
+    def confirm_by_shape(
+        self, properties: Iterable[JointProperty], *, was_shaken: bool
+    ) -> "JointVerdict":
         """Return a copy in which drawn shapes have confirmed those of the properties that were unknown.
 
-        A gear whose backlash is unknown stays unknown, because drawn shapes show only its ratio.
+        Drawn shapes show only the ratio of a gear. So a gear is confirmed only if its backlash is excluded as well: by
+        its torque in the check, or by a person.
+
+        Args:
+            properties: The properties that drawn shapes confirmed.
+            was_shaken: Whether a person shook the link, and found no backlash.
         """
+        is_gear_tight = was_shaken or self.findings["gear"].excludes_backlash
         visible: list[JointProperty] = [
-            name for name in properties if self.findings[name].shapes_suffice
+            name for name in properties if name != "gear" or is_gear_tight
         ]
         return self._confirm_unknown(visible, PropertyFinding("confirmed", by_shape=True))
 

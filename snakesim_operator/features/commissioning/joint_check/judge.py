@@ -204,7 +204,4 @@ class _JointEvaluator:
                 self._allowed_backlash_rad,
                 is_load_passed_on=response is not None and passes_load(response),
             )
-        small_motion_rad = 0.0 if response is None else response.small_motion_rad
-        return judge_gear_by_torque(
-            self._gear_plays[joint_index], small_motion_rad, self._allowed_backlash_rad
-        )
+        return judge_gear_by_torque(self._gear_plays[joint_index], self._allowed_backlash_rad)

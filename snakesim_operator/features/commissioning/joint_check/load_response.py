@@ -22,6 +22,11 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 from snakesim_operator.features.commissioning.joint_check.measurements import CheckMeasurements
+from snakesim_operator.features.commissioning.joint_check.tooth_contact import (
+    JointMotion,
+    ToothContact,
+    measure_tooth_contact,
+)
 
 SMOOTHING_TICKS = 5  # of torques; shorter than any change of the load
 MIN_STEP = 1e-9  # less is a rounding error
@@ -43,6 +48,7 @@ class LoadResponse:
     # Torque that the joint passes on to a neighbor in the direction of its small motion.
     passed_nm: float
     passed_error_nm: float  # standard deviation of `passed_nm`
+    contact: ToothContact  # of the teeth of its gear
 
     @property
     def load_nm(self) -> float:
@@ -88,7 +94,57 @@ def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> 
         noise_nm=max(resolution_nm, _find_max_range(torque_nm[rest][:, [joint_index, *neighbors]])),
         passed_nm=passed_nm,
         passed_error_nm=passed_error_nm,
+        contact=_measure_contact(measurements, joint_index, small, estimated_torque_nm),
     )
+
+
+def _measure_contact(
+    measurements: CheckMeasurements, joint_index: int, second_cycle: slice, torque_nm: Floats
+) -> ToothContact:
+    """Measure the contact of the teeth of a joint.
+
+    Args:
+        measurements: Measurements of the check.
+        joint_index: Index of the joint.
+        second_cycle: Ticks of the second cycle of the small motion.
+        torque_nm: Torques of all joints, (n, joints).
+    """
+    joint_torque_nm = torque_nm[:, joint_index]
+    smooth_torque_nm = _smooth(torque_nm)[:, joint_index]
+    small_ticks = np.flatnonzero(measurements.is_in_small_motion(joint_index))
+    large_ticks = np.flatnonzero(measurements.is_in_large_motion(joint_index))
+    small = slice(small_ticks[0], small_ticks[-1] + 1 + SETTLING_TICKS)
+    large = slice(large_ticks[0], large_ticks[-1] + 1)
+    resting_torque_nm = smooth_torque_nm[measurements.is_before_motion()]
+    resolution_nm = _find_resolution_nm(measurements, torque_nm, joint_index)
+    return measure_tooth_contact(
+        _get_motion(measurements, joint_index, small, smooth_torque_nm),
+        _get_motion(measurements, joint_index, second_cycle, smooth_torque_nm),
+        _get_motion(measurements, joint_index, large, joint_torque_nm),
+        noise_nm=max(resolution_nm, float(np.ptp(resting_torque_nm))),
+        angle_step_rad=_find_smallest_step(measurements.angle_rad[:, joint_index]),
+        window_ticks=SMOOTHING_TICKS,
+    )
+
+
+def _get_motion(
+    measurements: CheckMeasurements, joint_index: int, ticks: slice, torque_nm: Floats
+) -> JointMotion:
+    """Return the motion of a joint in some ticks. `torque_nm` is that of this joint in all ticks, (n,)."""
+    angle_rad = measurements.angle_rad[ticks, joint_index]
+    return JointMotion(
+        angle_rad=angle_rad,
+        target_rad=measurements.target_rad[ticks, joint_index],
+        torque_nm=torque_nm[ticks],
+        direction=_find_directions(angle_rad),
+    )
+
+
+def _find_directions(angle_rad: Floats) -> Floats:
+    """Return the direction in which a joint moves, +1 or -1 at each tick, (n,); 0 if there is only one tick."""
+    if len(angle_rad) < 2:
+        return np.zeros(len(angle_rad))
+    return np.sign(np.gradient(_smooth(angle_rad[:, None])[:, 0]))
 
 
 def find_neighbors_of_same_axis(axes: Sequence[str], joint_index: int) -> list[int]:
@@ -106,7 +162,7 @@ def _measure_passed_torque(angle_rad: Floats, neighbor_torque_nm: Floats) -> tup
         neighbor_torque_nm: Torque of each neighbor, (n, neighbors). The one that is most certainly large counts.
     """
     ticks = np.arange(len(angle_rad), dtype=np.float64)
-    direction = np.sign(np.gradient(_smooth(angle_rad[:, None])[:, 0]))
+    direction = _find_directions(angle_rad)
     regressors = np.column_stack(
         (np.ones_like(ticks), ticks - np.mean(ticks), angle_rad - np.mean(angle_rad), direction)
     )

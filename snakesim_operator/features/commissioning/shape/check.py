@@ -40,9 +40,15 @@ from snakesim_operator.features.commissioning.shape.decide import (
 from snakesim_operator.features.commissioning.shape.design import ShapePose, design_poses
 from snakesim_operator.features.commissioning.shape.outline import compute_drawing_mark
 from snakesim_operator.features.commissioning.shape.record import write_shape_record
+from snakesim_operator.features.commissioning.shape.shake import (
+    ask_to_shake_links,
+    format_shake_results,
+    list_joints,
+)
 
 HINT_AFTER_S = 3.0  # of a robot that does not come to rest
 ANGLES_PER_LINE = 5
+CORRECT_AND_REPEAT = "nothing was written: correct it, restart the host, and repeat the check"
 INSTRUCTION_BY_AXIS = {
     None: "Lay the robot along a straight edge, on its belly, with every joint straight",
     "yaw": "Lay the robot on its belly into shape {name}, with its head at the arrow",
@@ -53,12 +59,15 @@ INSTRUCTION_BY_AXIS = {
 def check_shapes(path: Path, selection: RobotSelection) -> int:
     """Guide a person through the shapes, print the verdict on each joint, and record the check in the robot file.
 
+    If the shapes confirm all joints, the person is asked to shake the links, because shapes do not show backlash.
+
     Args:
         path: Path of the user's own robot file, with which the host was started.
         selection: Network and namespace of the robot to connect to.
 
     Returns:
-        The exit code: 0 if order, sign, gear and zero of every joint were confirmed, otherwise 1.
+        The exit code: 0 if order, sign, gear and zero of every joint were confirmed, otherwise 1. A gear is confirmed
+        only if the person answered that its link does not move before its drive.
 
     Raises:
         RefusedError: The robot is armed or does not answer.
@@ -79,16 +88,20 @@ def check_shapes(path: Path, selection: RobotSelection) -> int:
             f"{len(poses)} poses. Use the sheets with drawing {mark}, by `snakesim robot shape draw {path}`."
         )
         reading_rad = np.array([_measure_pose(robot, pose) for pose in poses])
-    verdicts = judge_shapes(robot.joints, poses, reading_rad)
-    for line in format_verdicts(verdicts):
+        verdicts = judge_shapes(robot.joints, poses, reading_rad)
+        for line in format_verdicts(verdicts):
+            print_line(line)
+        if not all(verdict.all_confirmed for verdict in verdicts):
+            print_line(f"{path}: {CORRECT_AND_REPEAT}")
+            return 1
+        shake_results = ask_to_shake_links(robot)
+    for line in format_shake_results(shake_results):
         print_line(line)
-    if not all(verdict.all_confirmed for verdict in verdicts):
-        print_line(
-            f"{path}: nothing was written: correct it, restart the host, and repeat the check"
-        )
+    if list_joints(shake_results, "loose"):
+        print_line(f"{path}: {CORRECT_AND_REPEAT}")
         return 1
-    write_shape_record(path, robot.joints, description)
-    return 0
+    write_shape_record(path, robot.joints, description, list_joints(shake_results, "tight"))
+    return 1 if list_joints(shake_results, "unknown") else 0
 
 
 def format_verdicts(verdicts: Sequence[ShapeVerdict]) -> list[str]:
@@ -107,7 +120,7 @@ def format_verdicts(verdicts: Sequence[ShapeVerdict]) -> list[str]:
     if hint:
         lines.append(hint)
     lines.append(
-        "not judged: drives, which the start check moves; backlash: no link may move before its drive does"
+        "not judged: drives, which the start check moves; backlash, for which you shake the links"
     )
     return lines
 

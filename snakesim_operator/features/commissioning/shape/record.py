@@ -1,6 +1,7 @@
 """Writes the properties that drawn shapes confirmed into the robot file, and reads which of them are still valid."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -23,15 +24,27 @@ from snakesim_operator.features.commissioning.robot_edit import (
 from snakesim_operator.features.commissioning.shape.decide import SHAPE_PROPERTIES
 
 
-def write_shape_record(path: Path, joints: Sequence[Joint], robot: RobotDescription) -> None:
+@dataclass(frozen=True)
+class ShapeEvidence:
+    """What drawn shapes and a person who shook the links have confirmed, and is still valid."""
+
+    properties: Sequence[JointProperty] = ()  # of every joint; of the gear, only its ratio
+    shaken_joints: Sequence[str] = ()  # whose link does not move before its drive
+
+
+def write_shape_record(
+    path: Path, joints: Sequence[Joint], robot: RobotDescription, shaken_joints: Sequence[str]
+) -> None:
     """Write into a robot file that drawn shapes confirmed order, sign, gear and zero of every joint.
 
-    A robot whose drives are emulated gets no record. Properties of an earlier check that is still valid stay.
+    The gear counts as confirmed only if a person has shaken every link as well, because shapes show only its ratio. A
+    robot whose drives are emulated gets no record. Properties of an earlier check that is still valid stay.
 
     Args:
         path: Path of the robot file.
         joints: Joints of the file, with the modes that their drives have.
         robot: Description of the robot, with the serial numbers of its drives.
+        shaken_joints: Joints whose link a person shook, and found that it does not move before its drive.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -43,25 +56,29 @@ def write_shape_record(path: Path, joints: Sequence[Joint], robot: RobotDescript
         *SHAPE_PROPERTIES,
         *_read_confirmed_properties(path, joints, robot),
     }
+    if len(shaken_joints) < len(joints):
+        confirmed.discard("gear")
     record = msgspec.structs.replace(
         make_check_record(joints, robot, [name for name in PROPERTIES if name in confirmed]),
         by_shape=list(SHAPE_PROPERTIES),
+        shaken=list(shaken_joints),
     )
     write_check_record(path, record)
     missing = [name for name in PROPERTIES if name not in confirmed]
     if missing:
+        recorded = [name for name in SHAPE_PROPERTIES if name in confirmed]
         print_line(
-            f"{path}: {', '.join(SHAPE_PROPERTIES)} recorded. To confirm {', '.join(missing)}, restart the host, make "
+            f"{path}: {', '.join(recorded)} recorded. To confirm {', '.join(missing)}, restart the host, make "
             f"a run with `snakesim run joint_check`, and judge it with `snakesim robot check RUN --write {path}`"
         )
     else:
         print_line(f"{path}: checked by {record.by} on {record.on}; restart the host with it")
 
 
-def read_shape_properties(
+def read_shape_evidence(
     path: Path, joints: Sequence[Joint], robot: RobotDescription
-) -> list[JointProperty]:
-    """Return the properties that drawn shapes confirmed, if neither the mounting nor a drive has changed since.
+) -> ShapeEvidence:
+    """Return what drawn shapes confirmed; nothing if the mounting or a drive has changed since.
 
     Args:
         path: Path of the robot file.
@@ -72,7 +89,9 @@ def read_shape_properties(
         ConfigError: The file cannot be read.
     """
     record = _read_valid_record(path, joints, robot)
-    return list(record.by_shape) if record is not None else []
+    if record is None:
+        return ShapeEvidence()
+    return ShapeEvidence(record.by_shape, record.shaken)
 
 
 def _read_confirmed_properties(

@@ -6,6 +6,8 @@ import pytest
 
 from snakesim_operator.features.commissioning.joint_check.gear_play import (
     MIN_CHANGE_NM,
+    NO_REVERSAL,
+    GearPlay,
     PlayKind,
     judge_gear_plays,
     passes_load,
@@ -14,6 +16,7 @@ from snakesim_operator.features.commissioning.joint_check.load_response import (
     LoadResponse,
     find_neighbors_of_same_axis,
 )
+from snakesim_operator.features.commissioning.joint_check.tooth_contact import ToothContact
 
 JOINTS = 5
 AXES = ["yaw"] * JOINTS
@@ -28,8 +31,45 @@ TIGHT = LoadResponse(
     noise_nm=0.005,
     passed_nm=0.0,
     passed_error_nm=0.001,
+    contact=ToothContact(
+        min_load_nm=0.06,
+        reversal_rad=0.005,
+        unloaded_fraction=0.0,
+        max_load_nm=0.2,
+        unloaded_travel_rad=0.01,
+    ),
 )
-BACKLASH = replace(TIGHT, small_range_nm=0.02, elastic_nm=-0.01, neighbor_small_range_nm=0.002)
+NO_CONTACT = ToothContact(
+    min_load_nm=0.03,
+    reversal_rad=None,
+    unloaded_fraction=1.0,
+    max_load_nm=0.009,
+    unloaded_travel_rad=0.02,
+)
+# The teeth touch at one end of the small motion: numbers of robots 100 (ODrive) and 140 (Dynamixel) of the trials.
+ONE_END_CONTACTS = [
+    ToothContact(
+        min_load_nm=0.031,
+        reversal_rad=None,
+        unloaded_fraction=0.79,
+        max_load_nm=0.102,
+        unloaded_travel_rad=0.023,
+    ),
+    ToothContact(
+        min_load_nm=0.037,
+        reversal_rad=None,
+        unloaded_fraction=0.50,
+        max_load_nm=0.304,
+        unloaded_travel_rad=0.0215,
+    ),
+]
+BACKLASH = replace(
+    TIGHT,
+    small_range_nm=0.02,
+    elastic_nm=-0.01,
+    neighbor_small_range_nm=0.002,
+    contact=NO_CONTACT,
+)
 SLIPPING = replace(
     TIGHT,
     large_range_nm=0.1,
@@ -38,6 +78,7 @@ SLIPPING = replace(
     neighbor_large_range_nm=0.04,
     neighbor_small_range_nm=0.03,
     passed_nm=0.013,
+    contact=NO_CONTACT,
 )
 HARDLY_LOADED = replace(
     SLIPPING, elastic_nm=0.007, neighbor_large_range_nm=0.025, neighbor_small_range_nm=0.02
@@ -46,19 +87,62 @@ AT_END = 0
 BETWEEN = 2
 
 
-def judge(response: LoadResponse | None, joint: int = BETWEEN) -> PlayKind:
+def judge_play(response: LoadResponse | None, joint: int = BETWEEN) -> GearPlay:
     """Judge one joint among tight ones."""
     responses: list[LoadResponse | None] = [TIGHT] * JOINTS
     responses[joint] = response
     plays = judge_gear_plays(responses, AXES)
     others = [play.kind for i, play in enumerate(plays) if i != joint]
     assert others == ["tight"] * (JOINTS - 1)
-    return plays[joint].kind
+    return plays[joint]
+
+
+def judge(response: LoadResponse | None, joint: int = BETWEEN) -> PlayKind:
+    """Judge one joint among tight ones, and return only the kind of its play."""
+    return judge_play(response, joint).kind
 
 
 @pytest.mark.parametrize("joint", [AT_END, BETWEEN])
 def test_joint_whose_torque_follows_its_angle_is_tight(joint: int) -> None:
     assert judge(TIGHT, joint) == "tight"
+
+
+def test_tight_joint_has_at_most_the_backlash_that_its_reversal_hides() -> None:
+    assert judge_play(TIGHT).max_backlash_rad == TIGHT.contact.reversal_rad
+
+
+@pytest.mark.parametrize("joint", [AT_END, BETWEEN])
+def test_load_that_never_reverses_does_not_exclude_backlash(joint: int) -> None:
+    """The teeth may touch on one side only, however well the torque follows the angle."""
+    one_sided = replace(TIGHT, contact=replace(TIGHT.contact, reversal_rad=None))
+    play = judge_play(one_sided, joint)
+    assert play.kind == "unknown"
+    assert joint == AT_END or play.reason == NO_REVERSAL
+
+
+@pytest.mark.parametrize("contact", ONE_END_CONTACTS)
+@pytest.mark.parametrize("elastic_nm", [0.05, 0.076, 0.345])
+def test_joint_without_load_at_one_end_has_backlash(
+    contact: ToothContact, elastic_nm: float
+) -> None:
+    response = replace(TIGHT, elastic_nm=elastic_nm, contact=contact)
+    play = judge_play(response)
+    assert play.kind == "backlash"
+    assert play.min_backlash_rad == contact.unloaded_travel_rad
+    assert judge(response, AT_END) == "unknown"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"unloaded_fraction": 0.15},  # the most of any sound joint of the trials with a fine torque
+        {"max_load_nm": 0.05},  # too small to be sure
+        {"reversal_rad": 0.005},
+    ],
+)
+def test_weak_evidence_at_one_end_is_no_backlash(changes: dict[str, float]) -> None:
+    contact = replace(ONE_END_CONTACTS[0], **changes)
+    assert judge(replace(TIGHT, contact=contact)) in ("tight", "unknown")
 
 
 @pytest.mark.parametrize("friction_nm", [0.0, 0.2])

@@ -9,9 +9,11 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot_file.checked import PROPERTIES
 from snakesim_hal.model.robot_file.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.joint_check.check import format_report
+from snakesim_operator.features.commissioning.joint_check.gear_play import GearPlay
 from snakesim_operator.features.commissioning.joint_check.gear_rules import (
     IS_LOOSE,
     judge_gear_by_links,
+    judge_gear_by_torque,
 )
 from snakesim_operator.features.commissioning.joint_check.joint_verdict import (
     MATCHES_FILE,
@@ -233,11 +235,13 @@ def test_encoder_with_dead_zone_is_named_and_its_gear_is_not_judged(has_imus: bo
     assert [rows[joint].findings["drive"].state for joint in (0, 2)] == ["confirmed"] * 2
 
 
-def test_motion_of_a_single_tick_does_not_end_the_judgment() -> None:
+@pytest.mark.parametrize("ticks", [(3,), (3, 5), (3, 5, 7, 9)])
+def test_motion_of_a_single_tick_does_not_end_the_judgment(ticks: tuple[int, ...]) -> None:
     """A dead zone may jump as far as a small motion goes, so that the target turns back at once."""
     run = measurements()
     target_rad = run.target_rad.copy()
-    target_rad[REST + MOTION - 3, 0] = 0.001
+    for tick in ticks:
+        target_rad[REST + MOTION - tick, 0] = 0.001
     rows = judge_joints(replace(run, target_rad=target_rad), was_laid_straight=True)
     assert rows[0].findings["drive"].state == "confirmed"
 
@@ -255,9 +259,39 @@ def test_drawn_shapes_do_not_confirm_a_gear_whose_backlash_is_unknown() -> None:
     run = without_imus(measurements(), *range(JOINTS + 1))
     row = judge_joints(run, was_laid_straight=True)[0]
     assert "backlash and ratio unknown, as it made no small motion" in row.findings["gear"].reason
-    row = row.confirm_by_shape(["order", "sign", "gear", "zero"])
-    assert states(row) == {"gear": "unknown"}
-    assert row.confirm_by_hand(["gear"]).all_confirmed
+    seen = row.confirm_by_shape(["order", "sign", "gear", "zero"], was_shaken=False)
+    assert states(seen) == {"gear": "unknown"}
+    assert seen.confirm_by_hand(["gear"]).all_confirmed
+    assert row.confirm_by_shape(["order", "sign", "gear", "zero"], was_shaken=True).all_confirmed
+
+
+@pytest.mark.parametrize(
+    ("play", "state", "excludes_backlash"),
+    [
+        (GearPlay("tight", max_backlash_rad=0.006), "unknown", True),
+        (GearPlay("tight", max_backlash_rad=0.012), "unknown", False),
+        (GearPlay("backlash", min_backlash_rad=0.012), "wrong", False),
+        (GearPlay("backlash", min_backlash_rad=0.008), "unknown", False),
+        (GearPlay("unknown", "the floor hardly loads the joints"), "unknown", False),
+    ],
+)
+def test_only_a_computed_bound_within_the_allowed_backlash_lets_shapes_confirm_a_gear(
+    play: GearPlay, state: str, excludes_backlash: bool
+) -> None:
+    finding = judge_gear_by_torque(play, allowed_backlash_rad=0.01)
+    assert finding.state == state
+    assert finding.excludes_backlash == excludes_backlash
+    verdict = JointVerdict("joint_1", {"gear": finding})
+    seen = verdict.confirm_by_shape(["gear"], was_shaken=False).findings["gear"]
+    assert (seen.state == "confirmed") == excludes_backlash
+
+
+def test_shaking_does_not_confirm_a_gear_that_was_found_wrong() -> None:
+    finding = judge_gear_by_torque(
+        GearPlay("backlash", min_backlash_rad=0.012), allowed_backlash_rad=0.01
+    )
+    verdict = JointVerdict("joint_1", {"gear": finding})
+    assert verdict.confirm_by_shape(["gear"], was_shaken=True).findings["gear"].state == "wrong"
 
 
 def test_judge_two_imus_cannot_separate_joints_of_equal_effect() -> None:
