@@ -14,10 +14,8 @@ from snakesim_operator.features.commissioning.tolerances import MAX_RATIO_ERROR
 
 IS_LOOSE = "its gear or coupling is loose"  # which of them is not clear
 MIN_SLIPPING_RATIO = 0.5  # of link and drive in the small motion; within backlash it is near 0
-CONFIRM_GEAR_BY_HAND = (
-    NO_LINK
-    + "measure it with `snakesim robot calibrate gear`, shake the link, then add --gear-by-hand"
-)
+SHAKE_LINK = "shake the link, then add --gear-by-hand"
+CONFIRM_GEAR_BY_HAND = NO_LINK + f"measure it with `snakesim robot calibrate gear`, {SHAKE_LINK}"
 NO_BACKLASH = "no backlash above"  # and then the angle above which the torque excludes it
 
 
@@ -81,6 +79,17 @@ def judge_gear_by_links(
         )
     if reasons:
         return PropertyFinding("wrong", "; ".join(reasons))
+    if lost_motion is None:
+        return PropertyFinding(
+            "unknown",
+            f"backlash unknown, as it moved to one side only or its gyros are noisy: {SHAKE_LINK}",
+        )
+    if lost_motion.noise_rad > allowed_backlash_rad:
+        return PropertyFinding(
+            "unknown",
+            f"backlash unknown, as the noise of gyros and encoder allows {lost_motion.noise_rad:.3f} rad, and "
+            f"{allowed_backlash_rad:g} rad are allowed: {SHAKE_LINK}",
+        )
     return CONFIRMED
 
 
