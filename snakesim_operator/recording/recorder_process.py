@@ -51,11 +51,13 @@ from snakesim_operator.recording.tap import MessageTap
 from snakesim_operator.recording.writer import RecordingWriter
 
 CYCLE_S = 0.02
-# At the end, messages are on their way. After this time without one, none is expected, whether a host has left or not.
-LAST_MESSAGE_TIMEOUT_S = 2.0
-# At the end, for all messages. A run kills its recorder after 15 s, and until then the file must be closed.
-LAST_MESSAGES_LIMIT_S = 10.0
-QUIET_CYCLES_AT_END = 2  # at the end: after so many cycles without a message, none is on its way
+# At the end of a run, messages are on their way. After so many cycles without one, no more are expected. Cycles and
+# not seconds, because on a busy computer this process may pause for seconds.
+QUIET_CYCLES = 2  # if the host has left
+QUIET_CYCLES_WITH_HOST = 100  # 2 s, if it has not
+LAST_MESSAGES_LIMIT_S = (
+    10.0  # a run kills its recorder after 15 s, and until then the file must be closed
+)
 NICENESS = 10  # a robot's own processes have precedence
 MAX_HOSTS = 100  # files: one for each host that a robot had
 EXIT_DISK_FULL = 4
@@ -331,16 +333,17 @@ def _write_last_messages(tap: MessageTap, recorder: RobotRecorder, present_hosts
         present_hosts: Liveliness keys of the hosts on the network; other threads update the set.
     """
     limit_s = time.monotonic() + LAST_MESSAGES_LIMIT_S
-    deadline_s = time.monotonic() + LAST_MESSAGE_TIMEOUT_S
     quiet_cycles = 0
-    while quiet_cycles < QUIET_CYCLES_AT_END and time.monotonic() < min(deadline_s, limit_s):
-        if _write_arrivals(tap, recorder) > 0:
+    host_count = len(present_hosts)
+    while time.monotonic() < limit_s:
+        arrival_count = _write_arrivals(tap, recorder)
+        if arrival_count > 0 or len(present_hosts) != host_count:
             quiet_cycles = 0
-            deadline_s = time.monotonic() + LAST_MESSAGE_TIMEOUT_S
-        elif present_hosts:
-            quiet_cycles = 0
+            host_count = len(present_hosts)
         else:
             quiet_cycles += 1
+        if quiet_cycles >= (QUIET_CYCLES_WITH_HOST if present_hosts else QUIET_CYCLES):
+            return
         time.sleep(CYCLE_S)
 
 
