@@ -1,26 +1,26 @@
-"""The processes of a run, each as a program of its own."""
+"""The processes of a run, each of which is also a separate program."""
 
 from collections.abc import Callable, Sequence
 
 import pytest
 
-from snakesim_hal.programs import host_program as host_process
-from snakesim_hal.programs import router_program as router_process
-from snakesim_hal.programs import service_program as serve
-from snakesim_operator.recording import recorder_process as recorder
+from snakesim_hal.programs import host_program, router_program, service_program
+from snakesim_operator.recording import recorder_process
 
 
 @pytest.mark.parametrize(
-    ("main", "given"),
+    ("main", "arguments"),
     [
-        (host_process.main, ()),
-        (router_process.main, ()),
-        (recorder.main, ()),
-        (serve.main, ("control",)),
+        (host_program.main, ()),
+        (router_program.main, ()),
+        (recorder_process.main, ()),
+        (service_program.main, ("control",)),
     ],
 )
-def test_a_scenario_that_is_not_there_is_wrong_input(
-    main: Callable[[Sequence[str]], int], given: Sequence[str], capsys: pytest.CaptureFixture[str]
+def test_run_program_with_missing_scenario_fails_and_names_it(
+    main: Callable[[Sequence[str]], int],
+    arguments: Sequence[str],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert main([*given, "nowhere.toml"]) == 2
+    assert main([*arguments, "nowhere.toml"]) == 2
     assert "nowhere.toml" in capsys.readouterr().err
