@@ -1,4 +1,4 @@
-"""The grammar of `snakesim`: few first words, help and examples for each command, one meaning for each option."""
+"""The grammar of `snakesim`: few top-level words, help and examples for each command, one meaning for each option."""
 
 import argparse
 import re
@@ -13,7 +13,8 @@ from snakesim_hal.programs.commands import Command, CommandGroup
 from snakesim_operator.cli import CommandParser, MainParser, find_subparsers, main, make_parser
 
 MAX_COMMANDS = 25
-WITHOUT_REPORT = {  # they move, start or write something; what they print says what was done
+# These commands move, start or write something, and print only what they did.
+COMMANDS_WITHOUT_REPORT = {
     *("run", "replay", "console", "teleop", "record", "estop", "completion"),
     *("start host", "start service", "start preview", "start ros2", "start router"),
     *("robot arm", "robot disarm", "robot reset", "robot export", "robot jog"),
@@ -47,78 +48,76 @@ WITHOUT_REPORT = {  # they move, start or write something; what they print says 
 }
 
 
-def walk(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """All commands below a parser, without the nouns."""
-    below = find_subparsers(parser)
-    if not below:
+def iterate_commands(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield the parsers of all commands below a parser, without the parsers of command groups."""
+    subparsers = find_subparsers(parser)
+    if not subparsers:
         yield parser
-    for inner in below.values():
-        yield from walk(inner)
+    for subparser in subparsers.values():
+        yield from iterate_commands(subparser)
 
 
-def name_of(parser: argparse.ArgumentParser) -> str:
-    return parser.prog.removeprefix("snakesim ")
-
-
-TREE = make_parser()
-LEAVES = {name_of(leaf): leaf for leaf in walk(TREE)}
+MAIN_PARSER = make_parser()
+COMMAND_PARSERS = {
+    command.prog.removeprefix("snakesim "): command for command in iterate_commands(MAIN_PARSER)
+}
 
 
 def test_command_tree_has_few_top_level_words() -> None:
-    assert len(TREE.subparsers.choices) <= MAX_COMMANDS
-    listed = [action.dest for _, actions in TREE.list_commands_by_heading() for action in actions]
-    assert sorted(listed) == sorted(TREE.subparsers.choices), "each has a heading"
+    assert len(MAIN_PARSER.subparsers.choices) <= MAX_COMMANDS
+    listed = [
+        action.dest for _, actions in MAIN_PARSER.list_commands_by_heading() for action in actions
+    ]
+    assert sorted(listed) == sorted(MAIN_PARSER.subparsers.choices), "each word has a heading"
 
 
-@pytest.mark.parametrize("name", LEAVES)
-def test_each_command_has_help_and_two_examples_that_parse(name: str) -> None:
-    leaf = LEAVES[name]
-    assert leaf.description
-    assert leaf.description.endswith(".")
-    assert leaf.epilog
-    _, _, examples = leaf.epilog.rpartition("examples:\n")
+@pytest.mark.parametrize("name", COMMAND_PARSERS)
+def test_command_has_help_and_two_examples_that_parse(name: str) -> None:
+    parser = COMMAND_PARSERS[name]
+    assert parser.description
+    assert parser.description.endswith(".")
+    assert parser.epilog
+    _, _, examples = parser.epilog.rpartition("examples:\n")
     lines = [line.strip() for line in examples.splitlines()]
     assert len(lines) == 2 and len(set(lines)) == 2, lines
     for line in lines:
-        program, *words = shlex.split(line.partition(" > ")[0])
-        assert program == "snakesim" and " ".join(words).startswith(name), line
-        assert TREE.parse_args(words).act is not None
-    for action in leaf._actions:
+        program, *arguments = shlex.split(line.partition(" > ")[0])
+        assert program == "snakesim" and " ".join(arguments).startswith(name), line
+        assert MAIN_PARSER.parse_args(arguments).act is not None
+    for action in parser._actions:
         assert action.help, f"{name}: {action.dest} has no help"
 
 
-def test_each_option_means_the_same_everywhere() -> None:
+def test_command_option_has_the_same_meaning_everywhere() -> None:
     meanings: dict[str, dict[tuple[str, object], list[str]]] = {}
-    for name, leaf in LEAVES.items():
-        for action in leaf._actions:
+    for name, parser in COMMAND_PARSERS.items():
+        for action in parser._actions:
+            values = action.metavar if action.choices is None else tuple(action.choices)
             for option in action.option_strings:
-                meaning = (
-                    action.dest,
-                    action.metavar if action.choices is None else tuple(action.choices),
-                )
-                meanings.setdefault(option, {}).setdefault(meaning, []).append(name)
-    assert not {option: found for option, found in meanings.items() if len(found) > 1}
+                commands = meanings.setdefault(option, {}).setdefault((action.dest, values), [])
+                commands.append(name)
+    assert not {option: several for option, several in meanings.items() if len(several) > 1}
 
 
-def test_each_report_is_also_for_scripts() -> None:
-    with_json = {name for name, leaf in LEAVES.items() if "--json" in leaf.format_help()}
-    assert with_json == LEAVES.keys() - WITHOUT_REPORT
+def test_command_with_report_has_json_option() -> None:
+    with_json = {
+        name for name, parser in COMMAND_PARSERS.items() if "--json" in parser.format_help()
+    }
+    assert with_json == COMMAND_PARSERS.keys() - COMMANDS_WITHOUT_REPORT
 
 
-def test_each_robot_is_addressed_in_the_same_way() -> None:
-    for name, leaf in LEAVES.items():
-        options = {option for action in leaf._actions for option in action.option_strings}
-        network = {"--endpoint", "--router", "--session", "--namespace"} & options
-        assert name == "replay" or len(network) in (0, 4), name
+def test_command_with_network_options_has_all_four() -> None:
+    for name, parser in COMMAND_PARSERS.items():
+        options = {option for action in parser._actions for option in action.option_strings}
+        network_options = {"--endpoint", "--router", "--session", "--namespace"} & options
+        assert name == "replay" or len(network_options) in (0, 4), name
 
 
-def test_messages_and_pages_name_commands_that_exist() -> None:
+def test_command_reference_names_only_existing_commands() -> None:
     page = make_page()
-    for words in re.findall(r"`snakesim ([a-z0-9 ]+)`", page):
-        assert TREE.has_command(words.split()) or words in {
-            *TREE.subparsers.choices,
-            "robot calibrate",
-        }, words
+    command_groups = {*MAIN_PARSER.subparsers.choices, "robot calibrate"}
+    for command in re.findall(r"`snakesim ([a-z0-9 ]+)`", page):
+        assert MAIN_PARSER.has_command(command.split()) or command in command_groups, command
 
 
 def test_command_reference_page_is_current() -> None:
@@ -127,34 +126,34 @@ def test_command_reference_page_is_current() -> None:
 
 # --- packages that add commands ----------------------------------------------------------------------------
 
-LOWER = Command(
+LOWER_COMMAND = Command(
     name="arm_rest lower",
     help="Lower the arm rest.",
     run=lambda arguments: arguments.mm,
     add=lambda parser: parser.add_argument("mm", type=int),  # pyright: ignore[reportArgumentType]
     examples=("arm_rest lower 5", "arm_rest lower 20"),
 )
-NOUN = CommandGroup(name="arm_rest", heading="robot", help="Move the arm rest.")
+ARM_REST_GROUP = CommandGroup(name="arm_rest", heading="robot", help="Move the arm rest.")
 
 
-def added(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a package with the entry point `arm_rest` be installed."""
+def pretend_package_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Add the entry point `arm_rest` to those of the installed packages."""
     names = [*list_installed_plugins(COMMANDS), "arm_rest"]
     monkeypatch.setattr("snakesim_hal.model.plugins.list_installed_plugins", lambda _group: names)
 
 
-def test_a_package_adds_a_noun_and_a_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    added(monkeypatch)
-    with register_plugin_temporarily(COMMANDS, "arm_rest", (NOUN, LOWER)):
+def test_command_group_of_installed_package_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend_package_is_installed(monkeypatch)
+    with register_plugin_temporarily(COMMANDS, "arm_rest", (ARM_REST_GROUP, LOWER_COMMAND)):
         assert main(["arm_rest", "lower", "7"]) == 7
         assert "arm_rest" in make_parser().format_help()
 
 
-def test_command_without_noun_is_reported_and_others_work(
+def test_command_without_its_group_is_reported_and_others_work(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    added(monkeypatch)
-    with register_plugin_temporarily(COMMANDS, "arm_rest", (LOWER,)):
+    pretend_package_is_installed(monkeypatch)
+    with register_plugin_temporarily(COMMANDS, "arm_rest", (LOWER_COMMAND,)):
         parser = MainParser()
         parser.add_installed_commands()
     assert "no Noun 'arm_rest' is registered" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Results of an emergency stop: those of stop ports and of the network are combined to one for each robot."""
+"""Combines the results of stop ports and of the network to one emergency stop result for each robot."""
 
 from snakesim_operator.robot_commands.stop import combine_results, describe_results
 from snakesim_operator.robot_commands.stop_result import StopResult
@@ -7,10 +7,11 @@ ENDPOINT = "tcp/10.0.0.2:7447"
 
 
 def make_result(*, is_stopped: bool, is_doubtful: bool = False) -> StopResult:
+    """Make the result of a stop of the robot `snake`."""
     return StopResult("snake", ENDPOINT, is_stopped, "a text", is_doubtful)
 
 
-def test_a_remote_stop_counts_only_if_the_network_confirms_it() -> None:
+def test_remote_stop_counts_only_if_the_network_confirms_it() -> None:
     remote = make_result(is_stopped=True)
     (unconfirmed,) = combine_results([], [remote], [])
     assert not unconfirmed.is_stopped
@@ -18,13 +19,13 @@ def test_a_remote_stop_counts_only_if_the_network_confirms_it() -> None:
     assert combine_results([], [remote], [make_result(is_stopped=True)]) == [remote]
 
 
-def test_a_closed_remote_port_is_left_out_if_the_network_confirms_the_stop() -> None:
-    silent = make_result(is_stopped=False)
-    assert combine_results([], [silent], []) == [silent]
-    assert combine_results([], [silent], [make_result(is_stopped=True)]) == []
+def test_closed_remote_port_is_omitted_if_network_confirms_stop() -> None:
+    closed_port = make_result(is_stopped=False)
+    assert combine_results([], [closed_port], []) == [closed_port]
+    assert combine_results([], [closed_port], [make_result(is_stopped=True)]) == []
 
 
-def test_an_impostor_on_the_network_is_named_beside_the_result_of_the_stop_port() -> None:
+def test_doubtful_network_result_adds_warning_to_local_stop() -> None:
     local = make_result(is_stopped=True)
     doubtful = make_result(is_stopped=True, is_doubtful=True)
     results = combine_results([local], [], [doubtful])

@@ -1,4 +1,4 @@
-"""What torques alone show of the gear of a joint."""
+"""Judges the play of a gear from measured torques only."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ from snakesim_operator.features.commissioning.joint_check.tooth_contact import T
 
 JOINTS = 5
 AXES = ["yaw"] * JOINTS
-# Typical numbers of emulated joints on a floor.
+# These are typical measurements of emulated joints on a floor.
 TIGHT = LoadResponse(
     small_motion_rad=0.011,
     large_range_nm=1.0,
@@ -83,41 +83,41 @@ SLIPPING = replace(
 HARDLY_LOADED = replace(
     SLIPPING, elastic_nm=0.007, neighbor_large_range_nm=0.025, neighbor_small_range_nm=0.02
 )
-AT_END = 0
-BETWEEN = 2
+END_JOINT = 0
+MIDDLE_JOINT = 2
 
 
-def judge_play(response: LoadResponse | None, joint: int = BETWEEN) -> GearPlay:
-    """Judge one joint among tight ones."""
+def judge_play(response: LoadResponse | None, joint: int = MIDDLE_JOINT) -> GearPlay:
+    """Judge one joint with this response among tight joints, which must be judged as tight."""
     responses: list[LoadResponse | None] = [TIGHT] * JOINTS
     responses[joint] = response
     plays = judge_gear_plays(responses, AXES)
-    others = [play.kind for i, play in enumerate(plays) if i != joint]
-    assert others == ["tight"] * (JOINTS - 1)
+    other_kinds = [play.kind for i, play in enumerate(plays) if i != joint]
+    assert other_kinds == ["tight"] * (JOINTS - 1)
     return plays[joint]
 
 
-def judge(response: LoadResponse | None, joint: int = BETWEEN) -> PlayKind:
+def judge_among_tight(response: LoadResponse | None, joint: int = MIDDLE_JOINT) -> PlayKind:
     """Judge one joint among tight ones, and return only the kind of its play."""
     return judge_play(response, joint).kind
 
 
-@pytest.mark.parametrize("joint", [AT_END, BETWEEN])
+@pytest.mark.parametrize("joint", [END_JOINT, MIDDLE_JOINT])
 def test_joint_whose_torque_follows_its_angle_is_tight(joint: int) -> None:
-    assert judge(TIGHT, joint) == "tight"
+    assert judge_among_tight(TIGHT, joint) == "tight"
 
 
 def test_tight_joint_has_at_most_the_backlash_that_its_reversal_hides() -> None:
     assert judge_play(TIGHT).max_backlash_rad == TIGHT.contact.reversal_rad
 
 
-@pytest.mark.parametrize("joint", [AT_END, BETWEEN])
+@pytest.mark.parametrize("joint", [END_JOINT, MIDDLE_JOINT])
 def test_load_that_never_reverses_does_not_exclude_backlash(joint: int) -> None:
     """The teeth may touch on one side only, however well the torque follows the angle."""
     one_sided = replace(TIGHT, contact=replace(TIGHT.contact, reversal_rad=None))
     play = judge_play(one_sided, joint)
     assert play.kind == "unknown"
-    assert joint == AT_END or play.reason == NO_REVERSAL
+    assert joint == END_JOINT or play.reason == NO_REVERSAL
 
 
 @pytest.mark.parametrize("contact", ONE_END_CONTACTS)
@@ -129,7 +129,7 @@ def test_joint_without_load_at_one_end_has_backlash(
     play = judge_play(response)
     assert play.kind == "backlash"
     assert play.min_backlash_rad == contact.unloaded_travel_rad
-    assert judge(response, AT_END) == "unknown"
+    assert judge_among_tight(response, END_JOINT) == "unknown"
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_joint_without_load_at_one_end_has_backlash(
 )
 def test_weak_evidence_at_one_end_is_no_backlash(changes: dict[str, float]) -> None:
     contact = replace(ONE_END_CONTACTS[0], **changes)
-    assert judge(replace(TIGHT, contact=contact)) in ("tight", "unknown")
+    assert judge_among_tight(replace(TIGHT, contact=contact)) in ("tight", "unknown")
 
 
 @pytest.mark.parametrize("friction_nm", [0.0, 0.2])
@@ -152,59 +152,58 @@ def test_joint_without_load_in_the_small_motion_has_backlash(friction_nm: float)
         small_range_nm=BACKLASH.small_range_nm + 2 * friction_nm,
         large_range_nm=BACKLASH.large_range_nm + 2 * friction_nm,
     )
-    assert judge(response) == "backlash"
+    assert judge_among_tight(response) == "backlash"
 
 
 def test_joint_with_the_same_low_torque_in_both_motions_slips() -> None:
-    assert judge(SLIPPING) == "slipping"
+    assert judge_among_tight(SLIPPING) == "slipping"
 
 
 @pytest.mark.parametrize("response", [BACKLASH, SLIPPING])
 def test_joint_whose_torque_is_too_coarse_is_unknown(response: LoadResponse) -> None:
-    assert judge(replace(response, noise_nm=0.25)) == "unknown"
+    assert judge_among_tight(replace(response, noise_nm=0.25)) == "unknown"
 
 
-def test_joint_that_never_loads_its_neighbors_slips_also_if_their_torque_is_coarse() -> None:
-    assert (
-        judge(replace(SLIPPING, neighbor_large_range_nm=0.09, neighbor_small_range_nm=0.0))
-        == "slipping"
-    )
+def test_joint_that_never_loads_coarse_neighbors_slips() -> None:
+    response = replace(SLIPPING, neighbor_large_range_nm=0.09, neighbor_small_range_nm=0.0)
+    assert judge_among_tight(response) == "slipping"
 
 
-@pytest.mark.parametrize("large_nm", [0.008, 0.09])
-def test_joint_that_passes_no_load_on_may_slip_or_have_wide_backlash(large_nm: float) -> None:
-    """Backlash that is wider than the motion loads the neighbors at most once, when the teeth touch."""
+@pytest.mark.parametrize("neighbor_large_range_nm", [0.008, 0.09])
+def test_joint_that_passes_no_load_is_loose(neighbor_large_range_nm: float) -> None:
+    """The joint slips or has wide backlash, which loads the neighbors at most once, when the teeth touch."""
     response = replace(
-        SLIPPING, neighbor_large_range_nm=large_nm, neighbor_small_range_nm=0.007, passed_nm=0.0
+        SLIPPING,
+        neighbor_large_range_nm=neighbor_large_range_nm,
+        neighbor_small_range_nm=0.007,
+        passed_nm=0.0,
     )
     assert not passes_load(response)
-    assert judge(response) == "loose"
+    assert judge_among_tight(response) == "loose"
 
 
-def test_load_of_a_slipping_coupling_must_be_clearer_than_noise() -> None:
+def test_load_of_slipping_coupling_within_noise_does_not_count() -> None:
     assert passes_load(SLIPPING)
     assert not passes_load(replace(SLIPPING, passed_error_nm=0.01))
 
 
 def test_joint_between_both_patterns_is_loose() -> None:
-    assert (
-        judge(replace(SLIPPING, neighbor_large_range_nm=0.2, neighbor_small_range_nm=0.06))
-        == "loose"
-    )
+    response = replace(SLIPPING, neighbor_large_range_nm=0.2, neighbor_small_range_nm=0.06)
+    assert judge_among_tight(response) == "loose"
 
 
 @pytest.mark.parametrize("response", [BACKLASH, SLIPPING, HARDLY_LOADED])
-def test_joint_at_an_end_is_unknown_as_its_only_link_may_slide(response: LoadResponse) -> None:
-    """A sound joint at an end of an emulated robot was as close to backlash as this."""
-    assert judge(response, AT_END) == "unknown"
+def test_joint_at_an_end_is_unknown(response: LoadResponse) -> None:
+    """Its only link may slide: an end joint without a fault had such a response on an emulated robot."""
+    assert judge_among_tight(response, END_JOINT) == "unknown"
 
 
 def test_joint_without_small_motion_is_unknown() -> None:
-    assert judge(None) == "unknown"
+    assert judge_among_tight(None) == "unknown"
 
 
-def test_joint_whose_torque_follows_its_angle_little_is_unknown() -> None:
-    assert judge(replace(TIGHT, elastic_nm=0.15 * TIGHT.elastic_nm)) == "unknown"
+def test_joint_whose_torque_hardly_follows_its_angle_is_unknown() -> None:
+    assert judge_among_tight(replace(TIGHT, elastic_nm=0.15 * TIGHT.elastic_nm)) == "unknown"
 
 
 def test_pitch_joint_is_unknown() -> None:
@@ -214,8 +213,8 @@ def test_pitch_joint_is_unknown() -> None:
 
 
 @pytest.mark.parametrize("response", [HARDLY_LOADED, BACKLASH, SLIPPING])
-def test_robot_that_no_floor_loads_is_unknown(response: LoadResponse) -> None:
-    """So a robot that hangs, or in which every joint is loose, is not judged."""
+def test_robot_without_floor_load_is_unknown(response: LoadResponse) -> None:
+    """The check does not judge a suspended robot, or a robot in which every joint is loose."""
     assert response.elastic_nm < MIN_CHANGE_NM
     plays = judge_gear_plays([response] * JOINTS, AXES)
     assert [play.kind for play in plays] == ["unknown"] * JOINTS
@@ -232,7 +231,7 @@ def test_neighbors_have_the_same_axis(joint: int, neighbors: list[int]) -> None:
     assert find_neighbors_of_same_axis(axes, joint) == neighbors
 
 
-def test_pitch_joints_do_not_count_as_typical() -> None:
+def test_heavy_pitch_joints_do_not_change_verdict_of_yaw_joint() -> None:
     axes = ["yaw", "yaw", "pitch", "pitch", "yaw"]
     heavy = replace(TIGHT, elastic_nm=100.0)
     plays = judge_gear_plays([TIGHT, TIGHT, heavy, heavy, TIGHT], axes)

@@ -1,4 +1,4 @@
-"""A robot file that is compared with that of a host, and changed in place."""
+"""Compares a robot file with the robot of a host, and changes it in place."""
 
 import stat
 from pathlib import Path
@@ -18,34 +18,34 @@ from snakesim_testing.messages import raises_error
 
 
 @pytest.mark.parametrize(
-    ("changed", "same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)]
+    ("change", "is_same"), [("", True), ("\n[joints.joint_2]\nsign = -1\n", False)]
 )
 def test_robot_edit_drives_of_running_robot_match_the_edited_file(
-    tmp_path: Path, changed: str, same: bool
+    tmp_path: Path, change: str, is_same: bool
 ) -> None:
     path = tmp_path / "snake.toml"
     path.write_text((SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text())
-    running = restrict_drive_modes(
-        decode_table(read_table_with_base(str(path), "robots"), RobotFile), ("position", "torque")
-    ).joint_table
-    path.write_text(path.read_text() + changed)
-    assert (
-        [joint.drive for joint in read_joints_with_drive_modes(path, running)]
-        == [joint.drive for joint in running]
-    ) is same
+    robot_file = decode_table(read_table_with_base(str(path), "robots"), RobotFile)
+    running_joints = restrict_drive_modes(robot_file, ("position", "torque")).joint_table
+    path.write_text(path.read_text() + change)
+    edited_joints = read_joints_with_drive_modes(path, running_joints)
+    edited_drives = [joint.drive for joint in edited_joints]
+    running_drives = [joint.drive for joint in running_joints]
+    assert (edited_drives == running_drives) is is_same
 
 
 def test_robot_edit_follows_symbolic_link_and_keeps_permissions_and_text(tmp_path: Path) -> None:
     (tmp_path / "robots.git").mkdir()
-    real, link = tmp_path / "robots.git" / "snake.toml", tmp_path / "snake.toml"
-    real.write_text('extends = "planar13" # ours\nname = "snake"\n')
-    real.chmod(0o640)
-    link.symlink_to(real)
+    target = tmp_path / "robots.git" / "snake.toml"
+    link = tmp_path / "snake.toml"
+    target.write_text('extends = "planar13" # ours\nname = "snake"\n')
+    target.chmod(0o640)
+    link.symlink_to(target)
     write_joint_fields(link, {"joint_1": {"zero_rad": 0.25}}, "straight pose")
     assert link.is_symlink()
-    assert "zero_rad = 0.25" in real.read_text()
-    assert "# ours" in real.read_text()
-    assert stat.S_IMODE(real.stat().st_mode) == 0o640
+    assert "zero_rad = 0.25" in target.read_text()
+    assert "# ours" in target.read_text()
+    assert stat.S_IMODE(target.stat().st_mode) == 0o640
     assert sorted(path.name for path in tmp_path.rglob("*")) == [
         "robots.git",
         "snake.toml",
@@ -66,7 +66,7 @@ def test_robot_edit_invalid_change_leaves_file_unchanged(tmp_path: Path) -> None
 def test_robot_edit_checks_are_read_back_as_written(tmp_path: Path) -> None:
     path = tmp_path / "snake.toml"
     path.write_text('extends = "planar13"\nname = "snake"\n')
-    checked = StartCheckRecord(
+    check_record = StartCheckRecord(
         by="anna",
         on="2026-11-24",
         joints="5b2c4b1d9e0f7a36",
@@ -76,6 +76,7 @@ def test_robot_edit_checks_are_read_back_as_written(tmp_path: Path) -> None:
         straight=True,
         allowed_backlash_rad=0.02,
     )
-    for _ in range(2):  # once more, over the first
-        write_check_record(path, checked)
-        assert decode_table(read_table_with_base(str(path), "robots"), RobotFile).checked == checked
+    for _ in range(2):  # the second record replaces the first
+        write_check_record(path, check_record)
+        robot_file = decode_table(read_table_with_base(str(path), "robots"), RobotFile)
+        assert robot_file.checked == check_record

@@ -1,4 +1,4 @@
-"""The drawn shapes: angles by which joints can be distinguished, and sheets in true scale."""
+"""Drawn shapes: their angles distinguish all joints, and their sheets are in true scale."""
 
 import itertools
 import re
@@ -30,11 +30,12 @@ from snakesim_operator.features.commissioning.shape.pages import make_pages, mak
 
 
 def read_robot(name: str) -> RobotFile:
+    """Read a robot file that is shipped."""
     return decode_table(read_table_with_base(name, "robots"), RobotFile)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 13, 18, 19, 40])
-def test_codes_have_both_signs_and_are_separated_by_more_than_the_tolerance(count: int) -> None:
+def test_shape_codes_have_both_signs_and_exceed_tolerance(count: int) -> None:
     codes = choose_codes(count)
     assert len(codes) == count
     assert (codes.max(axis=1) == 1).all() and (codes.min(axis=1) == -1).all()
@@ -43,17 +44,15 @@ def test_codes_have_both_signs_and_are_separated_by_more_than_the_tolerance(coun
         assert MAX_SHAPE_ANGLE_RAD * separation > PLACEMENT_TOLERANCE_RAD
 
 
-@pytest.mark.parametrize("smallest_rad", [0.45, 0.6])
-def test_joints_that_bend_less_are_separated_by_more_shapes(smallest_rad: float) -> None:
-    codes = choose_codes(13, smallest_rad)
+@pytest.mark.parametrize("max_angle_rad", [0.45, 0.6])
+def test_shape_codes_of_joints_with_small_travel_exceed_tolerance(max_angle_rad: float) -> None:
+    codes = choose_codes(13, max_angle_rad)
     for i, j in itertools.permutations(range(13), 2):
-        assert (
-            smallest_rad * compute_separations(codes[i], codes[j : j + 1])[0]
-            > PLACEMENT_TOLERANCE_RAD
-        )
+        separation = compute_separations(codes[i], codes[j : j + 1])[0]
+        assert max_angle_rad * separation > PLACEMENT_TOLERANCE_RAD
 
 
-def test_up_to_18_joints_of_an_axis_need_three_shapes() -> None:
+def test_shape_codes_of_18_joints_need_only_three_shapes() -> None:
     assert choose_codes(18).shape[1] == 3
     assert choose_codes(19).shape[1] == 4
 
@@ -66,42 +65,42 @@ def test_shapes_stay_within_limits_and_do_not_cross_themselves(name: str) -> Non
             assert joint.limits.lower_rad <= angle_rad <= joint.limits.upper_rad
             assert joint.axis == pose.axis or angle_rad == 0
         positions_mm = compute_joint_positions_mm(robot, pose)
+        body_width_mm = 2000 * robot.module.radius_m
         for i, j in itertools.combinations(range(len(positions_mm)), 2):
-            if j > i + 2:  # links that are no neighbors are further apart than the body is wide
-                assert (
-                    np.linalg.norm(positions_mm[i] - positions_mm[j]) > 2000 * robot.module.radius_m
-                )
+            if j > i + 2:  # joints of links that are no neighbors
+                assert np.linalg.norm(positions_mm[i] - positions_mm[j]) > body_width_mm
 
 
-def test_yaw_turns_left_and_pitch_turns_right_on_the_page() -> None:
+def test_shape_page_turns_left_for_yaw_right_for_pitch() -> None:
     robot = read_robot("mamba")
     for pose in design_poses(robot.joint_table):
         if pose.axis is None:
             continue
         positions_mm = compute_joint_positions_mm(robot, pose)
         steps_mm = np.diff(positions_mm, axis=0)
-        turns_rad = np.diff(np.unwrap(np.arctan2(steps_mm[:, 1], steps_mm[:, 0])))
-        left = 1.0 if pose.axis == "yaw" else -1.0
-        assert turns_rad == pytest.approx(left * pose.angle_rad, abs=1e-9)
+        bends_rad = np.diff(np.unwrap(np.arctan2(steps_mm[:, 1], steps_mm[:, 0])))
+        direction = 1.0 if pose.axis == "yaw" else -1.0
+        assert bends_rad == pytest.approx(direction * pose.angle_rad, abs=1e-9)
 
 
-def test_sheets_show_every_joint_in_true_scale() -> None:
+def test_shape_sheets_contain_every_joint_in_true_scale() -> None:
     robot = read_robot("planar13")
     poses = design_poses(robot.joint_table)
     sheet_mm = np.array((273.0, 186.0))
     shape = tile_shape(robot, poses[1], sheet_mm)
-    lowest, highest = shape.drawing.bounds_mm
-    assert (lowest >= -1e-6).all()
-    assert (highest <= sheet_mm * (shape.column_count, shape.row_count) + 1e-6).all()
+    min_corner_mm, max_corner_mm = shape.drawing.bounds_mm
+    assert (min_corner_mm >= -1e-6).all()
+    assert (max_corner_mm <= sheet_mm * (shape.column_count, shape.row_count) + 1e-6).all()
     spine_mm = next(stroke.points_mm for stroke in shape.drawing.strokes if stroke.dashed)
     lengths_mm = np.linalg.norm(np.diff(spine_mm, axis=0), axis=1)
     assert lengths_mm == pytest.approx(1000 * np.array(robot.link_lengths_m))
     for x_mm, y_mm in spine_mm.tolist():
-        cell = (shape.row_count - 1 - int(y_mm // sheet_mm[1]), int(x_mm // sheet_mm[0]))
-        assert cell in shape.sheets
+        row = shape.row_count - 1 - int(y_mm // sheet_mm[1])
+        column = int(x_mm // sheet_mm[0])
+        assert (row, column) in shape.sheets
 
 
-def test_pdf_has_a_page_for_each_sheet_and_lines_in_true_scale() -> None:
+def test_shape_pdf_has_page_for_each_sheet_in_true_scale() -> None:
     robot = read_robot("planar13")
     poses = design_poses(robot.joint_table)
     pages = make_pages(robot, poses, "abc123", "a4")
@@ -118,19 +117,19 @@ def test_pdf_has_a_page_for_each_sheet_and_lines_in_true_scale() -> None:
     assert content[table_offset : table_offset + 4] == b"xref"
 
 
-def test_svg_has_all_shapes_in_millimeters() -> None:
+def test_shape_svg_contains_all_shapes_in_millimeters() -> None:
     robot = read_robot("planar13")
     poses = design_poses(robot.joint_table)
     text = encode_svg(make_poster(robot, poses, "abc123"), "shapes <1>")
-    width, height, box = re.findall(
+    width, height, view_box = re.findall(
         r'width="(\d+)mm" height="(\d+)mm" viewBox="0 0 (\d+ \d+)"', text
     )[0]
-    assert f"{width} {height}" == box
+    assert f"{width} {height}" == view_box
     assert text.count("joint_13 ") == len(poses) - 1
     assert "shapes &lt;1&gt;" in text
 
 
-def test_mark_of_the_drawing_changes_with_lengths_and_limits() -> None:
+def test_shape_drawing_mark_changes_with_angles() -> None:
     robot = read_robot("planar13")
     poses = design_poses(robot.joint_table)
     mark = compute_drawing_mark(robot, poses)

@@ -1,4 +1,4 @@
-"""How long a joint angle may be unknown."""
+"""Checks how long a joint angle may be unknown until the program refuses to continue."""
 
 import pytest
 
@@ -10,8 +10,8 @@ from snakesim_operator.features.commissioning.unknown_angles import (
 from snakesim_testing.messages import raises_error
 
 
-class AdjustableTime:
-    """A time that a test sets."""
+class AdjustableClock:
+    """A clock whose time a test sets."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -21,30 +21,30 @@ class AdjustableTime:
 
 
 @pytest.fixture
-def time() -> AdjustableTime:
-    return AdjustableTime()
+def clock() -> AdjustableClock:
+    return AdjustableClock()
 
 
-def test_angle_that_stays_unknown_is_refused_by_the_name_of_its_joint(time: AdjustableTime) -> None:
-    timeout = UnknownAngleTimeout(time)
+def test_unknown_angle_beyond_timeout_is_refused_by_joint_name(clock: AdjustableClock) -> None:
+    timeout = UnknownAngleTimeout(clock)
     timeout.check(["joint_2"])
-    time.now_s += MAX_UNKNOWN_S
+    clock.now_s += MAX_UNKNOWN_S
     timeout.check(["joint_2"])
-    time.now_s += 0.01
+    clock.now_s += 0.01
     with raises_error(RefusedError, code="commissioning/not-possible", field="joint_2"):
         timeout.check(["joint_2"])
 
 
-def test_angle_that_is_known_in_between_is_not_refused(time: AdjustableTime) -> None:
-    timeout = UnknownAngleTimeout(time)
+def test_unknown_angle_with_known_samples_between_is_not_refused(clock: AdjustableClock) -> None:
+    timeout = UnknownAngleTimeout(clock)
     for _ in range(10):
         timeout.check(["joint_1"])
-        time.now_s += 0.6 * MAX_UNKNOWN_S
+        clock.now_s += 0.6 * MAX_UNKNOWN_S
         timeout.check([])
-        time.now_s += 0.6 * MAX_UNKNOWN_S
+        clock.now_s += 0.6 * MAX_UNKNOWN_S
 
 
-def test_time_before_the_first_unknown_angle_does_not_count(time: AdjustableTime) -> None:
-    timeout = UnknownAngleTimeout(time)
-    time.now_s += 10 * MAX_UNKNOWN_S
+def test_unknown_angle_timeout_starts_at_the_first_unknown_angle(clock: AdjustableClock) -> None:
+    timeout = UnknownAngleTimeout(clock)
+    clock.now_s += 10 * MAX_UNKNOWN_S
     timeout.check(["joint_1"])

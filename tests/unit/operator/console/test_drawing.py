@@ -1,4 +1,4 @@
-"""What is drawn is where the robot's kinematics put it."""
+"""The console draws links, forces, obstacles and cameras where the robot's kinematics place them."""
 
 import math
 
@@ -46,33 +46,34 @@ def test_drawing_links_and_hinges_follow_base_pose_and_joint_angles():
     assert rotation_from_quaternion(drawing.hinges_wxyz[0])[:, 2] == pytest.approx(axis, abs=1e-9)
 
 
-def test_without_joints_there_is_nothing_to_draw():
+def test_drawing_without_joints_is_none():
     assert draw(RobotSnapshot(robot=ROBOT), None) is None
 
 
 def test_drawing_has_forces_and_their_resultant():
     point = make_contact((0.0, 10.0, 0.0))
     control = make_control_state([point], [20.0], propulsion_joint=ROBOT.joints[-1].name)
-    seen = make_world_model([point, point], [])
+    world = make_world_model([point, point], [])
     drawing = draw(
-        RobotSnapshot(robot=ROBOT, body=make_joints(), world=seen, control=control), None
+        RobotSnapshot(robot=ROBOT, body=make_joints(), world=world, control=control), None
     )
     assert drawing is not None
     assert drawing.propulsion_joint == JOINT_COUNT - 1
     assert drawing.pushed_obstacles == {"peg"}
-    spans = [
+    measured, resultant, desired = (
         arrows[:, 1] - arrows[:, 0]
         for arrows in (drawing.measured_forces, drawing.resultant, drawing.desired_forces)
-    ]
-    assert [len(span) for span in spans] == [2, 1, 1]
-    assert spans[0][0] == pytest.approx([0.0, 10 * M_PER_N, 0.0])
-    assert spans[1][0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
-    assert spans[2][0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
+    )
+    assert [len(measured), len(resultant), len(desired)] == [2, 1, 1]
+    assert measured[0] == pytest.approx([0.0, 10 * M_PER_N, 0.0])
+    assert resultant[0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
+    assert desired[0] == pytest.approx([0.0, 20 * M_PER_N, 0.0])
 
 
 def test_drawing_requested_force_without_contact_is_no_contact_force():
     points = [
-        make_contact((0.0, 10.0, 0.0), peg, x_m=x_m) for peg, x_m in (("felt", 0.1), ("clear", 0.3))
+        make_contact((0.0, 10.0, 0.0), "touched", x_m=0.1),
+        make_contact((0.0, 10.0, 0.0), "distant", x_m=0.3),
     ]
     control = make_control_state(points, [20.0, 30.0], measured_force_n=[17.5, 0.0])
     snapshot = RobotSnapshot(
@@ -80,15 +81,14 @@ def test_drawing_requested_force_without_contact_is_no_contact_force():
     )
     drawing = draw(snapshot, None)
     assert drawing is not None
-    assert drawing.pushed_obstacles == {"felt"}
+    assert drawing.pushed_obstacles == {"touched"}
     assert drawing.desired_forces[:, 0, 0] == pytest.approx([0.1])
     assert drawing.forces_without_contact[:, 0, 0] == pytest.approx([0.3])
-    assert drawing.forces_without_contact[0, 1] - drawing.forces_without_contact[
-        0, 0
-    ] == pytest.approx([0.0, MAX_FORCE_ARROW_M, 0.0])
+    start, end = drawing.forces_without_contact[0]
+    assert end - start == pytest.approx([0.0, MAX_FORCE_ARROW_M, 0.0])
     table = format_push_point_table(control)
-    assert "<td>felt</td><td>20.0</td><td>17.5</td>" in table
-    assert "<td>clear</td><td>30.0</td><td>0.0</td>" in table
+    assert "<td>touched</td><td>20.0</td><td>17.5</td>" in table
+    assert "<td>distant</td><td>30.0</td><td>0.0</td>" in table
     assert format_push_point_table(msgspec.structs.replace(control, measured_force_n=[])) == ""
 
 
@@ -104,55 +104,66 @@ def test_drawing_strong_force_has_arrow_of_limited_length():
     assert drawing.contacts_w[0] == pytest.approx(point.position_w)
 
 
-def test_the_force_polygon_names_every_force_and_their_resultant():
-    later, first = (
-        make_contact((*at_n, 0.0), "<b>", body_s_m=s_m)
-        for s_m, at_n in ((0.3, (0.0, 4.0)), (0.1, (3.0, 0.0)))
+def test_force_polygon_names_every_force_and_the_resultant():
+    head_contact = make_contact((0.0, 4.0, 0.0), "<b>", body_s_m=0.3)
+    tail_contact = make_contact((3.0, 0.0, 0.0), "<b>", body_s_m=0.1)
+    polygon = draw_force_polygon(
+        RobotSnapshot(robot=ROBOT, world=make_world_model([head_contact, tail_contact], []))
     )
-    drawn = draw_force_polygon(
-        RobotSnapshot(robot=ROBOT, world=make_world_model([later, first], []))
-    )
-    assert "resultant 5.0 N" in drawn
-    assert drawn.index(">3.0 N<") < drawn.index(">4.0 N<") < drawn.index(">5.0 N<")
+    assert "resultant 5.0 N" in polygon
+    assert polygon.index(">3.0 N<") < polygon.index(">4.0 N<") < polygon.index(">5.0 N<")
     assert "no contact force" in draw_force_polygon(
         RobotSnapshot(robot=ROBOT, world=make_world_model([], []))
     )
 
 
-def test_what_a_map_tells_is_not_drawn_as_perceived():
+def test_drawing_mapped_obstacle_is_not_drawn_as_perceived():
     mapped = KnownObstacle(name="a", shape="sphere", position_w=(0.0, 0.0, 0.0))
-    found = KnownObstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
-    felt = KnownObstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), touched=True)
+    seen = KnownObstacle(name="b", shape="sphere", position_w=(0.0, 0.0, 0.0), last_seen_ns=1)
+    touched = KnownObstacle(name="c", shape="sphere", position_w=(0.0, 0.0, 0.0), touched=True)
     drawing = draw(
         RobotSnapshot(
-            robot=ROBOT, body=make_joints(), world=make_world_model([], [mapped, found, felt])
+            robot=ROBOT, body=make_joints(), world=make_world_model([], [mapped, seen, touched])
         ),
         None,
     )
     assert drawing is not None
-    assert [o.name for o in drawing.perceived] == ["b", "c"]
+    assert [obstacle.name for obstacle in drawing.perceived] == ["b", "c"]
 
 
-def test_a_camera_that_looks_along_its_link_looks_along_x():
+def test_drawing_camera_along_its_link_looks_along_x():
     image = DepthImage(
-        tick=1, timestamp_ns=1, link=0, position_l=(0.0, 0.0, 0.0), orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0), width=4,
-        height=2, fx_px=1.0, fy_px=1.0, cx_px=2.0, cy_px=1.0, range_min_m=0.1, range_max_m=1.0, scale_m=0.001,
+        tick=1,
+        timestamp_ns=1,
+        link=0,
+        position_l=(0.0, 0.0, 0.0),
+        orientation_l_wxyz=(1.0, 0.0, 0.0, 0.0),
+        width=4,
+        height=2,
+        fx_px=1.0,
+        fy_px=1.0,
+        cx_px=2.0,
+        cy_px=1.0,
+        range_min_m=0.1,
+        range_max_m=1.0,
+        scale_m=0.001,
         depth=bytes(16),
-    )  # fmt: skip
+    )
     drawing = draw(
         RobotSnapshot(robot=ROBOT, body=make_joints(), images={"sensor/depth/head": image}), None
     )
     assert drawing is not None
-    looks = rotation_from_quaternion(drawing.cameras[0].wxyz)
-    assert looks[:, 2] == pytest.approx([1.0, 0.0, 0.0])
-    assert looks[:, 1] == pytest.approx([0.0, 0.0, -1.0])
+    camera_rotation = rotation_from_quaternion(drawing.cameras[0].wxyz)
+    assert camera_rotation[:, 2] == pytest.approx([1.0, 0.0, 0.0])
+    assert camera_rotation[:, 1] == pytest.approx([0.0, 0.0, -1.0])
     assert drawing.cameras[0].fov_rad == pytest.approx(math.pi / 2)
     assert drawing.cameras[0].aspect == 2.0
 
 
-def test_quaternions_give_back_their_rotations():
-    random = np.random.default_rng(1)
-    wxyz = np.vstack([np.eye(4), random.normal(size=(50, 4))])
+def test_quaternions_from_rotations_reproduce_the_rotations():
+    rng = np.random.default_rng(1)
+    wxyz = np.vstack([np.eye(4), rng.normal(size=(50, 4))])
     rotations = np.array([rotation_from_quaternion(q) for q in wxyz])
-    again = np.array([rotation_from_quaternion(q) for q in quaternions_from_rotations(rotations)])
-    assert again == pytest.approx(rotations, abs=1e-12)
+    quaternions = quaternions_from_rotations(rotations)
+    reproduced = np.array([rotation_from_quaternion(q) for q in quaternions])
+    assert reproduced == pytest.approx(rotations, abs=1e-12)

@@ -1,4 +1,4 @@
-"""The form of a controller's parameters, from the schema that control publishes."""
+"""The form for the parameters of a controller, made from the schema that the control service publishes."""
 
 import pytest
 
@@ -15,14 +15,15 @@ SCHEMA = """{"$ref": "#/$defs/S", "$defs": {"S": {"properties": {
 VALUES = '{"push_n": 10.0, "share": 0.5, "bend_rad": -0.2, "mode": "b", "on": true, "names": ["x"]}'
 
 
-def in_force(values: str, schema: str) -> ControlParameters:
+def make_parameters(values: str, schema: str) -> ControlParameters:
+    """Make the message with the present parameters of a controller and their schema."""
     return ControlParameters(
         tick=0, timestamp_ns=0, controller="any", parameters=values, schema=schema
     )
 
 
-def test_each_setting_has_an_input_within_its_bounds():
-    push, share, bend, mode, on = list_input_fields(in_force(VALUES, SCHEMA))
+def test_parameter_form_has_input_within_bounds_of_each_parameter():
+    push, share, bend, mode, is_on = list_input_fields(make_parameters(VALUES, SCHEMA))
     assert push == InputField(
         "push_n", 10.0, "N", low=0.1, high=40.0, step=0.1, hint="a bound; > 0, <= 10000 N"
     )
@@ -31,11 +32,11 @@ def test_each_setting_has_an_input_within_its_bounds():
     assert bend.low == -0.8
     assert bend.high == 0.8
     assert mode.choices == ("a", "b")
-    assert on.value is True
+    assert is_on.value is True
 
 
 @pytest.mark.parametrize(
     "schema", ["", "[]", "{}", "null", '{"properties": 1}', '{"$ref": "#/$defs/x"}', "{" * 9000]
 )
-def test_a_schema_that_cannot_be_read_gives_no_form(schema: str):
-    assert list_input_fields(in_force(VALUES, schema)) == []
+def test_parameter_form_of_unreadable_schema_is_empty(schema: str):
+    assert list_input_fields(make_parameters(VALUES, schema)) == []

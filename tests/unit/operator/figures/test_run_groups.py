@@ -1,4 +1,4 @@
-"""Runs of one figure: which arguments they are, and which of them are drawn as one mean."""
+"""The runs of a figure: which arguments name runs, and which runs are drawn as one mean."""
 
 import dataclasses
 from pathlib import Path
@@ -19,22 +19,23 @@ from snakesim_testing.operator.triplet_report import simulate_triplet
 
 
 def make_run(folder: str, seed: int, duration_s: float = 10.0) -> RunRecord:
+    """Return a simulated run with another folder, seed and duration."""
     config = msgspec.structs.replace(simulate_triplet().config, seed=seed, duration_s=duration_s)
     return dataclasses.replace(simulate_triplet(), path=Path(folder), config=config)
 
 
-def test_arguments_are_runs_and_then_signals(
+def test_figure_arguments_are_runs_and_then_signals(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "b").mkdir()
-    runs, names = split_runs_and_signals(["runs/a", "b", "angle_rad", "torque_nm.joint_1"])
+    runs, signals = split_runs_and_signals(["runs/a", "b", "angle_rad", "torque_nm.joint_1"])
     assert runs == [Path("runs/a"), Path("b")]
-    assert names == ["angle_rad", "torque_nm.joint_1"]
+    assert signals == ["angle_rad", "torque_nm.joint_1"]
     assert split_runs_and_signals(["missing"]) == ([Path("missing")], [])
 
 
-def test_runs_that_differ_in_the_seed_are_one_group() -> None:
+def test_runs_that_differ_only_in_seed_are_one_group() -> None:
     runs = [make_run("a", 1), make_run("b", 2), make_run("c", 1, 5.0), make_run("d", 3)]
     groups = group_runs_by_configuration(runs)
     assert [[run.path.name for run in group.records] for group in groups] == [
@@ -47,23 +48,23 @@ def test_runs_that_differ_in_the_seed_are_one_group() -> None:
     ]
 
 
-def test_no_mean_of_runs_that_are_not_repetitions() -> None:
+def test_run_groups_without_repetitions_are_refused() -> None:
     with pytest.raises(ConfigError, match="differ in their seeds"):
         group_runs_by_configuration([make_run("a", 1), make_run("b", 1, 5.0)])
 
 
-def test_no_mean_of_one_run_given_twice() -> None:
+def test_run_groups_with_one_run_given_twice_are_refused() -> None:
     with pytest.raises(ConfigError, match="count as one run"):
         group_runs_by_configuration([make_run("a", 1), make_run("b", 1), make_run("c", 2)])
 
 
-def test_equal_folder_names_are_told_apart_by_their_paths() -> None:
+def test_run_groups_with_equal_folder_names_have_paths_as_labels() -> None:
     groups = make_single_run_groups([make_run("x/run", 1), make_run("y/run", 2)])
     assert [group.label for group in groups] == ["x/run", "y/run"]
 
 
-def test_interval_of_a_mean_is_pointwise() -> None:
-    """Of two values, Student's t is 12.7 standard errors: 12.706 * sqrt(2) * 0.5 / sqrt(2) * difference."""
+def test_mean_interval_is_computed_for_each_point() -> None:
+    """For two values that differ by 2, the standard error is 1, and Student's t is 12.706."""
     mean, half_width = find_mean_and_half_width(np.array([[1.0, 2.0, np.nan], [3.0, 2.0, 1.0]]))
     assert mean[:2].tolist() == [2.0, 2.0]
     assert half_width[:2].tolist() == pytest.approx([12.706, 0.0])

@@ -1,4 +1,4 @@
-"""The lab file: what is wrong in it is named, with the way out."""
+"""The lab file and the roles of a lab: errors name the conflict, and each role has only its permissions."""
 
 from pathlib import Path
 
@@ -10,13 +10,13 @@ from snakesim_operator.features.lab.identities import iterate_identities
 from snakesim_operator.features.lab.lab_file import EXAMPLE_PATH, load_lab
 from snakesim_testing.messages import raises_error
 
-TEXT = EXAMPLE_PATH.read_text()
+EXAMPLE_TEXT = EXAMPLE_PATH.read_text()
 
 
 def test_lab_example_assigns_every_role() -> None:
-    held = list(iterate_identities(load_lab(EXAMPLE_PATH)))
-    assert {identity.role for identity in held} == {*Role, None}
-    assert len({identity.common_name for identity in held}) == len(held)
+    identities = list(iterate_identities(load_lab(EXAMPLE_PATH)))
+    assert {identity.role for identity in identities} == {*Role, None}
+    assert len({identity.common_name for identity in identities}) == len(identities)
 
 
 @pytest.mark.parametrize(
@@ -35,9 +35,9 @@ def test_lab_example_assigns_every_role() -> None:
     ],
 )
 def test_lab_file_errors_name_the_conflict(tmp_path: Path, old: str, new: str) -> None:
-    assert old in TEXT
+    assert old in EXAMPLE_TEXT
     path = tmp_path / "lab.toml"
-    path.write_text(TEXT.replace(old, new, 1))
+    path.write_text(EXAMPLE_TEXT.replace(old, new, 1))
     with raises_error(
         ConfigError,
         code=(
@@ -51,32 +51,34 @@ def test_lab_file_errors_name_the_conflict(tmp_path: Path, old: str, new: str) -
         load_lab(path)
 
 
-def test_every_key_has_a_role_that_writes_it() -> None:
-    """A key that is new in the key space names a writer that `snakesim_hal/wire/roles.py` knows."""
+def test_lab_roles_include_a_writer_of_every_key() -> None:
+    """A new key needs a writer in the access rules of `snakesim_hal/wire/roles.py`."""
     assert not [
-        line.key
-        for line in ACCESS_RULES
-        if not line.writers or (line.kind == "query" and not line.answerers)
+        rule.key
+        for rule in ACCESS_RULES
+        if not rule.writers or (rule.kind == "query" and not rule.answerers)
     ]
     assert set(ROLE_DESCRIPTIONS) == set(Role)
 
 
-def test_lab_rights_only_gnc_commands_and_only_robot_publishes() -> None:
-    """What the rules are for; the rest is in the table."""
+def test_lab_roles_only_gnc_commands_and_only_robot_publishes() -> None:
+    """These are the purposes of the access rules; the table of the rules contains the rest."""
     for role in Role:
-        granted = list(iterate_permissions(role, ["control"], allow_fault_injection=True))
-        puts = {key for flow, message, key in granted if (flow, message) == ("ingress", "put")}
-        assert ("actuator/joints" in puts) == (role is Role.GNC)
-        own = {
+        permissions = list(iterate_permissions(role, ["control"], allow_fault_injection=True))
+        writable_keys = {
+            key for flow, message, key in permissions if (flow, message) == ("ingress", "put")
+        }
+        assert ("actuator/joints" in writable_keys) == (role is Role.GNC)
+        robot_keys = {
             key
-            for key in puts
+            for key in writable_keys
             if key.startswith(("hal/", "sensor/")) and not key.startswith("hal/done/")
         }
-        assert bool(own) == (role is Role.ROBOT)
-    faults = {
+        assert bool(robot_keys) == (role is Role.ROBOT)
+    fault_permissions = {
         message
         for role in Role
         for _, message, key in iterate_permissions(role)
         if key.startswith("fault/")
     }
-    assert not faults
+    assert not fault_permissions

@@ -1,4 +1,4 @@
-"""What a qualification decides from measured values: a value that is unknown never passes."""
+"""The verdicts of a qualification on measured values; a value that is unknown never confirms a claim."""
 
 import math
 import re
@@ -50,13 +50,13 @@ BOUNDS = Bounds(has_watchdog=True, watchdog_s=0.1, period_s=0.02)
         ("A1", {}, "confirmed"),
     ],
 )
-def test_value_confirms_only_within_its_bounds(
+def test_check_confirms_only_value_within_its_bounds(
     value: float | str | None, bounds: dict[str, Any], verdict: str
 ):
     assert judge_check(Check(name="value", value=value, source="host", **bounds)) == verdict
 
 
-def test_one_refuted_value_refutes_and_one_unknown_value_prevents_confirmation():
+def test_combined_verdict_is_refuted_before_unknown_before_confirmed():
     assert combine_verdicts(["confirmed", "refuted", "unknown"]) == "refuted"
     assert combine_verdicts(["confirmed", "unknown"]) == "unknown"
     assert combine_verdicts(["confirmed", "confirmed"]) == "confirmed"
@@ -68,13 +68,14 @@ def test_check_is_described_with_unit_bound_and_source():
     assert describe_check(check) == "torque off after: 0.104 s (at most 0.2 s, drive log)"
 
 
-def readings(*values: tuple[float, bool]) -> list[TorqueReading]:
+def make_readings(*values: tuple[float, bool]) -> list[TorqueReading]:
+    """Make readings from times in s and whether the torque is enabled."""
     return [TorqueReading(round(time_s * 1e9), enabled) for time_s, enabled in values]
 
 
-def test_drive_log_gives_the_time_without_torque_and_every_enabling_after_it():
+def test_drive_log_gives_torque_off_time_and_later_enabling():
     log = make_timeline(
-        readings((0.0, True), (1.1, False), (1.9, True)), "drive log", lists_changes=True
+        make_readings((0.0, True), (1.1, False), (1.9, True)), "drive log", lists_changes=True
     )
     assert log.find_torque_off_s(1_000_000_000) == pytest.approx(0.1)
     assert log.count_enabled_again(1_200_000_000, 1_500_000_000) == 0
@@ -82,8 +83,10 @@ def test_drive_log_gives_the_time_without_torque_and_every_enabling_after_it():
     assert log.count_enabled_again(1_000_000_000, 1_050_000_000) == 1, "it is enabled at the start"
 
 
-def test_polled_status_tells_nothing_between_two_answers():
-    polled = make_timeline(readings((1.0, True), (1.2, False)), "drive status", lists_changes=False)
+def test_polled_drive_status_between_two_answers_is_unknown():
+    polled = make_timeline(
+        make_readings((1.0, True), (1.2, False)), "drive status", lists_changes=False
+    )
     assert polled.find_torque_off_s(1_000_000_000) == pytest.approx(0.2)
     assert polled.count_enabled_again(1_300_000_000, 2_000_000_000) is None
     assert make_timeline([], "drive status", lists_changes=False).find_torque_off_s(0) is None
@@ -92,7 +95,7 @@ def test_polled_status_tells_nothing_between_two_answers():
 @pytest.mark.parametrize(
     "bounds", [BOUNDS, Bounds(has_watchdog=False, watchdog_s=0.1, period_s=0.02)]
 )
-def test_every_step_has_a_procedure_and_a_criterion_with_values(bounds: Bounds):
+def test_qualification_step_has_procedure_and_criterion_with_values(bounds: Bounds):
     assert [step.key for step in STEPS] == list(PROCEDURES)
     for step in STEPS:
         criterion = describe_criterion(step, bounds)
@@ -100,21 +103,22 @@ def test_every_step_has_a_procedure_and_a_criterion_with_values(bounds: Bounds):
         assert "{" not in criterion
 
 
-def test_watchdog_criterion_follows_the_watchdog_of_the_drive():
+def test_torque_off_bound_follows_watchdog_and_period():
     assert BOUNDS.torque_off_s == pytest.approx(0.1 + 0.04 + 0.06)
 
 
-def normalize(text: str) -> str:
+def normalize_spaces(text: str) -> str:
+    """Replace each sequence of spaces and line breaks by one space."""
     return re.sub(r"\s+", " ", text)
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.id)
-def test_each_claim_is_a_sentence_of_its_page(claim):
-    assert claim.sentence == normalize(claim.sentence)
-    assert claim.sentence in normalize((DOCS / claim.page).read_text(encoding="utf-8"))
+def test_claim_is_a_sentence_of_its_page(claim):
+    assert claim.sentence == normalize_spaces(claim.sentence)
+    assert claim.sentence in normalize_spaces((DOCS / claim.page).read_text(encoding="utf-8"))
 
 
-def test_ids_of_claims_are_unique_and_each_driver_type_has_claims():
+def test_claims_have_unique_ids_and_cover_every_driver_type():
     assert len(CLAIM_BY_ID) == len(CLAIMS)
     for driver_type in ("can", "odrive", "moteus", "cia402", "dynamixel", "feetech"):
         assert f"bus-cut-{driver_type}" in {claim.id for claim in list_claims(driver_type)}

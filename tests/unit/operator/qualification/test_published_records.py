@@ -1,4 +1,4 @@
-"""Records in the documentation: each is signed by a listed key, and none is of an emulated drive."""
+"""Every qualification record in the documentation is signed with a listed key, and none is of an emulated drive."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from snakesim_operator.features.qualification.protocol.signature import find_sig
 
 DOCS = Path(__file__).parents[4] / "docs" / "hardware"
 RECORDS = DOCS / "records"
-STATUS_BY_PAGE = {
+PAGE_BY_DRIVER_TYPE = {
     "odrive": "odrive.md",
     "moteus": "moteus.md",
     "cia402": "cia402.md",
@@ -18,13 +18,14 @@ STATUS_BY_PAGE = {
 }
 
 
-def list_records() -> dict[str, Record]:
+def read_published_records() -> dict[str, Record]:
+    """Return the published records by file name."""
     return {path.name: read_record(path) for path in RECORDS.glob("*.json")}
 
 
-def test_published_records_are_signed_by_a_listed_key_and_are_of_real_drives():
+def test_published_records_have_listed_keys_and_real_drives():
     page = (RECORDS / "README.md").read_text(encoding="utf-8")
-    for name, record in list_records().items():
+    for name, record in read_published_records().items():
         assert not record.subject.emulated, name
         assert not find_signature_problem(record), name
         assert not find_claim_problem(record), name
@@ -33,12 +34,12 @@ def test_published_records_are_signed_by_a_listed_key_and_are_of_real_drives():
         assert name in page
 
 
-def test_pages_say_emulated_only_until_there_is_a_record_and_link_the_first_hour():
-    recorded = {record.subject.driver_type for record in list_records().values()}
-    for driver_type, name in STATUS_BY_PAGE.items():
+def test_drive_pages_without_record_state_emulated_and_link_first_hour():
+    recorded_types = {record.subject.driver_type for record in read_published_records().values()}
+    for driver_type, name in PAGE_BY_DRIVER_TYPE.items():
         page = (DOCS / name).read_text(encoding="utf-8")
         assert "first-hour.md" in page, name
-        if driver_type not in recorded:
+        if driver_type not in recorded_types:
             assert "emulated only" in page.lower(), name
     for name in ("README.md", "mixed.md"):
         assert "first-hour.md" in (DOCS / name).read_text(encoding="utf-8")

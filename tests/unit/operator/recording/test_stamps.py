@@ -1,4 +1,4 @@
-"""Files whose log times are the wall clock: every time is kept, and this program reads robot time from them."""
+"""Recordings whose log times are wall-clock times: they contain both times, and readers get robot time."""
 
 import time
 from pathlib import Path
@@ -28,22 +28,32 @@ PERIOD_NS = 10_000_000
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of half a second whose log times are robot times."""
     out = tmp_path_factory.mktemp("stamps") / "run"
     simulate(load_scenario("triplet", [parse_set_option("duration_s=0.5")]).config, out)
     return out / RECORDING_FILENAME
 
 
 @pytest.fixture(scope="module")
-def wall(recording: Path) -> Path:
+def wall_recording(recording: Path) -> Path:
+    """A copy of the recording whose log times are wall-clock times."""
     path = recording.parent / "wall.mcap"
     recover_recording(recording, path, "wall")
     return path
 
 
-def read_with_stock_reader(
+def read_with_mcap_reader(
     path: Path, topics: list[str] | None = None
 ) -> list[tuple[Any, Any, Any]]:
-    """Return channel, message and decoded protobuf of each message, in the order of the file."""
+    """Read a file with the library mcap.
+
+    Args:
+        path: the recording.
+        topics: of protobuf messages; None: all messages, which are not decoded.
+
+    Returns:
+        Channel, message and decoded protobuf of each message, in the order of the file.
+    """
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         if topics is None:
@@ -55,74 +65,83 @@ def read_with_stock_reader(
         return [(channel, message, content) for _, channel, message, content in decoded]
 
 
-def test_copy_with_wall_stamps_keeps_both_times_of_every_message(
-    recording: Path, wall: Path
+def test_recording_copy_with_wall_times_keeps_both_times(
+    recording: Path, wall_recording: Path
 ) -> None:
-    found = read_with_stock_reader(wall)
-    assert found
-    for channel, message, _ in found:
+    messages = read_with_mcap_reader(wall_recording)
+    assert messages
+    for channel, message, _ in messages:
         assert channel.metadata[CLOCK_ENTRY] == "wall"
         assert message.log_time > YEAR_2020_NS
         assert message.publish_time < MAX_ROBOT_NS
-    assert list(RecordingReader(wall).read_messages()) == list(
+    assert list(RecordingReader(wall_recording).read_messages()) == list(
         RecordingReader(recording).read_messages()
     )
-    assert RecordingReader(wall).missing == []
+    assert RecordingReader(wall_recording).missing == []
 
 
-def test_run_is_the_same_with_either_stamps(recording: Path, wall: Path) -> None:
-    by_wall = RunRecord.load(wall)
-    by_robot = RunRecord.load(recording)
-    assert by_wall.host.command_digest == by_robot.host.command_digest
-    assert by_wall.time_s.tolist() == by_robot.time_s.tolist()
+def test_recording_gives_the_same_run_with_either_times(
+    recording: Path, wall_recording: Path
+) -> None:
+    wall_run = RunRecord.load(wall_recording)
+    robot_run = RunRecord.load(recording)
+    assert wall_run.host.command_digest == robot_run.host.command_digest
+    assert wall_run.time_s.tolist() == robot_run.time_s.tolist()
 
 
-def test_messages_for_viewers_are_stamped_by_the_same_clock(recording: Path, wall: Path) -> None:
+def test_recording_messages_for_viewers_have_times_of_one_clock(
+    recording: Path, wall_recording: Path
+) -> None:
     """A viewer looks up transforms by the timestamps in the messages, at the log time that it shows."""
-    for path, least_ns in ((recording, 0), (wall, YEAR_2020_NS)):
-        states = read_with_stock_reader(path, ["/planar13/joint_states"])
+    for path, min_time_ns in ((recording, 0), (wall_recording, YEAR_2020_NS)):
+        states = read_with_mcap_reader(path, ["/planar13/joint_states"])
         assert len(states) > 45
         for _, message, content in states:
-            assert content.timestamp.ToNanoseconds() == message.log_time >= least_ns
-        assert read_with_stock_reader(path, ["/planar13/tf"])
+            assert content.timestamp.ToNanoseconds() == message.log_time >= min_time_ns
+        assert read_with_mcap_reader(path, ["/planar13/tf"])
 
 
-def test_copy_of_a_copy_is_in_robot_time_again(recording: Path, wall: Path, tmp_path: Path) -> None:
-    recover_recording(wall, tmp_path / "robot.mcap", "robot")
-    found = read_with_stock_reader(tmp_path / "robot.mcap")
-    original = read_with_stock_reader(recording)
-    assert all(CLOCK_ENTRY not in channel.metadata for channel, _, _ in found)
-    found_times, original_times = (
+def test_recording_copy_back_to_robot_time_equals_the_original(
+    recording: Path, wall_recording: Path, tmp_path: Path
+) -> None:
+    recover_recording(wall_recording, tmp_path / "robot.mcap", "robot")
+    copied = read_with_mcap_reader(tmp_path / "robot.mcap")
+    original = read_with_mcap_reader(recording)
+    assert all(CLOCK_ENTRY not in channel.metadata for channel, _, _ in copied)
+    copied_rows, original_rows = (
         [
             (channel.topic, message.log_time, message.publish_time, message.data)
             for channel, message, _ in messages
         ]
-        for messages in (found, original)
+        for messages in (copied, original)
     )
-    assert found_times == original_times
+    assert copied_rows == original_rows
 
 
-def test_copy_without_a_choice_keeps_the_stamps(wall: Path, tmp_path: Path) -> None:
-    count, _ = recover_recording(wall, tmp_path / "again.mcap")
-    original, copy = (read_with_stock_reader(path) for path in (wall, tmp_path / "again.mcap"))
+def test_recording_copy_without_chosen_clock_keeps_log_times(
+    wall_recording: Path, tmp_path: Path
+) -> None:
+    count, _ = recover_recording(wall_recording, tmp_path / "again.mcap")
+    original = read_with_mcap_reader(wall_recording)
+    copy = read_with_mcap_reader(tmp_path / "again.mcap")
     assert [message.log_time for _, message, _ in copy] == [
         message.log_time for _, message, _ in original
     ]
     assert count == len(copy)
 
 
-def test_recorder_writes_wall_stamps(tmp_path: Path) -> None:
+def test_recorder_writes_wall_times_and_robot_times(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a.mcap", log_time_clock="wall")
     contacts = Contacts(tick=3, timestamp_ns=3 * PERIOD_NS, contacts=[])
     before_ns = time.time_ns()
-    writer.write_arrival(
-        ReceivedSample(
-            keys.CONTACTS, encode(contacts), format_encoding(Contacts), time.monotonic_ns()
-        )
+    sample = ReceivedSample(
+        keys.CONTACTS, encode(contacts), format_encoding(Contacts), time.monotonic_ns()
     )
+    writer.write_arrival(sample)
     writer.close({})
-    ((_, message, _),) = read_with_stock_reader(tmp_path / "a.mcap")
+    ((_, message, _),) = read_with_mcap_reader(tmp_path / "a.mcap")
     assert message.publish_time == 3 * PERIOD_NS
     assert message.log_time == pytest.approx(before_ns, abs=10**9)
-    (read,) = RecordingReader(tmp_path / "a.mcap").read_messages()
-    assert (read.robot_time_ns, read.wall_time_ns) == (message.publish_time, message.log_time)
+    (read_message,) = RecordingReader(tmp_path / "a.mcap").read_messages()
+    assert read_message.robot_time_ns == message.publish_time
+    assert read_message.wall_time_ns == message.log_time

@@ -1,4 +1,4 @@
-"""What `snakesim reproduce` prints of an experiment and its findings, and which experiments there are."""
+"""The text and the record that `snakesim reproduce` writes, and the list of experiments."""
 
 import msgspec
 import pytest
@@ -26,8 +26,8 @@ from snakesim_operator.features.reproduce.trials import ExperimentTrials
 from snakesim_testing.messages import raises_error
 
 
-class Sledge(Experiment):
-    """An experiment for the tests."""
+class SledgeExperiment(Experiment):
+    """An experiment with invented figures, which only these tests use."""
 
     name = "sledge"
     source = PublishedSource(
@@ -47,7 +47,7 @@ class Sledge(Experiment):
         raise NotImplementedError
 
 
-SPEED = PublishedComparison(
+SPEED_COMPARISON = PublishedComparison(
     quantity="speed",
     unit="m/s",
     published=2.0,
@@ -56,11 +56,11 @@ SPEED = PublishedComparison(
     interval=(1.25, 1.75),
     runs=3,
 )
-ORDER = PublishedComparison(
+ORDER_COMPARISON = PublishedComparison(
     quantity="order", unit="", published="a, b", basis="printed", ours="a, b", runs=1
 )
 FINDINGS = ExperimentFindings(
-    comparisons=(SPEED, ORDER),
+    comparisons=(SPEED_COMPARISON, ORDER_COMPARISON),
     reasons=(
         DifferenceReason(cause="Ice is smooth.", effect=-0.00004, unit="m/s"),
         DifferenceReason(cause="The wind."),
@@ -74,8 +74,8 @@ FINDINGS = ExperimentFindings(
 )
 
 
-def test_a_text_has_the_source_the_numbers_and_the_reasons() -> None:
-    assert list(describe_lines(Sledge(), FINDINGS)) == [
+def test_comparison_text_contains_source_numbers_and_reasons() -> None:
+    assert list(describe_lines(SledgeExperiment(), FINDINGS)) == [
         "sledge",
         "source        A. Author: On sledges. Journal 1, 1999: table 2",
         "seen          the table",
@@ -103,16 +103,16 @@ def test_a_text_has_the_source_the_numbers_and_the_reasons() -> None:
     ]
 
 
-def test_texts_that_differ_are_said_to_differ() -> None:
-    other = PublishedComparison(
+def test_comparison_of_different_texts_reports_difference() -> None:
+    comparison = PublishedComparison(
         quantity="order", unit="", published="a", basis="printed", ours="b", runs=2
     )
-    assert describe_difference(other) == "they are not the same"
-    assert describe_ours(other) == "b (2 runs)"
+    assert describe_difference(comparison) == "they are not the same"
+    assert describe_ours(comparison) == "b (2 runs)"
 
 
-def test_a_record_for_scripts_has_all_numbers() -> None:
-    record = msgspec.json.decode(msgspec.json.encode(make_record(Sledge(), FINDINGS)))
+def test_comparison_record_for_scripts_contains_all_numbers() -> None:
+    record = msgspec.json.decode(msgspec.json.encode(make_record(SledgeExperiment(), FINDINGS)))
     assert record["name"] == "sledge"
     assert record["source"]["place"] == "table 2"
     assert record["comparisons"][0]["interval"] == [1.25, 1.75]
@@ -125,38 +125,34 @@ def test_every_experiment_states_its_source_and_conditions() -> None:
     assert len(EXPERIMENTS) >= 6
     for name, experiment in EXPERIMENTS.items():
         assert experiment.name == name
-        stated = [
+        source = experiment.source
+        sentences = [
             experiment.claim,
             experiment.published_conditions,
             experiment.our_conditions,
             experiment.method,
+            source.seen,
         ]
-        assert all(text.endswith(".") for text in [*stated, experiment.source.seen]), name
-        assert all((experiment.source.authors, experiment.source.title, experiment.source.place)), (
-            name
-        )
-        assert 1900 < experiment.source.year < 2100, name
+        assert all(sentence.endswith(".") for sentence in sentences), name
+        assert all((source.authors, source.title, source.place)), name
+        assert 1900 < source.year < 2100, name
 
 
-def test_the_list_has_a_line_with_name_and_year_for_each() -> None:
+def test_experiment_list_has_name_and_year_of_each() -> None:
     lines = list(list_lines(list(EXPERIMENTS.values())))
     assert [line.split()[:2] for line in lines] == [
         [experiment.name, str(experiment.source.year)] for experiment in EXPERIMENTS.values()
     ]
 
 
-def test_experiments_are_selected_once_each_or_all() -> None:
+def test_experiment_selection_has_each_once_or_all() -> None:
     names = list(EXPERIMENTS)
-    assert [
-        experiment.name for experiment in select_experiments([names[2], names[0], names[2]])
-    ] == [
-        names[2],
-        names[0],
-    ]
+    selected = select_experiments([names[2], names[0], names[2]])
+    assert [experiment.name for experiment in selected] == [names[2], names[0]]
     assert [experiment.name for experiment in select_experiments(["all"])] == names
 
 
 @pytest.mark.parametrize("names", [[], ["hu-slithring"]])
-def test_no_name_and_an_unknown_one_are_refused(names: list[str]) -> None:
+def test_experiment_selection_without_or_with_unknown_name_is_refused(names: list[str]) -> None:
     with raises_error(ConfigError, code="command/invalid-option", field="reproduce"):
         select_experiments(names)

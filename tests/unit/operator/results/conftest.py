@@ -1,4 +1,4 @@
-"""One run for all tests of results."""
+"""Provides one simulated run for all tests of results."""
 
 import pytest
 
@@ -8,4 +8,5 @@ from snakesim_testing.operator.triplet_report import simulate_triplet
 
 @pytest.fixture(scope="session")
 def record() -> RunRecord:
+    """The record of a run of the scenario `triplet`, which is simulated only once."""
     return simulate_triplet()

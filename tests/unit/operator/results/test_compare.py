@@ -1,4 +1,4 @@
-"""Comparing two runs: made-up records whose differences are known beforehand, and the words and pages on them."""
+"""Compares pairs of synthetic runs whose differences are known, and checks the figures, texts and pages."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.robot_file.robot import add_drive_identities, describe_robot
 from snakesim_hal.model.scenario import RunConfig, load_scenario, parse_set_option, write_config
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.messages import ControlState, JointMode
+from snakesim_hal.wire.messages import ControlState, JointMode, RobotDescription
 from snakesim_operator.results.compare.command import compare_runs
 from snakesim_operator.results.compare.difference import RunDifference, compute_difference
 from snakesim_operator.results.compare.page import render_comparison_page
@@ -27,100 +27,126 @@ from snakesim_testing.operator.triplet_report import make_finished_host_record
 
 JOINTS = 13
 SPEED_M_S = 0.1
+ARM_TIME_S = 0.5  # robot time at which a synthetic run is armed
 
 
-def configured(**changes: Any) -> RunConfig:
+def load_triplet_config(**changes: Any) -> RunConfig:
+    """Load the scenario `triplet` with these values changed."""
     return load_scenario(
         "triplet", [parse_set_option(f"{key}={value}") for key, value in changes.items()]
     ).config
 
 
-def made_up(
+def make_run(
     seconds: float = 2.0,
     rate_hz: float = 100.0,
-    start_s: float = 0.5,
+    start_s: float = ARM_TIME_S,
     speed_m_s: float = SPEED_M_S,
-    propelled: tuple[tuple[float, int], ...] = ((0.0, 9), (0.6, 8), (1.2, 7)),
-    controller_knows: bool = True,
+    propulsion_joints: tuple[tuple[float, int], ...] = ((0.0, 9), (0.6, 8), (1.2, 7)),
+    reports_path: bool = True,
 ) -> RunRecord:
-    """Joints that swing, each a little later; no pose, so the controller alone tells how far it came."""
-    run = msgspec.structs.replace(configured(), rate_hz=rate_hz, duration_s=seconds)
-    count = round(seconds * rate_hz)
-    since_s = np.arange(count) / rate_hz
-    phase = 2 * math.pi * since_s[:, None] + 0.3 * np.arange(JOINTS)
-    joints = [joint.name for joint in describe_of(run).joints]
-    control = [
+    """Make the record of a run in which each joint swings as a sine, a little later than the joint before it.
+
+    The record contains no pose, so only the controller's path shows the distance.
+
+    Args:
+        seconds: duration of the run.
+        rate_hz: ticks in each second.
+        start_s: robot time at which the run is armed.
+        speed_m_s: speed along the path that the controller reports.
+        propulsion_joints: when each propulsion joint takes over, in s from the start, and its index.
+        reports_path: whether the controller reports its path.
+    """
+    config = msgspec.structs.replace(load_triplet_config(), rate_hz=rate_hz, duration_s=seconds)
+    description = describe_run_robot(config)
+    joint_names = [joint.name for joint in description.joints]
+    tick_count = round(seconds * rate_hz)
+    elapsed_s = np.arange(tick_count) / rate_hz
+    phase_rad = 2 * math.pi * elapsed_s[:, None] + 0.3 * np.arange(JOINTS)
+
+    def find_propulsion_joint(time_s: float) -> str | None:
+        """Return the name of the joint that propels the robot at this time after the start."""
+        for takeover_s, joint in reversed(propulsion_joints):
+            if takeover_s <= time_s + 1e-9:
+                return joint_names[joint]
+        return None
+
+    control_states = [
         ControlState(
-            tick=row,
-            timestamp_ns=round((start_s + t) * 1e9),
+            tick=tick,
+            timestamp_ns=round((start_s + time_s) * 1e9),
             controller="obstacle_triplet",
             state="Locomoting",
             reason="pushing",
-            path_s_m=speed_m_s * t if controller_knows else None,
-            propulsion_joint=next(
-                (joints[j] for at_s, j in reversed(propelled) if at_s <= t + 1e-9), None
-            ),
+            path_s_m=speed_m_s * time_s if reports_path else None,
+            propulsion_joint=find_propulsion_joint(time_s),
         )
-        for row, t in enumerate(since_s.tolist())
+        for tick, time_s in enumerate(elapsed_s.tolist())
     ]
     return RunRecord(
         path=Path("made-up"),
-        config=run,
-        description=describe_of(run),
-        host=make_finished_host_record(count),
-        control_states=control,
+        config=config,
+        description=description,
+        host=make_finished_host_record(tick_count),
+        control_states=control_states,
         worlds=[],
         trajectories=[],
-        time_s=start_s + since_s,
-        angle_rad=0.3 * np.sin(phase),
-        velocity_rad_s=0.6 * math.pi * np.cos(phase),
-        torque_nm=2.0 * np.cos(phase),
-        mode=np.full((count, JOINTS), JointMode.POSITION, dtype=np.int8),
-        target=0.3 * np.sin(phase) + 0.01,
-        torque_limit_nm=np.full((count, JOINTS), 7.0),
-        position_w_m=np.full((count, 3), np.nan),
-        orientation_wxyz=np.full((count, 4), np.nan),
-        contact_peak_n=np.zeros(count),
-        contact_count=np.zeros(count),
+        time_s=start_s + elapsed_s,
+        angle_rad=0.3 * np.sin(phase_rad),
+        velocity_rad_s=0.6 * math.pi * np.cos(phase_rad),
+        torque_nm=2.0 * np.cos(phase_rad),
+        mode=np.full((tick_count, JOINTS), JointMode.POSITION, dtype=np.int8),
+        target=0.3 * np.sin(phase_rad) + 0.01,
+        torque_limit_nm=np.full((tick_count, JOINTS), 7.0),
+        position_w_m=np.full((tick_count, 3), np.nan),
+        orientation_wxyz=np.full((tick_count, 4), np.nan),
+        contact_peak_n=np.zeros(tick_count),
+        contact_count=np.zeros(tick_count),
     )
 
 
-def describe_of(run: RunConfig):
+def describe_run_robot(config: RunConfig) -> RobotDescription:
+    """Return the description that the host of a simulated run publishes."""
     return describe_robot(
-        run.robot, backend="sim", period_ns=run.period_ns, lease_ns=run.lease_ns, config_hash="x"
+        config.robot,
+        backend="sim",
+        period_ns=config.period_ns,
+        lease_ns=config.lease_ns,
+        config_hash="x",
     )
 
 
-def shown(difference: RunDifference) -> tuple[str, str]:
-    """Table and page; neither may show what is not a number. And for scripts, which get null."""
+def render_and_check(difference: RunDifference) -> tuple[str, str]:
+    """Return the table and the page of a difference, after a check that neither shows a NaN.
+
+    The values for scripts are checked, too: they contain null for each missing value.
+    """
     values = json.loads(msgspec.json.encode(make_json_values(difference)))
     assert values["identical"] == difference.is_identical
     assert (values["divergence"] is None) == (difference.divergence is None)
-    reported = (
-        "\n".join(format_comparison(difference)),
-        render_comparison_page(difference, check_tolerance(difference, 5)),
-    )
-    for text in reported:
+    table = "\n".join(format_comparison(difference))
+    page = render_comparison_page(difference, check_tolerance(difference, 5))
+    for text in (table, page):
         assert not re.search(
             r"\b(nan|inf|None)\b",
             re.sub(r"<(style|script)>.*?</\1>|base64,[^\"]*", "", text, flags=re.S),
         )
-    return reported
+    return table, page
 
 
-def test_the_same_run_twice_differs_in_nothing() -> None:
-    difference = compute_difference(made_up(), made_up())
+def test_compare_run_with_itself_has_no_difference() -> None:
+    difference = compute_difference(make_run(), make_run())
     assert difference.is_identical
     assert difference.divergence is None
     assert difference.differing_settings == []
-    # Angle, speed, torque, angle target.
-    assert [gap.rms for gap in difference.quantities] == [0.0] * 4
+    # The four quantities are angle, speed, torque and angle target.
+    assert [quantity.rms for quantity in difference.quantities] == [0.0] * 4
     assert difference.torque.correlation == pytest.approx(1)
     assert difference.advance is not None
     assert difference.advance.percent == 0
     assert difference.hand_overs.has_same_order
     assert difference.hand_overs.delays_s == [0, 0, 0]
-    text, html = shown(difference)
+    text, html = render_and_check(difference)
     assert "The runs are the same, joint by joint, for all of their 200 common ticks." in text
     assert "No difference: every angle is the same at every time." in html
 
@@ -130,50 +156,52 @@ def test_the_same_run_twice_differs_in_nothing() -> None:
     ("where", "wrong"), [(np.s_[:], np.nan), (np.s_[50:60, 3], np.nan), (np.s_[:], np.inf)]
 )
 def test_compare_nan_in_both_runs_is_not_equal(name: str, where: Any, wrong: float) -> None:
-    record = made_up()
-    hurt = getattr(record, name).copy()
-    hurt[where] = wrong
-    hurt = dataclasses.replace(record, **{name: hurt})
+    record = make_run()
+    values = getattr(record, name).copy()
+    values[where] = wrong
+    damaged = dataclasses.replace(record, **{name: values})
     for difference in (
-        compute_difference(hurt, hurt),
-        compute_difference(record, hurt),
-        compute_difference(hurt, record),
+        compute_difference(damaged, damaged),
+        compute_difference(record, damaged),
+        compute_difference(damaged, record),
     ):
-        text, html = shown(difference)
+        text, html = render_and_check(difference)
         assert not difference.is_identical
         assert "The runs are the same" not in text + html
         assert "Not a number in one run or in both, so it cannot be compared: " in text
 
 
-ODD: dict[str, dict[str, Any]] = {
+INVALID_ARRAYS: dict[str, dict[str, Any]] = {
     "too few joints": {"angle_rad": np.zeros((200, 5))},
     "too few ticks": {"torque_nm": np.zeros((5, JOINTS))},
     "texts": {"target": np.full((200, JOINTS), "x")},
     "complex": {"velocity_rad_s": np.zeros((200, JOINTS), dtype=complex)},
     "a number": {"mode": np.zeros(())},
     "positions in a plane": {"position_w_m": np.zeros((200, 2))},
-    "time that stands": {"time_s": np.zeros(200)},
+    "constant time": {"time_s": np.zeros(200)},
     "time that is not a number": {"time_s": np.full(200, np.nan)},
 }
 
 
-@pytest.mark.parametrize("odd", ODD)
-def test_a_black_box_with_odd_arrays_is_one_error(odd: str) -> None:
+@pytest.mark.parametrize("name", INVALID_ARRAYS)
+def test_compare_black_box_with_invalid_array_raises_one_error(name: str) -> None:
+    invalid = INVALID_ARRAYS[name]
     with raises_error(ConfigError, code="recording/not-readable") as caught:
-        compute_difference(made_up(), dataclasses.replace(made_up(), **ODD[odd]))
-    assert f"`{next(iter(ODD[odd]))}`" in str(caught.value)
+        compute_difference(make_run(), dataclasses.replace(make_run(), **invalid))
+    (field,) = invalid
+    assert f"`{field}`" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 OFF_JOINT = 4  # joint_5
 OFF_FROM_TICK = 120
 MOST_OFF_TICK = 150
-TICKS = 200  # of the made-up run, at 100 Hz
+TICKS = 200  # of the synthetic run, at 100 Hz
 
 
 def compare_with_one_joint_off() -> RunDifference:
     """Compare a run with one in which a joint is off by 0.2 rad from 1.2 s on, and by 0.3 rad at 1.5 s."""
-    run = made_up()
+    run = make_run()
     angle_rad = run.angle_rad.copy()
     angle_rad[OFF_FROM_TICK:, OFF_JOINT] += 0.2
     angle_rad[MOST_OFF_TICK, OFF_JOINT] += 0.1
@@ -206,52 +234,54 @@ def test_compare_one_joint_off_diverges_at_its_first_difference() -> None:
 
 
 def test_compare_one_joint_off_is_named_in_text_and_page() -> None:
-    text, html = shown(compare_with_one_joint_off())
+    text, html = render_and_check(compare_with_one_joint_off())
     assert "The runs diverge at 1.20 s, when joint_5 is first more than 0.05 rad apart." in text
     assert "joint_5 at 1.50 s" in text
     assert 'data-joint="joint_5"' in html
 
 
-def test_runs_are_aligned_at_their_first_arming_whenever_that_was() -> None:
-    difference = compute_difference(made_up(start_s=0.5), made_up(start_s=7.25))
+def test_compare_runs_armed_at_different_times_aligns_at_first_arming() -> None:
+    difference = compute_difference(make_run(start_s=0.5), make_run(start_s=7.25))
     assert difference.aligned.sampling_description == "tick by tick"
     assert difference.angle.rms == pytest.approx(0, abs=1e-12)
     assert difference.hand_overs.delays_s == pytest.approx([0, 0, 0])
 
 
 def test_compare_uses_only_the_common_time() -> None:
-    difference = compute_difference(made_up(seconds=2), made_up(seconds=1))
+    difference = compute_difference(make_run(seconds=2), make_run(seconds=1))
     assert difference.aligned.time_s[-1] == pytest.approx(0.99)
     assert difference.is_identical
-    # The third comes later than B lasts.
-    assert [one.joint_index for one in difference.hand_overs.a] == [9, 8]
-    assert [one.key for one in difference.differing_settings] == ["duration_s"]
+    # Run B ends before the third hand-over.
+    assert [hand_over.joint_index for hand_over in difference.hand_overs.a] == [9, 8]
+    assert [setting.key for setting in difference.differing_settings] == ["duration_s"]
 
 
 def test_compare_delayed_run_has_its_delay() -> None:
-    a, late = made_up(), 0.05
-    since_s = a.time_s[:, None] - a.time_s[0] - late
+    delay_s = 0.05
+    a = make_run()
+    delayed_s = a.time_s[:, None] - a.time_s[0] - delay_s
     b = dataclasses.replace(
-        a, angle_rad=0.3 * np.sin(2 * math.pi * since_s + 0.3 * np.arange(JOINTS))
+        a, angle_rad=0.3 * np.sin(2 * math.pi * delayed_s + 0.3 * np.arange(JOINTS))
     )
     difference = compute_difference(a, b)
-    size = 0.3 * 2 * math.sin(math.pi * late)  # of the difference of two sines
-    assert difference.angle.rms == pytest.approx(size / math.sqrt(2), rel=0.01)
-    assert difference.angle.correlation == pytest.approx(math.cos(2 * math.pi * late), abs=0.005)
+    # The difference of two sines is a sine with this amplitude.
+    amplitude_rad = 0.3 * 2 * math.sin(math.pi * delay_s)
+    assert difference.angle.rms == pytest.approx(amplitude_rad / math.sqrt(2), rel=0.01)
+    assert difference.angle.correlation == pytest.approx(math.cos(2 * math.pi * delay_s), abs=0.005)
 
 
-def test_scaled_torques_correlate_fully() -> None:
-    a = made_up()
+def test_compare_scaled_torques_have_full_correlation() -> None:
+    a = make_run()
     difference = compute_difference(a, dataclasses.replace(a, torque_nm=1.5 * a.torque_nm))
     assert difference.torque.correlation == pytest.approx(1)
     assert difference.torque.rms == pytest.approx(1.0 / math.sqrt(2), rel=0.01)
     assert difference.torque.max_difference is not None
     assert abs(difference.torque.max_difference.difference) == pytest.approx(1.0, rel=0.01)
-    shown(difference)
+    render_and_check(difference)
 
 
-def test_compare_different_rates_uses_the_coarser_and_says_so() -> None:
-    difference = compute_difference(made_up(rate_hz=100), made_up(rate_hz=30, seconds=1.5))
+def test_compare_different_rates_uses_and_reports_the_lower_rate() -> None:
+    difference = compute_difference(make_run(rate_hz=100), make_run(rate_hz=30, seconds=1.5))
     assert len(difference.aligned.time_s) == 45
     assert (
         difference.aligned.sampling_description
@@ -259,25 +289,28 @@ def test_compare_different_rates_uses_the_coarser_and_says_so() -> None:
     )
     assert difference.angle.rms is not None
     assert difference.angle.rms < 2e-4  # a sine between 10 ms ticks
-    assert {"rate_hz", "duration_s"} <= {one.key for one in difference.differing_settings}
-    assert difference.aligned.sampling_description in shown(difference)[0]
+    assert {"rate_hz", "duration_s"} <= {setting.key for setting in difference.differing_settings}
+    text, _ = render_and_check(difference)
+    assert difference.aligned.sampling_description in text
 
 
-def test_a_set_point_holds_until_the_next_one() -> None:
-    a = made_up(rate_hz=50)
-    b = made_up(rate_hz=40)
-    steps = [
-        np.repeat(np.floor((r.time_s - 0.5) * 10 + 1e-9)[:, None], JOINTS, axis=1) for r in (a, b)
-    ]
-    difference = compute_difference(
-        dataclasses.replace(a, target=steps[0]), dataclasses.replace(b, target=steps[1])
-    )
+def test_compare_setpoint_applies_until_the_next_one() -> None:
+    a = make_run(rate_hz=50)
+    b = make_run(rate_hz=40)
+
+    def set_step_targets(run: RunRecord) -> RunRecord:
+        """Replace the targets by steps at a rate of 10 Hz, which both runs can represent."""
+        steps = np.floor((run.time_s - ARM_TIME_S) * 10 + 1e-9)
+        return dataclasses.replace(run, target=np.repeat(steps[:, None], JOINTS, axis=1))
+
+    difference = compute_difference(set_step_targets(a), set_step_targets(b))
     assert difference.targets[0].rms == 0
 
 
-def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
-    """As a simulator and joint modules describe one robot."""
-    a, b = made_up(), made_up()
+def test_compare_serial_numbers_and_sensor_order_are_no_settings() -> None:
+    """A simulator and joint modules describe the same robot in these two ways."""
+    a = make_run()
+    b = make_run()
     described = add_drive_identities(
         b.description, [f"AE{i:02d}" for i in range(JOINTS)], ["1.0"] * JOINTS
     )
@@ -286,7 +319,7 @@ def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
     sensors = [slower, *(sensor for sensor in reversed(described.sensors) if sensor is not imu)]
     described = msgspec.structs.replace(described, sensors=sensors, simulated_time=True)
     difference = compute_difference(a, dataclasses.replace(b, description=described))
-    assert [one.key for one in difference.differing_settings] == [
+    assert [setting.key for setting in difference.differing_settings] == [
         f"description.sensors.{keys.IMU}.rate_hz"
     ]
     lines = format_comparison(difference)
@@ -295,7 +328,7 @@ def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
         "drives: A reports no serial numbers and no firmware versions, B those of 13 of 13 joints"
         in lines
     )
-    assert "drives: A reports no serial numbers" in shown(difference)[1]
+    assert "drives: A reports no serial numbers" in render_and_check(difference)[1]
     assert make_json_values(difference)["drives"]["joint_1"]["b"] == {
         "serial": "AE00",
         "firmware": "1.0",
@@ -303,13 +336,17 @@ def test_serial_numbers_and_the_order_of_sensors_are_no_settings() -> None:
 
 
 def test_compare_names_different_drives() -> None:
-    a, b = made_up(), made_up()
-    of_a = add_drive_identities(a.description, [f"A{i}" for i in range(JOINTS)], ["1.0"] * JOINTS)
-    of_b = add_drive_identities(
+    a = make_run()
+    b = make_run()
+    description_a = add_drive_identities(
+        a.description, [f"A{i}" for i in range(JOINTS)], ["1.0"] * JOINTS
+    )
+    description_b = add_drive_identities(
         a.description, [f"A{i}" for i in range(JOINTS - 1)] + ["B"], ["1.1"] * JOINTS
     )
     difference = compute_difference(
-        dataclasses.replace(a, description=of_a), dataclasses.replace(b, description=of_b)
+        dataclasses.replace(a, description=description_a),
+        dataclasses.replace(b, description=description_b),
     )
     assert difference.differing_settings == []
     assert (
@@ -318,12 +355,12 @@ def test_compare_names_different_drives() -> None:
     )
 
 
-def test_ticks_that_are_missing_are_told() -> None:
-    a = made_up()
-    keep = np.arange(200) != 50
+def test_compare_run_with_missing_tick_reports_it() -> None:
+    a = make_run()
+    kept = np.arange(TICKS) != 50
     columns = [name for name, value in vars(a).items() if isinstance(value, np.ndarray)]
     difference = compute_difference(
-        a, dataclasses.replace(a, **{name: getattr(a, name)[keep] for name in columns})
+        a, dataclasses.replace(a, **{name: getattr(a, name)[kept] for name in columns})
     )
     assert difference.aligned.sampling_description.startswith(
         "both at 100 Hz, but some ticks are missing"
@@ -335,9 +372,9 @@ TORQUE_JOINT = 6
 TORQUE_FROM_TICK = 100  # 1 s
 
 
-def made_up_with_torque_joint(torque_nm: float) -> RunRecord:
-    """Return the made-up run with one joint in torque mode from 1 s on."""
-    run = made_up()
+def make_run_with_torque_joint(torque_nm: float) -> RunRecord:
+    """Return the synthetic run with one joint in torque mode from 1 s on."""
+    run = make_run()
     mode = run.mode.copy()
     mode[TORQUE_FROM_TICK:, TORQUE_JOINT] = JointMode.TORQUE
     target = run.target.copy()
@@ -346,7 +383,7 @@ def made_up_with_torque_joint(torque_nm: float) -> RunRecord:
 
 
 def test_compare_targets_of_different_modes_are_not_compared() -> None:
-    difference = compute_difference(made_up(), made_up_with_torque_joint(5.0))
+    difference = compute_difference(make_run(), make_run_with_torque_joint(5.0))
     (angle_target,) = difference.targets
     assert angle_target.quantity == "angle target"
     assert angle_target.rms == 0
@@ -358,7 +395,9 @@ def test_compare_targets_of_different_modes_are_not_compared() -> None:
 
 
 def test_compare_torque_targets_names_worst_joint_and_time() -> None:
-    difference = compute_difference(made_up_with_torque_joint(5.0), made_up_with_torque_joint(6.0))
+    difference = compute_difference(
+        make_run_with_torque_joint(5.0), make_run_with_torque_joint(6.0)
+    )
     torque_target = difference.targets[1]
     assert torque_target.quantity == "torque target"
     assert torque_target.max_difference is not None
@@ -370,85 +409,86 @@ def test_compare_torque_targets_names_worst_joint_and_time() -> None:
         for joint, worst in enumerate(torque_target.max_difference_by_joint)
         if worst is not None
     ] == [TORQUE_JOINT]
-    shown(difference)
+    render_and_check(difference)
 
 
 @pytest.mark.parametrize(("speed_m_s", "percent"), [(0.09, -10.0), (0.125, 25.0), (-0.1, -200.0)])
-def test_distance_is_relative_to_the_first_run(speed_m_s: float, percent: float) -> None:
-    difference = compute_difference(made_up(), made_up(speed_m_s=speed_m_s))
+def test_compare_distance_is_relative_to_the_first_run(speed_m_s: float, percent: float) -> None:
+    difference = compute_difference(make_run(), make_run(speed_m_s=speed_m_s))
     assert difference.advance is not None
     assert difference.advance.percent == pytest.approx(percent)
-    asked = check_tolerance(difference, abs(percent) - 0.1)
-    assert asked is not None
-    assert not asked.holds
-    asked = check_tolerance(difference, abs(percent) + 0.1)
-    assert asked is not None
-    assert asked.holds
+    exceeded = check_tolerance(difference, abs(percent) - 0.1)
+    assert exceeded is not None
+    assert not exceeded.holds
+    kept = check_tolerance(difference, abs(percent) + 0.1)
+    assert kept is not None
+    assert kept.holds
 
 
-def test_compare_standing_run_has_no_relative_distance() -> None:
-    stood = made_up(speed_m_s=0)
-    both, one = (
-        compute_difference(stood, made_up(speed_m_s=1e-5)),
-        compute_difference(stood, made_up()),
-    )
-    assert both.advance is not None
-    assert both.advance.percent == 0
-    assert one.advance is not None
-    assert one.advance.percent is None
-    asked = check_tolerance(one, 1000)
-    assert asked is not None
-    assert not asked.holds
-    assert "A did not move" in asked.words
-    shown(both)
-    shown(one)
+def test_compare_stationary_run_has_no_relative_distance() -> None:
+    stationary = make_run(speed_m_s=0)
+    both_stationary = compute_difference(stationary, make_run(speed_m_s=1e-5))
+    only_b_moves = compute_difference(stationary, make_run())
+    assert both_stationary.advance is not None
+    assert both_stationary.advance.percent == 0
+    assert only_b_moves.advance is not None
+    assert only_b_moves.advance.percent is None
+    verdict = check_tolerance(only_b_moves, 1000)
+    assert verdict is not None
+    assert not verdict.holds
+    assert "A did not move" in verdict.words
+    render_and_check(both_stationary)
+    render_and_check(only_b_moves)
 
 
 def test_compare_unknown_distance_stays_unknown() -> None:
-    difference = compute_difference(made_up(), made_up(controller_knows=False))
+    difference = compute_difference(make_run(), make_run(reports_path=False))
     assert difference.advance is None
     assert check_tolerance(difference, 10) is None
-    text, html = shown(difference)
+    text, html = render_and_check(difference)
     assert "no measure that both have" in text
     assert "No distance" in html
 
 
 def test_compare_hand_overs_agree_until_first_difference() -> None:
-    b = made_up(propelled=((0.0, 9), (0.7, 8), (1.1, 6), (1.5, 7)))
-    difference = compute_difference(made_up(), b)
-    both = difference.hand_overs
-    assert both.common_count == 2
-    assert both.delays_s == pytest.approx([0, 0.1])
-    assert not both.has_same_order
-    said = "agrees for the first 2; then A continues with joint_8 at 1.20 s, B continues with joint_7 at 1.10 s"
-    text, html = shown(difference)
-    assert said in text
-    assert said in html
+    b = make_run(propulsion_joints=((0.0, 9), (0.7, 8), (1.1, 6), (1.5, 7)))
+    difference = compute_difference(make_run(), b)
+    hand_overs = difference.hand_overs
+    assert hand_overs.common_count == 2
+    assert hand_overs.delays_s == pytest.approx([0, 0.1])
+    assert not hand_overs.has_same_order
+    expected = "agrees for the first 2; then A continues with joint_8 at 1.20 s, B continues with joint_7 at 1.10 s"
+    text, html = render_and_check(difference)
+    assert expected in text
+    assert expected in html
 
 
-def test_settings_that_differ_are_named_with_both_values() -> None:
-    a = made_up()
+def test_compare_different_settings_are_named_with_both_values() -> None:
+    a = make_run()
     b = dataclasses.replace(
-        a, config=configured(**{"robot.motor.stiffness_nm_per_rad": 50, "seed": 2})
+        a, config=load_triplet_config(**{"robot.motor.stiffness_nm_per_rad": 50, "seed": 2})
     )
-    found = {one.key: (one.a, one.b) for one in compute_difference(a, b).differing_settings}
-    assert found["robot.motor.stiffness_nm_per_rad"] == ("60.0", "50.0")
-    assert found["seed"] == ("1", "2")
-    assert not [key for key in found if key.startswith("description.")]
+    settings = {
+        setting.key: (setting.a, setting.b)
+        for setting in compute_difference(a, b).differing_settings
+    }
+    assert settings["robot.motor.stiffness_nm_per_rad"] == ("60.0", "50.0")
+    assert settings["seed"] == ("1", "2")
+    assert not [key for key in settings if key.startswith("description.")]
 
 
-def test_a_run_that_never_armed_is_not_compared() -> None:
-    a = made_up()
-    empty = dataclasses.replace(a, path=Path("idle"), time_s=np.zeros(0))
+def test_compare_run_that_never_armed_is_refused() -> None:
+    armed = make_run()
+    never_armed = dataclasses.replace(armed, path=Path("idle"), time_s=np.zeros(0))
     with raises_error(ConfigError, code="recording/never-armed", field="blackbox.rows"):
-        compute_difference(a, empty)
+        compute_difference(armed, never_armed)
 
 
-def test_a_single_common_tick_is_enough() -> None:
-    shown(compute_difference(made_up(), made_up(seconds=0.01, controller_knows=False)))
+def test_compare_runs_with_one_common_tick_succeeds() -> None:
+    render_and_check(compute_difference(make_run(), make_run(seconds=0.01, reports_path=False)))
 
 
-def test_folders_that_hold_no_run_are_named(tmp_path: Path) -> None:
+def test_compare_folders_without_run_are_refused_by_name(tmp_path: Path) -> None:
     with raises_error(ConfigError, code="recording/not-a-run"):
         compare_runs(tmp_path / "nowhere", tmp_path)
     with raises_error(ConfigError, code="recording/not-a-run", field="config.json"):
@@ -457,10 +497,12 @@ def test_folders_that_hold_no_run_are_named(tmp_path: Path) -> None:
         (tmp_path / name).write_text("{")
     with raises_error(ConfigError, code="file/invalid-syntax", field="config.json"):
         compare_runs(tmp_path, tmp_path)
-    write_config(configured(), tmp_path / "config.json")
+    write_config(load_triplet_config(), tmp_path / "config.json")
     with raises_error(ConfigError, code="recording/not-readable"):
         compare_runs(tmp_path, tmp_path)
-    (tmp_path / "description.json").write_bytes(msgspec.json.encode(describe_of(configured())))
+    (tmp_path / "description.json").write_bytes(
+        msgspec.json.encode(describe_run_robot(load_triplet_config()))
+    )
     with raises_error(ConfigError, code="recording/not-readable", field="blackbox.rows"):
         compare_runs(tmp_path, tmp_path)
     with raises_error(ConfigError, code="command/invalid-option", field="--within"):

@@ -1,4 +1,4 @@
-"""Whether a body moved: measured, and told alike by summary, terminal and verdict."""
+"""Whether a body moved: the measurement, and its agreement in summary, terminal and verdict."""
 
 import re
 
@@ -14,21 +14,21 @@ from snakesim_operator.run.conclusion import print_summary
 from snakesim_testing.operator.triplet_report import DURATION_S, replace_fields
 
 
-def moved_as(record: RunRecord, x_m: np.ndarray) -> RunRecord:
-    """The same body, which goes along x like this and does not bend."""
+def set_motion_along_x(record: RunRecord, x_m: np.ndarray) -> RunRecord:
+    """Return the run of the same body that moves along x like this, and does not bend."""
     position = np.repeat(record.position_w_m[:1], len(x_m), axis=0)
     position[:, 0] += x_m
-    still = {
+    constant = {
         name: np.repeat(getattr(record, name)[:1], len(x_m), axis=0)
         for name in ("orientation_wxyz", "angle_rad")
     }
-    return replace_fields(record, position_w_m=position, **still)
+    return replace_fields(record, position_w_m=position, **constant)
 
 
 def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> None:
     time_s = record.time_s - record.time_s[0]
-    goes = moved_as(record, 0.1 * np.interp(time_s, [0, 2, 4.5, 7, 10], [0, 2, 2, 4.5, 4.5]))
-    motion = find_stops(goes)
+    x_m = 0.1 * np.interp(time_s, [0, 2, 4.5, 7, 10], [0, 2, 2, 4.5, 4.5])
+    motion = find_stops(set_motion_along_x(record, x_m))
     assert motion is not None
     spans = [(span.start_s, span.end_s) for span in motion.stops]
     assert np.array(spans) == pytest.approx(np.array([[2.0, 4.5], [7.0, DURATION_S]]), abs=0.15)
@@ -38,68 +38,69 @@ def test_motion_stop_between_and_rest_at_end_are_located(record: RunRecord) -> N
 
 
 @pytest.mark.parametrize(("amplitude_m", "moves"), [(0.004, False), (0.06, True)])
-def test_a_body_that_wriggles_in_place_does_not_locomote(
+def test_motion_back_and_forth_of_few_millimeters_is_none(
     record: RunRecord, amplitude_m: float, moves: bool
 ) -> None:
     time_s = record.time_s - record.time_s[0]
-    motion = find_stops(moved_as(record, amplitude_m * np.sin(2 * np.pi * time_s / 1.6)))
+    x_m = amplitude_m * np.sin(2 * np.pi * time_s / 1.6)
+    motion = find_stops(set_motion_along_x(record, x_m))
     assert motion is not None
     assert motion.moving_fraction == (1.0 if moves else 0.0)
 
 
 def test_motion_without_pose_is_unknown(record: RunRecord) -> None:
-    blind = replace_fields(record, position_w_m=record.position_w_m * np.nan, worlds=[])
-    assert find_stops(blind) is None
-    reported = summarize_run(blind, "complete")
-    assert reported.locomoting_fraction is reported.last_state is reported.last_reason is None
-    assert reported.reported_state == "NotLocomoting"
+    without_pose = replace_fields(record, position_w_m=record.position_w_m * np.nan, worlds=[])
+    assert find_stops(without_pose) is None
+    summary = summarize_run(without_pose, "complete")
+    assert summary.locomoting_fraction is None
+    assert summary.last_state is None
+    assert summary.last_reason is None
+    assert summary.reported_state == "NotLocomoting"
 
 
 def test_motion_uses_measured_pose_but_not_dead_reckoning(record: RunRecord) -> None:
-    """The black box has no pose then; guidance's world model has."""
-    blind = replace_fields(record, position_w_m=record.position_w_m * np.nan)
+    """The black box contains no pose here, but the world model of guidance does."""
+    without_pose = replace_fields(record, position_w_m=record.position_w_m * np.nan)
     for source, fraction in (("sensor", pytest.approx(0.63, abs=0.03)), ("dead_reckoning", None)):
         worlds = [msgspec.structs.replace(world, pose_from=source) for world in record.worlds]
-        known = replace_fields(blind, worlds=worlds)
-        summary = summarize_run(known, "complete")
+        with_world = replace_fields(without_pose, worlds=worlds)
+        summary = summarize_run(with_world, "complete")
         assert summary.locomoting_fraction == fraction
-        assert make_verdict(known, summary).text.startswith(
-            "Ran for 10.0 s; the distance is unknown;"
-        )
+        verdict = make_verdict(with_world, summary)
+        assert verdict.text.startswith("Ran for 10.0 s; the distance is unknown;")
 
 
-def test_hand_overs_are_counted_in_one_place(
+def test_hand_over_count_is_equal_in_summary_terminal_and_verdict(
     record: RunRecord, capsys: pytest.CaptureFixture[str]
 ) -> None:
     names = [joint.name for joint in record.description.joints]
-    control = [
+    control_states = [
         msgspec.structs.replace(state, propulsion_joint=names[i // 5 % 3])
         for i, state in enumerate(record.control_states)
     ]
-    many = replace_fields(record, control_states=control)
-    summary = summarize_run(many, "complete")
+    many_hand_overs = replace_fields(record, control_states=control_states)
+    summary = summarize_run(many_hand_overs, "complete")
     print_summary(summary)
     printed = re.search(r"\((\d+) hand-overs in all\)", capsys.readouterr().out)
-    said = re.search(r"handed over (\d+) times among 3 joints", make_verdict(many, summary).text)
+    verdict = make_verdict(many_hand_overs, summary)
+    in_verdict = re.search(r"handed over (\d+) times among 3 joints", verdict.text)
     assert printed is not None
-    assert said is not None
-    assert (
-        int(printed[1])
-        == int(said[1])
-        == summary.hand_overs
-        == len(summary.propulsion_joints or []) - 1
-        > 30
-    )
+    assert in_verdict is not None
+    hand_over_count = len(summary.propulsion_joints or []) - 1
+    assert hand_over_count > 30
+    assert summary.hand_overs == hand_over_count
+    assert int(printed[1]) == hand_over_count
+    assert int(in_verdict[1]) == hand_over_count
 
 
-def test_the_terminal_shows_both_directions_and_what_control_reported_besides(
+def test_terminal_summary_shows_displacement_energy_and_control_report(
     record: RunRecord, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    claims = [
-        msgspec.structs.replace(one, state="Locomoting", reason="pushing")
-        for one in record.control_states
+    control_states = [
+        msgspec.structs.replace(state, state="Locomoting", reason="pushing")
+        for state in record.control_states
     ]
-    summary = summarize_run(replace_fields(record, control_states=claims), "complete")
+    summary = summarize_run(replace_fields(record, control_states=control_states), "complete")
     sideways = msgspec.structs.replace(
         summary, energy_j_per_m=None, displacement_energy_j_per_m=50.4
     )

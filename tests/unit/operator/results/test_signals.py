@@ -1,4 +1,4 @@
-"""Signals that follow from what was recorded: contact forces, and the motion of the whole body."""
+"""Signals that are computed from a record: contact forces, and the motion of the whole body."""
 
 import dataclasses
 
@@ -31,6 +31,7 @@ YAW_RAD = 0.5
 
 
 def make_contact(link: int, obstacle: str | None, force_l: tuple[float, float, float]) -> m.Contact:
+    """Make a contact with this force in the frame of its link."""
     return m.Contact(
         link=link,
         obstacle=obstacle,
@@ -46,7 +47,7 @@ def make_contact(link: int, obstacle: str | None, force_l: tuple[float, float, f
 def make_straight_run(
     record: RunRecord, direction_rad: float, turn_rate_rad_s: float = 0.0
 ) -> RunRecord:
-    """Return a run of a straight body that heads along YAW_RAD, and travels at SPEED_M_S in a direction."""
+    """Return a run of a straight body that first heads along YAW_RAD, and travels at SPEED_M_S in a direction."""
     time_s = record.time_s - record.time_s[0]
     position_w = np.zeros_like(record.position_w_m)
     position_w[:, 0] = SPEED_M_S * time_s * np.cos(direction_rad)
@@ -61,35 +62,33 @@ def make_straight_run(
     )
 
 
-def test_velocity_is_in_world_and_body_frame(record: RunRecord) -> None:
+def test_signal_velocity_is_in_world_and_body_frame(record: RunRecord) -> None:
     sideways = make_straight_run(record, YAW_RAD + np.pi / 2)
     motion = compute_motion_signals(sideways)
+    tick_count = len(record.time_s)
     expected_w = SPEED_M_S * np.array([-np.sin(YAW_RAD), np.cos(YAW_RAD), 0.0])
-    assert motion["velocity_w_m_s"] == pytest.approx(
-        np.tile(expected_w, (len(record.time_s), 1)), abs=1e-9
-    )
-    assert motion["velocity_b_m_s"] == pytest.approx(
-        np.tile([0.0, SPEED_M_S, 0.0], (len(record.time_s), 1)), abs=1e-9
-    )
-    assert motion["heading_w_rad"] == pytest.approx(np.full(len(record.time_s), YAW_RAD))
+    assert motion["velocity_w_m_s"] == pytest.approx(np.tile(expected_w, (tick_count, 1)), abs=1e-9)
+    expected_b = [0.0, SPEED_M_S, 0.0]
+    assert motion["velocity_b_m_s"] == pytest.approx(np.tile(expected_b, (tick_count, 1)), abs=1e-9)
+    assert motion["heading_w_rad"] == pytest.approx(np.full(tick_count, YAW_RAD))
 
 
-def test_turn_rate_has_no_jump_where_the_heading_passes_half_a_turn(record: RunRecord) -> None:
+def test_signal_turn_rate_has_no_jump_at_half_a_turn(record: RunRecord) -> None:
     motion = compute_motion_signals(make_straight_run(record, 0.0, turn_rate_rad_s=1.0))
     assert motion["turn_rate_rad_s"] == pytest.approx(np.ones(len(record.time_s)))
 
 
-def test_no_velocity_reaches_over_a_gap(record: RunRecord) -> None:
+def test_signal_velocity_ignores_gaps_between_ticks(record: RunRecord) -> None:
     run = make_straight_run(record, 0.0)
     time_s = run.time_s.copy()
-    time_s[500:] += 2.0  # the body goes on at its place after two seconds
+    time_s[500:] += 2.0  # after a gap of two seconds the motion continues at the same place
     velocity_w = compute_motion_signals(dataclasses.replace(run, time_s=time_s))["velocity_w_m_s"]
     assert velocity_w[:, 0] == pytest.approx(np.full(len(time_s), SPEED_M_S))
 
 
-def test_body_frame_is_unknown_while_head_and_tail_meet(record: RunRecord) -> None:
+def test_signal_body_frame_is_unknown_if_head_touches_tail(record: RunRecord) -> None:
     angle_rad = np.zeros_like(record.angle_rad)
-    angle_rad[:, len(record.description.links) // 2 - 1] = np.pi  # folded in the middle
+    angle_rad[:, len(record.description.links) // 2 - 1] = np.pi  # the body is folded in the middle
     motion = compute_motion_signals(
         dataclasses.replace(make_straight_run(record, 0.0), angle_rad=angle_rad)
     )
@@ -98,7 +97,7 @@ def test_body_frame_is_unknown_while_head_and_tail_meet(record: RunRecord) -> No
     assert np.isfinite(motion["velocity_w_m_s"]).all()
 
 
-def test_forces_add_up_on_links_and_obstacles(record: RunRecord) -> None:
+def test_signal_forces_add_up_on_links_and_obstacles(record: RunRecord) -> None:
     collector = ContactCollector()
     first_tick = int(record.ticks[0])
     contacts = [
@@ -128,26 +127,21 @@ def test_forces_add_up_on_links_and_obstacles(record: RunRecord) -> None:
     ]
 
 
-def test_forces_of_obstacles_have_a_magnitude_without_a_pose(record: RunRecord) -> None:
+def test_signal_obstacle_force_without_pose_has_magnitude_only(record: RunRecord) -> None:
     collector = ContactCollector()
-    collector.add_sample(
-        m.Contacts(
-            tick=int(record.ticks[0]),
-            timestamp_ns=0,
-            contacts=[make_contact(1, "peg", (0.0, 3.0, 4.0))],
-        )
-    )
-    blind = dataclasses.replace(
+    contacts = [make_contact(1, "peg", (0.0, 3.0, 4.0))]
+    collector.add_sample(m.Contacts(tick=int(record.ticks[0]), timestamp_ns=0, contacts=contacts))
+    without_pose = dataclasses.replace(
         record,
         position_w_m=np.full_like(record.position_w_m, np.nan),
         contact_log=collector.make_log(),
     )
-    forces = compute_contact_signals(blind)
+    forces = compute_contact_signals(without_pose)
     assert forces["obstacle_force_n"][0, 0] == pytest.approx(5.0)
     assert np.isnan(forces["obstacle_force_w_n"]).all()
 
 
-def test_number_of_obstacle_columns_is_bounded() -> None:
+def test_signal_obstacle_column_count_is_bounded() -> None:
     collector = ContactCollector()
     contacts = [make_contact(0, f"peg_{i}", (1.0, 0.0, 0.0)) for i in range(MAX_OBSTACLES + 20)]
     for tick, contact in enumerate(contacts):
@@ -157,18 +151,18 @@ def test_number_of_obstacle_columns_is_bounded() -> None:
     assert OTHER in log.obstacles
 
 
-def test_strongest_link_force_of_a_run_is_that_of_its_contacts(record: RunRecord) -> None:
-    """The run as recorded: the sensor's own mean over 50 ms cannot be above the strongest force."""
+def test_signal_strongest_link_force_exceeds_recorded_mean(record: RunRecord) -> None:
+    """The contact sensor stores a mean over 50 ms, which cannot exceed the strongest force."""
     forces = compute_signals(record)["link_force_n"]
     assert np.nanmax(forces) >= np.nanmax(record.contact_peak_n) > 1.0
 
 
-def test_every_signal_has_a_unit(record: RunRecord) -> None:
+def test_signal_units_are_known_for_every_signal(record: RunRecord) -> None:
     for name in [*compute_signals(record), *make_signal_columns(record)]:
         assert find_unit(name, record) == UNITS[name.partition(".")[0]]
 
 
-def test_sideways_motion_counts_along_the_displacement(record: RunRecord) -> None:
+def test_summary_sideways_motion_counts_along_displacement(record: RunRecord) -> None:
     summary = summarize_run(make_straight_run(record, YAW_RAD + np.pi / 2), "complete")
     assert summary.heading_advance_m == pytest.approx(0.0, abs=1e-6)
     assert summary.heading_energy_j_per_m is None
@@ -178,30 +172,29 @@ def test_sideways_motion_counts_along_the_displacement(record: RunRecord) -> Non
     cost_j_per_m = summary.energy_j / summary.net_displacement_m
     assert summary.displacement_energy_j_per_m == pytest.approx(cost_j_per_m)
     weight_n = 9.81 * sum(link.mass_kg for link in record.description.links)
-    assert summary.displacement_cost_of_transport == pytest.approx(
-        cost_j_per_m / weight_n, rel=0.001
-    )
-    friction = record.config.scene.ground.friction
-    assert summary.displacement_efficiency == pytest.approx(
-        friction * weight_n / cost_j_per_m, rel=0.001
-    )
+    cost_of_transport = cost_j_per_m / weight_n
+    assert summary.displacement_cost_of_transport == pytest.approx(cost_of_transport, rel=0.001)
+    efficiency = record.config.scene.ground.friction * weight_n / cost_j_per_m
+    assert summary.displacement_efficiency == pytest.approx(efficiency, rel=0.001)
     assert summary.displacement_slip == pytest.approx(0.0, abs=1e-9)
     assert summary.lateral_slip == pytest.approx(1.0)
 
 
-def test_body_that_slides_to_and_fro_slips(record: RunRecord) -> None:
-    """Ten seconds forward along its own axis, of which the last 2.5 s go back: half of the path is lost."""
+def test_summary_body_that_slides_back_slips(record: RunRecord) -> None:
+    """The body slides forward for 7.5 s and back for 2.5 s, so it loses half of its path."""
     run = make_straight_run(record, YAW_RAD)
     position_w = run.position_w_m.copy()
-    turn = round(0.75 * len(position_w))
-    position_w[turn:] = position_w[turn - 1] - (position_w[turn:] - position_w[turn - 1])
+    reversal = round(0.75 * len(position_w))
+    farthest_w = position_w[reversal - 1]
+    position_w[reversal:] = farthest_w - (position_w[reversal:] - farthest_w)
     summary = summarize_run(dataclasses.replace(run, position_w_m=position_w), "complete")
     assert summary.displacement_slip == pytest.approx(0.5, abs=0.02)
     assert summary.lateral_slip == pytest.approx(0.0, abs=1e-9)
 
 
-def test_slip_of_a_resting_body_is_unknown(record: RunRecord) -> None:
+def test_slip_of_stationary_body_is_unknown(record: RunRecord) -> None:
     run = make_straight_run(record, 0.0)
-    slip = measure_slip(dataclasses.replace(run, position_w_m=np.zeros_like(run.position_w_m)), 0.0)
+    stationary = dataclasses.replace(run, position_w_m=np.zeros_like(run.position_w_m))
+    slip = measure_slip(stationary, 0.0)
     assert slip.longitudinal is None
     assert slip.lateral is None

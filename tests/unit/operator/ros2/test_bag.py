@@ -1,4 +1,4 @@
-"""A recording as a ROS 2 bag, read with a reader of bags; and contact forces as wrenches."""
+"""Converts a recording to a ROS 2 bag and reads it with the library rosbags; sums contact forces to wrenches."""
 
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ YEAR_2020_S = 1_577_836_800
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a simulated run of half a second."""
     out = tmp_path_factory.mktemp("bag") / "run"
     simulate(load_scenario("triplet", [parse_set_option("duration_s=0.5")]).config, out)
     return out
@@ -28,18 +29,19 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def read_bag(path: Path) -> dict[str, list[tuple[int, Any]]]:
     """Return the messages of each topic, each with its time in the bag in ns."""
-    found: dict[str, list[tuple[int, Any]]] = {}
+    messages: dict[str, list[tuple[int, Any]]] = {}
     with AnyReader([path]) as reader:
         for connection, time_ns, data in reader.messages():
-            found.setdefault(connection.topic, []).append(
+            messages.setdefault(connection.topic, []).append(
                 (time_ns, reader.deserialize(data, connection.msgtype))
             )
-    return found
+    return messages
 
 
 def make_contact(
     link: int, position_l: tuple[float, float, float], force_l: tuple[float, float, float]
 ) -> m.Contact:
+    """Make a contact with this force and a torque of 0.5 Nm about the vertical axis."""
     return m.Contact(
         link=link,
         obstacle="peg",
@@ -63,17 +65,17 @@ def test_wrench_of_a_link_is_the_sum_about_its_frame() -> None:
     assert not wrenches[[0, 2]].any()
 
 
-def test_bag_has_the_run_in_the_types_of_ros(run: Path, tmp_path: Path) -> None:
+def test_bag_contains_joints_and_contact_forces_of_the_run(run: Path, tmp_path: Path) -> None:
     lines: list[str] = []
     assert convert_recording_to_rosbag(run, tmp_path / "bag", lines.append, wall_time=False) == 0
     assert sorted(file.name for file in (tmp_path / "bag").iterdir()) == [
         "bag.mcap",
         "metadata.yaml",
     ]
-    found = read_bag(tmp_path / "bag")
+    messages = read_bag(tmp_path / "bag")
     record = RunRecord.load(run)
     forces_l_n = compute_signals(record)["link_force_l_n"]
-    names = [link.name for link in record.description.links]
+    link_names = [link.name for link in record.description.links]
     assert {
         "/joint_states",
         "/tf",
@@ -81,33 +83,33 @@ def test_bag_has_the_run_in_the_types_of_ros(run: Path, tmp_path: Path) -> None:
         "/robot_description",
         "/diagnostics",
         "/clock",
-    } <= set(found)
+    } <= set(messages)
 
-    by_stamp = {
+    joint_state_by_stamp_ns = {
         message.header.stamp.sec * 10**9 + message.header.stamp.nanosec: message
-        for _, message in found["/joint_states"]
+        for _, message in messages["/joint_states"]
     }
     row = 30
-    joint_state = by_stamp[round(record.time_s[row] * 1e9)]
+    joint_state = joint_state_by_stamp_ns[round(record.time_s[row] * 1e9)]
     assert joint_state.position.tolist() == record.angle_rad[row].tolist()
     assert joint_state.name == [joint.name for joint in record.description.joints]
 
     strongest_link = int(np.nanargmax(np.nanmax(np.linalg.norm(forces_l_n, axis=2), axis=0)))
     for link in (0, strongest_link):
-        wrenches = dict(found[f"/{names[link]}/contact"])
+        wrenches = dict(messages[f"/{link_names[link]}/contact"])
         for i, time_s in enumerate(record.time_s):
             message = wrenches[round(time_s * 1e9)]
             force = message.wrench.force
-            assert message.header.frame_id == names[link]
+            assert message.header.frame_id == link_names[link]
             assert [force.x, force.y, force.z] == pytest.approx(forces_l_n[i, link].tolist())
-    assert str(sum(map(len, found.values()))) in lines[0]
+    assert str(sum(map(len, messages.values()))) in lines[0]
 
 
 def test_bag_with_wall_stamps_has_no_clock(run: Path, tmp_path: Path) -> None:
     convert_recording_to_rosbag(run, tmp_path / "bag", lambda _line: None, wall_time=True)
-    found = read_bag(tmp_path / "bag")
-    assert "/clock" not in found
-    time_ns, message = found["/joint_states"][0]
+    messages = read_bag(tmp_path / "bag")
+    assert "/clock" not in messages
+    time_ns, message = messages["/joint_states"][0]
     assert message.header.stamp.sec > YEAR_2020_S
     assert time_ns == message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 

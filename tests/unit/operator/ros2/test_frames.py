@@ -1,9 +1,10 @@
-"""The tree of frames and the URDF, against our kinematics and MuJoCo's own URDF reader."""
+"""Compares the ROS frame tree with our kinematics, and the URDF with what MuJoCo reads from it."""
 
 import mujoco
 import numpy as np
 import pytest
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.geometry.kinematics import (
     compute_link_frames,
     rotation_from_quaternion,
@@ -15,19 +16,19 @@ from snakesim_operator.features.ros2.urdf import make_urdf
 from snakesim_testing.hal.small_robots import make_joint_state, make_pose
 from snakesim_testing.operator.ros2_robots import describe_shipped_robot
 
-Pair = tuple[np.ndarray, np.ndarray]
 
-
-def walked(tree: list[RosTransform], to: str) -> Pair:
-    """Pose of a frame in the root: position and rotation."""
-    above = {one.child: one for one in tree}
-    position, rotation = np.zeros(3), np.eye(3)
-    while to in above:
-        one = above[to]
-        turn = rotation_from_quaternion(one.orientation_wxyz)
-        position, rotation = np.array(one.position_m) + turn @ position, turn @ rotation
-        to = one.parent
-    assert to == "map"
+def find_pose_in_map(tree: list[RosTransform], frame: str) -> tuple[Floats, Floats]:
+    """Return the position (3,) and the rotation (3, 3) of a frame in the root frame `map`."""
+    transform_by_child = {transform.child: transform for transform in tree}
+    position: Floats = np.zeros(3)
+    rotation: Floats = np.eye(3)
+    while frame in transform_by_child:
+        transform = transform_by_child[frame]
+        frame_rotation = rotation_from_quaternion(transform.orientation_wxyz)
+        position = np.array(transform.position_m) + frame_rotation @ position
+        rotation = frame_rotation @ rotation
+        frame = transform.parent
+    assert frame == "map"
     return position, rotation
 
 
@@ -35,29 +36,29 @@ def walked(tree: list[RosTransform], to: str) -> Pair:
 def test_ros_frame_tree_equals_kinematics(name: str) -> None:
     robot = describe_shipped_robot(name)
     frames = RobotFrames(robot, "lab/")
-    random = np.random.default_rng(3)
-    angles = random.uniform(-0.9, 0.9, len(robot.joints)).tolist()
-    turned = (float(np.cos(0.3)), 0.0, 0.0, float(np.sin(0.3)))
-    at = make_pose(position_w=(1.0, 2.0, 0.05), orientation_wxyz=turned)
+    rng = np.random.default_rng(3)
+    angles_rad = rng.uniform(-0.9, 0.9, len(robot.joints)).tolist()
+    orientation_wxyz = (float(np.cos(0.3)), 0.0, 0.0, float(np.sin(0.3)))
+    base_pose = make_pose(position_w=(1.0, 2.0, 0.05), orientation_wxyz=orientation_wxyz)
     tree = [
         *frames.fixed,
-        frames.make_base_transform(at),
-        *frames.make_joint_transforms(make_joint_state(robot, angles)),
+        frames.make_base_transform(base_pose),
+        *frames.make_joint_transforms(make_joint_state(robot, angles_rad)),
     ]
     origins, rotations = compute_link_frames(
-        at.position_w,
-        rotation_from_quaternion(turned),
-        angles,
+        base_pose.position_w,
+        rotation_from_quaternion(orientation_wxyz),
+        angles_rad,
         [joint.axis for joint in robot.joints],
         [link.length_m for link in robot.links],
     )
     for i in range(len(robot.links)):
-        position, rotation = walked(tree, f"lab/{robot.links[i].name}")
+        position, rotation = find_pose_in_map(tree, f"lab/{robot.links[i].name}")
         assert np.allclose(position, origins[i])
         assert np.allclose(rotation, rotations[i])
 
 
-def test_optical_frames_look_along_z() -> None:
+def test_ros_optical_frame_looks_along_z() -> None:
     optical = rotation_from_quaternion(OPTICAL_IN_CAMERA)
     right, down, forward = optical.T
     assert np.allclose(forward, [1, 0, 0])
@@ -71,11 +72,11 @@ def test_ros_frame_names_are_valid() -> None:
 
 
 @pytest.mark.parametrize("name", ["planar13", "mamba"])
-def test_the_urdf_is_read_by_mujoco(name: str) -> None:
+def test_ros_urdf_in_mujoco_has_joints_axes_and_masses(name: str) -> None:
     robot = describe_shipped_robot(name)
     document = make_urdf(robot, "lab/")
     assert "has neither inertia nor friction" in document, (
-        "what a reader would miss is said in the document"
+        "a comment in the document lists what it omits"
     )
     model = mujoco.MjModel.from_xml_string(document)
     assert model.njnt == len(robot.joints)
@@ -85,5 +86,5 @@ def test_the_urdf_is_read_by_mujoco(name: str) -> None:
             [joint.angle_min_rad, joint.angle_max_rad]
         )
         assert model.joint(i).axis.tolist() == ([0, 0, 1] if joint.axis == "yaw" else [0, 1, 0])
-    moving = sum(link.mass_kg for link in robot.links[1:])  # the first is welded to the world there
-    assert model.body_mass.sum() == pytest.approx(moving)
+    moving_mass_kg = sum(link.mass_kg for link in robot.links[1:])  # MuJoCo fixes the first link
+    assert model.body_mass.sum() == pytest.approx(moving_mass_kg)

@@ -1,4 +1,4 @@
-"""Relays bound the rate at which samples of the robot reach ROS."""
+"""Checks that relays limit the rate of the samples that the bridge forwards to ROS."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,13 +8,13 @@ from snakesim_operator.features.ros2.relay import ImuMeasurement, ImuRelay
 
 
 class FakeSession:
-    """A session whose reader has what a test gives it."""
+    """A session whose reader returns the samples that a test adds."""
 
     def __init__(self) -> None:
         self.samples: list[Imu] = []
 
     def declare_reader(self, *_key_and_type: Any, depth: int | None) -> "FakeSession":
-        assert depth is None, "each sample may have an IMU that no other has"
+        assert depth is None, "any sample may be the only one with a certain IMU"
         return self
 
     def drain(self) -> list[Imu]:
@@ -23,7 +23,8 @@ class FakeSession:
         return drained
 
 
-def sample(tick: int, links: Sequence[int]) -> Imu:
+def make_imu_sample(tick: int, links: Sequence[int]) -> Imu:
+    """Make a sample with one measurement of the IMU of each of these links."""
     return Imu(
         tick=tick,
         timestamp_ns=tick * 10_000_000,
@@ -33,13 +34,13 @@ def sample(tick: int, links: Sequence[int]) -> Imu:
     )
 
 
-def test_an_imu_is_forwarded_at_most_once_in_a_cycle_and_none_is_lost() -> None:
-    """IMUs measure at 100 Hz, some in every sample and some in every other; the bridge has cycles at 25 Hz."""
+def test_imu_relay_forwards_each_imu_once_in_a_cycle() -> None:
+    """Samples arrive at 100 Hz, every second one with both IMUs; the bridge has cycles at 25 Hz."""
     session: Any = FakeSession()
     forwarded: list[dict[int, ImuMeasurement]] = []
     relay = ImuRelay(session, forwarded.append)
     for tick in range(16):
-        session.samples.append(sample(tick, [0, 1] if tick % 2 == 0 else [0]))
+        session.samples.append(make_imu_sample(tick, [0, 1] if tick % 2 == 0 else [0]))
         if tick % 4 == 3:
             relay.poll(tick // 4, lambda _: True)
     assert [sorted(measurements) for measurements in forwarded] == [[0, 1]] * 4
@@ -48,9 +49,9 @@ def test_an_imu_is_forwarded_at_most_once_in_a_cycle_and_none_is_lost() -> None:
     assert forwarded[0][1].index_in_sample == 1
 
 
-def test_a_sample_that_does_not_fit_the_robot_is_skipped() -> None:
+def test_imu_relay_skips_sample_of_another_robot() -> None:
     session: Any = FakeSession()
     forwarded: list[dict[int, ImuMeasurement]] = []
-    session.samples = [sample(1, [0])]
+    session.samples = [make_imu_sample(1, [0])]
     ImuRelay(session, forwarded.append).poll(0, lambda _: False)
     assert forwarded == []

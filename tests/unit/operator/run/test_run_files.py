@@ -1,4 +1,7 @@
-"""What a supervisor writes: in order, never waited for, kept while the disk is full, and told when it is lost."""
+"""The files of a run, which a supervisor writes in the background.
+
+They are written in order, no caller waits for the disk, and a loss is reported.
+"""
 
 import errno
 import os
@@ -13,50 +16,59 @@ from snakesim_operator.run.run_files import RunFiles
 from snakesim_testing.harness.wait import wait_until
 
 HANG_S = 30.0
+ROOM_BYTES = 2**30  # more than a test writes
 
 
-class Disk:
-    """A disk that takes so many bytes more, or hangs."""
+class FaultyDisk:
+    """A disk with a limited number of free bytes, which hangs on request."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.space, self.hangs, self.goes_on = 2**30, False, Event()
-        self._write, self._whole = os.write, under_test.write_atomically
+        self.free_bytes = ROOM_BYTES
+        self.hangs = False
+        self.answers = Event()  # set: calls that hang continue
+        self._real_write = os.write
+        self._real_write_atomically = under_test.write_atomically
         monkeypatch.setattr(under_test.os, "write", self.write)
-        monkeypatch.setattr(under_test, "write_atomically", self.write_whole)
+        monkeypatch.setattr(under_test, "write_atomically", self.write_atomically)
         monkeypatch.setattr(under_test, "RETRY_PERIOD_S", 0.02)
         monkeypatch.setattr(under_test, "DISK_TIMEOUT_S", 0.3)
 
-    def _take(self, size: int) -> int:
+    def _allocate(self, size: int) -> int:
+        """Return how many bytes of this size still have room on the disk."""
         if self.hangs:
-            self.goes_on.wait(HANG_S)
-        if self.space == 0:
+            self.answers.wait(HANG_S)
+        if self.free_bytes == 0:
             raise OSError(errno.ENOSPC, "No space left on device")
-        taken = min(size, self.space)
-        self.space -= taken
-        return taken
+        allocated = min(size, self.free_bytes)
+        self.free_bytes -= allocated
+        return allocated
 
     def write(self, handle: int, content: bytes) -> int:
-        return self._write(handle, content[: self._take(len(content))])
+        """Write as much as has room, as `os.write` does."""
+        return self._real_write(handle, content[: self._allocate(len(content))])
 
-    def write_whole(self, path: Path, content: bytes) -> None:
-        if self._take(len(content)) < len(content):
+    def write_atomically(self, path: Path, content: bytes) -> None:
+        """Write a file, or nothing if it does not have room."""
+        if self._allocate(len(content)) < len(content):
             raise OSError(errno.ENOSPC, "No space left on device")
-        self._whole(path, content)
+        self._real_write_atomically(path, content)
 
 
 @pytest.fixture
-def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
-    return Disk(monkeypatch)
+def disk(monkeypatch: pytest.MonkeyPatch) -> FaultyDisk:
+    return FaultyDisk(monkeypatch)
 
 
 def test_run_files_are_written_in_order_after_settling(tmp_path: Path) -> None:
-    warned: list[str] = []
-    files = RunFiles(tmp_path, warned.append)
+    warnings: list[str] = []
+    files = RunFiles(tmp_path, warnings.append)
     for i in range(1000):
         files.append("a.log", b"%d\n" % i)
         files.append("b.log", b"%d\n" % -i)
     files.rename("a.log", "a-1.log")
-    files.rename("never.log", "never-1.log")  # what nobody appended to has nothing to give
+    files.rename(
+        "never.log", "never-1.log"
+    )  # no task appended to this file, so there is nothing to rename
     files.append("a.log", b"new\n")
     files.write_file("whole.json", b"{}")
     files.wait_until_written()
@@ -64,7 +76,7 @@ def test_run_files_are_written_in_order_after_settling(tmp_path: Path) -> None:
     assert (tmp_path / "a.log").read_bytes() == b"new\n"
     assert (tmp_path / "whole.json").read_bytes() == b"{}"
     assert files.close() == ""
-    assert warned == []
+    assert warnings == []
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "a-1.log",
         "a.log",
@@ -73,57 +85,57 @@ def test_run_files_are_written_in_order_after_settling(tmp_path: Path) -> None:
     ]
 
 
-def test_nothing_is_lost_when_a_full_disk_has_room_again(
-    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+def test_run_files_are_complete_when_full_disk_gets_room(
+    tmp_path: Path, disk: FaultyDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(under_test, "DISK_TIMEOUT_S", 60.0)
-    warned: list[str] = []
-    files = RunFiles(tmp_path, warned.append)
-    disk.space = 10
+    warnings: list[str] = []
+    files = RunFiles(tmp_path, warnings.append)
+    disk.free_bytes = 10
     files.append("a.log", b"0123456789abcdef")
     files.write_file("whole.json", b"{}")
-    wait_until(lambda: warned, "a warning")
+    wait_until(lambda: warnings, "a warning")
     assert (tmp_path / "a.log").read_bytes() == b"0123456789"
-    began = time.monotonic()
+    start_s = time.monotonic()
     files.wait_until_written()
-    assert time.monotonic() - began < 30.0  # not the whole limit: writing has failed
-    disk.space = 2**30
+    assert time.monotonic() - start_s < 30.0  # not the whole timeout, because writing has failed
+    disk.free_bytes = ROOM_BYTES
     wait_until(lambda: (tmp_path / "whole.json").exists(), "the second file")
     assert (tmp_path / "a.log").read_bytes() == b"0123456789abcdef"
     assert files.close() == ""
-    assert warned == [f"{tmp_path}: No space left on device"]
+    assert warnings == [f"{tmp_path}: No space left on device"]
 
 
-def test_run_files_on_full_disk_are_absent_and_reported(tmp_path: Path, disk: Disk) -> None:
-    warned: list[str] = []
-    files = RunFiles(tmp_path, warned.append)
-    disk.space = 0
+def test_run_files_on_full_disk_are_absent_and_reported(tmp_path: Path, disk: FaultyDisk) -> None:
+    warnings: list[str] = []
+    files = RunFiles(tmp_path, warnings.append)
+    disk.free_bytes = 0
     for i in range(100):
         files.append("a.log", b"%d\n" % i)
     files.write_file("whole.json", b"{}")
-    wait_until(lambda: warned, "a warning")
+    wait_until(lambda: warnings, "a warning")
     assert files.close() == f"{tmp_path}: No space left on device"
-    assert len(warned) == 1
+    assert len(warnings) == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_run_files_on_hanging_disk_block_nobody_within_bounded_memory(
-    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+def test_run_files_on_hanging_disk_never_block_and_bound_memory(
+    tmp_path: Path, disk: FaultyDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(under_test, "MAX_PENDING_BYTES", 10_000)
     files = RunFiles(tmp_path, lambda _: None)
     disk.hangs = True
-    began = time.monotonic()
+    start_s = time.monotonic()
     for _ in range(1000):
         files.append("a.log", b"x" * 100)
     assert sum(len(task.content) for task in files._tasks) <= 10_000
     assert files.close() == f"{tmp_path}: the disk has not answered for 0.3 s"
-    assert time.monotonic() - began < HANG_S / 2  # no caller waited for the disk
-    disk.goes_on.set()
+    assert time.monotonic() - start_s < HANG_S / 2  # no caller waited for the disk
+    disk.answers.set()
 
 
-def test_what_comes_too_fast_for_a_slow_disk_is_told(
-    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+def test_run_files_too_fast_for_slow_disk_report_loss(
+    tmp_path: Path, disk: FaultyDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(under_test, "MAX_PENDING_BYTES", 10_000)
     monkeypatch.setattr(under_test, "DISK_TIMEOUT_S", 5.0)
@@ -132,7 +144,7 @@ def test_what_comes_too_fast_for_a_slow_disk_is_told(
     for i in range(200):
         files.append("a.log", b"%099d\n" % i)
     disk.hangs = False
-    disk.goes_on.set()
+    disk.answers.set()
     assert files.close() == f"{tmp_path}: the disk is too slow for the run's output"
     kept = (tmp_path / "a.log").read_bytes().splitlines()
     assert [int(line) for line in kept] == list(range(100))
@@ -146,7 +158,7 @@ def test_run_files_without_folder_are_not_kept() -> None:
     assert files.close() == ""
 
 
-def test_run_log_that_floods_is_cut_and_marked(
+def test_run_log_above_size_limit_is_cut_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(under_test, "MAX_LOG_BYTES", 2 * 2**20)

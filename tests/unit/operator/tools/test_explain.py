@@ -1,4 +1,4 @@
-"""Every key of every file is described, on the page and by `snakesim config --explain`."""
+"""Every key of every file has a description on the configuration page and in `snakesim config --explain`."""
 
 import json
 from pathlib import Path
@@ -17,10 +17,11 @@ from snakesim_operator.this_computer.explain import explain_key
 from snakesim_operator.this_computer.scenario_files import collect_values
 from snakesim_operator.this_computer.scenario_keys import collect_keys
 
-PER_SCENARIO = ("triplet", "peg_row", "surveyed_clutter")
+SCENARIOS = ("triplet", "peg_row", "surveyed_clutter")
 
 
 def explain(loaded: LoadedScenario, key: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Return what the command prints about a key."""
     assert explain_key(loaded, key, as_json=False) == 0
     return capsys.readouterr().out
 
@@ -28,6 +29,7 @@ def explain(loaded: LoadedScenario, key: str, capsys: pytest.CaptureFixture[str]
 def explain_as_json(
     loaded: LoadedScenario, key: str, capsys: pytest.CaptureFixture[str]
 ) -> dict[str, object]:
+    """Return what the command prints about a key for scripts."""
     assert explain_key(loaded, key, as_json=True) == 0
     return json.loads(capsys.readouterr().out)
 
@@ -35,7 +37,7 @@ def explain_as_json(
 # --- all files -------------------------------------------------------------------------------------------------
 
 
-def test_every_field_of_every_file_has_a_description() -> None:
+def test_explain_page_describes_every_field_of_every_file() -> None:
     assert fields_without_description() == []
 
 
@@ -45,7 +47,7 @@ def test_explain_page_is_current() -> None:
     )
 
 
-def test_all_kinds_of_files_and_plugins_are_on_the_page() -> None:
+def test_explain_page_contains_all_kinds_of_files_and_plugins() -> None:
     page = PAGE.read_text(encoding="utf-8")
     structs = documented_structs()
     assert {"Robot file", "Scene file", "Scenario file", "Suite file", "Lab file"} <= set(structs)
@@ -56,8 +58,8 @@ def test_all_kinds_of_files_and_plugins_are_on_the_page() -> None:
 # --- one key of a scenario -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scenario", PER_SCENARIO)
-def test_every_key_of_a_scenario_is_explained(
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_explain_knows_every_key_of_a_scenario(
     scenario: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     loaded = load_scenario(scenario)
@@ -65,13 +67,13 @@ def test_every_key_of_a_scenario_is_explained(
     for name, value, origin in collect_values(loaded):
         key = keys[name]
         assert key.doc.description, name
-        if name != "robot.joints":  # a key for each joint
+        if name != "robot.joints":  # each joint has a separate key
             assert (key.value, key.origin) == (value, origin), name
     for name in ("seed", "robot.limits.torque_nm", "control", "robot", "scene.route.kind"):
         assert explain(loaded, name, capsys)
 
 
-def test_a_value_has_its_documentation_and_where_it_comes_from(
+def test_explain_value_has_documentation_and_origin(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     loaded = load_scenario("triplet", [parse_set_option("control.propulsion_n=20")])
@@ -90,19 +92,23 @@ def test_a_value_has_its_documentation_and_where_it_comes_from(
 
 
 def test_explain_json_has_the_same_content(capsys: pytest.CaptureFixture[str]) -> None:
-    described = explain_as_json(load_scenario("triplet"), "rate_hz", capsys)
-    assert described["unit"] == "Hz"
-    assert described["value"] == 100.0
-    assert str(described["origin"]).endswith("triplet.toml")
+    key = explain_as_json(load_scenario("triplet"), "rate_hz", capsys)
+    assert key["unit"] == "Hz"
+    assert key["value"] == 100.0
+    assert str(key["origin"]).endswith("triplet.toml")
     table = explain_as_json(load_scenario("triplet"), "robot.module", capsys)
     assert isinstance(table["keys"], dict)
     assert list(table["keys"]) == ["length_m", "radius_m", "mass_kg"]
 
 
-def test_a_table_has_one_line_for_each_key(capsys: pytest.CaptureFixture[str]) -> None:
+def test_explain_table_has_one_line_for_each_key(capsys: pytest.CaptureFixture[str]) -> None:
     lines = explain(load_scenario("triplet"), "robot.module", capsys).splitlines()
-    at = lines.index("keys")
-    assert [line.split()[0] for line in lines[at + 2 :]] == ["length_m", "radius_m", "mass_kg"]
+    first_key_line = lines.index("keys") + 2
+    assert [line.split()[0] for line in lines[first_key_line:]] == [
+        "length_m",
+        "radius_m",
+        "mass_kg",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -118,7 +124,7 @@ def test_a_table_has_one_line_for_each_key(capsys: pytest.CaptureFixture[str]) -
         "controllers.policy.model",
     ],
 )
-def test_keys_that_the_scenario_does_not_give_are_explained(
+def test_explain_knows_keys_that_the_scenario_does_not_set(
     key: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert explain(load_scenario("triplet"), key, capsys).startswith(key)
@@ -150,7 +156,7 @@ def test_explain_lists_plugin_values_without_running_its_code(
         ("robot..", "there is no such key"),
     ],
 )
-def test_an_unknown_key_is_an_error_with_a_suggestion(key: str, hint: str) -> None:
-    with pytest.raises(ConfigError, match="there is no such key") as error:
+def test_explain_unknown_key_is_error_with_suggestion(key: str, hint: str) -> None:
+    with pytest.raises(ConfigError, match="there is no such key") as caught:
         explain_key(load_scenario("triplet"), key, as_json=False)
-    assert hint in str(error.value)
+    assert hint in str(caught.value)

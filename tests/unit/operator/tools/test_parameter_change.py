@@ -1,4 +1,4 @@
-"""`change`: new parameters of a controller that runs, and of one that cannot go on with them."""
+"""Changes parameters of a controller that continues with them, and of one that fails."""
 
 import pytest
 
@@ -24,36 +24,45 @@ CLOCK = Clock(
     newest={},
 )
 CHANGES = {"control.propulsion_n": 20}
-WHY = "controller obstacle_triplet (class ObstacleTriplet): update() raised ZeroDivisionError: division by zero"
+FAILURE = "controller obstacle_triplet (class ObstacleTriplet): update() raised ZeroDivisionError: division by zero"
 
 
-class Control:
-    """The control service as far as its parameters go: it reports its state after every request."""
+class ParameterService:
+    """The part of the control service that changes parameters; it answers whenever the network runs."""
 
-    def __init__(self, reported: ControlState | None, *, gone: bool = False) -> None:
-        """reported: after a request; None: it is silent. gone: it publishes no parameters after it."""
+    def __init__(
+        self, reported_state: ControlState | None, *, removes_parameters: bool = False
+    ) -> None:
+        """Start the service.
+
+        Args:
+            reported_state: the state that it publishes after a request; None: it publishes none.
+            removes_parameters: whether it stops publishing parameters after a request.
+        """
         self._network = LocalNetwork()
         session = self._network.create_session()
-        self._settings = LiveParameters(
+        self._parameters = LiveParameters(
             HostClient(session, "control"), load_scenario("triplet", []).config
         )
-        self._settings.configure(make_description())
-        self._settings.answer_requests(CLOCK)
-        self._states = session.declare_publisher(keys.CONTROL_STATE, ControlState)
-        self._reported = reported
-        self._gone = gone
+        self._parameters.configure(make_description())
+        self._parameters.answer_requests(CLOCK)
+        self._state_publisher = session.declare_publisher(keys.CONTROL_STATE, ControlState)
+        self._reported_state = reported_state
+        self._removes_parameters = removes_parameters
         self._network.run_responders = self._answer
         self.operator: LocalSession = self._network.create_session()
 
     def _answer(self) -> None:
-        self._settings.answer_requests(CLOCK)
-        if self._reported is not None:
-            self._states.put(self._reported)
-        if self._gone:
+        """Answer the requests, and publish what the constructor requires."""
+        self._parameters.answer_requests(CLOCK)
+        if self._reported_state is not None:
+            self._state_publisher.put(self._reported_state)
+        if self._removes_parameters:
             self._network.latched.clear()
 
 
-def state(reason: str, *, failed: bool = False) -> ControlState:
+def make_state(reason: str, *, failed: bool = False) -> ControlState:
+    """Make the state of a controller that does not locomote."""
     return ControlState(
         tick=8,
         timestamp_ns=80,
@@ -65,30 +74,39 @@ def state(reason: str, *, failed: bool = False) -> ControlState:
 
 
 @pytest.fixture(autouse=True)
-def short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_timeouts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten the timeouts of a change, because some of these tests wait for them."""
     for name in ("MAX_SILENCE_S", "REPORT_TIMEOUT_S"):
         monkeypatch.setattr(parameters, name, 0.05)
 
 
 @pytest.mark.parametrize(
-    "reported", [state("standing still"), None], ids=["goes on", "time stands"]
+    "reported_state", [make_state("standing still"), None], ids=["running", "paused"]
 )
-def test_what_a_controller_goes_on_with_is_returned(reported: ControlState | None) -> None:
-    before, now = parameters.change_parameters(Control(reported).operator, CHANGES, "ada")
+def test_parameter_change_of_running_or_paused_controller_is_returned(
+    reported_state: ControlState | None,
+) -> None:
+    service = ParameterService(reported_state)
+    before, after = parameters.change_parameters(service.operator, CHANGES, "ada")
     assert before.changes == 0
-    assert now.changes == 1
-    assert now.requester == "ada"
+    assert after.changes == 1
+    assert after.requester == "ada"
 
 
-@pytest.mark.parametrize("gone", [False, True])
-def test_a_value_that_ends_control_is_named_with_the_reason(gone: bool) -> None:
-    control = Control(state(WHY, failed=True), gone=gone)
+@pytest.mark.parametrize("removes_parameters", [False, True])
+def test_parameter_change_that_ends_control_names_value_and_reason(
+    removes_parameters: bool,
+) -> None:
+    service = ParameterService(
+        make_state(FAILURE, failed=True), removes_parameters=removes_parameters
+    )
     with raises_error(
-        ControllerError, code="controller/failed", field=("control.propulsion_n", WHY)
+        ControllerError, code="controller/failed", field=("control.propulsion_n", FAILURE)
     ):
-        parameters.change_parameters(control.operator, CHANGES, "ada")
+        parameters.change_parameters(service.operator, CHANGES, "ada")
 
 
-def test_settings_that_vanish_without_a_reason_are_not_confirmed() -> None:
+def test_parameter_change_without_state_and_parameters_is_not_confirmed() -> None:
+    service = ParameterService(None, removes_parameters=True)
     with raises_error(RefusedError, code="robot/not-confirmed"):
-        parameters.change_parameters(Control(None, gone=True).operator, CHANGES, "ada")
+        parameters.change_parameters(service.operator, CHANGES, "ada")

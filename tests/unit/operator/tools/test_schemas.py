@@ -1,4 +1,4 @@
-"""The published contract in `schemas/` is what the code says, to the letter, and what the code sends fits it."""
+"""The published schemas in `schemas/` equal those of the code, and messages and shipped files match them."""
 
 import json
 import math
@@ -32,25 +32,27 @@ if TYPE_CHECKING:
 
 REPOSITORY = Path(__file__).parents[4]
 PUBLISHED = REPOSITORY / "schemas"
-each_message = pytest.mark.parametrize(
+for_each_message = pytest.mark.parametrize(
     "message", list(VERSIONS), ids=lambda message: message.__name__
 )
 
 
-def files_under(folder: Path) -> dict[str, str]:
+def read_files(folder: Path) -> dict[str, str]:
+    """Return the texts of all files in a folder, by their relative path."""
     return {
-        str(p.relative_to(folder)): p.read_text(encoding="utf-8")
-        for p in folder.rglob("*")
-        if p.is_file()
+        str(path.relative_to(folder)): path.read_text(encoding="utf-8")
+        for path in folder.rglob("*")
+        if path.is_file()
     }
 
 
-def test_the_published_files_are_what_the_code_says() -> None:
-    published, generated = files_under(PUBLISHED), dict(generate_contract_files())
-    # Tests/unit/can_backend.
+def test_schemas_published_files_equal_generated_files() -> None:
+    published = read_files(PUBLISHED)
+    generated = dict(generate_contract_files())
+    # The schemas of the folder `can` have tests in tests/unit/can_backend.
     published = {name: text for name, text in published.items() if not name.startswith("can/")}
-    for by_hand in ("README.md", "protocol.md"):
-        del published[by_hand]
+    for handwritten in ("README.md", "protocol.md"):
+        del published[handwritten]
     assert sorted(published) == sorted(generated), "run `make schemas` and commit what it changes"
     for name, text in generated.items():
         assert published[name] == text, (
@@ -63,10 +65,10 @@ def test_writing_schemas_removes_files_outside_the_contract(tmp_path: Path) -> N
     (tmp_path / "messages" / "Gone.json").write_text("{}")
     (tmp_path / "README.md").write_text("by hand")
     written = write_schemas(tmp_path)
-    found = files_under(tmp_path)
-    assert found.pop("README.md") == "by hand"
-    assert found == dict(generate_contract_files())
-    assert {str(path.relative_to(tmp_path)) for path in written} == set(found)
+    remaining = read_files(tmp_path)
+    assert remaining.pop("README.md") == "by hand"
+    assert remaining == dict(generate_contract_files())
+    assert {str(path.relative_to(tmp_path)) for path in written} == set(remaining)
 
 
 def test_writing_schemas_into_foreign_folder_removes_nothing(tmp_path: Path) -> None:
@@ -76,67 +78,69 @@ def test_writing_schemas_into_foreign_folder_removes_nothing(tmp_path: Path) -> 
     assert (tmp_path / "files" / "thesis.json").is_file()
 
 
-# --- schema against messages -----------------------------------------------------------------------------------
+# --- schemas and messages -------------------------------------------------------------------------------------
 
 
 @cache
-def published_contract() -> dict[str, str]:
+def generate_contract_once() -> dict[str, str]:
+    """Return the generated files by name; they are generated only once."""
     return dict(generate_contract_files())
 
 
 @cache
-def validator(name: str) -> "Validator":
-    # Imported here, and without its check of addresses, which takes 2 s: each worker imports this file.
+def make_validator(name: str) -> "Validator":
+    """Return the validator of a schema, which is made only once."""
+    # The import stands here, without the check of addresses that takes 2 s, because each worker imports this file.
     sys.modules.setdefault("rfc3987_syntax", None)  # pyright: ignore[reportArgumentType]
     from jsonschema import Draft202012Validator
 
-    return Draft202012Validator(json.loads(published_contract()[name]))
+    return Draft202012Validator(json.loads(generate_contract_once()[name]))
 
 
-def fits(value: Any, name: str) -> bool:
-    """Whether a message or file is what a published schema allows; bytes are base64 there."""
-    return validator(name).is_valid(json.loads(msgspec.json.encode(value)))
+def matches_schema(value: Any, name: str) -> bool:
+    """Return whether a schema allows this message or file; schemas represent bytes as base64."""
+    return make_validator(name).is_valid(json.loads(msgspec.json.encode(value)))
 
 
-def schema_name(message: type[Message]) -> str:
+def make_schema_name(message: type[Message]) -> str:
+    """Return the file name of the schema of a message type."""
     return f"messages/{message.__name__}.json"
 
 
-@each_message
+@for_each_message
 @given(data=st.data())
 @settings(max_examples=8)
-def test_every_message_fits_its_schema(message: type[Message], data: st.DataObject) -> None:
-    assert fits(data.draw(make_strategy(message)), schema_name(message))
+def test_message_always_matches_its_schema(message: type[Message], data: st.DataObject) -> None:
+    assert matches_schema(data.draw(make_strategy(message)), make_schema_name(message))
 
 
-@each_message
-def test_schema_and_decoder_agree_on_what_is_missing(message: type[Message]) -> None:
-    assert json.loads(published_contract()[schema_name(message)])["encoding"] == format_encoding(
-        message
-    )
+@for_each_message
+def test_schema_and_decoder_require_the_same_fields(message: type[Message]) -> None:
+    schema = json.loads(generate_contract_once()[make_schema_name(message)])
+    assert schema["encoding"] == format_encoding(message)
     example = make_plain_example(message)
-    assert fits(example, schema_name(message))
+    assert matches_schema(example, make_schema_name(message))
     for field in example:
-        rest = {name: value for name, value in example.items() if name != field}
+        incomplete = {name: value for name, value in example.items() if name != field}
         try:
-            MessageDecoder(message).decode(encode(rest), format_encoding(message))
-            taken = True
+            MessageDecoder(message).decode(encode(incomplete), format_encoding(message))
+            is_decoded = True
         except WireError:
-            taken = False
-        assert fits(rest, schema_name(message)) == taken, field
+            is_decoded = False
+        assert matches_schema(incomplete, make_schema_name(message)) == is_decoded, field
 
 
-@each_message
-def test_schema_and_decoder_agree_on_what_is_out_of_bounds(message: type[Message]) -> None:
+@for_each_message
+def test_schema_refuses_values_that_the_decoder_refuses(message: type[Message]) -> None:
     example = make_plain_example(message)
-    for at, info in iter_places(example, inspect.type_info(message)):
-        for poison in list_invalid_values(info):
-            if isinstance(poison, bytes) or (
-                isinstance(poison, float) and not math.isfinite(poison)
-            ):
+    for place, type_info in iter_places(example, inspect.type_info(message)):
+        for invalid in list_invalid_values(type_info):
+            is_infinite = isinstance(invalid, float) and not math.isfinite(invalid)
+            if is_infinite or isinstance(invalid, bytes):
                 continue  # JSON has no such value
-            assert not fits(replace_at(example, at, poison), schema_name(message)), (
-                f"{at} took {poison!r}"
+            changed = replace_at(example, place, invalid)
+            assert not matches_schema(changed, make_schema_name(message)), (
+                f"{place} accepts {invalid!r}"
             )
 
 
@@ -144,15 +148,15 @@ def test_schema_and_decoder_agree_on_what_is_out_of_bounds(message: type[Message
 
 
 @pytest.mark.parametrize(("kind", "schema"), [("robots", "robot"), ("scenes", "scene")])
-def test_every_shipped_file_fits_its_schema_and_names_itself(kind: str, schema: str) -> None:
+def test_shipped_file_matches_its_schema_and_contains_its_name(kind: str, schema: str) -> None:
     for name in list_shipped_names(kind):
         values = read_table_with_base(name, kind).values
-        assert fits(values, f"files/{schema}.json"), name
+        assert matches_schema(values, f"files/{schema}.json"), name
         assert values["name"] == name
 
 
 @pytest.mark.parametrize("name", list_shipped_names("scenarios"))
-def test_every_shipped_scenario_loads_and_fits_run_schema(name: str) -> None:
+def test_shipped_scenario_loads_and_matches_run_schema(name: str) -> None:
     config = load_scenario(name).config
     assert config.name == name
-    assert fits(config, "files/run.json")
+    assert matches_schema(config, "files/run.json")

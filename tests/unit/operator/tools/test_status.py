@@ -1,4 +1,4 @@
-"""How long `snakesim status` tries to connect: once where nothing can listen yet, longer where something may."""
+"""How long `snakesim status` tries to connect: only once on loopback without a local robot, otherwise longer."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,22 +12,30 @@ from snakesim_operator.base.robot_selection import RobotSelection
 from snakesim_operator.base.targets import CONNECT_TIMEOUT_S
 from snakesim_operator.robot_commands import status
 
-HERE = "tcp/127.0.0.1:7461"
-ELSEWHERE = "tcp/10.0.0.1:7447"
+LOCAL_ENDPOINT = "tcp/127.0.0.1:7461"
+REMOTE_ENDPOINT = "tcp/10.0.0.1:7447"
 
 
 @pytest.mark.parametrize(
-    ("endpoint", "runs_here", "seconds"),
-    [(HERE, False, 0.0), (HERE, True, CONNECT_TIMEOUT_S), (ELSEWHERE, False, CONNECT_TIMEOUT_S)],
+    ("endpoint", "has_local_robot", "expected_timeout_s"),
+    [
+        (LOCAL_ENDPOINT, False, 0.0),
+        (LOCAL_ENDPOINT, True, CONNECT_TIMEOUT_S),
+        (REMOTE_ENDPOINT, False, CONNECT_TIMEOUT_S),
+    ],
 )
-def test_one_attempt_is_enough_on_loopback(
-    endpoint: str, runs_here: bool, seconds: float, monkeypatch: pytest.MonkeyPatch
+def test_status_tries_once_only_on_loopback_without_robot(
+    endpoint: str,
+    has_local_robot: bool,
+    expected_timeout_s: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    tried: list[float] = []
+    timeouts_s: list[float] = []
 
     @contextmanager
     def refuse(_link: ConnectionSettings, connect_timeout_s: float) -> Iterator[Session]:
-        tried.append(connect_timeout_s)
+        """Store the timeout of this attempt, and fail."""
+        timeouts_s.append(connect_timeout_s)
         raise NotConnectedError("nothing listens")
         yield
 
@@ -36,13 +44,13 @@ def test_one_attempt_is_enough_on_loopback(
         namespace="planar13",
         robot="planar13",
         backend="sim",
-        endpoint=HERE,
+        endpoint=LOCAL_ENDPOINT,
         stop_host="127.0.0.1",
         stop_port=9,
         pid=1,
     )
     monkeypatch.setattr(
-        RobotSelection, "list_local_robots", lambda _self: [robot] if runs_here else []
+        RobotSelection, "list_local_robots", lambda _self: [robot] if has_local_robot else []
     )
     assert status.print_status(RobotSelection(endpoint)) == 1
-    assert tried == [seconds]
+    assert timeouts_s == [expected_timeout_s]
