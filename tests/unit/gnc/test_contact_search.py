@@ -1,6 +1,11 @@
-"""A body that does not come on moves by a wave until it can push, and goes over without a jump."""
+"""Tests the contact search of `obstacle_aided`.
+
+A body that does not advance moves by a wave until it can push off obstacles again. It enters and leaves the search
+without a jump of its targets.
+"""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import msgspec
@@ -19,38 +24,53 @@ from snakesim_hal.wire.messages import KnownObstacle
 from snakesim_testing.gnc.stage import ObservationStage, make_contact, make_stage
 
 TAIL_S_M = 0.3
-SEARCHES = "in search of contacts"
-JUMP_RAD = 0.08  # of a target from one tick to the next; the waves themselves make 0.03
+SEARCH_REASON = "in search of contacts"
+MAX_STEP_RAD = 0.08  # of a target from one tick to the next; the waves themselves make 0.03
+FORWARD_PERIOD_S = pytest.approx(0.8, rel=0.05)
+FEEDBACK_PERIOD_S = pytest.approx(math.tau / 5.39, rel=0.15)
+SLOW_FEEDBACK_PERIOD_S = pytest.approx(2 * math.tau / 5.39, rel=0.15)
+PERIOD_TICKS = 240  # from which a period is measured
 
 
-def searching(
+def make_searching_controller(
     *, among_pegs: bool = False, **parameters: float
 ) -> tuple[ObservationStage, ObstacleAided]:
-    """A body on its path that searches for contacts after a second, unless configured otherwise."""
+    """Return a stage and a controller that searches for contacts after a second, unless configured otherwise."""
     stage = make_stage()
     stage.pegs = stage.pegs if among_pegs else []
     defaults = ObstacleAidedParameters(search_after_s=1.0)
     return stage, ObstacleAided(stage.robot, msgspec.structs.replace(defaults, **parameters))
 
 
-def stands(
+def command_standing_body(
     controller: ObstacleAided, stage: ObservationStage, ticks: range
 ) -> list[ControllerCommand]:
-    """What is commanded while the body stays where it is."""
+    """Return the commands while the body stays where it is."""
     return [controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in ticks]
 
 
-def targets(commands: list[ControllerCommand]) -> np.ndarray:
+def list_targets(commands: list[ControllerCommand]) -> np.ndarray:
+    """Return the targets of each tick and joint."""
     return np.array([command.setpoints.target for command in commands])
 
 
-FORWARD_WAVE_S = pytest.approx(0.8, rel=0.05)  # periods
-FEEDBACK_WAVE_S = pytest.approx(math.tau / 5.39, rel=0.15)
+def find_max_step_rad(commands: list[ControllerCommand]) -> float:
+    """Return the largest change of a target from one tick to the next."""
+    return float(np.abs(np.diff(list_targets(commands), axis=0)).max())
 
 
-def period_s(commands: list[ControllerCommand]) -> float:
-    """Period of the sine that fits the targets of the head best."""
-    head = targets(commands)[:, -1]
+def is_searching(command: ControllerCommand) -> bool:
+    return SEARCH_REASON in command.telemetry.reason
+
+
+def measure_periods_s(commands: list[ControllerCommand], starts: Sequence[int]) -> list[float]:
+    """Return the period of the head's wave after each of these commands."""
+    return [measure_period_s(commands[start : start + PERIOD_TICKS]) for start in starts]
+
+
+def measure_period_s(commands: list[ControllerCommand]) -> float:
+    """Return the period of the sine that fits the targets of the head best."""
+    head = list_targets(commands)[:, -1]
     times_s = 0.01 * np.arange(len(head))
     periods_s = np.arange(0.4, 4.0, 0.02)
     errors: list[float] = []
@@ -62,78 +82,79 @@ def period_s(commands: list[ControllerCommand]) -> float:
     return float(periods_s[int(np.argmin(errors))])
 
 
-def test_contact_search_of_standing_body_ends_with_path_retried() -> None:
-    stage, controller = searching(search_after_s=1.2, search_s=2.0, shape_nm_per_rad=0.0)
-    alone = stands(controller, stage, range(300))
-    searches = [SEARCHES in command.telemetry.reason for command in alone]
+def test_contact_search_of_standing_body_ends_when_it_can_push() -> None:
+    stage, controller = make_searching_controller(
+        search_after_s=1.2, search_s=2.0, shape_nm_per_rad=0.0
+    )
+    without_pegs = command_standing_body(controller, stage, range(300))
+    searches = [is_searching(command) for command in without_pegs]
     assert not any(searches[:115])
     assert all(searches[125:])
-    assert np.ptp(targets(alone[125:])[:, -1]) > 0.5  # of the head
+    head_targets_rad = list_targets(without_pegs[125:])[:, -1]
+    assert np.ptp(head_targets_rad) > 0.5
+
     stage.pegs = make_stage().pegs
-    beside = stands(controller, stage, range(300, 400))
-    assert not any(SEARCHES in command.telemetry.reason for command in beside[25:])
-    assert max(command.telemetry.propulsion_n or 0.0 for command in beside) > 5.0
-    assert np.abs(np.diff(targets(alone + beside), axis=0)).max() < JUMP_RAD
-    again = stands(controller, stage, range(400, 480))
-    assert SEARCHES in again[-1].telemetry.reason
+    beside_pegs = command_standing_body(controller, stage, range(300, 400))
+    assert not any(is_searching(command) for command in beside_pegs[25:])
+    assert max(command.telemetry.propulsion_n or 0.0 for command in beside_pegs) > 5.0
+    assert find_max_step_rad(without_pegs + beside_pegs) < MAX_STEP_RAD
+
+    # The body does not advance by pushing either.
+    assert is_searching(command_standing_body(controller, stage, range(400, 480))[-1])
 
 
 @pytest.mark.parametrize("among_pegs", [True, False])
 def test_contact_search_fruitless_wave_is_replaced_by_the_other(among_pegs: bool) -> None:
-    stage, controller = searching(among_pegs=among_pegs, shape_nm_per_rad=0.0)
-    seen = stands(controller, stage, range(1010))
-    periods = [period_s(seen[first : first + 240]) for first in (150, 450, 750)]
-    first, second = FORWARD_WAVE_S, FEEDBACK_WAVE_S
+    stage, controller = make_searching_controller(among_pegs=among_pegs, shape_nm_per_rad=0.0)
+    commands = command_standing_body(controller, stage, range(1010))
+    first, second = FORWARD_PERIOD_S, FEEDBACK_PERIOD_S
     if among_pegs:
         first, second = second, first
-    assert periods == [first, second, first]
-    assert np.abs(np.diff(targets(seen), axis=0)).max() < JUMP_RAD
+    assert measure_periods_s(commands, (150, 450, 750)) == [first, second, first]
+    assert find_max_step_rad(commands) < MAX_STEP_RAD
 
 
 @pytest.mark.slow
 def test_contact_search_wave_starts_slow_and_continues_fast() -> None:
-    stage, controller = searching(among_pegs=True, shape_nm_per_rad=0.0)
+    stage, controller = make_searching_controller(among_pegs=True, shape_nm_per_rad=0.0)
     for tick in range(100):
         controller.update(stage.make_observation(tick, TAIL_S_M - 0.15 + 0.0015 * tick))
-    seen = stands(controller, stage, range(100, 1150))
-    slow, fast = (
-        pytest.approx(2 * math.tau / 5.39, rel=0.15),
-        pytest.approx(math.tau / 5.39, rel=0.15),
-    )
-    assert [period_s(seen[first : first + 240]) for first in (150, 750)] == [slow, fast]
-    assert np.abs(np.diff(targets(seen), axis=0)).max() < JUMP_RAD
+    commands = command_standing_body(controller, stage, range(100, 1150))
+    periods_s = measure_periods_s(commands, (150, 750))
+    assert periods_s == [SLOW_FEEDBACK_PERIOD_S, FEEDBACK_PERIOD_S]
+    assert find_max_step_rad(commands) < MAX_STEP_RAD
 
 
-def test_a_wave_that_leads_to_the_goal_goes_on() -> None:
-    stage, controller = searching()
-    stands(controller, stage, range(110))
-    led = [
+def test_contact_search_wave_that_advances_body_is_kept() -> None:
+    stage, controller = make_searching_controller()
+    command_standing_body(controller, stage, range(110))
+    advancing = [
         controller.update(stage.make_observation(tick, TAIL_S_M + 0.0003 * (tick - 110)))
         for tick in range(110, 900)
     ]
-    assert all(SEARCHES in command.telemetry.reason for command in led)
-    assert [period_s(led[first : first + 240]) for first in (60, 300, 540)] == [FORWARD_WAVE_S] * 3
+    assert all(is_searching(command) for command in advancing)
+    assert measure_periods_s(advancing, (60, 300, 540)) == [FORWARD_PERIOD_S] * 3
 
 
 def test_contact_search_detects_standing_body_despite_pose_noise() -> None:
-    (stage, controller), noise = searching(search_after_s=1.2), np.random.default_rng(1)
+    stage, controller = make_searching_controller(search_after_s=1.2)
+    random = np.random.default_rng(1)
     observations = (
-        stage.make_observation(tick, TAIL_S_M + noise.normal(0.0, 0.005)) for tick in range(300)
+        stage.make_observation(tick, TAIL_S_M + random.normal(0.0, 0.005)) for tick in range(300)
     )
-    assert any(
-        SEARCHES in controller.update(observation).telemetry.reason for observation in observations
-    )
+    assert any(is_searching(controller.update(observation)) for observation in observations)
 
 
 def test_contact_search_can_be_disabled() -> None:
-    stage, never = searching(search_after_s=0.0)
-    assert not any(
-        SEARCHES in command.telemetry.reason for command in stands(never, stage, range(500))
-    )
+    stage, controller = make_searching_controller(search_after_s=0.0)
+    commands = command_standing_body(controller, stage, range(500))
+    assert not any(is_searching(command) for command in commands)
 
 
-def test_the_wave_is_that_of_the_shipped_policy() -> None:
-    stage, passed_s, draw = make_stage(), 2.3, np.random.default_rng(3)
+def test_force_feedback_wave_equals_the_shipped_policy() -> None:
+    stage = make_stage()
+    time_s = 2.3
+    random = np.random.default_rng(3)
     observation = stage.make_observation(0, TAIL_S_M)
     assert observation.world is not None
     assert observation.trajectory is not None
@@ -144,11 +165,15 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
     forces_n = np.zeros(14)
     for contact in contacts:
         forces_n[contact.link] += np.linalg.norm(contact.force_w)
-    velocity, torque = draw.normal(0.0, 1.0, 13).tolist(), draw.normal(0.0, 3.0, 13).tolist()
-    joints = msgspec.structs.replace(observation.joints, velocity_rad_s=velocity, torque_nm=torque)
-    nodes = PlanarBody(stage.robot).compute_body_points_w(observation.world, joints.angle_rad)
-    goal_w = nodes[:, -1] + np.array([0.5, 2.0])
-    bearing_rad = np.arctan2(2.0, 0.5) - np.arctan2(*(nodes[:, -1] - nodes[:, 0])[::-1])
+    velocities_rad_s = random.normal(0.0, 1.0, 13).tolist()
+    torques_nm = random.normal(0.0, 3.0, 13).tolist()
+    joints = msgspec.structs.replace(
+        observation.joints, velocity_rad_s=velocities_rad_s, torque_nm=torques_nm
+    )
+    body_w = PlanarBody(stage.robot).compute_body_points_w(observation.world, joints.angle_rad)
+    goal_w = body_w[:, -1] + np.array([0.5, 2.0])
+    body_direction_w = body_w[:, -1] - body_w[:, 0]
+    bearing_rad = np.arctan2(2.0, 0.5) - np.arctan2(*body_direction_w[::-1])
     session = onnxruntime.InferenceSession(POLICY_FOLDER / "lab.onnx")
     learned = msgspec.json.decode(session.get_modelmeta().custom_metadata_map["snakesim.learned"])
     sizes = {
@@ -160,27 +185,28 @@ def test_the_wave_is_that_of_the_shipped_policy() -> None:
         "contact_n": 14,
     }
     policy = PolicyArrays.make_from_parameters(learned, ["yaw"] * 13, sizes)
-    goal = [np.cos(bearing_rad), np.sin(bearing_rad)]
-    seen = [
-        passed_s,
-        *goal,
+    policy_inputs = [
+        time_s,
+        np.cos(bearing_rad),
+        np.sin(bearing_rad),
         *joints.angle_rad,
         *joints.velocity_rad_s,
         *joints.torque_nm,
         *forces_n,
     ]
-    felt = replace(
+    observation = replace(
         observation,
         joints=joints,
         world=msgspec.structs.replace(observation.world, contacts=contacts),
         trajectory=msgspec.structs.replace(observation.trajectory, goal_w=tuple(goal_w.tolist())),
     )
-    wave = ForceFeedbackWave(stage.robot).compute_reference_rad(felt, passed_s)
-    assert wave == pytest.approx(policy.compute_targets(np.array(seen, np.float32)), abs=1e-4)
+    reference_rad = ForceFeedbackWave(stage.robot).compute_reference_rad(observation, time_s)
+    targets_rad = policy.compute_targets(np.array(policy_inputs, np.float32))
+    assert reference_rad == pytest.approx(targets_rad, abs=1e-4)
 
 
-def felt_by(stage: ObservationStage, torque_nm: float = 0.0) -> np.ndarray:
-    """Angles of all joints of a straight body, whatever path there is."""
+def compute_straight_body_wave_rad(stage: ObservationStage, torque_nm: float = 0.0) -> np.ndarray:
+    """Return the reference angles of the force feedback wave for a straight body without a world model."""
     joints = stage.make_observation(0, TAIL_S_M, torque_nm=torque_nm).joints
     straight = msgspec.structs.replace(joints, angle_rad=[0.0] * len(joints.angle_rad))
     observation = replace(stage.make_observation(0, TAIL_S_M, without="world"), joints=straight)
@@ -188,47 +214,49 @@ def felt_by(stage: ObservationStage, torque_nm: float = 0.0) -> np.ndarray:
 
 
 def test_contact_search_bends_along_same_curve_for_any_joint_spacing() -> None:
-    near, apart = felt_by(make_stage(13)), felt_by(make_stage(14, ("yaw", "pitch")))
-    assert apart[::2] == pytest.approx(2.0 * near[::2])
-    assert np.ptp(near) > 0.5
-    assert not apart[1::2].any()
+    yaw_only_rad = compute_straight_body_wave_rad(make_stage(13))
+    alternating_rad = compute_straight_body_wave_rad(make_stage(14, ("yaw", "pitch")))
+    assert alternating_rad[::2] == pytest.approx(2.0 * yaw_only_rad[::2])
+    assert np.ptp(yaw_only_rad) > 0.5
+    assert not alternating_rad[1::2].any()
 
 
 def test_contact_search_scales_torque_by_its_limit() -> None:
-    weak, strong = (
-        felt_by(make_stage(torque_nm=limit_nm), 0.2 * limit_nm) for limit_nm in (3.5, 7.0)
+    weak_rad, strong_rad = (
+        compute_straight_body_wave_rad(make_stage(torque_nm=limit_nm), 0.2 * limit_nm)
+        for limit_nm in (3.5, 7.0)
     )
-    assert weak == pytest.approx(strong)
-    assert weak != pytest.approx(felt_by(make_stage()))
+    assert weak_rad == pytest.approx(strong_rad)
+    assert weak_rad != pytest.approx(compute_straight_body_wave_rad(make_stage()))
 
 
-def test_what_a_knock_is_felt_as_comes_over_several_ticks() -> None:
+def test_force_feedback_wave_follows_a_knock_over_several_ticks() -> None:
     stage = make_stage()
     observation = stage.make_observation(0, TAIL_S_M)
-    knocked = replace(
-        observation, joints=msgspec.structs.replace(observation.joints, velocity_rad_s=[20.0] * 13)
-    )
-    calm, struck = ForceFeedbackWave(stage.robot), ForceFeedbackWave(stage.robot)
-    for wave in (calm, struck):
+    fast_joints = msgspec.structs.replace(observation.joints, velocity_rad_s=[20.0] * 13)
+    knocked_observation = replace(observation, joints=fast_joints)
+    calm_wave = ForceFeedbackWave(stage.robot)
+    knocked_wave = ForceFeedbackWave(stage.robot)
+    for wave in (calm_wave, knocked_wave):
         wave.compute_reference_rad(observation, 0.01)
-    apart = [
+    differences_rad = [
         np.ptp(
             [
-                calm.compute_reference_rad(observation, 0.01),
-                struck.compute_reference_rad(knocked, 0.01),
+                calm_wave.compute_reference_rad(observation, 0.01),
+                knocked_wave.compute_reference_rad(knocked_observation, 0.01),
             ],
             axis=0,
         )
         for _ in range(20)
     ]
-    assert np.max(np.diff(apart, axis=0)) < 0.11
-    assert np.max(apart[0]) < 0.11
-    assert np.max(apart[-1]) > 0.3  # rad
+    assert np.max(np.diff(differences_rad, axis=0)) < 0.11
+    assert np.max(differences_rad[0]) < 0.11
+    assert np.max(differences_rad[-1]) > 0.3
 
 
 def test_smoothed_wave_does_not_follow_vibrating_torques() -> None:
     stage = make_stage()
-    swings: list[float] = []
+    mean_accelerations: list[float] = []
     for smoothing_s in (0.0, 0.1):
         wave = ForceFeedbackWave(stage.robot, smoothing_s=smoothing_s)
         angles: list[np.ndarray] = []
@@ -236,12 +264,12 @@ def test_smoothed_wave_does_not_follow_vibrating_torques() -> None:
             torque_nm = 3.0 * math.copysign(1.0, math.sin(math.tau * 22.0 * 0.01 * tick))
             observation = stage.make_observation(tick, TAIL_S_M, torque_nm=torque_nm)
             angles.append(wave.compute_reference_rad(observation, 0.0 if tick == 0 else 0.01))
-        swings.append(float(np.abs(np.diff(angles, n=2, axis=0))[20:].mean()))
-    unsmoothed, smoothed = swings
+        mean_accelerations.append(float(np.abs(np.diff(angles, n=2, axis=0))[20:].mean()))
+    unsmoothed, smoothed = mean_accelerations
     assert smoothed < 0.25 * unsmoothed
 
 
-def test_smoothed_wave_starts_at_its_reference_and_follows_its_own_curve() -> None:
+def test_smoothed_wave_starts_at_its_reference_and_then_lags() -> None:
     stage = make_stage()
     smoothed = ForceFeedbackWave(stage.robot, smoothing_s=0.1)
     unsmoothed = ForceFeedbackWave(stage.robot)
@@ -266,13 +294,13 @@ def test_amplitude_scale_changes_the_wave_and_not_the_bend() -> None:
 
 @pytest.mark.parametrize("speed_m_s", [0.2, -0.2])
 def test_contact_search_of_moving_body_does_not_start(speed_m_s: float) -> None:
-    stage, controller = searching()
+    stage, controller = make_searching_controller()
     stage.speed_m_s = speed_m_s
-    moving = [
+    commands = [
         controller.update(stage.make_observation(tick, 1.5 + speed_m_s * 0.01 * tick))
         for tick in range(400)
     ]
-    assert not any(SEARCHES in command.telemetry.reason for command in moving)
+    assert not any(is_searching(command) for command in commands)
 
 
 @pytest.mark.parametrize(
@@ -281,13 +309,12 @@ def test_contact_search_of_moving_body_does_not_start(speed_m_s: float) -> None:
 )
 def test_contact_search_of_u_shaped_body_raises_no_error(pegs: list[KnownObstacle]) -> None:
     stage = make_stage()
-    turn = np.linspace(-np.pi / 2, np.pi / 2, 40)
-    bend = np.column_stack([0.7 + 0.12 * np.cos(turn), 0.12 + 0.12 * np.sin(turn)])
-    stage.route = Route([(-0.3, 0.0), *map(tuple, bend.tolist()), (-3.0, 0.24)])
+    angles_rad = np.linspace(-np.pi / 2, np.pi / 2, 40)
+    bend_m = np.column_stack([0.7 + 0.12 * np.cos(angles_rad), 0.12 + 0.12 * np.sin(angles_rad)])
+    stage.route = Route([(-0.3, 0.0), *map(tuple, bend_m.tolist()), (-3.0, 0.24)])
     stage.pegs = pegs
     for tail_s_m in np.linspace(0.3, 0.7, 9):
         controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
         for tick in range(5):
-            assert np.isfinite(
-                controller.update(stage.make_observation(tick, float(tail_s_m))).setpoints.target
-            ).all()
+            command = controller.update(stage.make_observation(tick, float(tail_s_m)))
+            assert np.isfinite(command.setpoints.target).all()

@@ -1,4 +1,4 @@
-"""The controller of an environment with corrections: everything but the targets is that of the other controller."""
+"""Tests the controller of an environment whose actions correct the targets of another controller."""
 
 import pytest
 
@@ -17,26 +17,32 @@ MEMBERS = [name for name in vars(Controller) if not name.startswith("_") and nam
 
 
 @pytest.mark.parametrize("controller", [HoldPose, ObstacleTriplet, PolicyController])
-def test_it_has_every_declaration_of_the_other_controller(controller: type[Controller]) -> None:
+def test_correcting_class_has_declarations_of_corrected_controller(
+    controller: type[Controller],
+) -> None:
     corrected = require_base_class(
         _make_correcting_class(controller, []), Controller, "controller 'corrected'"
     )
     for name in MEMBERS:
-        own, other = (getattr(cls, name) for cls in (corrected, controller))
-        assert getattr(own, "__func__", own) is getattr(other, "__func__", other), name
+        corrected_member, member = (getattr(cls, name) for cls in (corrected, controller))
+        # Class methods are bound to their class, so that their functions are compared.
+        assert getattr(corrected_member, "__func__", corrected_member) is getattr(
+            member, "__func__", member
+        ), name
 
 
-def test_it_adds_corrections_to_targets_in_position_mode_alone() -> None:
-    stage, residual_rad = make_stage(3), [0.0, 0.1, -0.2]
+def test_correcting_controller_adds_corrections_to_position_targets() -> None:
+    stage = make_stage(3)
+    residual_rad = [0.0, 0.1, -0.2]
     observation = stage.make_observation(0, 0.3)
     corrected = _make_correcting_class(HoldPose, residual_rad)(stage.robot, NoParameters())
     command = corrected.update(observation)
     assert command.setpoints.mode == [JointMode.POSITION] * 3
-    added = [
+    added_rad = [
         target - angle
         for target, angle in zip(
             command.setpoints.target, observation.joints.angle_rad, strict=True
         )
     ]
-    assert added == pytest.approx(residual_rad)
+    assert added_rad == pytest.approx(residual_rad)
     assert command.telemetry.reason == "holding"

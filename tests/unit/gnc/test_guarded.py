@@ -1,4 +1,4 @@
-"""A controller that answers wrongly is named, with the field, the value and what is allowed."""
+"""Tests that an invalid command of a controller is an error with the controller, the field and the allowed values."""
 
 import math
 from dataclasses import replace
@@ -22,83 +22,88 @@ from snakesim_testing.messages import raises_error
 
 STAGE = make_stage(3)
 OBSERVATION = STAGE.make_observation(0, 0.3)
-GOOD = make_position_setpoints(STAGE.robot, OBSERVATION.joints.angle_rad)
-WHO = r"^controller ./wave.py:Wave \(class Wave\): "
+VALID_SETPOINTS = make_position_setpoints(STAGE.robot, OBSERVATION.joints.angle_rad)
 
 
 class Wave(Controller[Any]):
-    """Answers whatever it is given."""
+    """A controller that returns its parameters as its command.
+
+    It raises them instead if they are an error: an instance when it is created, a class when it is updated.
+    """
 
     def __init__(self, robot: RobotDescription, parameters: Any) -> None:
         super().__init__(robot, parameters)
-        self.answer = parameters
+        self.command = parameters
         if isinstance(parameters, Exception):
             raise parameters
 
     def update(self, observation: Observation) -> Any:
-        if isinstance(self.answer, type) and issubclass(self.answer, BaseException):
-            raise self.answer("as planned")
-        return self.answer
+        if isinstance(self.command, type) and issubclass(self.command, BaseException):
+            raise self.command("as planned")
+        return self.command
 
 
-def update(answer: Any) -> ControllerCommand:
-    return GuardedController("./wave.py:Wave", Wave, STAGE.robot, answer).update(OBSERVATION)
+def update_guarded(command: Any) -> ControllerCommand:
+    """Create and update a guarded controller that returns a command."""
+    return GuardedController("./wave.py:Wave", Wave, STAGE.robot, command).update(OBSERVATION)
 
 
-def points(**changes: Any) -> ControllerCommand:
-    return ControllerCommand(replace(GOOD, **changes))
+def change_setpoints(**changes: Any) -> ControllerCommand:
+    """Return a valid command with changes of its setpoints."""
+    return ControllerCommand(replace(VALID_SETPOINTS, **changes))
 
 
-def reported(**telemetry: Any) -> ControllerCommand:
-    return ControllerCommand(GOOD, Telemetry(**telemetry))
+def change_telemetry(**telemetry: Any) -> ControllerCommand:
+    """Return a valid command with this telemetry."""
+    return ControllerCommand(VALID_SETPOINTS, Telemetry(**telemetry))
 
 
-def made_of(setpoints: Any, telemetry: Any = None) -> ControllerCommand:
+def make_command(setpoints: Any, telemetry: Any = None) -> ControllerCommand:
     return ControllerCommand(setpoints, telemetry or Telemetry())
 
 
-def test_guarded_valid_answer_passes_unchanged() -> None:
-    for answer in (
-        ControllerCommand(GOOD),
-        points(target=[1, 0.5, -2]),
-        points(mode=list(JointMode)[:3]),
+def test_guarded_valid_command_passes_unchanged() -> None:
+    for command in (
+        ControllerCommand(VALID_SETPOINTS),
+        change_setpoints(target=[1, 0.5, -2]),
+        change_setpoints(mode=list(JointMode)[:3]),
     ):
-        assert update(answer) is answer
+        assert update_guarded(command) is command
 
 
 @pytest.mark.parametrize(
     "answer",
     [
         None,
-        GOOD,
-        made_of([0.0] * 3),
-        made_of(GOOD, "moving"),
-        points(target=[0.0] * 2),
-        points(mode=[JointMode.POSITION] * 4),
-        points(torque_limit_nm=[]),
-        points(target=np.zeros(3)),
-        points(target=[0.0, math.nan, 0.0]),
-        points(target=[0.0, 0.0, -math.inf]),
-        points(target=[2e5, 0.0, 0.0]),
-        points(target=[np.float64(1), 0.0, 0.0]),
-        points(target=[True, 0.0, 0.0]),
-        points(target=["1", 0.0, 0.0]),
-        points(torque_limit_nm=[7.0, -1.0, 7.0]),
-        points(mode=[1, 1, 1]),
-        points(mode=[JointMode.POSITION, 7, "x"]),
-        reported(reason=None),
-        reported(usable_push_points="3"),
-        reported(propulsion_joint=3),
+        VALID_SETPOINTS,
+        make_command([0.0] * 3),
+        make_command(VALID_SETPOINTS, "moving"),
+        change_setpoints(target=[0.0] * 2),
+        change_setpoints(mode=[JointMode.POSITION] * 4),
+        change_setpoints(torque_limit_nm=[]),
+        change_setpoints(target=np.zeros(3)),
+        change_setpoints(target=[0.0, math.nan, 0.0]),
+        change_setpoints(target=[0.0, 0.0, -math.inf]),
+        change_setpoints(target=[2e5, 0.0, 0.0]),
+        change_setpoints(target=[np.float64(1), 0.0, 0.0]),
+        change_setpoints(target=[True, 0.0, 0.0]),
+        change_setpoints(target=["1", 0.0, 0.0]),
+        change_setpoints(torque_limit_nm=[7.0, -1.0, 7.0]),
+        change_setpoints(mode=[1, 1, 1]),
+        change_setpoints(mode=[JointMode.POSITION, 7, "x"]),
+        change_telemetry(reason=None),
+        change_telemetry(usable_push_points="3"),
+        change_telemetry(propulsion_joint=3),
         ZeroDivisionError,
         SystemExit,
         ValueError("no such robot"),
     ],
 )
-def test_guarded_invalid_answer_is_named(answer: Any) -> None:
+def test_guarded_invalid_answer_is_an_error(answer: Any) -> None:
     with raises_error(ControllerError, code="controller/failed"):
-        update(answer)
+        update_guarded(answer)
 
 
 def test_guarded_keyboard_interrupt_is_no_controller_fault() -> None:
     with pytest.raises(KeyboardInterrupt):
-        update(KeyboardInterrupt)
+        update_guarded(KeyboardInterrupt)
