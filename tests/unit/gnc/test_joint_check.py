@@ -1,4 +1,6 @@
-"""How the joint check moves each joint: to both sides, back, and within its limits."""
+"""Tests how the joint check moves each joint: to both sides, back, and within its limits."""
+
+import itertools
 
 import pytest
 
@@ -7,53 +9,68 @@ from snakesim_hal.controller import Observation
 from snakesim_testing.hal.small_robots import make_description, make_joint_state
 
 PERIOD_S = 0.01
-SECONDS = 4.0  # for each joint
+SECONDS_PER_JOINT = 4.0
+LARGE_MOTION_RAD = 0.055  # the large motions to each side are at least this large
 ROBOT = make_description()
 LIMIT_RAD = ROBOT.joints[0].angle_max_rad
 
 
-def targets(start_rad: float, seconds: float, dead: int | None = None) -> list[list[float]]:
-    """Those of every tick; joints follow at once, but for a dead one."""
+def run_joint_check(
+    start_rad: float, seconds: float, blocked_joint: int | None = None
+) -> list[list[float]]:
+    """Return the targets of every tick and joint. All joints but a blocked one follow at once."""
     check = JointCheck(ROBOT, JointCheckParameters())
-    angles = [start_rad] * len(ROBOT.joints)
-    made: list[list[float]] = []
+    angles_rad = [start_rad] * len(ROBOT.joints)
+    targets_rad: list[list[float]] = []
     for tick in range(round(seconds / PERIOD_S)):
-        observation = Observation(
-            tick, tick * PERIOD_S, PERIOD_S, make_joint_state(ROBOT, angles), None, None
-        )
-        made.append(list(check.update(observation).setpoints.target))
-        angles = [angle if joint == dead else made[-1][joint] for joint, angle in enumerate(angles)]
-    return made
+        joints = make_joint_state(ROBOT, angles_rad)
+        observation = Observation(tick, tick * PERIOD_S, PERIOD_S, joints, None, None)
+        targets_rad.append(list(check.update(observation).setpoints.target))
+        angles_rad = [
+            angle_rad if joint == blocked_joint else targets_rad[-1][joint]
+            for joint, angle_rad in enumerate(angles_rad)
+        ]
+    return targets_rad
 
 
-def test_every_joint_moves_alone_to_both_sides_and_back() -> None:
-    made = targets(0.1, SECONDS * len(ROBOT.joints))
-    for tick in made:
-        assert sum(abs(target - 0.1) > 1e-9 for target in tick) <= 1
-    for column in zip(*made, strict=True):
-        assert max(column) > 0.1 + 0.055
-        assert min(column) < 0.1 - 0.055
-        assert column[-1] == 0.1
+def test_joint_check_moves_each_joint_alone_to_both_sides() -> None:
+    start_rad = 0.1
+    targets_rad = run_joint_check(start_rad, SECONDS_PER_JOINT * len(ROBOT.joints))
+    for targets_of_tick in targets_rad:
+        assert sum(abs(target_rad - start_rad) > 1e-9 for target_rad in targets_of_tick) <= 1
+    for targets_of_joint in zip(*targets_rad, strict=True):
+        assert max(targets_of_joint) > start_rad + LARGE_MOTION_RAD
+        assert min(targets_of_joint) < start_rad - LARGE_MOTION_RAD
+        assert targets_of_joint[-1] == start_rad
 
 
-def test_a_joint_beside_its_limit_moves_away_from_it_only() -> None:
+def test_joint_check_beside_limit_moves_only_away_from_it() -> None:
     start_rad = LIMIT_RAD - 0.03
-    for column in zip(*targets(start_rad, SECONDS * len(ROBOT.joints)), strict=True):
-        assert max(column) == start_rad
-        assert min(column) < start_rad - 0.055
+    targets_rad = run_joint_check(start_rad, SECONDS_PER_JOINT * len(ROBOT.joints))
+    for targets_of_joint in zip(*targets_rad, strict=True):
+        assert max(targets_of_joint) == start_rad
+        assert min(targets_of_joint) < start_rad - LARGE_MOTION_RAD
 
 
-def test_small_motions_follow_large_ones_and_are_slow() -> None:
-    column = [tick[0] - 0.1 for tick in targets(0.1, SECONDS)]
-    last_large = max(tick for tick, offset in enumerate(column) if abs(offset) > 0.03)
-    small = column[last_large + 40 :]
-    assert max(small) == pytest.approx(0.006, abs=0.001) == -min(small)
-    assert max(abs(small[i + 1] - small[i]) for i in range(len(small) - 1)) < 0.0007
-    turns = [i for i in range(1, len(small) - 1) if small[i - 1] < small[i] > small[i + 1]]
-    assert len(turns) == 2
+def test_joint_check_small_motions_follow_large_ones_slowly() -> None:
+    start_rad = 0.1
+    targets_rad = run_joint_check(start_rad, SECONDS_PER_JOINT)
+    offsets_rad = [targets_of_tick[0] - start_rad for targets_of_tick in targets_rad]
+    last_large_tick = max(tick for tick, offset in enumerate(offsets_rad) if abs(offset) > 0.03)
+    small_rad = offsets_rad[last_large_tick + 40 :]
+    assert max(small_rad) == pytest.approx(0.006, abs=0.001) == -min(small_rad)
+    assert max(abs(after - before) for before, after in itertools.pairwise(small_rad)) < 0.0007
+    peaks = [
+        i
+        for i in range(1, len(small_rad) - 1)
+        if small_rad[i - 1] < small_rad[i] > small_rad[i + 1]
+    ]
+    assert len(peaks) == 2
 
 
-def test_a_joint_that_does_not_follow_is_asked_once() -> None:
-    column = [tick[1] for tick in targets(0.0, SECONDS * len(ROBOT.joints), dead=1)]
-    assert max(column) > 0.14
-    assert min(column) == 0.0
+def test_joint_check_moves_a_blocked_joint_to_one_side_only() -> None:
+    targets_rad = run_joint_check(0.0, SECONDS_PER_JOINT * len(ROBOT.joints), blocked_joint=1)
+    targets_of_joint = [targets_of_tick[1] for targets_of_tick in targets_rad]
+    # The check moves the target to one side, and does not try the other.
+    assert max(targets_of_joint) > 0.14
+    assert min(targets_of_joint) == 0.0

@@ -1,4 +1,4 @@
-"""Parameters of a controller that runs: taken when they are valid, otherwise nothing changes."""
+"""Tests requests for new parameters of a running controller: valid ones take effect, others change nothing."""
 
 import msgspec
 import pytest
@@ -24,28 +24,33 @@ CLOCK = Clock(
 
 
 class Bench:
-    """Control's parameters, and an operator."""
+    """The live parameters of the control service, and an operator who requests others."""
 
     def __init__(self) -> None:
         network = LocalNetwork()
         config = load_scenario("triplet", []).config
         self.parameters = LiveParameters(HostClient(network.create_session(), "control"), config)
         self.parameters.configure(make_description())
-        self.anew: list[bool] = []
-        network.run_responders = lambda: self.anew.append(self.parameters.answer_requests(CLOCK))
+        # For each request, whether control must create its controller again.
+        self.must_rebuild: list[bool] = []
+        network.run_responders = lambda: self.must_rebuild.append(
+            self.parameters.answer_requests(CLOCK)
+        )
         self.operator: LocalSession = network.create_session()
         self.parameters.answer_requests(CLOCK)
 
-    def ask(self, parameters: str, controller: str = "obstacle_triplet") -> Answer:
+    def request_parameters(self, parameters: str, controller: str = "obstacle_triplet") -> Answer:
         return self.operator.send_request(
             keys.PARAMETERS,
             ParametersRequest(requester="ada", controller=controller, parameters=parameters),
         )
 
-    def in_force(self) -> ControlParameters:
-        found = self.operator.wait_for_latched(keys.PARAMETERS_IN_FORCE, ControlParameters, 1.0)
-        assert found is not None
-        return found
+    def read_parameters_in_force(self) -> ControlParameters:
+        parameters = self.operator.wait_for_latched(
+            keys.PARAMETERS_IN_FORCE, ControlParameters, 1.0
+        )
+        assert parameters is not None
+        return parameters
 
 
 @pytest.fixture
@@ -53,17 +58,17 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_live_parameters_start_from_configuration_and_rebuild_the_controller(
+def test_live_parameters_valid_request_takes_effect_and_rebuilds_controller(
     bench: Bench,
 ):
-    reported = bench.in_force()
+    reported = bench.read_parameters_in_force()
     assert msgspec.json.decode(reported.parameters)["propulsion_n"] == 35.0
     assert '"propulsion_n":{"unit":"N"' in reported.schema
     assert reported.requester is None
     assert reported.changes == 0
-    assert bench.ask('{"propulsion_n": 20}').ok
-    assert bench.anew == [True]
-    reported = bench.in_force()
+    assert bench.request_parameters('{"propulsion_n": 20}').ok
+    assert bench.must_rebuild == [True]
+    reported = bench.read_parameters_in_force()
     assert msgspec.json.decode(reported.parameters)["propulsion_n"] == 20.0
     assert reported.requester == "ada"
     assert reported.changes == 1
@@ -71,7 +76,7 @@ def test_live_parameters_start_from_configuration_and_rebuild_the_controller(
 
 
 @pytest.mark.parametrize(
-    ("parameters", "said"),
+    ("parameters", "expected_reason"),
     [
         (
             '{"propulsion_n": -1}',
@@ -82,17 +87,19 @@ def test_live_parameters_start_from_configuration_and_rebuild_the_controller(
         ("[]", "object"),
     ],
 )
-def test_others_are_refused_and_nothing_changes(bench: Bench, parameters: str, said: str):
-    before = bench.in_force()
-    answer = bench.ask(parameters)
+def test_live_parameters_invalid_request_is_refused_and_changes_nothing(
+    bench: Bench, parameters: str, expected_reason: str
+):
+    before = bench.read_parameters_in_force()
+    answer = bench.request_parameters(parameters)
     assert not answer.ok
     assert answer.refusal == "bad_parameters"
-    assert said in answer.reason
-    assert bench.anew == [False]
-    assert bench.in_force() == before
+    assert expected_reason in answer.reason
+    assert bench.must_rebuild == [False]
+    assert bench.read_parameters_in_force() == before
 
 
-def test_parameters_for_another_controller_are_refused(bench: Bench):
-    answer = bench.ask("{}", controller="hold")
+def test_live_parameters_for_another_controller_are_refused(bench: Bench):
+    answer = bench.request_parameters("{}", controller="hold")
     assert answer.refusal == "wrong_controller"
     assert "obstacle_triplet" in answer.reason

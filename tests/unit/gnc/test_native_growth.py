@@ -1,4 +1,4 @@
-"""The path search in C gives the grids and paths of its specification in Python, to the last bit."""
+"""Tests that the path search in C gives the grids and paths of its specification in Python, to the last bit."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -71,7 +71,7 @@ def make_obstacles(random: np.random.Generator, body_w: Floats) -> list[KnownObs
     return obstacles
 
 
-def finish(search: PathSearchSteps) -> tuple[list[int], SearchedPath | None]:
+def finish_search(search: PathSearchSteps) -> tuple[list[int], SearchedPath | None]:
     """Return the nodes of each step of a search, and its path."""
     nodes: list[int] = []
     while True:
@@ -85,13 +85,13 @@ def assert_equal_bits(
     first: tuple[list[int], SearchedPath | None], second: tuple[list[int], SearchedPath | None]
 ) -> None:
     assert first[0] == second[0]
-    one, other = first[1], second[1]
-    if one is None or other is None:
-        assert one is other
+    first_path, second_path = first[1], second[1]
+    if first_path is None or second_path is None:
+        assert first_path is second_path
         return
-    assert one.points_w.tobytes() == other.points_w.tobytes()
-    assert one.margins_n.tobytes() == other.margins_n.tobytes()
-    assert one.cost_m == other.cost_m
+    assert first_path.points_w.tobytes() == second_path.points_w.tobytes()
+    assert first_path.margins_n.tobytes() == second_path.margins_n.tobytes()
+    assert first_path.cost_m == second_path.cost_m
 
 
 @needs_library
@@ -99,7 +99,7 @@ def assert_equal_bits(
     "seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 12))]
 )
 @pytest.mark.parametrize("kind", ["ahead", "whole body", "whole body beside failed paths"])
-def test_paths_equal_those_of_the_specification_to_the_last_bit(kind: str, seed: int) -> None:
+def test_native_paths_equal_those_of_the_specification_to_the_bit(kind: str, seed: int) -> None:
     random = np.random.default_rng(seed)
     body_w = make_body(random)
     obstacles = make_obstacles(random, body_w)
@@ -111,7 +111,7 @@ def test_paths_equal_those_of_the_specification_to_the_last_bit(kind: str, seed:
     )
     goal_rad = float(random.uniform(-1.2, 1.2))
     failed_w = np.concatenate([body_w[::3] + random.normal(0.0, 0.02, 2) for _ in range(3)])
-    found: list[tuple[list[int], SearchedPath | None]] = []
+    results: list[tuple[list[int], SearchedPath | None]] = []
     for growth in (NumpyExpander, NativeExpander):
         beam = BeamSearch(ObstacleGrid(obstacles), parameters, growth)
         if kind == "ahead":
@@ -120,34 +120,38 @@ def test_paths_equal_those_of_the_specification_to_the_last_bit(kind: str, seed:
             search = beam.search_whole_body(body_w, goal_rad, 15, 0.07)
         else:
             search = beam.search_whole_body(body_w, goal_rad, 15, 0.07, failed_w)
-        found.append(finish(search))
-    assert_equal_bits(found[0], found[1])
+        results.append(finish_search(search))
+    assert_equal_bits(results[0], results[1])
 
 
 @needs_library
 @pytest.mark.parametrize("kept_nodes", [2, 7, 20])
-def test_of_paths_that_cost_the_same_both_keep_the_same(kept_nodes: int) -> None:
+def test_native_search_keeps_the_same_of_equal_paths(kept_nodes: int) -> None:
     """Without obstacles, progress and curvature in the cost, all paths cost the same."""
     body_w = np.column_stack([np.linspace(-1.0, 0.0, 101), np.zeros(101)])
     parameters = replace(
         SEARCH, kept_nodes=kept_nodes, progress_reward=0.0, curvature_change_cost_m=0.0
     )
-    found = [
-        finish(BeamSearch(ObstacleGrid([]), parameters, growth).search_ahead(body_w, 0.3, 10))
+    results = [
+        finish_search(
+            BeamSearch(ObstacleGrid([]), parameters, growth).search_ahead(body_w, 0.3, 10)
+        )
         for growth in (NumpyExpander, NativeExpander)
     ]
-    assert_equal_bits(found[0], found[1])
+    assert_equal_bits(results[0], results[1])
 
 
 @needs_library
-def test_the_random_scenes_reach_what_they_are_to_compare() -> None:
-    """Paths that are long, that end early, that push and that cannot push: otherwise equal paths would show nothing."""
+def test_random_scenes_lead_to_all_kinds_of_paths() -> None:
+    """The comparison needs paths that are long, end early, push, and cannot push."""
     paths: list[SearchedPath] = []
     for seed in range(12):
         random = np.random.default_rng(seed)
         body_w = make_body(random)
         obstacles = make_obstacles(random, body_w)
-        _, path = finish(BeamSearch(ObstacleGrid(obstacles), SEARCH).search_ahead(body_w, 0.0, 30))
+        _, path = finish_search(
+            BeamSearch(ObstacleGrid(obstacles), SEARCH).search_ahead(body_w, 0.0, 30)
+        )
         if path is not None:
             paths.append(path)
     assert max(len(path.points_w) for path in paths) == 31
@@ -166,22 +170,22 @@ def make_task(initial_drag_m: Floats) -> SearchTask:
     )
 
 
-def start_layer() -> NodeLayer:
+def make_start_layer() -> NodeLayer:
     return make_start_nodes(np.zeros((1, 2)), np.zeros(1))
 
 
 @needs_library
-def test_an_array_of_a_wrong_size_is_named() -> None:
+def test_native_expander_names_an_array_of_wrong_size() -> None:
     task = make_task(initial_drag_m=np.zeros((BODY_ARCS - 1, 3)))
     message = r"the drag of the lying body has the shape \(19, 3\), the C library of the planner expects \(20, 3\)"
     with pytest.raises(PlannerLibraryError, match=message):
-        NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), max_arc_count=5)
+        NativeExpander(ObstacleGrid([]), SEARCH, task, make_start_layer(), max_arc_count=5)
 
 
 @needs_library
-def test_no_more_layers_than_there_is_room_for() -> None:
+def test_native_expander_refuses_more_layers_than_allocated() -> None:
     task = make_task(initial_drag_m=np.zeros((BODY_ARCS, 3)))
-    paths = NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), max_arc_count=2)
+    paths = NativeExpander(ObstacleGrid([]), SEARCH, task, make_start_layer(), max_arc_count=2)
     assert paths.trace_cheapest() is None
     assert paths.expand_layer()
     assert paths.expand_layer()
@@ -202,7 +206,7 @@ def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @needs_library
-def test_the_grid_of_obstacles_is_the_same_without_the_library(
+def test_obstacle_grid_is_the_same_without_the_library(
     request: pytest.FixtureRequest,
 ) -> None:
     random = np.random.default_rng(5)
@@ -216,12 +220,12 @@ def test_the_grid_of_obstacles_is_the_same_without_the_library(
 
 
 @pytest.mark.usefixtures("no_library")
-def test_without_the_library_the_specification_plans() -> None:
+def test_path_search_without_the_library_uses_the_specification() -> None:
     assert not is_native_available()
     body_w = make_body(np.random.default_rng(0))
-    nodes, path = finish(BeamSearch(ObstacleGrid([]), SEARCH).search_ahead(body_w, 0.0, 3))
+    nodes, path = finish_search(BeamSearch(ObstacleGrid([]), SEARCH).search_ahead(body_w, 0.0, 3))
     assert nodes[0] == 1
     assert path is not None
     task = make_task(initial_drag_m=np.zeros((BODY_ARCS, 3)))
     with pytest.raises(PlannerLibraryError, match="SNAKESIM_NATIVE"):
-        NativeExpander(ObstacleGrid([]), SEARCH, task, start_layer(), max_arc_count=2)
+        NativeExpander(ObstacleGrid([]), SEARCH, task, make_start_layer(), max_arc_count=2)

@@ -1,4 +1,4 @@
-"""`obstacle_aided` between torque and position mode; what it does to a body is in tests/system/physics."""
+"""Tests when `obstacle_aided` uses torque mode and position mode. Tests of runs are in tests/system/physics."""
 
 import numpy as np
 import pytest
@@ -7,25 +7,25 @@ from snakesim_gnc.control.obstacle_aided import ObstacleAided, ObstacleAidedPara
 from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.gnc.stage import make_stage
 
-HELD_NM = 0.6  # that every joint is measured with
+MEASURED_NM = 0.6  # torque of each joint
 
 
-@pytest.mark.parametrize("lost", ["world", "trajectory"])
-def test_obstacle_aided_leaving_torque_mode_holds_with_present_torque(lost: str):
+@pytest.mark.parametrize("missing_input", ["world", "trajectory"])
+def test_obstacle_aided_leaving_torque_mode_holds_with_present_torque(missing_input: str):
     stage = make_stage()
     controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
-    observations = [stage.make_observation(tick, 1.0, torque_nm=HELD_NM) for tick in range(40)]
+    observations = [stage.make_observation(tick, 1.0, torque_nm=MEASURED_NM) for tick in range(40)]
     pushing = [controller.update(observation) for observation in observations][-1].setpoints
     assert set(pushing.mode) == {JointMode.TORQUE}
     assert np.abs(pushing.target).max() > 0.1
 
     holding = controller.update(
-        stage.make_observation(40, 1.0, torque_nm=HELD_NM, without=lost)
+        stage.make_observation(40, 1.0, torque_nm=MEASURED_NM, without=missing_input)
     ).setpoints
     assert set(holding.mode) == {JointMode.POSITION}
     stiffness = [joint.stiffness_nm_per_rad for joint in stage.robot.joints]
-    by_spring_nm = (np.array(holding.target) - observations[-1].joints.angle_rad) * stiffness
-    assert by_spring_nm == pytest.approx(HELD_NM, rel=0.1)
+    holding_torque_nm = (np.array(holding.target) - observations[-1].joints.angle_rad) * stiffness
+    assert holding_torque_nm == pytest.approx(MEASURED_NM, rel=0.1)
 
 
 def test_obstacle_aided_body_without_push_holds_in_position_mode():
@@ -36,25 +36,25 @@ def test_obstacle_aided_body_without_push_holds_in_position_mode():
     assert set(commands[-1].setpoints.mode) == {JointMode.POSITION}
 
 
-def test_drive_damping_gives_the_torques_of_torque_mode_to_a_body_at_rest():
+def test_drive_damping_of_resting_body_gives_torques_of_torque_mode():
     """At rest the damping is zero, so the position targets must give the same torques."""
     stage = make_stage()
-    soft = ObstacleAided(stage.robot, ObstacleAidedParameters(shape_nm_s_per_rad=0.0))
-    damped = ObstacleAided(
+    without_damping = ObstacleAided(stage.robot, ObstacleAidedParameters(shape_nm_s_per_rad=0.0))
+    with_damping = ObstacleAided(
         stage.robot, ObstacleAidedParameters(shape_nm_s_per_rad=0.0, drive_damping=True)
     )
     observations = [stage.make_observation(tick, 1.0) for tick in range(40)]
-    torques = [soft.update(observation) for observation in observations][-1].setpoints
-    targets = [damped.update(observation) for observation in observations][-1].setpoints
+    torques = [without_damping.update(observation) for observation in observations][-1].setpoints
+    targets = [with_damping.update(observation) for observation in observations][-1].setpoints
     assert set(torques.mode) == {JointMode.TORQUE}
     assert set(targets.mode) == {JointMode.POSITION}
     assert np.abs(torques.target).max() > 0.1
     stiffness = [joint.stiffness_nm_per_rad for joint in stage.robot.joints]
-    by_spring_nm = (np.array(targets.target) - observations[-1].joints.angle_rad) * stiffness
-    assert by_spring_nm == pytest.approx(torques.target, abs=0.02)
+    drive_torque_nm = (np.array(targets.target) - observations[-1].joints.angle_rad) * stiffness
+    assert drive_torque_nm == pytest.approx(torques.target, abs=0.02)
 
 
-def test_front_joints_are_in_position_mode_and_the_others_push():
+def test_front_correction_puts_only_front_joints_in_position_mode():
     stage = make_stage()
     parameters = ObstacleAidedParameters(front_correction_m=0.25)
     controller = ObstacleAided(stage.robot, parameters)

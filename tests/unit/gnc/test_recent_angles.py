@@ -1,11 +1,11 @@
-"""The joint angles of the last ticks: those nearest to a time, which may lie before, between or after all of them."""
+"""Tests the search for the joint angles that were measured nearest to a time."""
 
 import numpy as np
 
 from snakesim_gnc.geometry.planar_body import JointAngleHistory
 
 
-def test_angles_nearest_to_a_time_are_found_among_all_that_are_kept() -> None:
+def test_joint_angle_history_finds_angles_nearest_to_a_time() -> None:
     random = np.random.default_rng(5)
     for _ in range(50):
         times_ns = np.unique(random.integers(0, 60, 12)).tolist()

@@ -1,4 +1,4 @@
-"""A controller is too slow when updates would stop a robot, and not when a busy computer delayed some."""
+"""Tests when durations of updates show that a controller is too slow, and not only delayed by a busy computer."""
 
 import pytest
 
@@ -6,11 +6,12 @@ from snakesim_gnc.control.service.update_times import UpdateTimes
 from snakesim_testing.gnc.stage import make_stage
 
 ROBOT = make_stage(3).robot
-PERIOD_S, LEASE_S = ROBOT.period_ns * 1e-9, ROBOT.lease_ns * 1e-9
+PERIOD_S = ROBOT.period_ns * 1e-9
+LEASE_S = ROBOT.lease_ns * 1e-9
 
 
 @pytest.mark.parametrize(
-    ("times_s", "words"),
+    ("durations_s", "expected_reason"),
     [
         ([], ""),
         ([0.9 * PERIOD_S] * 50, ""),
@@ -25,8 +26,13 @@ PERIOD_S, LEASE_S = ROBOT.period_ns * 1e-9, ROBOT.lease_ns * 1e-9
     ],
     ids=["none", "quick", "few", "a busy computer", "one", "a stop", "often"],
 )
-def test_what_shows_that_a_controller_is_too_slow(times_s: list[float], words: str) -> None:
+def test_update_times_give_the_reason_of_a_slow_controller(
+    durations_s: list[float], expected_reason: str
+) -> None:
     times = UpdateTimes(ROBOT)
-    for took_s in times_s:
-        times.add_duration(took_s)
-    assert times.too_slow_reason == "" if not words else words in times.too_slow_reason
+    for duration_s in durations_s:
+        times.add_duration(duration_s)
+    if expected_reason:
+        assert expected_reason in times.too_slow_reason
+    else:
+        assert times.too_slow_reason == ""
