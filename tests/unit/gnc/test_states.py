@@ -1,4 +1,4 @@
-"""The four states of the paper's Figure 6, and what counts as moving."""
+"""Tests the four locomotion states of the paper's Figure 6, and the recent advance of the body."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,13 @@ import pytest
 from snakesim_gnc.control.service.advance import RecentAdvance
 from snakesim_gnc.control.service.states import determine_locomotion_state
 
-READY = {"usable_push_points": 3, "recent_displacement_m": 0.1}
+MOVING = {"usable_push_points": 3, "recent_displacement_m": 0.1}
+PERIOD_S = 0.02  # from one position of the body's center to the next
+STANDSTILL_M = 0.005  # a body that advances less in a second stands still
 
 
 @pytest.mark.parametrize(
-    ("change", "state", "word"),
+    ("changes", "expected_state", "expected_reason"),
     [
         ({}, "Locomoting", "pushing"),
         ({"usable_push_points": None}, "Locomoting", "moving"),
@@ -53,47 +55,55 @@ READY = {"usable_push_points": 3, "recent_displacement_m": 0.1}
         ),
     ],
 )
-def test_states_have_a_reason(change, state, word):
-    found, reason = determine_locomotion_state(**{**READY, **change})
-    assert found == state
-    assert word in reason
+def test_locomotion_state_has_a_reason(changes, expected_state, expected_reason):
+    state, reason = determine_locomotion_state(**{**MOVING, **changes})
+    assert state == expected_state
+    assert expected_reason in reason
 
 
-def advanced(speed_m_s, seconds, noise_m=0.0, every_s=0.02):
-    rng, advance, far = np.random.default_rng(1), RecentAdvance(), []
-    for tick in range(round(seconds / every_s)):
-        x, y, z = (rng.standard_normal(3) * noise_m).tolist()
-        advance.add_center(tick * every_s, (x + speed_m_s * tick * every_s, y, z))
-        far.append(advance.distance_m)
-    return far
-
-
-def test_the_advance_is_that_of_the_last_second():
-    far = advanced(0.1, 5.0)
-    assert far[0] == 0.0
-    assert far[-1] == pytest.approx(0.1, rel=0.03)
-    # Soon after the start.
-    assert next(i for i, metres in enumerate(far) if metres >= 0.005) * 0.02 < 0.3
-
-
-def test_noise_is_no_advance():
-    assert max(advanced(0.0, 100.0, noise_m=0.001)) < 0.005
-
-
-def test_a_body_that_stops_stands_still_a_second_later():
+def measure_advances_m(speed_m_s, duration_s, noise_m=0.0):
+    """Return the recent advance after each position of a body at constant speed, whose positions are noisy."""
+    random = np.random.default_rng(1)
     advance = RecentAdvance()
-    for tick in range(300):
-        advance.add_center(tick * 0.02, (0.1 * min(tick * 0.02, 2.0), 0.0, 0.0))
-        if tick * 0.02 > 3.4:
+    distances_m = []
+    for sample in range(round(duration_s / PERIOD_S)):
+        x, y, z = (random.standard_normal(3) * noise_m).tolist()
+        time_s = sample * PERIOD_S
+        advance.add_center(time_s, (x + speed_m_s * sample * PERIOD_S, y, z))
+        distances_m.append(advance.distance_m)
+    return distances_m
+
+
+def test_recent_advance_is_that_of_the_last_second():
+    distances_m = measure_advances_m(0.1, 5.0)
+    assert distances_m[0] == 0.0
+    assert distances_m[-1] == pytest.approx(0.1, rel=0.03)
+    # The advance exceeds a standstill soon after the start.
+    first_moving = next(i for i, distance_m in enumerate(distances_m) if distance_m >= STANDSTILL_M)
+    assert first_moving * PERIOD_S < 0.3
+
+
+def test_recent_advance_of_standing_body_ignores_noise():
+    assert max(measure_advances_m(0.0, 100.0, noise_m=0.001)) < STANDSTILL_M
+
+
+def test_recent_advance_is_zero_soon_after_body_stops():
+    stop_s = 2.0
+    advance = RecentAdvance()
+    for sample in range(300):
+        time_s = sample * PERIOD_S
+        advance.add_center(time_s, (0.1 * min(time_s, stop_s), 0.0, 0.0))
+        if time_s > stop_s + 1.4:
             assert advance.distance_m is not None
-            assert advance.distance_m < 0.005
+            assert advance.distance_m < STANDSTILL_M
 
 
-def test_states_are_unknown_before_first_sample_and_after_a_gap():
+def test_recent_advance_is_unknown_at_start_and_zero_after_gap():
     advance = RecentAdvance()
     assert advance.distance_m is None
     advance.add_center(0.0, (0.0, 0.0, 0.0))
     advance.add_center(5.0, (1.0, 0.0, 0.0))
     assert advance.distance_m == 0.0
-    advance.add_center(4.0, (9.0, 0.0, 0.0))  # comes too late to say anything
+    # A position that arrives too late is ignored.
+    advance.add_center(4.0, (9.0, 0.0, 0.0))
     assert advance.distance_m == 0.0

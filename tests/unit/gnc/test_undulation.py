@@ -1,4 +1,4 @@
-"""The baselines: a wave that travels to the tail, and bends towards the goal."""
+"""Tests the undulating baselines, whose wave travels to the tail and bends towards the goal, and pushes by waves."""
 
 import dataclasses
 from functools import cache
@@ -24,7 +24,8 @@ TAIL_S_M = 0.3
 POSITION_MODE_NM_PER_RAD = 0.0
 
 
-def references(controller, stage, ticks: int, speed_m_s: float = 0.0) -> np.ndarray:
+def list_references_rad(controller, stage, ticks: int, speed_m_s: float = 0.0) -> np.ndarray:
+    """Return the reference angles of each tick for a body that advances on its path at constant speed."""
     observations = [
         stage.make_observation(tick, TAIL_S_M + 0.01 * tick * speed_m_s) for tick in range(ticks)
     ]
@@ -33,29 +34,31 @@ def references(controller, stage, ticks: int, speed_m_s: float = 0.0) -> np.ndar
     )
 
 
-def test_the_wave_travels_from_head_to_tail() -> None:
+def test_undulation_wave_travels_from_head_to_tail() -> None:
     stage = make_stage()
-    angles = references(LateralUndulation(stage.robot, LateralUndulationParameters()), stage, 200)
+    angles = list_references_rad(
+        LateralUndulation(stage.robot, LateralUndulationParameters()), stage, 200
+    )
     peaks = angles.argmax(axis=0)
     assert peaks[11] < peaks[10] < peaks[9]
 
 
-@pytest.mark.parametrize(("lag_rad", "bends"), [(0.9, 1.0), (-0.9, -1.0)])
-def test_undulation_head_steers_to_path_and_against_its_bend(lag_rad: float, bends: float) -> None:
+@pytest.mark.parametrize(("lag_rad", "sign"), [(0.9, 1.0), (-0.9, -1.0)])
+def test_undulation_head_steers_to_path_and_against_its_bend(lag_rad: float, sign: float) -> None:
     stage = make_stage()
-    straight = references(
+    straight = list_references_rad(
         LateralUndulation(stage.robot, LateralUndulationParameters(lag_rad=lag_rad)), stage, 1
     )
     stage.route = Route([(0.0, 0.0), (2.0, 0.0), (2.0, 3.0)])
-    steered = references(
+    steered = list_references_rad(
         HeadSteeredUndulation(stage.robot, HeadSteeredUndulationParameters(lag_rad=lag_rad)),
         stage,
         1,
     )
-    assert bends * (np.mean(steered[0]) - np.mean(straight[0])) > 0.01
+    assert sign * (np.mean(steered[0]) - np.mean(straight[0])) > 0.01
 
 
-def test_undulation_standing_body_is_pushed_harder_up_to_limit() -> None:
+def test_obstacle_aided_pushes_standing_body_harder_up_to_limit() -> None:
     stage = make_stage()
     controller = ObstacleAided(
         stage.robot,
@@ -66,16 +69,17 @@ def test_undulation_standing_body_is_pushed_harder_up_to_limit() -> None:
     first, *_, last = [
         controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in range(400)
     ]
-    pushed = np.abs(np.array(last.setpoints.target) - first.setpoints.target)
-    assert 0.01 < pushed.max() < 2.0 / 60.0 + 0.25  # of the torque, and of the largest look-ahead
+    moved_rad = np.abs(np.array(last.setpoints.target) - first.setpoints.target)
+    # The limit has a part of the torque limit over the stiffness, and one of the largest look-ahead.
+    assert 0.01 < moved_rad.max() < 2.0 / 60.0 + 0.25
     assert last.telemetry.propulsion_n is not None
     assert first.telemetry.propulsion_n is not None
     assert last.telemetry.propulsion_n > first.telemetry.propulsion_n
 
 
 @cache
-def pushed(push_scale: float, push_sign_s: float = 0.0) -> np.ndarray:
-    """References of a body that stays where it is."""
+def list_pushing_references_rad(push_scale: float, push_sign_s: float = 0.0) -> np.ndarray:
+    """Return the reference angles of each tick while a controller pushes a body that does not move."""
     stage = make_stage()
     parameters = ObstacleAidedParameters(
         push_scale=push_scale,
@@ -83,70 +87,77 @@ def pushed(push_scale: float, push_sign_s: float = 0.0) -> np.ndarray:
         search_after_s=0.0,
         shape_nm_per_rad=POSITION_MODE_NM_PER_RAD,
     )
-    return references(ObstacleAided(stage.robot, parameters), stage, 300)
+    return list_references_rad(ObstacleAided(stage.robot, parameters), stage, 300)
 
 
 @pytest.mark.slow
-def test_a_scaled_push_is_turned_round() -> None:
-    still = pushed(0.0)
-    forward, back = (pushed(scale)[-1] - still[-1] for scale in (1.0, -1.0))
-    assert forward @ back < 0
-    assert np.abs(still[-1] - still[0]).max() < 1e-6
+def test_obstacle_aided_negative_push_scale_reverses_the_push() -> None:
+    without_push_rad = list_pushing_references_rad(0.0)
+    forward_rad = list_pushing_references_rad(1.0)[-1] - without_push_rad[-1]
+    backward_rad = list_pushing_references_rad(-1.0)[-1] - without_push_rad[-1]
+    assert forward_rad @ backward_rad < 0
+    assert np.abs(without_push_rad[-1] - without_push_rad[0]).max() < 1e-6
 
 
-def test_undulation_push_uses_friction_of_the_planned_path() -> None:
-    tilts: list[float] = []
+def test_obstacle_aided_push_uses_friction_of_the_planned_path() -> None:
+    mean_normals_x: list[float] = []
     for friction in (0.0, 0.2):
         stage = make_stage()
         stage.assumed_obstacle_friction = friction
         controller = ObstacleAided(stage.robot, ObstacleAidedParameters())
-        points = [controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in range(50)][
-            -1
-        ].telemetry.push_points
-        assert len(points) >= 3
-        # Of the forces, along the way.
-        tilts.append(float(np.mean([point.normal_w[0] for point in points])))
-    assert tilts[0] - tilts[1] == pytest.approx(0.2, abs=0.05)
+        commands = [controller.update(stage.make_observation(tick, TAIL_S_M)) for tick in range(50)]
+        push_points = commands[-1].telemetry.push_points
+        assert len(push_points) >= 3
+        mean_normals_x.append(float(np.mean([point.normal_w[0] for point in push_points])))
+    # Friction tilts the forces backward.
+    without_friction, with_friction = mean_normals_x
+    assert without_friction - with_friction == pytest.approx(0.2, abs=0.05)
 
 
-def test_a_push_of_random_sign_goes_both_ways() -> None:
-    start = pushed(0.0)[0]
-    along = (pushed(1.0, push_sign_s=0.5) - start) @ (pushed(1.0)[-1] - start)
-    assert along.max() > 0.0 > along.min()
+def test_obstacle_aided_push_of_random_sign_acts_both_ways() -> None:
+    start_rad = list_pushing_references_rad(0.0)[0]
+    random_sign_rad = list_pushing_references_rad(1.0, push_sign_s=0.5) - start_rad
+    forward_rad = list_pushing_references_rad(1.0)[-1] - start_rad
+    projections = random_sign_rad @ forward_rad
+    assert projections.max() > 0.0 > projections.min()
 
 
 def test_undulation_compliant_wave_shrinks_only_at_resistance() -> None:
-    stage, parameters = (
-        make_stage(),
-        CompliantUndulationParameters(softness_rad_per_nm=0.1, steering=0.0),
-    )
+    stage = make_stage()
+    parameters = CompliantUndulationParameters(softness_rad_per_nm=0.1, steering=0.0)
 
-    def largest(resistance: float) -> float:
-        controller, swing = CompliantUndulation(stage.robot, parameters), 0.0
+    def measure_amplitude_rad(resistance_nm_per_rad: float) -> float:
+        """Return the largest reference angle while springs resist the joints."""
+        controller = CompliantUndulation(stage.robot, parameters)
+        amplitude_rad = 0.0
         for tick in range(400):
             observation = stage.make_observation(tick, TAIL_S_M)
-            resisted = [
-                resistance * angle for angle in controller.compute_reference_rad(observation, 0.0)
+            torques_nm = [
+                resistance_nm_per_rad * angle_rad
+                for angle_rad in controller.compute_reference_rad(observation, 0.0)
             ]
-            joints = msgspec.structs.replace(observation.joints, torque_nm=resisted)
-            reference = controller.update(
-                dataclasses.replace(observation, joints=joints)
-            ).telemetry.reference_rad
-            swing = max(swing, float(np.abs(reference).max())) if tick > 200 else 0.0
-        return swing
+            joints = msgspec.structs.replace(observation.joints, torque_nm=torques_nm)
+            command = controller.update(dataclasses.replace(observation, joints=joints))
+            if tick > 200:
+                reference_rad = float(np.abs(command.telemetry.reference_rad).max())
+                amplitude_rad = max(amplitude_rad, reference_rad)
+        return amplitude_rad
 
-    assert abs(largest(0.0) - parameters.amplitude_rad) < 0.01
-    assert largest(4.0) < 0.8 * parameters.amplitude_rad
+    assert abs(measure_amplitude_rad(0.0) - parameters.amplitude_rad) < 0.01
+    assert measure_amplitude_rad(4.0) < 0.8 * parameters.amplitude_rad
 
 
-def test_without_a_path_a_compliant_wave_yields_to_nothing() -> None:
+def test_undulation_compliant_wave_without_path_ignores_resistance() -> None:
     stage = make_stage()
     controller = CompliantUndulation(stage.robot, CompliantUndulationParameters())
     observations = [
-        stage.make_observation(t, TAIL_S_M, without="trajectory", torque_nm=3.0) for t in range(50)
+        stage.make_observation(tick, TAIL_S_M, without="trajectory", torque_nm=3.0)
+        for tick in range(50)
     ]
-    held = [controller.update(observation).telemetry.reference_rad for observation in observations]
-    assert all(one == held[0] for one in held)
+    references_rad = [
+        controller.update(observation).telemetry.reference_rad for observation in observations
+    ]
+    assert all(reference_rad == references_rad[0] for reference_rad in references_rad)
 
 
 def test_undulation_jammed_wave_reverses_for_a_while() -> None:
@@ -155,9 +166,11 @@ def test_undulation_jammed_wave_reverses_for_a_while() -> None:
     )
     stage = make_stage()
     jammed, free = (
-        references(CompliantUndulation(stage.robot, parameters), stage, 200, speed)
+        list_references_rad(CompliantUndulation(stage.robot, parameters), stage, 200, speed)
         for speed in (0.0, 0.2)
     )
     assert np.abs(jammed[:50] - free[:50]).max() < 1e-9
-    assert np.abs(jammed[80] - free[20]).max() < 0.05  # 0.5 s on, 0.3 s back
-    assert np.abs(jammed[110] - free[50]).max() < 0.05  # and on again
+    # After 0.5 s forward and 0.3 s backward, the wave is where it was after 0.2 s.
+    assert np.abs(jammed[80] - free[20]).max() < 0.05
+    # Another 0.3 s later, it is where the reversal began.
+    assert np.abs(jammed[110] - free[50]).max() < 0.05

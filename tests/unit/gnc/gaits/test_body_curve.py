@@ -1,4 +1,7 @@
-"""The same parameters of a curve on robots with other numbers of joints, and robots that cannot form a curve."""
+"""Tests that the parameters of a curve mean the same on robots with other numbers of joints.
+
+Curves that the joints of a robot cannot form are refused.
+"""
 
 import math
 
@@ -21,9 +24,9 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_testing.gnc.stage import make_robot
 from snakesim_testing.messages import raises_error
 
-# Of a node from the continuous curve, in body lengths: 8 joints are coarser than 20.
+# Distance of a node from the continuous curve, in body lengths: 8 joints are coarser than 20.
 MAX_DISTANCES = {8: 0.02, 13: 0.008, 20: 0.004}
-PHASES = (0.0, 1.0, 2.5, 4.0)
+PHASES_RAD = (0.0, 1.0, 2.5, 4.0)
 
 
 def find_continuous_nodes(
@@ -52,17 +55,17 @@ def find_robot_nodes(modules: int, angles_rad: Floats) -> tuple[Floats, Floats]:
 
 def measure_distance(nodes: Floats, curve: Floats) -> float:
     """Return the largest distance of corresponding points after the best motion of one set in the plane."""
-    a = np.array([1, 1j]) @ nodes
-    b = np.array([1, 1j]) @ curve
-    a = a - a.mean()
-    b = b - b.mean()
-    turned = a * np.exp(1j * np.angle(np.vdot(a, b)))
-    return float(np.abs(turned - b).max())
+    centered_nodes = np.array([1, 1j]) @ nodes
+    centered_curve = np.array([1, 1j]) @ curve
+    centered_nodes = centered_nodes - centered_nodes.mean()
+    centered_curve = centered_curve - centered_curve.mean()
+    turned = centered_nodes * np.exp(1j * np.angle(np.vdot(centered_nodes, centered_curve)))
+    return float(np.abs(turned - centered_curve).max())
 
 
 @pytest.mark.parametrize("modules", [8, 13, 20])
-@pytest.mark.parametrize("phase_rad", PHASES)
-def test_the_same_parameters_give_the_same_curve_on_any_planar_robot(
+@pytest.mark.parametrize("phase_rad", PHASES_RAD)
+def test_body_curve_parameters_give_same_curve_on_any_planar_robot(
     modules: int, phase_rad: float
 ) -> None:
     parameters = SerpenoidParameters()
@@ -79,22 +82,22 @@ def test_the_same_parameters_give_the_same_curve_on_any_planar_robot(
     assert distance < MAX_DISTANCES[modules]
 
 
-def test_joint_angles_depend_on_the_spacing_and_the_curve_does_not() -> None:
+def test_body_curve_joint_angles_are_larger_with_fewer_joints() -> None:
     """A controller that copied joint angles would fail: 8 joints bend more than twice as far as 20."""
-    peaks: dict[int, float] = {}
+    max_angles_rad: dict[int, float] = {}
     for modules in (8, 20):
         curve = BodyCurve(make_robot(modules), "yaw")
-        angles = [
+        angles_rad = [
             curve.compute_joint_angles_rad(
-                compute_serpenoid_headings(curve.head_distance_fractions, u, 0.7, 0.67)
+                compute_serpenoid_headings(curve.head_distance_fractions, phase_rad, 0.7, 0.67)
             )
-            for u in PHASES
+            for phase_rad in PHASES_RAD
         ]
-        peaks[modules] = float(np.abs(angles).max())
-    assert peaks[8] > 2.0 * peaks[20]
+        max_angles_rad[modules] = float(np.abs(angles_rad).max())
+    assert max_angles_rad[8] > 2.0 * max_angles_rad[20]
 
 
-def test_equal_links_have_the_discrete_form_of_the_serpenoid_curve() -> None:
+def test_body_curve_equal_links_form_the_discrete_serpenoid_curve() -> None:
     """phi_i = A sin(...) with A = 2 alpha sin(delta / 2) and a lag of delta = 2 pi l / lambda from joint to joint."""
     alpha, wavelength = 0.6, 0.5
     curve = BodyCurve(make_robot(20), "yaw")
@@ -106,23 +109,25 @@ def test_equal_links_have_the_discrete_form_of_the_serpenoid_curve() -> None:
     shapes = np.array(
         [
             curve.compute_joint_angles_rad(
-                compute_serpenoid_headings(curve.head_distance_fractions, u, alpha, wavelength)
+                compute_serpenoid_headings(
+                    curve.head_distance_fractions, phase_rad, alpha, wavelength
+                )
             )
-            for u in np.linspace(0.0, math.tau, 64, endpoint=False)
+            for phase_rad in np.linspace(0.0, math.tau, 64, endpoint=False)
         ]
     )
-    series = np.fft.rfft(shapes, axis=0)[1] / 32
-    inner = series[2:-2]  # the pieces at both ends have other lengths
+    amplitudes = np.fft.rfft(shapes, axis=0)[1] / 32  # complex, of the first harmonic
+    inner = amplitudes[2:-2]  # the pieces at both ends have other lengths
     assert np.abs(inner) == pytest.approx(2.0 * alpha * math.sin(0.5 * delta))
     assert np.angle(inner[1:] / inner[:-1]) == pytest.approx(delta)
 
 
-def test_a_bend_is_shared_by_the_joints_whatever_their_number() -> None:
+def test_body_curve_bend_is_shared_by_any_number_of_joints() -> None:
     for modules in (8, 20):
         curve = BodyCurve(make_robot(modules), "yaw")
-        turned = curve.compute_joint_angles_rad(curve.make_bend_headings_rad(1.0)).sum()
+        bend_rad = curve.compute_joint_angles_rad(curve.make_bend_headings_rad(1.0)).sum()
         # The middles of both end pieces are not at the ends.
-        assert turned == pytest.approx(1.0, abs=1.2 / modules)
+        assert bend_rad == pytest.approx(1.0, abs=1.2 / modules)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +140,7 @@ def test_a_bend_is_shared_by_the_joints_whatever_their_number() -> None:
     ],
     ids=["short wave", "winding", "winding of oscillators", "folds"],
 )
-def test_a_curve_that_the_joints_cannot_form_is_refused(gait, parameters) -> None:
+def test_gait_with_curve_beyond_joint_limits_is_refused(gait, parameters) -> None:
     with raises_error(ConfigError):
         gait.check(make_robot(8), parameters)
 
@@ -145,6 +150,6 @@ def test_a_curve_that_the_joints_cannot_form_is_refused(gait, parameters) -> Non
     [(Rectilinear, RectilinearParameters()), (SinusLifting, SinusLiftingParameters())],
     ids=["rectilinear", "sinus_lifting"],
 )
-def test_a_robot_without_pitch_joints_is_not_refused(gait, parameters) -> None:
+def test_gait_of_robot_without_pitch_joints_is_accepted(gait, parameters) -> None:
     """It holds its pose and reports the reason, as the other gaits do."""
     gait.check(make_robot(13), parameters)

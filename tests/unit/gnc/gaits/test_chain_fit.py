@@ -1,4 +1,4 @@
-"""Chains of alternating joints on curves in space."""
+"""Tests how chains of alternating joints are fitted to curves in space, and the waves between these fits."""
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from snakesim_gnc.control.gaits.backbones import (
     compute_node_fractions,
 )
 from snakesim_gnc.control.gaits.chain_fit import BackboneCurve, ChainFit, KeyframeWaves
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.geometry.kinematics import compute_link_frames
 from snakesim_hal.wire.messages import RobotDescription
@@ -31,23 +32,29 @@ def measure_length_m(robot: RobotDescription) -> float:
     return sum(link.length_m for link in robot.links)
 
 
-def fit_helix(robot: RobotDescription, phases: int = 16) -> KeyframeWaves:
-    places, length_m = compute_node_fractions(robot), measure_length_m(robot)
+def fit_helix(robot: RobotDescription, keyframe_count: int = 16) -> KeyframeWaves:
+    fractions = compute_node_fractions(robot)
+    length_m = measure_length_m(robot)
     waves = KeyframeWaves(
-        robot, lambda phase: compute_helix(places, length_m, PARAMETERS, phase), phases
+        robot, lambda phase: compute_helix(fractions, length_m, PARAMETERS, phase), keyframe_count
     )
     assert waves.advance_fit()
     return waves
 
 
+def measure_max_distance_m(chain: ChainFit, curve_points: Floats) -> float:
+    """Return the largest distance of a node of the chain from its place on the curve."""
+    return float(np.linalg.norm(chain.compute_node_positions() - curve_points, axis=1).max())
+
+
 @pytest.mark.parametrize("modules", [16, 18, 24])
-def test_the_same_helix_fits_robots_of_any_length(modules: int) -> None:
+def test_chain_fit_of_helix_fits_robots_of_any_length(modules: int) -> None:
     robot = make_alternating_robot(modules)
     waves = fit_helix(robot)
     assert waves.max_deviation_m < MAX_DISTANCE * measure_length_m(robot)
 
 
-def test_a_chain_that_lies_on_a_curve_already_is_found() -> None:
+def test_chain_fit_finds_a_chain_that_forms_the_curve_exactly() -> None:
     """The nodes of a chain with known angles are a curve that the chain can reach exactly."""
     robot = make_alternating_robot(10)
     axes = [joint.axis for joint in robot.joints]
@@ -60,61 +67,65 @@ def test_a_chain_that_lies_on_a_curve_already_is_found() -> None:
         BackboneCurve(nodes, np.cross(rotations[5][:, 0], rotations[5][:, 1]))
     ):
         pass
-    assert np.linalg.norm(
-        chain.compute_node_positions() - nodes, axis=1
-    ).max() < 0.02 * measure_length_m(robot)
+    assert measure_max_distance_m(chain, nodes) < 0.02 * measure_length_m(robot)
 
 
-def test_overlapping_groups_are_better_than_one_link_at_a_time(
+def test_chain_fit_by_groups_is_better_than_by_single_links(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Every second link cannot follow the curve if links are laid one by one."""
     robot = make_alternating_robot()
-    places, length_m = compute_node_fractions(robot), measure_length_m(robot)
-    backbone = compute_helix(places, length_m, PARAMETERS, 0.0)
+    backbone = compute_helix(
+        compute_node_fractions(robot), measure_length_m(robot), PARAMETERS, 0.0
+    )
     distances_m: list[float] = []
-    for group in (6, 1):
-        monkeypatch.setattr("snakesim_gnc.control.gaits.chain_fit.GROUP_LINKS", group)
+    for group_links in (6, 1):
+        monkeypatch.setattr("snakesim_gnc.control.gaits.chain_fit.GROUP_LINKS", group_links)
         monkeypatch.setattr("snakesim_gnc.control.gaits.chain_fit.FINAL_STEPS", 0)
         chain = ChainFit(robot)
         for _ in chain.fit_first(backbone):
             pass
-        distances_m.append(
-            float(
-                np.linalg.norm(
-                    chain.compute_node_positions() - backbone.node_positions, axis=1
-                ).max()
-            )
-        )
+        distances_m.append(measure_max_distance_m(chain, backbone.node_positions))
     together_m, one_by_one_m = distances_m
     assert together_m < 0.7 * one_by_one_m
 
 
-def test_the_waves_pass_through_the_keyframes_and_close() -> None:
+def test_keyframe_waves_pass_through_keyframes_and_are_periodic() -> None:
     waves = fit_helix(make_alternating_robot())
-    phases = 2.0 * np.pi * np.arange(16) / 16
-    passed = np.array([waves.compute_joint_angles_rad(phase) for phase in phases])
-    assert passed == pytest.approx(waves.keyframes_rad, abs=1e-9)
+    phases_rad = 2.0 * np.pi * np.arange(16) / 16
+    angles_at_keyframes_rad = np.array(
+        [waves.compute_joint_angles_rad(phase_rad) for phase_rad in phases_rad]
+    )
+    assert angles_at_keyframes_rad == pytest.approx(waves.keyframes_rad, abs=1e-9)
     assert waves.compute_joint_angles_rad(2.0 * np.pi) == pytest.approx(
         waves.compute_joint_angles_rad(0.0)
     )
-    between = np.array(
-        [waves.compute_joint_angles_rad(phase) for phase in np.linspace(0.0, 2.0 * np.pi, 200)]
+    angles_between_rad = np.array(
+        [
+            waves.compute_joint_angles_rad(phase_rad)
+            for phase_rad in np.linspace(0.0, 2.0 * np.pi, 200)
+        ]
     )
-    assert np.abs(np.diff(between, axis=0)).max() < 0.1
+    assert np.abs(np.diff(angles_between_rad, axis=0)).max() < 0.1
 
 
-def test_the_waves_between_keyframes_are_near_the_curve() -> None:
+def test_keyframe_waves_between_keyframes_are_near_the_curve() -> None:
     robot = make_alternating_robot()
-    coarse, fine = fit_helix(robot, 16), fit_helix(robot, 32)
-    between = [coarse.compute_joint_angles_rad(2.0 * np.pi * (k + 0.5) / 16) for k in range(16)]
-    assert np.array(between) == pytest.approx(fine.keyframes_rad[1::2], abs=0.05)
+    coarse = fit_helix(robot, 16)
+    fine = fit_helix(robot, 32)
+    angles_between_rad = [
+        coarse.compute_joint_angles_rad(2.0 * np.pi * (k + 0.5) / 16) for k in range(16)
+    ]
+    assert np.array(angles_between_rad) == pytest.approx(fine.keyframes_rad[1::2], abs=0.05)
 
 
-def test_a_fit_of_some_steps_at_a_time_is_the_same_fit() -> None:
+def test_keyframe_fit_in_several_calls_is_the_same_fit() -> None:
     robot = make_alternating_robot()
-    places, length_m = compute_node_fractions(robot), measure_length_m(robot)
-    waves = KeyframeWaves(robot, lambda phase: compute_helix(places, length_m, PARAMETERS, phase))
+    fractions = compute_node_fractions(robot)
+    length_m = measure_length_m(robot)
+    waves = KeyframeWaves(
+        robot, lambda phase: compute_helix(fractions, length_m, PARAMETERS, phase)
+    )
     calls = 1
     while not waves.advance_fit(3):
         calls += 1
@@ -123,16 +134,17 @@ def test_a_fit_of_some_steps_at_a_time_is_the_same_fit() -> None:
 
 
 @pytest.mark.parametrize("bend_rad", [2.0, -2.0])
-def test_rolling_turns_the_arc_in_the_frames_of_the_links(bend_rad: float) -> None:
+def test_keyframe_waves_of_rolling_arc_equal_the_closed_form(bend_rad: float) -> None:
     """All yaw joints follow one cosine, and all pitch joints one sine, as in the closed form of rolling."""
     robot = make_alternating_robot()
-    places, length_m = compute_node_fractions(robot), measure_length_m(robot)
-    waves = KeyframeWaves(robot, lambda phase: compute_arc(places, length_m, bend_rad, phase))
+    fractions = compute_node_fractions(robot)
+    length_m = measure_length_m(robot)
+    waves = KeyframeWaves(robot, lambda phase: compute_arc(fractions, length_m, bend_rad, phase))
     waves.advance_fit()
-    series = np.fft.rfft(waves.keyframes_rad, axis=0)[1] / 8
-    inner = series[2:-2]
-    bend_of_pair = 2.0 * 2.0 / 19.0  # of two links, in one of the two planes
-    assert np.abs(inner) == pytest.approx(bend_of_pair, rel=0.12)
+    amplitudes = np.fft.rfft(waves.keyframes_rad, axis=0)[1] / 8  # complex, of the first harmonic
+    inner = amplitudes[2:-2]
+    pair_bend_rad = 2.0 * 2.0 / 19.0  # of two links, in one of the two planes
+    assert np.abs(inner) == pytest.approx(pair_bend_rad, rel=0.12)
     lead_rad = np.angle(inner[1::2] / inner[0::2])  # of pitch before yaw
     assert lead_rad == pytest.approx(
         np.full(len(lead_rad), np.sign(bend_rad) * lead_rad[0] * np.sign(bend_rad)), abs=0.2
@@ -148,7 +160,7 @@ def test_rolling_turns_the_arc_in_the_frames_of_the_links(bend_rad: float) -> No
     ],
     ids=["wide", "short"],
 )
-def test_a_helix_that_the_joints_cannot_form_is_refused(gait, parameters) -> None:
+def test_backbone_gait_with_helix_beyond_joint_limits_is_refused(gait, parameters) -> None:
     with raises_error(ConfigError):
         gait.check(make_alternating_robot(), parameters)
 
@@ -156,7 +168,7 @@ def test_a_helix_that_the_joints_cannot_form_is_refused(gait, parameters) -> Non
 @pytest.mark.parametrize(
     "robot", [make_alternating_robot(), make_robot(13)], ids=["alternating", "planar"]
 )
-def test_the_default_parameters_are_accepted(robot: RobotDescription) -> None:
+def test_backbone_gaits_with_default_parameters_are_accepted(robot: RobotDescription) -> None:
     """A planar robot is not refused: it holds its pose and reports the reason."""
     BackboneSidewinding.check(robot, PARAMETERS)
     BackboneRolling.check(robot, BackboneRollingParameters())

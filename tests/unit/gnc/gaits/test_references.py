@@ -1,4 +1,7 @@
-"""What all gaits share: they start where the joints are, move without a jump, stop, reverse, and explain themselves."""
+"""Tests what all gaits have in common.
+
+They start at the measured angles, move without a jump, stop, reverse, and state a reason while they cannot move.
+"""
 
 import dataclasses
 from typing import Any
@@ -33,12 +36,12 @@ def make_stage_for(gait: type[Controller[Any]]) -> ObservationStage:
     return make_stage(18, ("yaw", "pitch"))
 
 
-def drive(
+def command_standing_body(
     controller: Controller[Any], stage: ObservationStage, ticks: range, **changes: Any
 ) -> list[ControllerCommand]:
-    """The commands for a body that does not move. To lay it on the path again in every tick would take long."""
-    seen = stage.make_observation(ticks.start, 0.3, **changes)
-    observations = [dataclasses.replace(seen, tick=tick, time_s=tick * PERIOD_S) for tick in ticks]
+    """Return the commands for a body that does not move. Its pose is computed once, because this takes long."""
+    first = stage.make_observation(ticks.start, 0.3, **changes)
+    observations = [dataclasses.replace(first, tick=tick, time_s=tick * PERIOD_S) for tick in ticks]
     return [controller.update(observation) for observation in observations]
 
 
@@ -51,10 +54,10 @@ def list_references(commands: list[ControllerCommand]) -> Floats:
 
 
 @pytest.mark.parametrize("gait", PLANAR + SPATIAL)
-def test_a_gait_starts_at_the_pose_and_never_jumps(gait: type[Controller[Any]]) -> None:
+def test_gait_starts_at_measured_pose_and_never_jumps(gait: type[Controller[Any]]) -> None:
     stage = make_stage_for(gait)
     controller = gait(stage.robot, gait.Parameters())
-    commands = drive(controller, stage, range(300))
+    commands = command_standing_body(controller, stage, range(300))
     targets = list_targets(commands)
     measured_rad = np.array(stage.make_observation(0, 0.3).joints.angle_rad)
     assert np.abs(targets[0] - measured_rad).max() < 0.02
@@ -64,51 +67,55 @@ def test_a_gait_starts_at_the_pose_and_never_jumps(gait: type[Controller[Any]]) 
 
 @pytest.mark.parametrize("gait", PLANAR + SPATIAL)
 @pytest.mark.parametrize("without", ["world", "trajectory"])
-def test_a_gait_that_stops_holds_and_continues_at_the_same_phase(
+def test_gait_without_input_holds_and_continues_at_same_phase(
     gait: type[Controller[Any]], without: str
 ) -> None:
     stage = make_stage_for(gait)
     interrupted = gait(stage.robot, gait.Parameters())
-    before = drive(interrupted, stage, range(250))
-    held = drive(interrupted, stage, range(250, 350), without=without)
-    after = drive(interrupted, stage, range(350, 400))
-    targets = list_targets(before + held + after)
+    commands_before = command_standing_body(interrupted, stage, range(250))
+    commands_without_input = command_standing_body(
+        interrupted, stage, range(250, 350), without=without
+    )
+    commands_after = command_standing_body(interrupted, stage, range(350, 400))
+    targets = list_targets(commands_before + commands_without_input + commands_after)
     assert np.abs(np.diff(targets, axis=0)).max() < MAX_STEP_RAD
-    references = list_references(held)
-    assert (references == list_references(before)[-1]).all()
-    whole = gait(stage.robot, gait.Parameters())
-    assert list_references(after) == pytest.approx(
-        list_references(drive(whole, stage, range(300)))[250:]
+    references = list_references(commands_without_input)
+    assert (references == list_references(commands_before)[-1]).all()
+    uninterrupted = gait(stage.robot, gait.Parameters())
+    assert list_references(commands_after) == pytest.approx(
+        list_references(command_standing_body(uninterrupted, stage, range(300)))[250:]
     )
 
 
 @pytest.mark.parametrize("gait", PLANAR + SPATIAL)
-def test_a_gait_is_periodic(gait: type[Controller[Any]]) -> None:
-    """After ten periods, in which the amplitudes of oscillators settle."""
+def test_gait_references_are_periodic(gait: type[Controller[Any]]) -> None:
+    """The amplitudes of oscillators settle within the first ten periods."""
     stage = make_stage_for(gait)
     parameters = msgspec.structs.replace(gait.Parameters(), period_s=1.0)
     controller = gait(stage.robot, parameters)
-    references = list_references(drive(controller, stage, range(1200)))
+    references = list_references(command_standing_body(controller, stage, range(1200)))
     period_ticks = round(1.0 / PERIOD_S)
     assert np.abs(references[1199] - references[1199 - period_ticks]).max() < 0.005
     assert np.abs(references[1199] - references[1199 - period_ticks // 3]).max() > 0.1
 
 
 @pytest.mark.parametrize("gait", PLANAR + SPATIAL)
-def test_at_a_negative_speed_a_gait_runs_backward(gait: type[Controller[Any]]) -> None:
+def test_gait_at_negative_speed_runs_backward(gait: type[Controller[Any]]) -> None:
     stage = make_stage_for(gait)
     controller = gait(stage.robot, gait.Parameters())
-    forward = list_references(drive(controller, stage, range(600)))
+    forward = list_references(command_standing_body(controller, stage, range(600)))
     stage.speed_m_s = -0.2
-    backward = list_references(drive(controller, stage, range(600, 700)))
+    backward = list_references(command_standing_body(controller, stage, range(600, 700)))
     assert np.abs(backward[80] - forward[-82]).max() < 0.05
 
 
 @pytest.mark.parametrize("gait", SPATIAL)
-def test_a_planar_robot_holds_and_states_the_missing_joints(gait: type[Controller[Any]]) -> None:
+def test_spatial_gait_of_planar_robot_holds_and_states_missing_joints(
+    gait: type[Controller[Any]],
+) -> None:
     stage = make_stage(13)
     controller = gait(stage.robot, gait.Parameters())
-    commands = drive(controller, stage, range(50))
+    commands = command_standing_body(controller, stage, range(50))
     targets = list_targets(commands)
     assert {command.telemetry.reason for command in commands} == {
         "this robot has no joints that turn up and down"
@@ -117,33 +124,33 @@ def test_a_planar_robot_holds_and_states_the_missing_joints(gait: type[Controlle
 
 
 @pytest.mark.parametrize("gait", PLANAR)
-def test_a_robot_of_pitch_joints_holds_and_states_the_missing_joints(
+def test_planar_gait_without_yaw_joints_states_missing_joints(
     gait: type[Controller[Any]],
 ) -> None:
     stage = make_stage(6, ("pitch",))
-    commands = drive(gait(stage.robot, gait.Parameters()), stage, range(20))
+    commands = command_standing_body(gait(stage.robot, gait.Parameters()), stage, range(20))
     assert {command.telemetry.reason for command in commands} == {
         "this robot has no joints that turn left and right"
     }
 
 
 @pytest.mark.parametrize("gait", PLANAR)
-def test_a_planar_gait_leaves_pitch_joints_straight(gait: type[Controller[Any]]) -> None:
+def test_planar_gait_leaves_pitch_joints_straight(gait: type[Controller[Any]]) -> None:
     stage = make_stage(18, ("yaw", "pitch"))
     controller = gait(stage.robot, gait.Parameters())
-    references = list_references(drive(controller, stage, range(200)))
+    references = list_references(command_standing_body(controller, stage, range(200)))
     pitch = [i for i, joint in enumerate(stage.robot.joints) if joint.axis == "pitch"]
     assert np.abs(references[:, pitch]).max() == 0.0
 
 
 @pytest.mark.parametrize("gait", [Serpenoid, Cpg])
-def test_directional_control_bends_towards_the_path(gait: type[Controller[Any]]) -> None:
-    """The body lies to the left of a path along x, or to its right."""
-    sums: list[float] = []
+def test_gait_beside_its_path_bends_towards_it(gait: type[Controller[Any]]) -> None:
+    """The body is 0.5 m to the left of a path along x, or to its right."""
+    mean_angles_rad: list[float] = []
     for offset_m in (0.5, -0.5):
         stage = make_stage(13)
         controller = gait(stage.robot, gait.Parameters())
-        total = 0.0
+        mean_angle_rad = 0.0
         observation = stage.make_observation(0, 2.0)
         assert observation.trajectory is not None
         path_w = [(0.0, -offset_m), (6.0, -offset_m)]
@@ -152,35 +159,35 @@ def test_directional_control_bends_towards_the_path(gait: type[Controller[Any]])
         for tick in range(640):
             command = controller.update(dataclasses.replace(observation, tick=tick))
             if tick >= 320:  # two periods
-                total += float(np.mean(command.telemetry.reference_rad)) / 320
-        sums.append(total)
-    to_the_right, to_the_left = sums
-    assert to_the_right < -0.02
-    assert to_the_left > 0.02
+                mean_angle_rad += float(np.mean(command.telemetry.reference_rad)) / 320
+        mean_angles_rad.append(mean_angle_rad)
+    left_of_path_rad, right_of_path_rad = mean_angles_rad
+    assert left_of_path_rad < -0.02
+    assert right_of_path_rad > 0.02
 
 
 @pytest.mark.parametrize("gait", [Serpenoid, Cpg])
-def test_another_path_does_not_jerk_the_joints(gait: type[Controller[Any]]) -> None:
-    """Its direction differs by two radians, and the joints move no faster than in the wave itself."""
+def test_gait_on_new_path_does_not_jerk_the_joints(gait: type[Controller[Any]]) -> None:
+    """The direction of the new path differs by two radians. The joints move no faster than in the wave itself."""
     stage = make_stage(13)
     controller = gait(stage.robot, gait.Parameters())
     observation = stage.make_observation(0, 2.0)
     assert observation.trajectory is not None
-    aside = msgspec.structs.replace(
+    new_trajectory = msgspec.structs.replace(
         observation.trajectory, path_id=1, path_w=[(2.0, 0.0), (1.0, 4.0)]
     )
-    replanned = dataclasses.replace(observation, trajectory=aside)
+    replanned = dataclasses.replace(observation, trajectory=new_trajectory)
     references = list_references([controller.update(observation) for _ in range(480)])
-    wave_step = np.abs(np.diff(references[160:], axis=0)).max()
-    after = list_references([controller.update(replanned) for _ in range(160)])
-    steps = np.abs(np.diff(np.vstack([references[-1:], after]), axis=0))
-    assert steps.max() < 1.1 * wave_step
+    max_wave_step_rad = np.abs(np.diff(references[160:], axis=0)).max()
+    references_after = list_references([controller.update(replanned) for _ in range(160)])
+    steps_rad = np.abs(np.diff(np.vstack([references[-1:], references_after]), axis=0))
+    assert steps_rad.max() < 1.1 * max_wave_step_rad
 
 
 def test_serpenoid_wave_travels_from_head_to_tail() -> None:
     stage = make_stage(13)
     controller = Serpenoid(stage.robot, SerpenoidParameters(k_theta=0.0))
-    references = list_references(drive(controller, stage, range(160)))
+    references = list_references(command_standing_body(controller, stage, range(160)))
     peaks = references.argmax(axis=0)
     assert peaks[7] < peaks[6] < peaks[5]
 
@@ -189,18 +196,18 @@ def test_sinus_lifting_lifts_where_the_body_bends_most() -> None:
     """There the body is convex upward, so that the pitch joints bend down."""
     stage = make_stage(40, ("yaw", "pitch"))
     controller = SinusLifting(stage.robot, SinusLiftingParameters(wavelength=1.0))
-    reference = list_references(drive(controller, stage, range(100)))[-1]
-    sideways = reference[0::2] ** 2
-    down = reference[1::2]
-    assert np.corrcoef(sideways[2:-2], down[2:-2])[0, 1] > 0.8
+    reference_rad = list_references(command_standing_body(controller, stage, range(100)))[-1]
+    squared_yaw = reference_rad[0::2] ** 2
+    pitch_rad = reference_rad[1::2]
+    assert np.corrcoef(squared_yaw[2:-2], pitch_rad[2:-2])[0, 1] > 0.8
 
 
 def test_concertina_folds_one_half_while_the_other_holds() -> None:
-    thirds = [
+    at_ends_of_thirds = [
         compute_fold_fractions(phase)
         for phase in (0.0, 2.0 * np.pi / 3.0 - 1e-9, 4.0 * np.pi / 3.0 - 1e-9)
     ]
-    assert np.array(thirds) == pytest.approx(
+    assert np.array(at_ends_of_thirds) == pytest.approx(
         np.array([[0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]), abs=1e-6
     )
     fractions = np.array(
@@ -212,7 +219,7 @@ def test_concertina_folds_one_half_while_the_other_holds() -> None:
 def test_backbone_gaits_fit_before_they_move() -> None:
     stage = make_stage(18, ("yaw", "pitch"))
     controller = BackboneSidewinding(stage.robot, BackboneSidewindingParameters())
-    commands = drive(controller, stage, range(60))
+    commands = command_standing_body(controller, stage, range(60))
     reasons = [command.telemetry.reason for command in commands]
     assert reasons[0] == FITTING_REASON
     assert reasons[-1] == ""
