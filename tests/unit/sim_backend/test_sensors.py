@@ -210,7 +210,7 @@ def test_sensor_delayed_joint_states_are_those_of_earlier_ticks():
         prompt.advance()
 
 
-def test_sensor_delayed_pose_is_that_of_earlier_tick_with_its_timestamp():
+def test_sensor_delayed_pose_has_the_timestamp_of_its_tick():
     delay_ticks = 3
     delayed = push_snake_at_peg({"pose": {"delay_s": 0.03}})
     prompt = push_snake_at_peg()
