@@ -214,14 +214,14 @@ class Simulation:
     def _list_results(self) -> list[Floats]:
         contacts = self.physics.contacts
         forces_w = contacts.friction_force_w
-        feet = self.physics.laws.foot_forces_n
+        foot_forces_n = self.physics.laws.foot_forces_n
         return [
             self.data.qfrc_passive.copy(),
             self.data.qpos.copy(),
             self.data.qvel.copy(),
             np.array(contacts.normal_force_n),
             np.array([[number, *forces_w[number]] for number in sorted(forces_w)]),
-            np.zeros(0) if feet is None else feet.copy(),
+            np.zeros(0) if foot_forces_n is None else foot_forces_n.copy(),
             np.array([self.measured_force.max_n]),
         ]
 

@@ -421,7 +421,7 @@ def test_diverging_physics_is_reported_at_once_and_permanently(torque):
 
 
 def test_oscillating_firmware_is_detected_and_joint_named():
-    """A stiff loop, with a light rotor and no lag, whose damping acts too strongly for the step."""
+    """The rotor is light, the loop has no lag, and its damping is too strong for the step."""
     physics_model = make_physics_model(make_config({"motor": {"armature_kg_m2": 1e-6}}, ICE))
     with raises_error(BackendError, code="simulator/diverged"):
         for _ in range(5000):

@@ -82,7 +82,7 @@ def test_robot_in_pipe_starts_at_rest_at_its_bottom(open_top: bool) -> None:
 
 @pytest.mark.parametrize("laws", VERSIONS)
 def test_body_sliding_in_pipe_decelerates_by_its_friction(laws: LawsVersion) -> None:
-    """It lies in a corner of the polygon, on both staves, so N is a little more than its weight."""
+    """The body lies in a corner of the polygon, on both staves, so N is a little more than its weight."""
     config = make_pipe_config()
     run = SimulatorRig(config)
     sim = build_sim_model(config, SimSettings(), motors=False, laws=laws)

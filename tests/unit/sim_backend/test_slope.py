@@ -116,7 +116,7 @@ def test_slope_imus_at_rest_measure_the_gravity_vector(gravity_m_s2: float) -> N
 
 
 def test_slope_that_does_not_hold_robot_keeps_its_start() -> None:
-    """It lies across the slope, where it would roll down while it comes to rest."""
+    """The robot lies across the slope, where it would roll down while it comes to rest."""
     ground = {"slope_rad": 0.7, "slope_towards_rad": math.pi / 2}
     run = SimulatorRig(make_config(scene={"ground": {"friction": FRICTION, **ground}}))
     position_m = run.sim.true_state().base_position_w

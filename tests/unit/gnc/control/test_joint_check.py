@@ -52,7 +52,7 @@ def test_joint_check_beside_limit_moves_only_away_from_it() -> None:
         assert min(targets_of_joint) < start_rad - LARGE_MOTION_RAD
 
 
-def test_joint_check_small_motions_follow_large_ones_slowly() -> None:
+def test_joint_check_slow_small_motions_follow_the_large_ones() -> None:
     start_rad = 0.1
     targets_rad = run_joint_check(start_rad, SECONDS_PER_JOINT)
     offsets_rad = [targets_of_tick[0] - start_rad for targets_of_tick in targets_rad]

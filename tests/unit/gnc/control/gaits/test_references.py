@@ -193,7 +193,7 @@ def test_serpenoid_wave_travels_from_head_to_tail() -> None:
 
 
 def test_sinus_lifting_lifts_where_the_body_bends_most() -> None:
-    """There the body is convex upward, so that the pitch joints bend down."""
+    """Where the body bends most, it is convex upward, so that the pitch joints bend down."""
     stage = make_stage(40, ("yaw", "pitch"))
     controller = SinusLifting(stage.robot, SinusLiftingParameters(wavelength=1.0))
     reference_rad = list_references(command_standing_body(controller, stage, range(100)))[-1]

@@ -55,12 +55,13 @@ def find_robot_nodes(modules: int, angles_rad: Floats) -> tuple[Floats, Floats]:
 
 def measure_distance(nodes: Floats, curve: Floats) -> float:
     """Return the largest distance of corresponding points after the best motion of one set in the plane."""
-    centered_nodes = np.array([1, 1j]) @ nodes
-    centered_curve = np.array([1, 1j]) @ curve
-    centered_nodes = centered_nodes - centered_nodes.mean()
-    centered_curve = centered_curve - centered_curve.mean()
-    turned = centered_nodes * np.exp(1j * np.angle(np.vdot(centered_nodes, centered_curve)))
-    return float(np.abs(turned - centered_curve).max())
+    # Points are complex numbers, so that a rotation is a multiplication.
+    node_points = np.array([1, 1j]) @ nodes
+    curve_points = np.array([1, 1j]) @ curve
+    node_points = node_points - node_points.mean()
+    curve_points = curve_points - curve_points.mean()
+    rotation = np.exp(1j * np.angle(np.vdot(node_points, curve_points)))
+    return float(np.abs(node_points * rotation - curve_points).max())
 
 
 @pytest.mark.parametrize("modules", [8, 13, 20])
@@ -99,7 +100,8 @@ def test_body_curve_joint_angles_are_larger_with_fewer_joints() -> None:
 
 def test_body_curve_equal_links_form_the_discrete_serpenoid_curve() -> None:
     """phi_i = A sin(...) with A = 2 alpha sin(delta / 2) and a lag of delta = 2 pi l / lambda from joint to joint."""
-    alpha, wavelength = 0.6, 0.5
+    alpha = 0.6
+    wavelength = 0.5
     curve = BodyCurve(make_robot(20), "yaw")
     delta = (
         math.tau
@@ -151,5 +153,5 @@ def test_gait_with_curve_beyond_joint_limits_is_refused(gait, parameters) -> Non
     ids=["rectilinear", "sinus_lifting"],
 )
 def test_gait_of_robot_without_pitch_joints_is_accepted(gait, parameters) -> None:
-    """It holds its pose and reports the reason, as the other gaits do."""
+    """The gait holds the pose of the robot and reports the reason, as the other gaits do."""
     gait.check(make_robot(13), parameters)

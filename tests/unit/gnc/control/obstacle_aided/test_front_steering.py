@@ -1,4 +1,4 @@
-"""The front of the body returns to its path; what this does to a run is measured in docs/benchmarks."""
+"""Tests the corrections that lead the front of the body back to its path. docs/benchmarks measures whole runs."""
 
 import numpy as np
 import pytest
@@ -20,14 +20,14 @@ def path_angles_rad() -> np.ndarray:
     return 0.4 * np.sin(0.7 * np.arange(13))
 
 
-def test_a_body_on_its_path_needs_no_correction(path_angles_rad: np.ndarray):
+def test_front_corrections_of_body_on_its_path_are_zero(path_angles_rad: np.ndarray):
     points_w = make_body_points_w(path_angles_rad)
     corrections_rad = compute_front_corrections_rad(points_w, points_w, FIRST_JOINT, CORRECTION_M)
     assert corrections_rad == pytest.approx(np.zeros(13), abs=1e-12)
 
 
 @pytest.mark.parametrize("turn_rad", [-0.3, 0.2])
-def test_corrections_lead_a_turned_front_back_to_the_path(
+def test_front_corrections_lead_a_turned_front_to_the_path(
     path_angles_rad: np.ndarray, turn_rad: float
 ):
     path_w = make_body_points_w(path_angles_rad)
