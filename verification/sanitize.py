@@ -26,7 +26,7 @@ SANITIZERS = (
 )
 TESTS = (
     "tests/unit/sim_backend",
-    "tests/unit/gnc/test_native_growth.py",
+    "tests/unit/gnc/navigation/path_search/test_native_growth.py",
     "tests/system/physics",
     "tests/system/native",
 )

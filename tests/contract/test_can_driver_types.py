@@ -174,7 +174,7 @@ def robot(driver_type: DriverTypeCase) -> Iterator[DriveRobot]:
     opened.backend.close()
 
 
-def test_driver_describes_the_drives_where_they_report_themselves(robot: DriveRobot) -> None:
+def test_driver_describes_serials_and_firmware_that_drives_report(robot: DriveRobot) -> None:
     joints = robot.backend.describe().joints
     assert [joint.serial for joint in joints] == [
         robot.driver_type.serial.format(i + 1) for i in range(JOINTS)
@@ -272,7 +272,7 @@ def test_drives_stop_by_watchdog_when_driver_is_gone(
 
 
 @pytest.mark.usefixtures("with_watchdog")
-def test_drives_stopped_behind_cut_bus_are_read_before_reset(robot: DriveRobot) -> None:
+def test_drives_stopped_behind_cut_bus_are_reported_before_reset(robot: DriveRobot) -> None:
     """Read the stop first, although the driver ran all the time and its commands were lost on the cut bus."""
     robot.run(30, "armed")
     robot.go_wrong("cut:bus_1@0-9")
@@ -292,7 +292,7 @@ def test_drives_stopped_behind_cut_bus_are_read_before_reset(robot: DriveRobot) 
 
 
 @pytest.mark.usefixtures("with_watchdog")
-def test_stop_of_a_silent_drive_is_reported_when_it_answers(robot: DriveRobot) -> None:
+def test_stop_of_silent_drive_is_reported_when_it_answers(robot: DriveRobot) -> None:
     """Report the stop of a drive that is silent after a pause of the host as soon as it answers again."""
     robot.run(20, "armed")
     robot.go_wrong("mute:joint_2@0-9")
@@ -376,7 +376,7 @@ def test_duplicate_drive_ids_stop_the_robot_and_block_start(robot: DriveRobot) -
 
 
 @for_can_driver_types
-def test_another_program_that_commands_drives_stops_the_robot(robot: DriveRobot) -> None:
+def test_second_program_that_commands_drives_stops_the_robot(robot: DriveRobot) -> None:
     robot.run(20, "armed")
     channel = drives_of(robot.backend).wire.channel
     command = can.Message(arbitration_id=2 << 5 | 7, data=[8, 0, 0, 0], is_extended_id=False)
@@ -407,7 +407,7 @@ def test_bus_log_is_read_by_python_can_as_sent(driver_type: DriverTypeCase, tmp_
 
 @for_can_driver_types
 @pytest.mark.parametrize(
-    "dotted",
+    "changes",
     [
         {"rate_hz": TOO_FAST},
         {"rate_hz": 20},
@@ -416,14 +416,17 @@ def test_bus_log_is_read_by_python_can_as_sent(driver_type: DriverTypeCase, tmp_
     ],
 )
 def test_configuration_that_drives_do_not_support_is_refused(
-    driver_type: DriverTypeCase, dotted: dict[str, Any]
+    driver_type: DriverTypeCase, changes: dict[str, Any]
 ) -> None:
-    name = driver_type.backend.name
-    fixed = {"backend": name, "robot__chain__modules": JOINTS, "rate_hz": 100}
-    changes = dict(dotted)
-    if changes.get("rate_hz") == TOO_FAST:
-        changes["rate_hz"] = driver_type.too_fast_hz
-    config = make_run_config(**fixed | changes)
+    valid = {
+        "backend": driver_type.backend.name,
+        "robot__chain__modules": JOINTS,
+        "rate_hz": 100,
+    }
+    invalid: dict[str, Any] = valid | changes
+    if invalid["rate_hz"] == TOO_FAST:
+        invalid["rate_hz"] = driver_type.too_fast_hz
+    config = make_run_config(**invalid)
     with raises_error(
         ConfigError,
         code=(

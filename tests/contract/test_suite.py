@@ -19,9 +19,8 @@ from snakesim_testing.benches.workbench import read_example_from_docs
 ROOT = Path(__file__).parents[2]
 SUITE = ROOT / "snakesim_testing" / "contract"
 PLUGIN = "snakesim_testing.contract.plugin"
-pytestmark = pytest.mark.timeout(
-    900
-)  # these tests run whole suites, perhaps on an emulated machine
+# These tests run whole suites, perhaps on an emulated machine.
+pytestmark = pytest.mark.timeout(900)
 FAILED_OUTCOMES = {"failure", "error"}
 WORKBENCH = "./snakesim_testing/benches/workbench.py"
 
@@ -77,8 +76,7 @@ def find_unnoticed_mutants(
         "-q",
     )
     assert report.is_file(), completed.stdout + completed.stderr
-    # By mutant and clause.
-    outcomes: dict[tuple[str, str], set[str]] = defaultdict(set)
+    outcomes: dict[tuple[str, str], set[str]] = defaultdict(set)  # by mutant and clause
     for case in ElementTree.parse(report).getroot().iter("testcase"):
         clause, _, rest = case.attrib["name"].partition("[")
         children = [child.tag for child in case if child.tag in ("failure", "error", "skipped")]
@@ -145,7 +143,8 @@ def test_contract_passes_late_coarse_slow_or_realtime_backend(
         f"{WORKBENCH}:WorkbenchDrives",
     )
     completed = run_suite("--snakesim-backend", f"{WORKBENCH}:{backend}", *options, "-q")
-    assert completed.returncode == 0 and expected_output in completed.stdout, completed.stdout
+    assert completed.returncode == 0, completed.stdout
+    assert expected_output in completed.stdout, completed.stdout
 
 
 @pytest.mark.parametrize(
@@ -163,14 +162,14 @@ def test_contract_passes_late_coarse_slow_or_realtime_backend(
         ),
     ],
 )
-def test_contract_wrong_call_is_reported_once(options, expected_output) -> None:
+def test_contract_suite_with_wrong_options_reports_the_error_once(options, expected_output) -> None:
     completed = run_suite(*options, "-q")
     assert completed.returncode != 0
     assert expected_output in completed.stdout + completed.stderr
     assert " failed" not in completed.stdout
 
 
-def test_contract_project_may_define_options_of_usual_names(tmp_path: Path) -> None:
+def test_contract_plugin_leaves_usual_option_names_to_the_project(tmp_path: Path) -> None:
     names = ["--backend", "--scenario", "--set", "--mute"]
     (tmp_path / "conftest.py").write_text(
         f"def pytest_addoption(parser):\n    for name in {names}:\n        parser.addoption(name)\n"

@@ -23,7 +23,10 @@ SITE_PACKAGES = BUILD_FOLDER / "site"  # Python packages
 PYTHON_SCRIPT = BUILD_FOLDER / "python"  # a script that runs the emulated Python
 UV = ROOT / ".tools" / "bin" / "uv"
 EMULATOR = "qemu-aarch64-static"
-TESTS = ("tests/unit/sim_backend/test_laws.py", "tests/unit/gnc/test_native_growth.py")
+TESTS = (
+    "tests/unit/sim_backend/test_laws.py",
+    "tests/unit/gnc/navigation/path_search/test_native_growth.py",
+)
 SCENARIO = "peg_row"
 DURATION_S = "0.3"  # of robot time; the emulator is slow
 COMMAND_TIMEOUT_S = 1800  # long enough for a slow computer

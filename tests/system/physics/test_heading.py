@@ -36,7 +36,7 @@ def _moved_to_the_left_m(heading_w_rad: float, seconds: int, seed: int) -> float
     return places[-1] - places[0]
 
 
-@pytest.mark.slow  # the planner's heading: tests/unit/gnc/test_clutter_planner.py
+@pytest.mark.slow  # the planner's heading: tests/unit/gnc/navigation/test_clutter_planner.py
 def test_the_snake_goes_where_somebody_steers_it() -> None:
     assert _moved_to_the_left_m(0.7, seconds=9, seed=1) > 0.25
 

@@ -35,7 +35,7 @@ def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
     assert beside.command_digest == apart.command_digest
 
 
-@pytest.mark.slow  # tests/unit/gnc/test_guarded.py, and a stop while it hangs below
+@pytest.mark.slow  # tests/unit/gnc/control/service/test_guarded.py, and a stop while it hangs below
 @pytest.mark.parametrize(
     ("backend", "deed", "words"),
     [

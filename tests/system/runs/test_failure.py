@@ -58,14 +58,14 @@ def test_killed_controller_leads_to_safe_joints_and_failed_run(
     assert "lease of control expired" in told_later.out
 
 
-@pytest.mark.slow  # tests/unit/gnc/test_guarded.py has each wrong answer
+@pytest.mark.slow  # tests/unit/gnc/control/service/test_guarded.py has each wrong answer
 @pytest.mark.parametrize(
     "clock_mode", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)]
 )
 def test_a_controller_that_answers_wrongly_is_named_at_once(
     tmp_path: Path, clock_mode: str
 ) -> None:
-    """What else is a wrong answer: tests/unit/gnc/test_guarded.py."""
+    """`tests/unit/gnc/control/service/test_guarded.py` has the other wrong answers."""
     (tmp_path / "wave.py").write_text(
         "from snakesim_hal.controller import ControllerCommand, RequestedSetpoints\n"
         "from snakesim_gnc.control.hold import HoldPose\n"

@@ -1,4 +1,4 @@
-"""The checker of the documentation's English finds what it should, and leaves code alone."""
+"""Tests that the checker of the documentation's English finds wrong sentences, and ignores code."""
 
 import importlib.util
 import itertools
@@ -42,16 +42,16 @@ def test_remove_code_page_keeps_line_numbers(checker: ModuleType) -> None:
     assert checker.remove_code(lines) == ["Use `code` here.", "", "", "", "See [this]."]
 
 
-def test_empty_header_cell_is_found(checker: ModuleType) -> None:
+def test_table_with_empty_header_cell_is_found(checker: ModuleType) -> None:
     table = ["| name | |", "|---|---|", "| a | b |", "", "| name | value |", "|---|---|"]
     assert list(checker.find_tables_without_header(table)) == [1]
 
 
 def test_long_sentence_is_found_with_its_line(checker: ModuleType) -> None:
-    long = " ".join(["word"] * (checker.MAX_SENTENCE_WORDS + 1)) + "."
-    assert list(checker.find_long_sentences(["Short one.", "", long])) == [
-        (3, checker.MAX_SENTENCE_WORDS + 1)
-    ]
+    word_count = checker.MAX_SENTENCE_WORDS + 1
+    long_sentence = " ".join(["word"] * word_count) + "."
+    page = ["Short one.", "", long_sentence]
+    assert list(checker.find_long_sentences(page)) == [(3, word_count)]
 
 
 def test_heading_without_text_is_found(checker: ModuleType) -> None:
@@ -74,13 +74,13 @@ def test_heading_without_text_is_found(checker: ModuleType) -> None:
 
 def test_repeated_sentence_is_found_with_its_line(checker: ModuleType) -> None:
     sentence = "The host checks the lease once in each period."
-    found = list(
+    repeated_sentences = list(
         checker.find_repeated_sentences([sentence, "", f"Again. {sentence}", "", "Again."])
     )
-    assert found == [(3, sentence)]
+    assert repeated_sentences == [(3, sentence)]
 
 
-def test_headings_follow_an_empty_line() -> None:
+def test_headings_of_all_pages_follow_an_empty_line() -> None:
     """A heading directly after a table would be a row of it on the site."""
     root = CHECKER.parents[2]
     pages = [
@@ -88,7 +88,7 @@ def test_headings_follow_an_empty_line() -> None:
         for folder in ("docs", "schemas", "benchmarks", "deploy")
         for page in (root / folder).rglob("*.md")
     ]
-    found = [
+    headings_after_tables = [
         f"{page.relative_to(root)}:{number}"
         for page in [*pages, *root.glob("*.md")]
         for number, (line, following) in enumerate(
@@ -96,4 +96,4 @@ def test_headings_follow_an_empty_line() -> None:
         )
         if line.startswith("|") and following.startswith("#")
     ]
-    assert found == []
+    assert headings_after_tables == []

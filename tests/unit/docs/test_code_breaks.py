@@ -1,14 +1,12 @@
-"""Code in table cells: where it may break, and a `|` in it."""
+"""Tests the line breaks and the `|` of code in table cells of the documentation."""
 
 from docs.site.code_breaks import on_page_content
 
 
 def test_long_code_in_a_cell_may_break_after_a_separator() -> None:
     html = "<td><code>tests/unit/hal/test_lease.py</code></td>"
-    assert (
-        on_page_content(html)
-        == "<td><code>tests/<wbr>unit/<wbr>hal/<wbr>test_<wbr>lease.<wbr>py</code></td>"
-    )
+    expected = "<td><code>tests/<wbr>unit/<wbr>hal/<wbr>test_<wbr>lease.<wbr>py</code></td>"
+    assert on_page_content(html) == expected
 
 
 def test_code_in_a_cell_shows_no_backslash_before_a_bar() -> None:

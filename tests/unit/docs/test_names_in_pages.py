@@ -1,4 +1,4 @@
-"""Commands, imports and files that a page names exist, also in its prose. Other tests run the blocks of tutorials."""
+"""Tests that the commands, imports and files that a page names exist. Other tests run the blocks of tutorials."""
 
 import importlib
 import re
@@ -12,7 +12,7 @@ import pytest
 from docs.style.check_prose import ROOT, list_pages
 
 # A heading of the reference of commands.
-COMMAND = re.compile(r"^#+ `?snakesim ([a-z][\w -]*?)`?$", re.MULTILINE)
+COMMAND_HEADING = re.compile(r"^#+ `?snakesim ([a-z][\w -]*?)`?$", re.MULTILINE)
 NAMED_COMMAND = re.compile(r"(?:`|^|\$ |bin/)snakesim ([a-z][\w-]*)(?: ([a-z][\w-]*))?")
 IMPORT = re.compile(r"^\s*from (snakesim[\w.]*) import ([\w, ]+)", re.MULTILINE)
 NAMED_FILE = re.compile(r"`((?:\w[\w-]*/)+[\w.-]+\.(?:py|c|toml|md|sh))(?:::\w+)?`")
@@ -27,7 +27,7 @@ WRITTEN_BY_THE_READER = ("acme_servo_driver/", "waves/")
 @cache
 def list_commands() -> frozenset[str]:
     text = (ROOT / "docs" / "reference" / "commands.md").read_text(encoding="utf-8")
-    return frozenset(COMMAND.findall(text))
+    return frozenset(COMMAND_HEADING.findall(text))
 
 
 def find_unknown_commands(text: str) -> Iterator[str]:
@@ -60,25 +60,17 @@ def find_unknown_files(text: str) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("page", list_pages(), ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_what_a_page_names_exists(page: Path) -> None:
+def test_page_names_only_commands_imports_and_files_that_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert list(find_unknown_commands(text)) == []
     assert list(find_unknown_imports(text)) == []
     assert list(find_unknown_files(text)) == []
 
 
-def test_unknown_names_are_found() -> None:
-    assert list(
-        find_unknown_commands(
-            "run `snakesim router`, `snakesim topic list` or `snakesim topic hear`"
-        )
-    ) == [
-        "snakesim router",
-        "snakesim topic hear",
-    ]
-    assert list(
-        find_unknown_imports("from snakesim_hal.model.scenario import load_scenario, load")
-    ) == ["snakesim_hal.model.scenario.load"]
-    assert list(
-        find_unknown_files("`snakesim_hal/host/host.py`, `host/host.py`, `host/guest.py`")
-    ) == ["host/guest.py"]
+def test_unknown_commands_imports_and_files_are_found() -> None:
+    text = "run `snakesim router`, `snakesim topic list` or `snakesim topic hear`"
+    assert list(find_unknown_commands(text)) == ["snakesim router", "snakesim topic hear"]
+    text = "from snakesim_hal.model.scenario import load_scenario, load"
+    assert list(find_unknown_imports(text)) == ["snakesim_hal.model.scenario.load"]
+    text = "`snakesim_hal/host/host.py`, `host/host.py`, `host/guest.py`"
+    assert list(find_unknown_files(text)) == ["host/guest.py"]

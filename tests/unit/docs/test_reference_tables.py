@@ -1,4 +1,4 @@
-"""Tables of the reference that people write: what a user can name is in them."""
+"""Tests that hand-written tables of the documentation have all extras, plugins, variables and keys of the product."""
 
 import re
 import tomllib
@@ -9,7 +9,7 @@ import pytest
 from docs.style.check_prose import PRODUCT_CODE, ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-VARIABLE = re.compile(r"""["'](SNAKESIM_[A-Z_]+)["']""")  # a text of its own, and no macro of C
+VARIABLE = re.compile(r"""["'](SNAKESIM_[A-Z_]+)["']""")  # a whole string, and no macro of C
 CONSTANTS = {"SNAKESIM_COMMAND"}  # in the `__all__` of a module
 
 
@@ -26,7 +26,7 @@ def list_variables() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("extra", PROJECT["optional-dependencies"])
-def test_an_extra_has_a_row_with_its_size(extra: str) -> None:
+def test_extra_has_a_row_with_its_size(extra: str) -> None:
     assert re.search(
         rf"^\| `{extra}` \|.*\| \d+ MB \|$", read_page("get-started/installation.md"), re.MULTILINE
     )
@@ -35,28 +35,28 @@ def test_an_extra_has_a_row_with_its_size(extra: str) -> None:
 @pytest.mark.parametrize(
     "group", [group for group in PROJECT["entry-points"] if group.startswith("snakesim.")]
 )
-def test_an_entry_point_group_has_a_row(group: str) -> None:
+def test_entry_point_group_has_a_row(group: str) -> None:
     assert f"| `{group}` |" in read_page("reference/plugins.md")
 
 
 @pytest.mark.parametrize("controller", PROJECT["entry-points"]["snakesim.controllers"])
-def test_a_controller_has_a_row(controller: str) -> None:
+def test_controller_has_a_row(controller: str) -> None:
     assert re.search(
         rf"^\| [^|]*`{controller}`[^|]* \|", read_page("reference/controllers.md"), re.MULTILINE
     )
 
 
 @pytest.mark.parametrize("backend", PROJECT["entry-points"]["snakesim.backends"])
-def test_a_backend_is_introduced(backend: str) -> None:
+def test_backend_is_introduced_in_the_concepts(backend: str) -> None:
     assert f"`{backend}`" in read_page("get-started/concepts.md")
 
 
 @pytest.mark.parametrize("variable", sorted(set(list_variables()) - CONSTANTS))
-def test_an_environment_variable_has_a_row(variable: str) -> None:
+def test_environment_variable_has_a_row(variable: str) -> None:
     assert f"`{variable}`" in read_page("reference/environment-variables.md")
 
 
-def test_each_key_of_a_file_has_a_description() -> None:
+def test_configuration_keys_have_descriptions() -> None:
     rows = re.findall(
         r"^\| `([^`]+)` \|.*\| (.*) \|$", read_page("reference/configuration.md"), re.MULTILINE
     )

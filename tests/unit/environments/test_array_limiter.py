@@ -1,4 +1,4 @@
-"""The limiter on arrays against the limiter of real robots, bit for bit, over random commands."""
+"""Compares the limiter on arrays with the limiter of real robots, bit for bit, for random commands."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ ROUNDS = 30
 
 
 def make_robot(random: np.random.Generator) -> RobotDescription:
-    """A robot whose joints have limits of their own; some cannot move."""
+    """Return a robot whose joints have different limits. Some joints cannot move."""
     robot = make_description()
     joints = [
         msgspec.structs.replace(
@@ -43,15 +43,15 @@ def make_robot(random: np.random.Generator) -> RobotDescription:
     return msgspec.structs.replace(robot, joints=joints)
 
 
-def draw(random: np.random.Generator, scale: float) -> Any:
-    """Numbers of which some are zeros, of both signs, and some are exactly at typical bounds."""
+def draw_joint_values(random: np.random.Generator, scale: float) -> Any:
+    """Return random numbers, of which some are zeros of both signs, and some are exactly at typical limits."""
     values = random.normal(0.0, scale, (ROBOTS, JOINTS))
     special = random.choice([0.0, -0.0, 0.4, -0.4, 0.7, 1.5, -1.5], (ROBOTS, JOINTS))
     return np.where(random.random((ROBOTS, JOINTS)) < 0.3, special, values)
 
 
 @pytest.mark.parametrize("mode", [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE])
-def test_arrays_of_robots_are_limited_as_each_robot_alone(mode: JointMode) -> None:
+def test_array_limiter_equals_the_limiter_of_each_robot(mode: JointMode) -> None:
     random = np.random.default_rng(int(mode))
     robots = [make_robot(random) for _ in range(ROBOTS)]
     limits_of_robot = [JointLimits.from_description(robot) for robot in robots]
@@ -59,23 +59,24 @@ def test_arrays_of_robots_are_limited_as_each_robot_alone(mode: JointMode) -> No
     for i, robot in enumerate(robots):
         limits.set_robot(i, robot)
     for _ in range(ROUNDS):
-        requested = draw(random, 2.0)
-        last_target = draw(random, 1.0)
-        angle_rad, velocity_rad_s = draw(random, 1.0), draw(random, 3.0)
-        fraction = np.where(
+        requested = draw_joint_values(random, 2.0)
+        last_target = draw_joint_values(random, 1.0)
+        angle_rad = draw_joint_values(random, 1.0)
+        velocity_rad_s = draw_joint_values(random, 3.0)
+        torque_fraction = np.where(
             random.random((ROBOTS, JOINTS)) < 0.7, 1.0, random.uniform(0.2, 1.0, (ROBOTS, JOINTS))
         )
         last_limit_nm = limits.torque_nm * random.choice([0.0, 0.5, 1.0], (ROBOTS, JOINTS))
         measured = MeasuredArrays(angle_rad, velocity_rad_s)
 
-        torque_limit_nm = limit_torque_limits(last_limit_nm, fraction, limits)
+        torque_limit_nm = limit_torque_limits(last_limit_nm, torque_fraction, limits)
         target = limit_targets(mode, requested, last_target, torque_limit_nm, measured, limits)
-        names = find_active_limit_indices(
-            mode, requested, target, torque_limit_nm, fraction, measured, limits
+        name_indices = find_active_limit_indices(
+            mode, requested, target, torque_limit_nm, torque_fraction, measured, limits
         )
 
         for i, robot_limits in enumerate(limits_of_robot):
-            asked: JointCommand = make_joint_command(
+            command: JointCommand = make_joint_command(
                 robots[i],
                 mode=[mode] * JOINTS,
                 target=requested[i].tolist(),
@@ -84,13 +85,24 @@ def test_arrays_of_robots_are_limited_as_each_robot_alone(mode: JointMode) -> No
             state = MeasuredState(angle_rad[i], velocity_rad_s[i], np.zeros(JOINTS))
             last = AppliedSetpoints(np.full(JOINTS, int(mode)), last_target[i], last_limit_nm[i])
             expected = limit_command(
-                asked, measured=state, last=last, limits=robot_limits, torque_fraction=fraction[i]
+                command,
+                measured=state,
+                last=last,
+                limits=robot_limits,
+                torque_fraction=torque_fraction[i],
             )
             assert target[i].tobytes() == expected.target.tobytes()
             assert torque_limit_nm[i].tobytes() == expected.torque_limit_nm.tobytes()
             expected_names = find_active_limits(
-                asked, expected, measured=state, limits=robot_limits, torque_fraction=fraction[i]
+                command,
+                expected,
+                measured=state,
+                limits=robot_limits,
+                torque_fraction=torque_fraction[i],
             )
-            assert {
-                joint: LIMIT_NAMES[name] for joint, name in enumerate(names[i].tolist()) if name
-            } == expected_names
+            active_names = {
+                joint: LIMIT_NAMES[name_index]
+                for joint, name_index in enumerate(name_indices[i].tolist())
+                if name_index
+            }
+            assert active_names == expected_names

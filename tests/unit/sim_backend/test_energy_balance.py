@@ -1,4 +1,4 @@
-"""The energy balance of a body that undulates on the ground, and what samples of torque and velocity make of it."""
+"""Tests the energy balance of a body that undulates on the ground, and the work that its samples show."""
 
 from dataclasses import dataclass
 
@@ -77,7 +77,7 @@ def _add_physics_step(rig: SimulatorRig, balance: EnergyBalance) -> None:
 
 @pytest.mark.parametrize("motor", [{}, JOINT_FRICTION], ids=["no joint friction", "joint friction"])
 @pytest.mark.parametrize("friction", [SLIPPERY, ROUGH])
-def test_work_of_motors_is_what_friction_dissipates_and_the_kinetic_energy(friction, motor):
+def test_energy_balance_motor_work_equals_friction_and_kinetic_energy(friction, motor):
     balance = run_wave(friction=friction, motor=motor)
     dissipated_j = -(balance.ground_work_j + balance.damping_work_j + balance.dry_friction_work_j)
     assert balance.motor_work_j > 0.5
@@ -105,7 +105,7 @@ def compute_missing_torque_nm_s_per_rad(
 
 
 @pytest.mark.parametrize("friction", [SLIPPERY, ROUGH])
-def test_samples_miss_the_torque_that_each_new_target_causes(friction):
+def test_energy_balance_samples_miss_torque_of_new_targets(friction):
     """The missing work depends on the motion, and not on the ground."""
     balance = run_wave(friction=friction)
     motor = make_config().robot.motor
@@ -116,12 +116,12 @@ def test_samples_miss_the_torque_that_each_new_target_causes(friction):
     assert balance.motor_work_j - balance.sampled_work_j == pytest.approx(expected_j, rel=0.1)
 
 
-def test_sampled_work_is_negative_on_slippery_ground():
+def test_energy_balance_sampled_work_is_negative_on_slippery_ground():
     balance = run_wave(friction=SLIPPERY)
     assert balance.motor_work_j > 0.0
     assert balance.sampled_work_j < 0.0
 
 
-def test_samples_of_every_physics_step_miss_nothing():
+def test_energy_balance_samples_of_every_step_are_complete():
     balance = run_wave(rate_hz=round(1.0 / STEP_S))
     assert balance.sampled_work_j == pytest.approx(balance.motor_work_j, abs=0.03)

@@ -1,4 +1,4 @@
-"""A fluid acts on the links by the formulas of MuJoCo's documentation, and carries the fraction of weight it should."""
+"""Compares the forces of a fluid on the links with the formulas of MuJoCo's documentation, and tests its buoyancy."""
 
 from typing import Any
 
@@ -20,16 +20,16 @@ from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import G, SimulatorRig, make_config
 from snakesim_testing.sim.swimming import HONEY, WATER, Swimmer
 
-STRANGE = {**WATER, "blunt_drag": 0.9, "slender_drag": 0.1, "kutta_lift": 0.4}
+UNUSUAL = {**WATER, "blunt_drag": 0.9, "slender_drag": 0.1, "kutta_lift": 0.4}
 FLOATING = {"on_route": False, "height_m": 1.0}
 VERSIONS: list[LawsVersion] = ["c", "python"]
 
 
-@pytest.mark.parametrize("fluid", [WATER, HONEY, STRANGE])
+@pytest.mark.parametrize("fluid", [WATER, HONEY, UNUSUAL])
 @pytest.mark.parametrize(
     "velocity", [(1.0, 0.0, 0.0), (0.0, -0.5, 0.0), (0.6, 0.3, 0.0), (-0.4, 0.2, 0.5)]
 )
-def test_force_on_moving_links_is_that_of_the_documented_formula(
+def test_fluid_force_on_moving_links_equals_the_documented_formula(
     fluid: dict[str, Any], velocity: tuple[float, float, float]
 ) -> None:
     swimmer = Swimmer(fluid)
@@ -39,7 +39,7 @@ def test_force_on_moving_links_is_that_of_the_documented_formula(
     assert expected_n @ velocity_m_s < 0.0  # it brakes
 
 
-def test_added_inertia_is_that_of_potential_flow() -> None:
+def test_fluid_added_inertia_equals_that_of_potential_flow() -> None:
     swimmer = Swimmer(WATER)
     for i, geom in enumerate(swimmer.sim.link_geoms):
         added_kg = swimmer.ellipsoids.added_kg[i] / WATER["density_kg_m3"]
@@ -51,7 +51,7 @@ def test_added_inertia_is_that_of_potential_flow() -> None:
 
 @pytest.mark.parametrize("fluid", [WATER, HONEY])
 @pytest.mark.parametrize("velocity", [(1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.3, 0.0)])
-def test_gliding_body_comes_to_where_an_independent_integrator_says(
+def test_fluid_gliding_body_moves_as_an_independent_integrator_computes(
     fluid: dict[str, Any], velocity: tuple[float, float, float]
 ) -> None:
     swimmer = Swimmer(fluid, step_s=0.0005)
@@ -60,7 +60,7 @@ def test_gliding_body_comes_to_where_an_independent_integrator_says(
     assert moved_m == pytest.approx(expected_m, abs=0.01 * float(np.linalg.norm(expected_m)))
 
 
-def test_neutral_robot_neither_sinks_nor_rises_and_measures_gravity() -> None:
+def test_fluid_neutral_robot_neither_sinks_nor_rises() -> None:
     run = SimulatorRig(make_config(scene={"fluid": WATER}, start=FLOATING))
     before_w = run.sim.true_state().base_position_w
     assert before_w[2] == pytest.approx(1.0 + run.config.robot.module.radius_m, abs=1e-9)
@@ -70,7 +70,7 @@ def test_neutral_robot_neither_sinks_nor_rises_and_measures_gravity() -> None:
         assert acceleration == pytest.approx((0.0, 0.0, G), abs=1e-6)
 
 
-def test_heavy_robot_sinks_at_the_speed_at_which_drag_balances_its_weight() -> None:
+def test_fluid_drag_balances_the_weight_of_a_sinking_robot() -> None:
     swimmer = Swimmer({**WATER, "buoyancy": 0.9})
     swimmer.physics.step(1000)
     speed_m_s = -swimmer.data.qvel[2]
@@ -80,7 +80,7 @@ def test_heavy_robot_sinks_at_the_speed_at_which_drag_balances_its_weight() -> N
 
 
 @pytest.mark.parametrize("buoyancy", [0.0, 0.5])
-def test_ground_carries_the_rest_of_the_weight(buoyancy: float) -> None:
+def test_fluid_buoyancy_leaves_the_rest_of_weight_to_ground(buoyancy: float) -> None:
     config = make_config(scene={"fluid": {**WATER, "buoyancy": buoyancy}})
     sim = build_sim_model(config, SimSettings(), motors=False)
     data = MjData(sim.model)
@@ -94,14 +94,14 @@ def test_ground_carries_the_rest_of_the_weight(buoyancy: float) -> None:
     assert forces_n.sum() == pytest.approx((1.0 - buoyancy) * weight_n, rel=1e-3)
 
 
-def test_robot_without_fluid_falls_to_the_ground_before_the_run() -> None:
+def test_robot_without_fluid_settles_on_the_ground_before_start() -> None:
     run = SimulatorRig(make_config(start={**FLOATING, "height_m": 0.05}))
     assert run.sim.true_state().base_position_w[2] == pytest.approx(
         run.config.robot.module.radius_m, abs=1e-3
     )
 
 
-def test_both_versions_of_the_laws_compute_the_same_bits_on_the_bottom() -> None:
+def test_laws_in_fluid_compute_the_same_bits_on_the_bottom() -> None:
     config = make_config(scene={"fluid": {**WATER, "buoyancy": 0.2}})
     states: list[np.ndarray] = []
     for laws in VERSIONS:
@@ -116,14 +116,14 @@ def test_both_versions_of_the_laws_compute_the_same_bits_on_the_bottom() -> None
     assert np.array_equal(states[0], states[1])
 
 
-def test_scene_without_fluid_has_none() -> None:
+def test_model_of_scene_without_fluid_has_no_fluid() -> None:
     model = build_sim_model(make_config(), SimSettings()).model
     assert model.opt.density == model.opt.viscosity == 0.0
     assert not model.body_gravcomp.any()
     assert not model.geom_fluid.any()
 
 
-def test_exported_model_has_the_fluid_of_the_scene() -> None:
+def test_exported_model_has_the_fluid_of_the_scene_file() -> None:
     mjcf = export_mjcf(make_config(scene={"fluid": WATER}), SimSettings())
     assert 'density="1000" viscosity="0.001"' in mjcf
     assert 'fluidshape="ellipsoid"' in mjcf
@@ -134,6 +134,6 @@ def test_exported_model_has_the_fluid_of_the_scene() -> None:
     "change",
     [{"density_kg_m3": -1}, {"viscosity_pa_s": 101}, {"buoyancy": 1.1}, {"blunt_drag": 11}],
 )
-def test_values_out_of_range_are_refused(change: dict[str, Any]) -> None:
+def test_fluid_values_out_of_range_are_refused(change: dict[str, Any]) -> None:
     with raises_error(ConfigError, code="config/out-of-range"):
         decode_table(ConfigTable({**SCENE, "fluid": {**WATER, **change}}, "water.toml"), SceneFile)

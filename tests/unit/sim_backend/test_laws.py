@@ -1,7 +1,7 @@
-"""The two versions of the laws compute the same bits: the C version and the Python version, which is its specification.
+"""Tests that the C version of the laws computes the same bits as the Python version, which is its specification.
 
-Each of many random states is given to both: the snake bent, lifted, pressed into the ground and into obstacles, in
-motion, with springs under the feet, contacts that rub, and obstacles that have moved.
+Both get many random states. In these the snake is bent, lifted, pressed into the ground and into obstacles, and moves.
+There are springs under its feet, contacts with friction, and obstacles that have moved.
 """
 
 from typing import Any
@@ -37,7 +37,7 @@ PEGS = [
     }
     for i in range(6)
 ]
-MOVING = [
+MOVING_BOXES = [
     {
         "name": "post",
         "position_m": [0.3, 0.1],
@@ -64,8 +64,8 @@ MOVING = [
 SCENES: dict[str, dict[str, Any]] = {
     "flat ground": {"ground": {"friction": 0.2}},
     "pegs": {"ground": {"friction": 0.1}, "cylinder": PEGS},
-    "one obstacle that moves": {"ground": {"friction": 0.3}, "box": MOVING[:1]},
-    "obstacles that move": {"ground": {"friction": 0.3}, "box": MOVING, "cylinder": PEGS[:2]},
+    "one obstacle that moves": {"ground": {"friction": 0.3}, "box": MOVING_BOXES[:1]},
+    "obstacles that move": {"ground": {"friction": 0.3}, "box": MOVING_BOXES, "cylinder": PEGS[:2]},
     "hills": {
         "ground": {
             "friction": 0.3,
@@ -75,7 +75,7 @@ SCENES: dict[str, dict[str, Any]] = {
     "slope": {
         "gravity_m_s2": 3.7,
         "ground": {"friction": 0.3, "slope_rad": 0.2, "slope_towards_rad": 2.5},
-        "box": MOVING,
+        "box": MOVING_BOXES,
         "cylinder": PEGS[:2],
     },
     "pipes and stairs": {
@@ -117,7 +117,7 @@ SCENES: dict[str, dict[str, Any]] = {
             "friction": 0.3,
             "heightfield": {"height_m": 0.1, "wavelength_m": 0.8, "area_m": 6.0},
         },
-        "box": MOVING[:1],
+        "box": MOVING_BOXES[:1],
     },
     "rough hills": {
         "ground": {
@@ -148,7 +148,7 @@ SCENES: dict[str, dict[str, Any]] = {
         "cylinder": PEGS[:2],
     },
 }
-SCALES = {
+ROBOT_WITH_SCALES = {
     "skin": {
         "forward": 0.11,
         "backward": 0.14,
@@ -156,7 +156,7 @@ SCALES = {
         "links": {"link_3": {"forward": 0.3}, "link_13": {"sideways": 0.05}},
     }
 }
-WHEELS = {
+ROBOT_WITH_WHEELS = {
     "wheels": {
         "radius_m": 0.03,
         "bearing_radius_m": 0.004,
@@ -164,17 +164,26 @@ WHEELS = {
         "tire_friction": 0.6,
     }
 }
-SEPARATE = {"wheels": {**WHEELS["wheels"], "separate_limits": True}}
+ROBOT_WITH_SEPARATE_WHEEL_LIMITS = {
+    "wheels": {**ROBOT_WITH_WHEELS["wheels"], "separate_limits": True}
+}
 ROBOTS: dict[str, dict[str, Any]] = {
-    "cloth": SCALES,
-    "mud": WHEELS,
-    "rough hills": SCALES,
-    "steps": SCALES,
-    "turning wheels": SEPARATE,
-    "turning wheels on hills": SEPARATE,
+    "cloth": ROBOT_WITH_SCALES,
+    "mud": ROBOT_WITH_WHEELS,
+    "rough hills": ROBOT_WITH_SCALES,
+    "steps": ROBOT_WITH_SCALES,
+    "turning wheels": ROBOT_WITH_SEPARATE_WHEEL_LIMITS,
+    "turning wheels on hills": ROBOT_WITH_SEPARATE_WHEEL_LIMITS,
 }
 # Scenes in which some robots lie on their sides and backs.
-ROLLED = "cloth", "mud", "rough hills", "steps", "turning wheels", "turning wheels on hills"
+SCENES_WITH_ROLLED_ROBOTS = (
+    "cloth",
+    "mud",
+    "rough hills",
+    "steps",
+    "turning wheels",
+    "turning wheels on hills",
+)
 
 
 class Simulation:
@@ -187,8 +196,8 @@ class Simulation:
         self.physics = PhysicsStepper(self.sim, self.data)
         self.measured_force = self.physics.start_force_measurement()
 
-    def go(self, state: "State", min_friction: float) -> list[Floats]:
-        """Begin at a state, and step. Returns everything that the laws compute."""
+    def run(self, state: "State", min_friction: float) -> list[Floats]:
+        """Start at a state, make steps, and return everything that the laws compute."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = state.positions
         self.data.qvel[:] = state.velocities
@@ -205,14 +214,14 @@ class Simulation:
     def _list_results(self) -> list[Floats]:
         contacts = self.physics.contacts
         forces_w = contacts.friction_force_w
-        feet = self.physics.laws.foot_forces_n
+        foot_forces_n = self.physics.laws.foot_forces_n
         return [
             self.data.qfrc_passive.copy(),
             self.data.qpos.copy(),
             self.data.qvel.copy(),
             np.array(contacts.normal_force_n),
             np.array([[number, *forces_w[number]] for number in sorted(forces_w)]),
-            np.zeros(0) if feet is None else feet.copy(),
+            np.zeros(0) if foot_forces_n is None else foot_forces_n.copy(),
             np.array([self.measured_force.max_n]),
         ]
 
@@ -248,7 +257,7 @@ def count_obstacle_dofs(model: mujoco.MjModel) -> int:
 
 
 @pytest.fixture(autouse=True)
-def library() -> None:
+def require_laws_library() -> None:
     """Skip the test where there is no C version."""
     loaded = load_shared_library(LAWS_LIBRARY)
     if loaded.library is None:
@@ -257,54 +266,55 @@ def library() -> None:
 
 @pytest.mark.trials
 @pytest.mark.parametrize("scene", list(SCENES))
-def test_the_c_version_computes_the_bits_of_the_python_version(scene: str) -> None:
-    compare(scene, STATES)
+def test_laws_in_c_compute_the_bits_of_python(scene: str) -> None:
+    compare_laws(scene, STATES)
 
 
 @pytest.mark.slow  # a hundred states: the test before this one
 @pytest.mark.parametrize("scene", list(SCENES))
-def test_it_computes_them_in_ten_thousand_states(scene: str) -> None:
-    compare(scene, MANY_STATES)
+def test_laws_in_c_compute_the_same_bits_in_many_states(scene: str) -> None:
+    compare_laws(scene, MANY_STATES)
 
 
-def compare(scene: str, states: int) -> None:
+def compare_laws(scene: str, states: int) -> None:
     """Give random states to both versions, and compare all that they compute."""
     config = make_config(ROBOTS.get(scene), SCENES[scene])
     specification = Simulation(config, "python")
     plugin = Simulation(config, "c")
     random = np.random.default_rng(7)
-    rubbing = 0
-    pushed = 0
+    friction_contact_count = 0
+    states_with_contact = 0
     for number in range(states):
-        state = State(specification.model, random, rolls=scene in ROLLED)
+        state = State(specification.model, random, rolls=scene in SCENES_WITH_ROLLED_ROBOTS)
         min_friction = float(random.choice([0.0, 0.0, 2.0]))
-        expected = specification.go(state, min_friction)
-        computed = plugin.go(state, min_friction)
-        rubbing += len(specification.physics.contacts.friction_force_w)
-        pushed += specification.measured_force.max_n > 0.0
-        for wanted, got in zip(expected, computed, strict=True):
-            assert wanted.tobytes() == got.tobytes(), f"state {number}: {wanted - got}"
+        expected = specification.run(state, min_friction)
+        computed = plugin.run(state, min_friction)
+        friction_contact_count += len(specification.physics.contacts.friction_force_w)
+        states_with_contact += specification.measured_force.max_n > 0.0
+        for expected_array, array in zip(expected, computed, strict=True):
+            difference = expected_array - array
+            assert expected_array.tobytes() == array.tobytes(), f"state {number}: {difference}"
     if scene not in ("flat ground", "cloth", "mud"):
-        assert rubbing > states / 10, "too few states have contacts with friction"
+        assert friction_contact_count > states / 10, "too few states have contacts with friction"
     if "pegs" in scene or "obstacle" in scene:
-        assert pushed > states / 10, "too few states have contacts with obstacles"
+        assert states_with_contact > states / 10, "too few states have contacts with obstacles"
 
 
-def test_forces_may_be_computed_any_number_of_times_without_changing_the_next_step() -> None:
+def test_laws_computed_repeatedly_do_not_change_the_next_step() -> None:
     config = make_config(scene=SCENES["obstacles that move"])
-    watched = Simulation(config, "c")
+    recomputed = Simulation(config, "c")
     undisturbed = Simulation(config, "c")
-    state = State(watched.model, np.random.default_rng(3))
-    for simulation in (watched, undisturbed):
-        simulation.go(state, 0.0)
+    state = State(recomputed.model, np.random.default_rng(3))
+    for simulation in (recomputed, undisturbed):
+        simulation.run(state, 0.0)
     for _ in range(3):
-        mujoco.mj_forward(watched.model, watched.data)
-    for simulation in (watched, undisturbed):
+        mujoco.mj_forward(recomputed.model, recomputed.data)
+    for simulation in (recomputed, undisturbed):
         simulation.physics.step(5)
-    assert watched.data.qpos.tobytes() == undisturbed.data.qpos.tobytes()
+    assert recomputed.data.qpos.tobytes() == undisturbed.data.qpos.tobytes()
 
 
-def test_a_plain_mujoco_program_begins_with_feet_that_stick_where_they_are() -> None:
+def test_laws_in_plain_mujoco_start_with_feet_that_stick() -> None:
     simulation = Simulation(make_config(scene=SCENES["flat ground"]), "c")
     simulation.data.qpos[:2] = 3.0, -2.0
     simulation.data.qpos[2] = 0.99 * simulation.data.qpos[2]
@@ -313,22 +323,22 @@ def test_a_plain_mujoco_program_begins_with_feet_that_stick_where_they_are() -> 
 
 
 @pytest.mark.parametrize("threads", [1, 2, 4])
-def test_a_batch_computes_the_bits_of_single_simulations_on_any_number_of_threads(
+def test_batch_computes_bits_of_single_simulations_with_any_threads(
     threads: int,
 ) -> None:
     config = make_config(scene=SCENES["obstacles that move"])
     single = Simulation(config, "c")
     simulations = batch.Batch(single.model, nsim=BATCH_SIZE, nthread=threads)
     random = np.random.default_rng(11)
-    kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    state = np.empty(mujoco.mj_stateSize(single.model, kind))
+    state_kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(single.model, state_kind))
     expected: list[bytes] = []
     for row in range(BATCH_SIZE):
-        single.go(State(single.model, random), 0.0)
-        mujoco.mj_getState(single.model, single.data, state, kind)
+        single.run(State(single.model, random), 0.0)
+        mujoco.mj_getState(single.model, single.data, state, state_kind)
         simulations.state[row] = state
         single.physics.step(BATCH_STEPS)
-        mujoco.mj_getState(single.model, single.data, state, kind)
+        mujoco.mj_getState(single.model, single.data, state, state_kind)
         expected.append(state.tobytes())
     simulations.step(nstep=BATCH_STEPS // 2)
     simulations.step(nstep=BATCH_STEPS - BATCH_STEPS // 2)

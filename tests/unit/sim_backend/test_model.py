@@ -1,4 +1,4 @@
-"""The compiled model against the files that it comes from."""
+"""Compares the compiled model with the robot file and scene file that it is built from."""
 
 import mujoco
 import numpy as np
@@ -62,15 +62,15 @@ def test_model_motors_have_values_of_robot_file(robot_and_model):
 def test_model_link_inertia_is_that_of_a_capsule():
     config = make_config()
     model = open_sim(config).sim.model
-    r, length, mass = (
-        config.robot.module.radius_m,
-        config.robot.module.length_m,
-        config.robot.module.mass_kg,
-    )
-    cylinder, sphere = np.pi * r**2 * length, 4 / 3 * np.pi * r**3
-    m_c, m_s = mass * np.array([cylinder, sphere]) / (cylinder + sphere)
-    about_axis = m_c * r**2 / 2 + m_s * 2 / 5 * r**2
-    across = m_c * (r**2 / 4 + length**2 / 12) + m_s * (
+    r = config.robot.module.radius_m
+    length = config.robot.module.length_m
+    mass = config.robot.module.mass_kg
+    # A capsule is a cylinder and two halves of a sphere.
+    cylinder_m3 = np.pi * r**2 * length
+    sphere_m3 = 4 / 3 * np.pi * r**3
+    cylinder_kg, sphere_kg = mass * np.array([cylinder_m3, sphere_m3]) / (cylinder_m3 + sphere_m3)
+    about_axis = cylinder_kg * r**2 / 2 + sphere_kg * 2 / 5 * r**2
+    across = cylinder_kg * (r**2 / 4 + length**2 / 12) + sphere_kg * (
         2 / 5 * r**2 + length**2 / 4 + 3 / 8 * length * r
     )
     assert sorted(model.body("link_5").inertia) == pytest.approx(
@@ -82,25 +82,26 @@ def test_model_link_inertia_is_that_of_a_capsule():
     ("rate_hz", "timestep_s", "steps"),
     [(100, 0.001, 10), (100, 0.003, 4), (1000, 0.004, 1), (300, 0.001, 4)],
 )
-def test_a_whole_number_of_steps_makes_a_period(rate_hz, timestep_s, steps):
+def test_model_period_is_a_whole_number_of_steps(rate_hz, timestep_s, steps):
     config = make_config(rate_hz=rate_hz)
     sim = open_sim(config, timestep_s=timestep_s, contact_time_s=0.01).sim
     assert sim.steps_per_tick == steps
     assert sim.model.opt.timestep * steps == pytest.approx(config.period_ns * 1e-9, rel=1e-12)
 
 
-def test_contacts_too_stiff_for_the_step_are_refused():
+def test_model_contacts_too_stiff_for_the_step_are_refused():
     with raises_error(ConfigError, code="config/out-of-range"):
         open_sim(make_config(), timestep_s=0.005, contact_time_s=0.002)
 
 
-def test_neighbours_pass_through_each_other_and_distant_links_do_not():
+def test_model_only_links_that_are_not_neighbors_collide():
     config = make_config({"chain": {"modules": 8}, "limits": {"angle_rad": 1.5}})
     run = SimulatorRig(config)
-    data, model = run.sim.data, run.sim.sim.model
+    data = run.sim.data
     assert not any(data.contact.geom.min(axis=1) > 0)
-    data.qpos[7:] = 1.0  # rolled up: far more than a full turn
-    mujoco.mj_forward(model, data)
+    # The snake is rolled up by more than a revolution.
+    data.qpos[7:] = 1.0
+    mujoco.mj_forward(run.sim.sim.model, data)
     pairs = {tuple(sorted(pair)) for pair in data.contact.geom.tolist() if min(pair) > 0}
     assert pairs
     assert all(second - first > 1 for first, second in pairs)

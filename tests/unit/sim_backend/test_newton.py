@@ -1,4 +1,4 @@
-"""The Newton solver of the MuJoCo that the lock pins: its sparse factorization gives what its dense one gives."""
+"""Compares the sparse with the dense factorization in the Newton solver of the installed MuJoCo version."""
 
 from typing import Literal
 
@@ -7,7 +7,9 @@ import numpy as np
 
 from snakesim_hal.base.arrays import Floats
 
-BODIES, ARM_LINKS = 4, 4  # 4 * (6 + 2 * 4) = 56 degrees of freedom
+BODIES = 4
+ARM_LINKS = 4
+DEGREES_OF_FREEDOM = 56  # 4 * (6 + 2 * 4)
 ARM_LINK = """
 <body pos="0.1 {y} 0">
   <joint axis="0 0 1" damping="0.01"/>
@@ -15,8 +17,8 @@ ARM_LINK = """
 """
 
 
-def accelerations(jacobian: Literal["dense", "sparse"]) -> Floats:
-    """Accelerations of bodies with two arms each that lie on the ground and on each other, (56,)."""
+def compute_accelerations(jacobian: Literal["dense", "sparse"]) -> Floats:
+    """Compute the accelerations (56,) of bodies with two arms each, which lie on the ground and on each other."""
     bodies = ""
     for number in range(BODIES):
         arms = "".join(
@@ -31,7 +33,7 @@ def accelerations(jacobian: Literal["dense", "sparse"]) -> Floats:
         f'<mujoco><option solver="Newton" jacobian="{jacobian}" tolerance="1e-10"><flag island="disable"/></option>'
         f'<worldbody><geom type="plane" size="5 5 1"/>{bodies}</worldbody></mujoco>'
     )
-    assert model.nv == 56
+    assert model.nv == DEGREES_OF_FREEDOM
     data = mujoco.MjData(model)
     data.qvel[:] = np.random.default_rng(0).normal(size=model.nv)
     mujoco.mj_forward(model, data)
@@ -39,9 +41,9 @@ def accelerations(jacobian: Literal["dense", "sparse"]) -> Floats:
     return data.qacc.copy()
 
 
-def test_sparse_and_dense_factorization_give_the_same_accelerations() -> None:
+def test_newton_solver_sparse_and_dense_factorization_are_equal() -> None:
     """MuJoCo 4.0.0 gave other accelerations for every degree of freedom of these branching bodies."""
-    dense = accelerations("dense")
+    dense = compute_accelerations("dense")
     np.testing.assert_allclose(
-        accelerations("sparse"), dense, rtol=0.0, atol=1e-8 * np.abs(dense).max()
+        compute_accelerations("sparse"), dense, rtol=0.0, atol=1e-8 * np.abs(dense).max()
     )

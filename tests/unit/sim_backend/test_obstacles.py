@@ -1,4 +1,4 @@
-"""Every kind of obstacle stands where its outline says."""
+"""Tests that the simulated shape of each kind of obstacle is that of its outline."""
 
 import numpy as np
 import pytest
@@ -17,31 +17,38 @@ KINDS = {
 
 
 @pytest.mark.parametrize("scene", KINDS.values(), ids=KINDS.keys())
-def test_the_body_touches_exactly_when_it_reaches_the_outline(scene):
-    """Link 0's rear cap, a sphere of the body's radius, moved in along a line."""
+def test_obstacle_touches_body_exactly_at_its_outline(scene):
+    """The rear cap of link 0, a sphere with the body's radius, approaches the center of the obstacle along a line."""
     config = make_config(scene=scene)
     run = SimulatorRig(config)
     data = run.sim.data
     (placed,) = place_obstacles(config)
-    center = np.array(placed.obstacle.position_w[:2])
-    radius = config.robot.module.radius_m
-    for angle in np.arange(0.2, 2 * np.pi, 0.7):
-        outward = np.array([np.cos(angle), np.sin(angle)])
+    center_w = np.array(placed.obstacle.position_w[:2])
+    radius_m = config.robot.module.radius_m
+    distances_m = np.linspace(0.0, 1.0, 20001)[::20]  # from the center
+    for angle_rad in np.arange(0.2, 2 * np.pi, 0.7):
+        outward_w = np.array([np.cos(angle_rad), np.sin(angle_rad)])
         # The snake points away from the obstacle.
-        data.qpos[3:7] = [np.cos(angle / 2), 0, 0, np.sin(angle / 2)]
+        data.qpos[3:7] = [np.cos(angle_rad / 2), 0, 0, np.sin(angle_rad / 2)]
         data.qpos[7:] = 0.0
-        reach = np.linspace(0.0, 1.0, 20001)
-        gaps = np.array(
-            [compute_outline_distance_m(placed.obstacle, center + r * outward) for r in reach[::20]]
+        outline_distances_m = np.array(
+            [
+                compute_outline_distance_m(placed.obstacle, center_w + distance_m * outward_w)
+                for distance_m in distances_m
+            ]
         )
-        touching = float(np.interp(radius, gaps, reach[::20]))
-        for offset, touched in ((2e-5, set[str]()), (-2e-5, {placed.obstacle.name})):
-            data.qpos[:3] = [*(center + (touching + offset) * outward), radius]
+        touching_m = float(np.interp(radius_m, outline_distances_m, distances_m))
+        for offset_m, expected_names in (
+            (2e-5, set[str]()),
+            (-2e-5, {placed.obstacle.name}),
+        ):
+            data.qpos[:3] = [*(center_w + (touching_m + offset_m) * outward_w), radius_m]
             run.sim.physics.forward()
-            assert {contact.obstacle for contact in run.sim.true_state().contacts} == touched
+            names = {contact.obstacle for contact in run.sim.true_state().contacts}
+            assert names == expected_names
 
 
-def test_steps_and_ground_and_the_snake_itself_are_no_contacts():
+def test_contacts_exclude_steps_ground_and_the_snake_itself():
     step = {"step": [{"position_m": [0.7, 0.0], "size_m": [3.0, 2.0], "height_m": 0.05}]}
     run = SimulatorRig(make_config(scene=step))
     run.advance(0.2)

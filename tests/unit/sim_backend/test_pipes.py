@@ -1,4 +1,4 @@
-"""Pipes in the simulator: their inside is round and closed, a body lies at its bottom, and slides there by mu N."""
+"""Tests simulated pipes: their inside is round and closed, and a body rests and slides at their bottom."""
 
 import math
 from typing import Any
@@ -18,7 +18,7 @@ from snakesim_testing.sim.simulator_rig import G, SimulatorRig, make_config
 
 FRICTION = 0.3
 # Radius of the polygon's corners, divided by that of its sides.
-CORNER = 1.0 / math.cos(math.pi / STAVES)
+CORNER_RATIO = 1.0 / math.cos(math.pi / STAVES)
 PIPE: dict[str, Any] = {
     "position_m": [1.0, 0.5],
     "length_m": 8.0,
@@ -51,26 +51,26 @@ def measure_distances_m(sim: SimModel, angles_rad: Floats) -> list[float]:
     return distances_m
 
 
-def test_inside_of_a_pipe_is_closed_and_round() -> None:
+def test_pipe_inside_is_closed_and_round() -> None:
     sim = build_sim_model(make_pipe_config(), SimSettings())
     distances_m = measure_distances_m(sim, np.linspace(0.0, 2 * math.pi, 500))
     assert min(distances_m) == pytest.approx(PIPE["inner_radius_m"], rel=1e-4)
-    assert max(distances_m) <= PIPE["inner_radius_m"] * CORNER * 1.0001
+    assert max(distances_m) <= PIPE["inner_radius_m"] * CORNER_RATIO * 1.0001
 
 
-def test_top_of_a_half_pipe_is_open() -> None:
+def test_half_pipe_is_open_at_its_top() -> None:
     sim = build_sim_model(make_pipe_config(open_top=True), SimSettings())
     above = measure_distances_m(sim, np.linspace(0.02, math.pi - 0.02, 100))
     below = measure_distances_m(sim, -np.linspace(0.02, math.pi - 0.02, 100))
     assert set(above) == {-1.0}
-    assert max(below) <= PIPE["inner_radius_m"] * CORNER * 1.0001
+    assert max(below) <= PIPE["inner_radius_m"] * CORNER_RATIO * 1.0001
 
 
 @pytest.mark.parametrize("open_top", [False, True])
-def test_robot_starts_at_rest_at_the_bottom_of_a_pipe(open_top: bool) -> None:
+def test_robot_in_pipe_starts_at_rest_at_its_bottom(open_top: bool) -> None:
     run = SimulatorRig(make_pipe_config(open_top=open_top))
     state = run.sim.true_state()
-    bottom_m = PIPE["radius_m"] - CORNER * (
+    bottom_m = PIPE["radius_m"] - CORNER_RATIO * (
         PIPE["inner_radius_m"] - run.config.robot.module.radius_m
     )
     assert state.base_position_w[:2] == pytest.approx(PIPE["position_m"], abs=1e-3)
@@ -81,8 +81,8 @@ def test_robot_starts_at_rest_at_the_bottom_of_a_pipe(open_top: bool) -> None:
 
 
 @pytest.mark.parametrize("laws", VERSIONS)
-def test_body_slides_in_a_pipe_by_its_friction(laws: LawsVersion) -> None:
-    """It lies in a corner of the polygon, on both staves, so N is a little more than its weight."""
+def test_body_sliding_in_pipe_decelerates_by_its_friction(laws: LawsVersion) -> None:
+    """The body lies in a corner of the polygon, on both staves, so N is a little more than its weight."""
     config = make_pipe_config()
     run = SimulatorRig(config)
     sim = build_sim_model(config, SimSettings(), motors=False, laws=laws)
@@ -96,12 +96,11 @@ def test_body_slides_in_a_pipe_by_its_friction(laws: LawsVersion) -> None:
     before_m_s = data.qvel[:2] @ direction_w
     physics.step(100)
     step_s = sim.model.opt.timestep
-    assert before_m_s - data.qvel[:2] @ direction_w == pytest.approx(
-        FRICTION * G * CORNER * 100 * step_s, rel=0.01
-    )
+    speed_loss_m_s = before_m_s - data.qvel[:2] @ direction_w
+    assert speed_loss_m_s == pytest.approx(FRICTION * G * CORNER_RATIO * 100 * step_s, rel=0.01)
 
 
-def test_robot_starts_and_stays_on_a_solid_pipe() -> None:
+def test_robot_on_solid_pipe_starts_at_rest_and_stays() -> None:
     """The pipe is below the middle of the robot, and across."""
     pipe = {
         "position_m": [0.75, 0.0],

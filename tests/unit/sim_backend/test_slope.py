@@ -1,4 +1,4 @@
-"""Gravity is a parameter of the scene, and flat ground may slope: bodies stay, slide and are measured accordingly."""
+"""Tests scenes with other gravity and with sloping flat ground: where bodies stay and slide, and what IMUs measure."""
 
 import math
 from typing import Any
@@ -47,7 +47,7 @@ class Sled:
 @pytest.mark.parametrize("laws", VERSIONS)
 @pytest.mark.parametrize("gravity_m_s2", [1.62, G])
 @pytest.mark.parametrize("towards_rad", [0.0, math.pi])
-def test_body_below_the_friction_angle_does_not_creep(
+def test_slope_below_the_friction_angle_holds_the_body(
     laws: LawsVersion, gravity_m_s2: float, towards_rad: float
 ) -> None:
     ground = {"slope_rad": 0.9 * FRICTION_ANGLE_RAD, "slope_towards_rad": towards_rad}
@@ -62,7 +62,7 @@ def test_body_below_the_friction_angle_does_not_creep(
 @pytest.mark.parametrize("laws", VERSIONS)
 @pytest.mark.parametrize("gravity_m_s2", [1.62, G])
 @pytest.mark.parametrize("towards_rad", [0.0, math.pi])
-def test_body_above_the_friction_angle_slides_by_the_remaining_gravity(
+def test_slope_above_friction_angle_accelerates_body_by_remaining_gravity(
     laws: LawsVersion, gravity_m_s2: float, towards_rad: float
 ) -> None:
     slope_rad = 1.5 * FRICTION_ANGLE_RAD
@@ -76,7 +76,7 @@ def test_body_above_the_friction_angle_slides_by_the_remaining_gravity(
 
 
 @pytest.mark.parametrize("laws", VERSIONS)
-def test_viscous_ground_gives_a_terminal_speed(laws: LawsVersion) -> None:
+def test_slope_of_viscous_ground_leads_to_terminal_speed(laws: LawsVersion) -> None:
     along_s_per_m = 2.0
     viscous = {"along_s_per_m": along_s_per_m, "across_s_per_m": 4.0}
     sled = Sled(laws, {"friction": 0.0, "slope_rad": 0.2, "viscous": viscous})
@@ -85,7 +85,7 @@ def test_viscous_ground_gives_a_terminal_speed(laws: LawsVersion) -> None:
 
 
 @pytest.mark.parametrize("slope_rad", [0.2, 0.6])
-def test_both_versions_of_the_laws_start_and_slide_alike_to_the_bit(slope_rad: float) -> None:
+def test_slope_gives_same_bits_with_both_laws(slope_rad: float) -> None:
     ground = {"slope_rad": slope_rad, "slope_towards_rad": 0.4}
     one, other = (Sled(laws, ground, 3.7) for laws in VERSIONS)
     for _ in range(20):
@@ -96,7 +96,7 @@ def test_both_versions_of_the_laws_start_and_slide_alike_to_the_bit(slope_rad: f
 
 
 @pytest.mark.parametrize("gravity_m_s2", [1.62, G])
-def test_imus_at_rest_measure_the_gravity_vector(gravity_m_s2: float) -> None:
+def test_slope_imus_at_rest_measure_the_gravity_vector(gravity_m_s2: float) -> None:
     ground = {"friction": 0.6, "slope_rad": 0.3, "slope_towards_rad": math.pi}
     config = make_config(scene={"ground": ground, "gravity_m_s2": gravity_m_s2})
     expected = (gravity_m_s2 * math.sin(0.3), 0.0, gravity_m_s2 * math.cos(0.3))
@@ -115,8 +115,8 @@ def test_imus_at_rest_measure_the_gravity_vector(gravity_m_s2: float) -> None:
     assert np.mean(imu.acceleration_m_s2, axis=0) == pytest.approx(expected, rel=1e-3, abs=1e-3)
 
 
-def test_robot_starts_where_it_is_placed_on_a_slope_that_does_not_hold_it() -> None:
-    """It lies across the slope, where it would roll down while it comes to rest."""
+def test_slope_that_does_not_hold_robot_keeps_its_start() -> None:
+    """The robot lies across the slope, where it would roll down while it comes to rest."""
     ground = {"slope_rad": 0.7, "slope_towards_rad": math.pi / 2}
     run = SimulatorRig(make_config(scene={"ground": {"friction": FRICTION, **ground}}))
     position_m = run.sim.true_state().base_position_w
@@ -135,7 +135,7 @@ def make_loose_block(base_friction: float) -> dict[str, Any]:
     }
 
 
-def test_loose_obstacle_stays_on_a_slope_that_its_friction_holds() -> None:
+def test_slope_holds_a_loose_obstacle_with_enough_friction() -> None:
     ground = {"friction": FRICTION, "slope_rad": 0.2, "slope_towards_rad": 0.0}
     run = SimulatorRig(make_config(scene={"ground": ground, "box": [make_loose_block(0.25)]}))
     run.advance(1.0)
@@ -145,7 +145,7 @@ def test_loose_obstacle_stays_on_a_slope_that_its_friction_holds() -> None:
         SimulatorRig(config)
 
 
-def test_level_ground_has_the_gravity_of_mujoco_to_the_bit() -> None:
+def test_level_ground_has_exactly_the_gravity_of_mujoco() -> None:
     for towards_rad in (0.0, 2.0, math.pi):
         scene = decode_scene(ground={"friction": 0.1, "slope_towards_rad": towards_rad})
         assert repr(compute_gravity_w(scene)) == "(0.0, 0.0, -9.81)"
@@ -166,7 +166,7 @@ def test_exported_model_has_the_gravity_of_the_scene() -> None:
         {"ground": {"friction": 0.1, "slope_towards_rad": 7}},
     ],
 )
-def test_values_out_of_range_are_refused(sections: dict[str, Any]) -> None:
+def test_slope_and_gravity_out_of_range_are_refused(sections: dict[str, Any]) -> None:
     with raises_error(ConfigError, code="config/out-of-range"):
         decode_scene(**sections)
 

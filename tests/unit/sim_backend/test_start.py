@@ -1,4 +1,4 @@
-"""How the snake lies when the run begins: on flat and uneven ground, on a step, and with pitch joints."""
+"""Tests the pose of the snake at the start of a run: on flat and uneven ground, on a step, and with pitch joints."""
 
 import mujoco
 import numpy as np
@@ -13,32 +13,32 @@ from snakesim_testing.sim.hilly_start import CURVE, HILLS
 from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
 
-def uneven_of(config):
+def get_heightfield(config):
     assert config.scene.ground.heightfield is not None
     return config.scene.ground.heightfield
 
 
-def deepest_m(run):
-    """How far the snake is inside anything."""
+def measure_penetration_m(run):
+    """Return how far the snake is inside the ground or an obstacle."""
     return max(0.0, -min(run.sim.data.contact.dist, default=0.0))
 
 
-def stays(run, seconds=1.0, within_m=2e-3):
-    """Holding the angles of its start, the snake does not move any more."""
+def assert_stays(run, seconds=1.0, max_distance_m=2e-3):
+    """Check that a snake that holds its start angles does not move any more."""
     start = run.sim.true_state()
-    run.command(
-        [JointMode.POSITION] * run.count, compute_start_pose(run.config).angles_rad.tolist()
-    )
+    start_angles_rad = compute_start_pose(run.config).angles_rad.tolist()
+    run.command([JointMode.POSITION] * run.count, start_angles_rad)
     run.advance(seconds)
     end = run.sim.true_state()
-    assert np.linalg.norm(end.base_position_w - start.base_position_w) < within_m
+    assert np.linalg.norm(end.base_position_w - start.base_position_w) < max_distance_m
     assert np.abs(end.velocities_rad_s).max() < 0.02
 
 
 def test_start_on_flat_ground_is_at_rest_at_time_zero():
     config = load_scenario("triplet").config
     run = SimulatorRig(config)
-    state, pose = run.sim.true_state(), compute_start_pose(config)
+    state = run.sim.true_state()
+    pose = compute_start_pose(config)
     assert state.time_s == 0.0
     assert state.base_position_w == pytest.approx(
         [*pose.position_w, config.robot.module.radius_m], abs=1.1 * SINK_M
@@ -47,48 +47,53 @@ def test_start_on_flat_ground_is_at_rest_at_time_zero():
     assert not state.base_velocity_w.any()
     assert not state.velocities_rad_s.any()
     assert not state.torques_nm.any()
-    stays(run)
+    assert_stays(run)
 
 
 def test_start_hills_have_requested_height_and_repeat_for_seed():
-    uneven = uneven_of(make_config(scene=HILLS))
-    heights = make_heights(uneven)
-    assert (heights.min(), heights.max()) == pytest.approx((-0.03, 0.03))
-    assert np.array_equal(heights, make_heights(uneven))
-    spacing = uneven.area_m / (len(heights) - 1)
-    assert (
-        np.abs(np.diff(heights, axis=0)).max() / spacing
-        < 2 * np.pi * uneven.height_m / uneven.wavelength_m
-    )
-    up_and_down = np.abs(np.diff(np.sign(heights - heights.mean()), axis=1)).sum(axis=1).mean() / 2
-    assert up_and_down == pytest.approx(2 * uneven.area_m / uneven.wavelength_m, rel=0.5)
+    heightfield = get_heightfield(make_config(scene=HILLS))
+    heights_m = make_heights(heightfield)
+    assert (heights_m.min(), heights_m.max()) == pytest.approx((-0.03, 0.03))
+    assert np.array_equal(heights_m, make_heights(heightfield))
+
+    spacing_m = heightfield.area_m / (len(heights_m) - 1)
+    max_slope = np.abs(np.diff(heights_m, axis=0)).max() / spacing_m
+    assert max_slope < 2 * np.pi * heightfield.height_m / heightfield.wavelength_m
+
+    signs = np.sign(heights_m - heights_m.mean())
+    mean_crossings = np.abs(np.diff(signs, axis=1)).sum(axis=1).mean() / 2
+    expected_crossings = 2 * heightfield.area_m / heightfield.wavelength_m
+    assert mean_crossings == pytest.approx(expected_crossings, rel=0.5)
 
 
-def test_the_height_field_is_where_the_heights_say():
+def test_start_height_field_of_model_equals_the_heights():
     config = make_config(scene=HILLS)
     run = SimulatorRig(config, settle_s=0.0)
-    heights = make_heights(uneven_of(config))
-    grid = np.linspace(-3.0, 3.0, len(heights))
-    hit = np.zeros(1, dtype=np.int32)
+    heights_m = make_heights(get_heightfield(config))
+    grid_m = np.linspace(-3.0, 3.0, len(heights_m))
+    ray_height_m = 5.0
+    down_w = np.array([0.0, 0.0, -1.0])
+    hit_geom = np.zeros(1, dtype=np.int32)
     for i, j in ((5, 80), (60, 12), (33, 40)):
-        above = np.array([grid[j], grid[i], 5.0])
-        drop = mujoco.mj_ray(
-            run.sim.sim.model, run.sim.data, above, np.array([0.0, 0.0, -1.0]), None, 1, -1, hit
+        above_w = np.array([grid_m[j], grid_m[i], ray_height_m])
+        distance_m = mujoco.mj_ray(
+            run.sim.sim.model, run.sim.data, above_w, down_w, None, 1, -1, hit_geom
         )
-        assert 5.0 - drop == pytest.approx(heights[i, j], abs=2e-3)
+        assert ray_height_m - distance_m == pytest.approx(heights_m[i, j], abs=2e-3)
 
 
 @pytest.mark.parametrize("robot", ["planar13", "mamba"])
-def test_on_uneven_ground_it_rests_where_it_was_put(robot):
+def test_start_on_uneven_ground_is_at_rest_where_placed(robot):
     run = SimulatorRig(
         make_config(scene={**HILLS, **CURVE}, base_robot=robot, start={"on_route": True})
     )
-    assert deepest_m(run) < 2e-3
-    state, pose = run.sim.true_state(), compute_start_pose(run.config)
+    assert measure_penetration_m(run) < 2e-3
+    state = run.sim.true_state()
+    pose = compute_start_pose(run.config)
     assert state.base_position_w[:2] == pytest.approx(pose.position_w, abs=0.05)
     assert not state.velocities_rad_s.any()
-    stays(run, within_m=0.01)
-    assert deepest_m(run) < 2e-3
+    assert_stays(run, max_distance_m=0.01)
+    assert measure_penetration_m(run) < 2e-3
 
 
 def test_start_half_on_a_step_does_not_sink_in():
@@ -96,30 +101,32 @@ def test_start_half_on_a_step_does_not_sink_in():
     run = SimulatorRig(
         make_config(scene={**step, **CURVE}, base_robot="mamba", start={"on_route": True})
     )
-    stays(run, within_m=0.01)
-    assert deepest_m(run) < 2e-3
-    state, robot = run.sim.true_state(), run.config.robot
-    origins, _ = compute_link_frames(
+    assert_stays(run, max_distance_m=0.01)
+    assert measure_penetration_m(run) < 2e-3
+    state = run.sim.true_state()
+    robot = run.config.robot
+    origins_w, _ = compute_link_frames(
         state.base_position_w,
         rotation_from_quaternion(state.base_orientation_wxyz),
         state.angles_rad,
         robot.axes,
         robot.link_lengths_m,
     )
-    assert origins[-1][2] == pytest.approx(0.06 + robot.module.radius_m, abs=0.005)
-    assert origins[1][2] < 0.06 + robot.module.radius_m
+    height_on_step_m = 0.06 + robot.module.radius_m
+    assert origins_w[-1][2] == pytest.approx(height_on_step_m, abs=0.005)
+    assert origins_w[1][2] < height_on_step_m
 
 
-def test_alternating_axes_lie_stably_passive_and_held():
+def test_start_of_alternating_axes_is_stable_passive_and_held():
     run = SimulatorRig(make_config(base_robot="mamba"))
     run.advance(1.0)
     state = run.sim.true_state()
     assert state.angles_rad == pytest.approx([0.0] * 18, abs=0.01)
     assert np.abs(state.velocities_rad_s).max() < 1e-2
-    stays(run)
+    assert_stays(run)
 
 
-def test_a_long_and_a_short_robot_start_too():
+def test_start_of_long_and_short_robot_is_on_the_ground():
     for modules in (1, 40):
         run = SimulatorRig(make_config({"chain": {"modules": modules}}))
         run.advance(0.05)

@@ -1,4 +1,4 @@
-"""Forces between links and obstacles: those that the C library writes into the state, and those that Python reads."""
+"""Compares the contact forces of obstacles that the C library writes into the state with those that Python reads."""
 
 from typing import Any
 
@@ -45,22 +45,22 @@ needs_c = pytest.mark.skipif(
 
 @needs_c
 @pytest.mark.parametrize("name", SCENES)
-def test_the_state_has_the_forces_that_python_reads(name: str) -> None:
+def test_obstacle_contacts_in_the_state_equal_those_of_python(name: str) -> None:
     placed = create_settled_robot(make_config(scene={"name": "test", **SCENES[name]}))
     random = np.random.default_rng(1)
     joints = placed.motors.count
     limits_nm = [joint.limits.torque_nm for joint in placed.config.robot.joint_table]
-    touched = 0
+    contact_count = 0
     for step in range(STEPS):
         if step % 30 == 0:
             placed.motors.set_inputs(
                 [JointMode.POSITION] * joints, random.uniform(-1.2, 1.2, joints).tolist(), limits_nm
             )
         placed.physics.step(1)
-        expected = [[touch.link, *touch.force_w] for touch in placed.contact_reader.read()]
+        expected = [[contact.link, *contact.force_w] for contact in placed.contact_reader.read()]
         assert placed.read_obstacle_contacts() == expected
-        touched += len(expected)
-    assert touched > 20
+        contact_count += len(expected)
+    assert contact_count > 20
 
 
 class MeasuringRobot:
@@ -70,7 +70,7 @@ class MeasuringRobot:
         config = make_config(scene={"name": "test", **scene})
         self.backend = SimBackend(config, SimSettings(timestep_s=step_s), laws=laws)
         self.step_s: float = self.backend.sim.model.opt.timestep
-        self.touches = ObstacleContactReader(
+        self.contact_reader = ObstacleContactReader(
             self.backend.sim, self.backend.data, self.backend.physics.contacts
         )
         self.measured_force = self.backend.physics.start_force_measurement()
@@ -95,7 +95,7 @@ def test_measured_force_in_c_equals_that_in_python(name: str, step_s: float) -> 
     pair_counts: set[int] = set()
     for number in range(3 * STEPS):
         robot.step(number)
-        forces_n = robot.touches.sum_forces_n()
+        forces_n = robot.contact_reader.sum_forces_n()
         specification.add_sample(forces_n)
         assert robot.measured_force.max_n == specification.max_n, f"step {number}"
         pair_counts.add(len(forces_n))
@@ -103,7 +103,7 @@ def test_measured_force_in_c_equals_that_in_python(name: str, step_s: float) -> 
 
 
 @needs_c
-def test_both_versions_of_the_laws_measure_the_same_force() -> None:
+def test_measured_force_is_the_same_with_both_laws() -> None:
     scene = SCENES["rough and smooth pegs"]
     native = MeasuringRobot(scene, 0.002, "c")
     python = MeasuringRobot(scene, 0.002, "python")
@@ -117,7 +117,7 @@ def test_both_versions_of_the_laws_measure_the_same_force() -> None:
 
 
 @pytest.mark.parametrize("laws", ["python", pytest.param("c", marks=needs_c)])
-def test_computing_forces_again_adds_nothing_to_the_measured_force(laws: LawsVersion) -> None:
+def test_measured_force_ignores_repeated_computation_of_forces(laws: LawsVersion) -> None:
     robot = MeasuringRobot(SCENES["rough and smooth pegs"], 0.002, laws)
     number = 0
     while robot.measured_force.max_n == 0.0:
@@ -131,7 +131,7 @@ def test_computing_forces_again_adds_nothing_to_the_measured_force(laws: LawsVer
 
 
 @needs_c
-def test_force_cannot_be_measured_in_a_model_without_its_plugin() -> None:
+def test_measured_force_without_its_plugin_is_an_error() -> None:
     placed = create_settled_robot(
         make_config(scene={"name": "test", **SCENES["rough and smooth pegs"]})
     )

@@ -1,0 +1,251 @@
+"""Tests how push-points are found, and how a triplet of them and a propulsion joint are chosen."""
+
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from snakesim_gnc.control.obstacle_triplet.contacts import PushPoint, find_push_points, plan_contact
+from snakesim_gnc.control.obstacle_triplet.selection import (
+    PropulsionChoice,
+    TripletFinder,
+    choose_triplet,
+    find_alternating_triples,
+    find_propulsion_joint,
+    solve_triplets,
+)
+from snakesim_gnc.geometry.body_on_path import BodyOnPath
+from snakesim_hal.model.geometry.route import Route
+from snakesim_hal.wire.messages import KnownObstacle
+from snakesim_testing.gnc.stage import (
+    BODY_RADIUS_M,
+    CLEARANCE_M,
+    compute_body_points,
+    make_pegs,
+    make_route,
+    make_stage,
+)
+
+SEGMENTS = [0.055, *[0.11] * 12, 0.055]
+BODY_S_M = [0.0, *np.cumsum(SEGMENTS).tolist()]  # of the tail, the joints and the head, on the body
+STRAIGHT = Route([(0.0, 0.0), (5.0, 0.0)])
+SEARCH_WINDOW = {"search_middle_s_m": 1.5, "window_m": 3.0}  # on the path
+LIMITS = {"gap_m": 0.06, "give_up_gap_m": 0.12, "end_m": 0.03}
+HYSTERESIS_M = 0.003  # by which noise must not change the propulsion joint
+
+
+def plan_peg_contacts():
+    """Return the planned contacts with the first nine pegs along the usual route, from tail to head."""
+    route = make_route()
+    return [
+        plan_contact(route, peg, BODY_RADIUS_M, **SEARCH_WINDOW) for peg in make_pegs(route)[:9]
+    ]
+
+
+def find_points_at(tail_s_m, *, kept=(), offset_w=(0.0, 0.0)):
+    """Return the push-points of a body at this place of the path, or beside it, and its pose on the path."""
+    stage = make_stage()
+    pose = BodyOnPath(stage.route, SEGMENTS).compute_pose_at(tail_s_m)
+    measured_w = compute_body_points(stage, tail_s_m) + np.array(offset_w)[:, None]
+    points = find_push_points(plan_peg_contacts(), kept, pose, measured_w, BODY_S_M, **LIMITS)
+    return points, pose
+
+
+def list_obstacles(points):
+    return [point.contact.obstacle for point in points]
+
+
+def test_planned_contact_with_peg_is_at_an_inflection():
+    contacts = plan_peg_contacts()
+    for contact, inflection_s_m in zip(contacts, make_route().find_inflections_s_m(), strict=False):
+        assert contact.path_s_m == pytest.approx(inflection_s_m, abs=1e-3)
+        assert contact.clearance_m == pytest.approx(CLEARANCE_M, abs=1e-5)
+        assert contact.normal_w[0] > 0, "the peg pushes forward"
+        assert np.dot(contact.normal_w, contact.tangent_w) == pytest.approx(0.0, abs=1e-12)
+    sides = [contact.side for contact in contacts[:4]]
+    assert sides in ([1, -1, 1, -1], [-1, 1, -1, 1])
+
+
+@pytest.mark.parametrize(
+    ("y_m", "shape", "clearance_m"),
+    [
+        (0.1, {"shape": "sphere", "radius_m": 0.03}, 0.03),
+        (-0.1, {"shape": "sphere", "radius_m": 0.03}, 0.03),
+        (
+            0.3,
+            {"shape": "box", "yaw_rad": math.pi / 4, "half_size_m": (0.1, 0.1, 0.1)},
+            0.26 - 0.1 * math.sqrt(2),
+        ),
+    ],
+    ids=["ball on the left", "ball on the right", "corner of a turned box"],
+)
+def test_planned_contact_beside_straight_path_uses_nearest_obstacle_point(y_m, shape, clearance_m):
+    obstacle = KnownObstacle(name="obstacle", position_w=(2.0, y_m, 0.0), **shape)
+    contact = plan_contact(STRAIGHT, obstacle, BODY_RADIUS_M, **SEARCH_WINDOW)
+    assert contact.point_w == pytest.approx((2.0, 0.0), abs=1e-3)
+    assert contact.normal_w == pytest.approx((0.0, -math.copysign(1.0, y_m)))
+    assert contact.side == -math.copysign(1.0, y_m)
+    assert contact.clearance_m == pytest.approx(clearance_m, abs=1e-4)
+
+
+def test_planned_contact_with_box_on_path_has_negative_clearance():
+    box = KnownObstacle(
+        name="box", shape="box", position_w=(2.0, -0.05, 0.0), half_size_m=(0.1, 0.1, 0.1)
+    )
+    contact = plan_contact(STRAIGHT, box, BODY_RADIUS_M, **SEARCH_WINDOW)
+    assert contact.clearance_m < -0.04
+    assert contact.side == 1
+
+
+def test_push_points_are_contacts_that_the_body_covers():
+    points, pose = find_points_at(0.2)
+    assert list_obstacles(points) == ["peg_0", "peg_1", "peg_2", "peg_3", "peg_4"]
+    for point in points:
+        body_s_m = np.interp(point.contact.path_s_m, pose.body_points_s_m, BODY_S_M)
+        assert [point.body_s_m] == pytest.approx([body_s_m])
+        assert point.gap_m == pytest.approx(CLEARANCE_M, abs=2e-3)
+
+
+def test_push_points_of_body_beside_path_are_too_far():
+    displaced_along_path, _ = find_points_at(0.2, offset_w=(0.07, 0.0))
+    assert displaced_along_path
+    displaced_across_path, _ = find_points_at(0.2, offset_w=(0.0, 0.08))
+    assert not displaced_across_path
+
+
+def test_present_push_points_may_be_further_away_than_new_ones():
+    present = list_obstacles(find_points_at(0.2)[0])
+    new_points, _ = find_points_at(0.2, offset_w=(0.0, 0.08))
+    kept_points, _ = find_points_at(0.2, kept=present, offset_w=(0.0, 0.08))
+    assert len(kept_points) > len(new_points)
+    distant_points, _ = find_points_at(0.2, kept=present, offset_w=(5.0, 5.0))
+    assert not distant_points
+
+
+def test_contacts_at_the_tips_of_body_are_no_push_points():
+    contact_s_m = make_route().find_inflections_s_m()[0]
+    inside, _ = find_points_at(contact_s_m - 0.04)
+    assert "peg_0" in list_obstacles(inside)
+    at_tip, _ = find_points_at(contact_s_m - 0.02)
+    assert "peg_0" not in list_obstacles(at_tip)
+
+
+@given(st.lists(st.sampled_from([-1, 1]), max_size=10))
+def test_alternating_triples_are_all_threes_on_alternating_sides(sides):
+    triples = find_alternating_triples(sides)
+    combined = combinations(range(len(sides)), 3)
+    assert sorted(triples) == [
+        (i, j, k) for i, j, k in combined if sides[i] == -sides[j] == sides[k]
+    ]
+
+
+@given(st.floats(0.0, 1.2), st.floats(0.05, 0.5), st.one_of(st.none(), st.integers(0, 12)))
+def test_selection_propulsion_joint_is_first_ahead_of_middle_contact(
+    middle_s_m, distance_m, present_joint
+):
+    head_s_m = middle_s_m + distance_m  # of the contact nearest to the head
+    joint = find_propulsion_joint(BODY_S_M, middle_s_m, head_s_m, present_joint, HYSTERESIS_M)
+    between = [i for i in range(13) if middle_s_m < BODY_S_M[i + 1] < head_s_m]
+    if joint is None:
+        assert not between
+    else:
+        assert joint in between
+        first = between[0]
+        is_kept = (
+            joint == present_joint == first + 1 and BODY_S_M[first + 1] - middle_s_m < HYSTERESIS_M
+        )
+        assert joint == first or is_kept
+
+
+def test_selection_noise_does_not_change_the_propulsion_joint():
+    joint_s_m = BODY_S_M[6]  # of joint 5
+    head_s_m = 1.2
+    within_s_m = joint_s_m - 0.001
+    beyond_s_m = joint_s_m - 0.004
+    assert find_propulsion_joint(BODY_S_M, within_s_m, head_s_m, 6, HYSTERESIS_M) == 6
+    assert find_propulsion_joint(BODY_S_M, beyond_s_m, head_s_m, 6, HYSTERESIS_M) == 5
+    assert find_propulsion_joint(BODY_S_M, within_s_m, head_s_m, 5, HYSTERESIS_M) == 5
+    assert find_propulsion_joint(BODY_S_M, within_s_m, head_s_m, None, HYSTERESIS_M) == 5
+
+
+def make_choices(count=7):
+    """Return choices of neighboring triplets, each one peg nearer to the head than the one before."""
+    contacts = plan_peg_contacts()
+    triplets = solve_triplets(
+        [(contacts[i], contacts[i + 1], contacts[i + 2]) for i in range(count)],
+        condition_max=100.0,
+    )
+    return [
+        PropulsionChoice(triplet, (0.1 + 0.3 * i, 0.4 + 0.3 * i, 0.7 + 0.3 * i), 3 + i, 0.1)
+        for i, triplet in enumerate(triplets)
+    ]
+
+
+def test_selection_keeps_triplet_and_successor_shares_most_push_points():
+    choices = make_choices()
+    present = choices[3].triplet
+    assert choose_triplet(choices, present, switch_fraction=0.5) is choices[3]
+    without_present = [choices[0], choices[1], choices[4], choices[6]]
+    assert choose_triplet(without_present, present, switch_fraction=0.5) is choices[4]
+
+
+def test_selection_of_equal_triplets_is_nearest_to_the_tail():
+    choices = make_choices()
+    names = [choice.triplet.names for choice in choices]
+    assert choose_triplet(choices, None, switch_fraction=0.5) is choices[0]
+    second = choose_triplet(choices, None, switch_fraction=0.5, banned_triplets=names[:1])
+    assert second is choices[1]
+    assert choose_triplet(choices, None, switch_fraction=0.5, banned_triplets=names) is None
+
+
+def test_triplet_finder_returns_choices_with_joints_and_refusals():
+    points, pose = find_points_at(0.2)
+    finder = make_triplet_finder()
+    choices, refusals = finder.find_propulsion_choices(
+        points, pose.body_points_w, BODY_S_M, None, None
+    )
+    peg_numbers = [[int(name[-1]) for name in choice.triplet.names] for choice in choices]
+    assert peg_numbers == [[0, 1, 2], [0, 1, 4], [1, 2, 3], [2, 3, 4]]
+    assert len(refusals) == 1
+    assert "peg_0/peg_3/peg_4: a contact would have to pull: lambda_1" in refusals[0]
+    for choice in choices:
+        assert choice.body_s_m[1] < BODY_S_M[choice.joint + 1] < choice.body_s_m[2]
+        assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9
+
+    barred_joint = choices[0].joint
+    other_choices, more_refusals = finder.find_propulsion_choices(
+        points, pose.body_points_w, BODY_S_M, None, barred_joint
+    )
+    assert [choice.joint for choice in other_choices] == [
+        choice.joint for choice in choices if choice.joint != barred_joint
+    ]
+    assert len(other_choices) + len(more_refusals) == len(choices) + len(refusals)
+
+
+def make_triplet_finder() -> TripletFinder:
+    return TripletFinder(condition_max=100.0, authority_min=0.02, hold_on_m=HYSTERESIS_M)
+
+
+@pytest.mark.parametrize(
+    ("slope_deg", "expected_triplets"),
+    [(29.5, ["012", "014", "123", "234"]), (30.5, ["014"]), (37.5, ["014"]), (38.0, [])],
+)
+def test_triplet_finder_maximum_slope_depends_on_peg_spacing(
+    slope_deg: float, expected_triplets: list[str]
+):
+    """On a row of pegs at distances a and b along a wave of slope alpha, lambda_1 > 0 where cos 2 alpha > a/(a + b)."""
+    route = make_route(math.tan(math.radians(slope_deg)) * 0.6 / math.tau)
+    contacts = [
+        plan_contact(route, peg, BODY_RADIUS_M, **SEARCH_WINDOW) for peg in make_pegs(route)[:5]
+    ]
+    points = [PushPoint(contact, 0.1 + 0.3 * i, 0.0) for i, contact in enumerate(contacts)]
+    body_w = BodyOnPath(route, SEGMENTS).compute_pose_at(0.2).body_points_w
+    choices, refusals = make_triplet_finder().find_propulsion_choices(
+        points, body_w, BODY_S_M, None, None
+    )
+    triplets = ["".join(name[-1] for name in choice.triplet.names) for choice in choices]
+    assert triplets == expected_triplets
+    assert all("lambda_1" in refusal for refusal in refusals)
