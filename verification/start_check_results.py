@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_operator.features.evaluate.table import compute_wilson_interval
+from snakesim_operator.results.metrics.intervals import compute_wilson_interval
 from verification.start_check_trials import NONE, CheckTrial, Outcome
 
 FAULT_HEADER = (
