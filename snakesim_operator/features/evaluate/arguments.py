@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.programs.arguments import (
+    add_former_option,
     add_output_argument,
     add_resume_argument,
     add_scenario_name_argument,
     add_seed_argument,
+    add_seeds_argument,
     add_set_argument,
     add_workers_argument,
     make_number_parser,
@@ -25,19 +27,6 @@ if TYPE_CHECKING:
 MAX_TITLE_CHARACTERS = 200  # of a suite
 
 
-class _FormerOption(argparse.Action):
-    """An option that was renamed before the first release. It ends the command with the name of today, its `const`."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: object,
-        option_string: str | None = None,
-    ) -> None:
-        parser.error(f"{option_string} is now called {self.const}")
-
-
 def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "suite", metavar="SUITE", help="name of a shipped suite, or path of a suite file"
@@ -45,10 +34,8 @@ def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class"
     )
-    _add_seeds(
-        parser, "number of seeds for each condition and controller (default: the suite's)", None
-    )
-    _add_former_option(parser, "--fields", "--seeds")
+    add_seeds_argument(parser, "for each condition and controller (default: the suite's)")
+    add_former_option(parser, "--fields", "--seeds")
     _add_conditions(parser, "only these conditions of the suite, by number")
     parser.add_argument(
         "--against",
@@ -65,7 +52,7 @@ def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
     add_scenario_name_argument(parser)
     _add_vary(parser, "values of a key: KEY=LOW:HIGH:COUNT, or KEY=[A, B] (may be repeated)")
-    _add_seeds(parser, "number of seeds for each value (default: 1)", 1)
+    add_seeds_argument(parser, "for each value (default: 1)", 1)
     add_set_argument(parser)
     _add_shared_options(parser)
 
@@ -92,8 +79,8 @@ def _add_optimize_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of candidates in the file at the end (default: 50)",
     )
-    _add_former_option(parser, "--trials", "--candidates")
-    _add_seeds(parser, "number of seeds for each candidate and condition (default: 1)", 1)
+    add_former_option(parser, "--trials", "--candidates")
+    add_seeds_argument(parser, "for each candidate and condition (default: 1)", 1)
     parser.add_argument(
         "--storage",
         type=Path,
@@ -105,29 +92,14 @@ def _add_optimize_arguments(parser: argparse.ArgumentParser) -> None:
     add_workers_argument(parser)
 
 
-def _add_former_option(parser: argparse.ArgumentParser, former: str, new: str) -> None:
-    """Add a hidden option that ends the command with an error, which names the option that replaced it."""
-    parser.add_argument(former, action=_FormerOption, const=new, nargs="?", help=argparse.SUPPRESS)
-
-
 def _add_conditions(parser: argparse.ArgumentParser, help_text: str) -> None:
     parser.add_argument("--conditions", metavar="1,2,...", help=help_text)
-    _add_former_option(parser, "--rows", "--conditions")
+    add_former_option(parser, "--rows", "--conditions")
 
 
 def _add_vary(parser: argparse.ArgumentParser, help_text: str) -> None:
     parser.add_argument(
         "--vary", action="append", required=True, metavar="KEY=RANGE", help=help_text
-    )
-
-
-def _add_seeds(parser: argparse.ArgumentParser, help_text: str, default: int | None) -> None:
-    parser.add_argument(
-        "--seeds",
-        type=make_number_parser(1, 100_000),
-        default=default,
-        metavar="N",
-        help=help_text,
     )
 
 
@@ -137,7 +109,7 @@ def _add_shared_options(parser: argparse.ArgumentParser) -> None:
         metavar="CONTROLLER:SEED[:CONDITION]",
         help="run one trial, with its folder and report",
     )
-    _add_former_option(parser, "--only", "--trial")
+    add_former_option(parser, "--only", "--trial")
     add_output_argument(parser, "folder of the results (default: runs/NAME-TIME)")
     add_resume_argument(parser)
     add_seed_argument(

@@ -1,4 +1,4 @@
-"""The conditions of a suite: what each of them sets in the scenario. Each is a row of the table of results."""
+"""The conditions of a suite, and the values that each of them sets in the scenario."""
 
 import itertools
 import math

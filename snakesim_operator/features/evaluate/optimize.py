@@ -257,7 +257,8 @@ def _report_best(request: SearchRequest, study: Study) -> int:
         )
     if best.user_attrs[IS_STALLED_ATTRIBUTE]:
         print_line(
-            "  the search ended this run when it was stuck; this command runs it to its end, so its number may differ:"
+            "  the search ended this trial because the robot did not advance; this command runs to the end, so its "
+            "number may differ:"
         )
     _print_run_command(request, best.params)
     return 0

@@ -32,7 +32,7 @@ def make_trials(
     """Make every trial of a suite in the order of the table, each with its whole configuration.
 
     The values that the suite sets are checked here with the first seed of each condition. If a later seed gives a scene
-    that has no room for its obstacles, the outcome of that trial says so.
+    without room for its obstacles, the outcome of that trial is an error.
 
     Args:
         suite: The suite.

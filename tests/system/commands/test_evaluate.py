@@ -175,7 +175,7 @@ STOPPED = {
     "optimize": ("keeps all candidates", "the same command continues with\n  --storage stopped.db"),
     "train": (
         "generation 1:",
-        "stopped/policy.onnx is the best policy until then, .* goes on with --resume",
+        "stopped/policy.onnx is the best policy until then, .* continues with --resume",
     ),
 }
 ARGUMENTS = {
@@ -199,7 +199,7 @@ ARGUMENTS = {
         "0.2",
         "--population",
         "4",
-        "--fields",
+        "--seeds",
         "1",
         "--out",
         "stopped",
@@ -266,9 +266,9 @@ def test_training_on_a_cluster_finds_the_same_policy(home: Path) -> None:
         "2",
         "--population",
         "4",
-        "--fields",
+        "--seeds",
         "1",
-        "--check-fields",
+        "--check-seeds",
         "1",
         "--duration",
         "0.5",
