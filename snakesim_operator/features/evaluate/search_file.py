@@ -174,9 +174,8 @@ def _check_same_search(path: Path, stored: Any, command: SearchCommand) -> None:
         stored_command = msgspec.convert(stored, SearchCommand)
     except msgspec.ValidationError:
         raise ConfigError(
-            f"--storage {path}: the file holds candidates and does not contain the command that made them: an "
-            f"older version or another program wrote it. Candidates of two searches are not comparable; choose "
-            f"another file",
+            f"--storage {path}: the file was written by an older version of SnakeSIM or by another program, and cannot "
+            "be continued; choose another file",
             code="evaluation/other-search",
         ) from None
     this_command = msgspec.convert(msgspec.to_builtins(command), SearchCommand)
