@@ -20,7 +20,7 @@ from pathlib import Path
 
 import msgspec
 
-from snakesim_operator.features.evaluate.table import compute_wilson_interval
+from snakesim_operator.results.metrics.intervals import compute_wilson_interval
 from verification.start_check_signals import find_signals_path, load_signals, save_signals
 from verification.start_check_trials import JOINT_MODULES, NONE, CheckTrial, Outcome, judge_trial
 

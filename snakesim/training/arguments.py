@@ -5,12 +5,13 @@ import dataclasses
 
 from snakesim_hal.programs.arguments import (
     add_duration_argument,
-    add_fields_argument,
+    add_former_option,
     add_json_argument,
     add_output_argument,
     add_resume_argument,
     add_scenario_name_argument,
     add_seed_argument,
+    add_seeds_argument,
     add_set_argument,
     add_workers_argument,
     make_number_parser,
@@ -39,10 +40,12 @@ def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _add_count_option(parser, "--generations", 1, 20, "generations of the search")
     _add_count_option(parser, "--population", 4, 12, "policies in a generation")
-    add_fields_argument(parser, "for each policy, anew in each generation (default: 4)", 4)
+    add_seeds_argument(parser, "for each policy, new ones in each generation (default: 4)", 4)
+    add_former_option(parser, "--fields", "--seeds")
     _add_count_option(
-        parser, "--check-fields", 1, 8, "fields on which the mean of the search is checked"
+        parser, "--check-seeds", 1, 8, "number of seeds with which the mean policy is checked"
     )
+    add_former_option(parser, "--check-fields", "--check-seeds")
     add_seed_argument(parser, "of the search (default: 1)", 1)
     parser.add_argument(
         "--init",
@@ -75,7 +78,7 @@ def _add_train_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="KEY=LOW:HIGH",
-        help="a number for each field (may be repeated)",
+        help="a random value for each seed (may be repeated)",
     )
     add_workers_argument(parser)
     add_output_argument(parser, "folder of what comes of it", required=True)
@@ -154,7 +157,7 @@ def _list_search_options(arguments: argparse.Namespace) -> list[str]:
     options = ["--form", arguments.form]
     if arguments.duration:
         options += ["--duration", f"{arguments.duration:g}"]
-    for name in ("generations", "population", "fields", "check_fields", "seed"):
+    for name in ("generations", "population", "seeds", "check_seeds", "seed"):
         flag = f"--{name.replace('_', '-')}"
         options += [flag, str(getattr(arguments, name))]
     if arguments.frame_skip != DEFAULT_FRAME_SKIP:
@@ -177,7 +180,7 @@ COMMANDS: Commands = (
     ),
     Command(
         name="policy train",
-        help="Search a policy for a scenario on random fields. An ONNX file for --controller policy:FILE.",
+        help="Search a policy for a scenario on random scenes. An ONNX file for --controller policy:FILE.",
         add=_add_train_arguments,
         run=_run_train,
         details="In --out: policy.onnx, curve.csv and curve.png, as of the newest generation. The same numbers "

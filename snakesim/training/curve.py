@@ -31,7 +31,8 @@ def _write_figure(path: Path, generations: Sequence[SearchGeneration]) -> None:
 def _draw_curve(path: Path, generations: Sequence[SearchGeneration]) -> None:
     """Draw the learning curve into a file: rewards over the number of episodes.
 
-    The curves are the mean and the best reward of each generation, and the rewards of the mean policy on check fields.
+    The curves are the mean and the best reward of each generation, and the rewards of the mean policy with the check
+    seeds.
 
     Args:
         path: Path of the picture to write.
@@ -58,7 +59,7 @@ def _draw_curve(path: Path, generations: Sequence[SearchGeneration]) -> None:
         check_rewards,
         "o-",
         color="tab:blue",
-        label="mean policy, on other fields",
+        label="mean policy, with other seeds",
     )
     axes.set(xlabel="episodes", ylabel="reward of an episode")
     axes.grid(alpha=0.3)

@@ -23,7 +23,7 @@ Values = Mapping[str, float]  # parameters of a policy, by name
 Arguments = Mapping[str, Any]  # of `SnakeEnv`
 MapFunction = Callable[[Callable[..., Any], Sequence[Sequence[Any]]], list[Any]]
 """Calls a function with each of several argument lists, and returns the results in their order."""
-Job = tuple[PolicyArrays, int]  # an episode: what acts, and the seed of its field
+Job = tuple[PolicyArrays, int]  # an episode: what acts, and its seed
 MAX_BATCH_SIZE = 32  # episodes that a process steps together; a worker that dies loses no more
 
 
@@ -53,7 +53,7 @@ class EpisodeResult:
 class EpisodeRunner:
     """Runs episodes, within a `with` block.
 
-    The same policies and fields give the same numbers with any number of processes.
+    The same policies and seeds give the same numbers with any number of processes.
     """
 
     def __init__(
@@ -88,27 +88,27 @@ class EpisodeRunner:
     def __exit__(self, *_: object) -> None:
         self._exit_stack.close()
 
-    def run(self, policies: Sequence[Values], fields: Sequence[int]) -> list[list[EpisodeResult]]:
-        """Run every policy on every field.
+    def run(self, policies: Sequence[Values], seeds: Sequence[int]) -> list[list[EpisodeResult]]:
+        """Run every policy with every seed.
 
         Args:
             policies: Parameters of each policy, by name.
-            fields: Seeds of the random fields.
+            seeds: Seeds of the episodes, and so of their random scenes.
 
         Returns:
-            A list of episodes for each policy. Fields without room for their obstacles are left out.
+            A list of episodes for each policy. Seeds whose scene has no room for its obstacles are left out.
         """
         jobs: list[Job] = []
         for values in policies:
             policy = PolicyArrays.make_from_parameters(values, self.axes, self.sizes)
-            jobs += [(policy, field) for field in fields]
+            jobs += [(policy, seed) for seed in seeds]
         batch_size = min(max(math.ceil(len(jobs) / self._batch_count), 1), MAX_BATCH_SIZE)
         batches = [jobs[start : start + batch_size] for start in range(0, len(jobs), batch_size)]
         results = self._map_jobs(_run_batch, [(self._arguments, batch) for batch in batches])
         all_episodes = [episode for batch_episodes in results for episode in batch_episodes]
         episodes_by_policy: list[list[EpisodeResult]] = []
-        for start in range(0, len(all_episodes), len(fields)):
-            policy_episodes = all_episodes[start : start + len(fields)]
+        for start in range(0, len(all_episodes), len(seeds)):
+            policy_episodes = all_episodes[start : start + len(seeds)]
             episodes_by_policy.append(
                 [episode for episode in policy_episodes if episode is not None]
             )
@@ -154,16 +154,16 @@ def _run_batch(arguments: Arguments, jobs: Sequence[Job]) -> list[EpisodeResult 
 
     Args:
         arguments: Arguments of `SnakeEnv`, by name.
-        jobs: Policy and seed of the field of each episode. At most MAX_BATCH_SIZE.
+        jobs: Policy and seed of each episode. At most MAX_BATCH_SIZE.
 
     Returns:
-        An episode for each job, in order. It is None if the obstacles of the field find no place.
+        An episode for each job, in order. It is None if the scene has no room for its obstacles.
     """
     setup, environments = _get_cached_environments(arguments)
     row_count = MAX_BATCH_SIZE  # rows behind those of the jobs stay empty
     can_run = np.zeros(row_count, dtype=np.bool_)
-    for row, (_, field) in enumerate(jobs):
-        can_run[row] = _start_episode(environments, row, field)
+    for row, (_, seed) in enumerate(jobs):
+        can_run[row] = _start_episode(environments, row, seed)
     observations = environments.observe(can_run)
     targets_rad = np.zeros((row_count, len(setup.action_names)))
     total_reward = np.zeros(row_count)
@@ -204,10 +204,10 @@ def _run_batch(arguments: Arguments, jobs: Sequence[Job]) -> list[EpisodeResult 
     return episodes
 
 
-def _start_episode(environments: Environments, row: int, field: int) -> bool:
-    """Start an episode on a field. Returns False if its obstacles find no place."""
+def _start_episode(environments: Environments, row: int, seed: int) -> bool:
+    """Start an episode with a seed. Return False if its scene has no room for its obstacles."""
     try:
-        environments.reset(row, field, np.random.default_rng(field))
+        environments.reset(row, seed, np.random.default_rng(seed))
     except ConfigError:
         return False
     return True

@@ -19,7 +19,7 @@ SEARCH_FILENAME = "search.jsonl"
 
 
 class SearchCheck(msgspec.Struct, frozen=True):
-    """How the mean of the search did on the fields that it is checked on: means of the episodes."""
+    """The results of the mean policy with the check seeds: means over the episodes."""
 
     reward: float
     advance_m: float

@@ -1,4 +1,4 @@
-"""Searches a policy by CMA-ES over the parameters of a form, on fields that are new in each generation."""
+"""Searches a policy by CMA-ES over the parameters of a form, with seeds that are new in each generation."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from snakesim.training.form import FORMS
 from snakesim.training.kept_search import KeptGeneration, SearchCheck
 
 CHECK_INTERVAL = 5  # generations
-# Seed of the first field that is searched on; evaluations use fields from 1 on.
+# First seed of the search; evaluations use seeds from 1 on.
 FIRST_TRAINING_SEED = 1_000_001
-FIRST_CHECK_SEED = 2_000_001  # seed of the first field that policies are checked on
-# Step to other seeds when no field of a generation has room for its obstacles.
+FIRST_CHECK_SEED = 2_000_001  # first seed of the checks
+# Step to other seeds when no scene of a generation has room for its obstacles.
 RETRY_SEED_STEP = 10_000_000
 
 
@@ -24,9 +24,9 @@ class SearchGeneration:
 
     generation: int
     episodes: int  # so far, checks not counted
-    mean_reward: float  # of the population, on this generation's fields
+    mean_reward: float  # of the population, with the seeds of this generation
     best_reward: float
-    # Of the distribution's mean, on fields that it is not searched on; None: not checked.
+    # Of the mean policy, with seeds that the search does not use; None: not checked.
     check_reward: float | None
     check_advance_m: float | None
     check_goals: float | None  # share that reached it
@@ -38,8 +38,8 @@ class SearchEffort:
 
     generations: int
     population: int
-    fields: int  # for each policy
-    check_fields: int
+    seeds: int  # number of seeds for each policy and generation
+    check_seeds: int  # number of seeds for each check
     seed: int
     spread: float = 1.0  # of the first generation, times that of the form
 
@@ -51,7 +51,7 @@ class SearchStep:
     row: SearchGeneration
     kept: KeptGeneration  # what the search needs to go on after it
     best: dict[str, float]  # the best policy of all that were checked
-    best_reward: float  # of that policy, on the fields that it was checked on
+    best_reward: float  # of that policy, with the check seeds
 
 
 def run_search(
@@ -66,7 +66,7 @@ def run_search(
     Args:
         episodes: Runs the episodes of policies.
         form: Name of the form in FORMS whose parameters are searched.
-        effort: Number of generations, policies and fields, and the seed of the search.
+        effort: Numbers of generations, policies and seeds, and the seed of the search.
         start_values: Start values of parameters, by name. Missing parameters start at the values of the form.
         known_generations: Results of the first generations, from an earlier search with the same arguments. Their
             policies are proposed again by the optimizer, but not run.
@@ -113,9 +113,9 @@ def run_search(
 def _run_check(
     episodes: EpisodeRunner, policy: Mapping[str, float], effort: SearchEffort
 ) -> SearchCheck:
-    """Run a policy on the check fields, which the search does not use, and return the means over these episodes."""
-    fields = range(FIRST_CHECK_SEED, FIRST_CHECK_SEED + effort.check_fields)
-    check_episodes = episodes.run([policy], fields)[0]
+    """Run a policy with the check seeds, which the search does not use, and return the means over these episodes."""
+    seeds = range(FIRST_CHECK_SEED, FIRST_CHECK_SEED + effort.check_seeds)
+    check_episodes = episodes.run([policy], seeds)[0]
     return SearchCheck(
         reward=compute_mean(check_episodes, "total_reward"),
         advance_m=compute_mean(check_episodes, "advance_m"),
@@ -129,14 +129,14 @@ def _run_generation(
     number: int,
     effort: SearchEffort,
 ) -> list[float]:
-    """Run the policies of a generation on the fields of the generation, and return the mean reward of each policy."""
+    """Run the policies of a generation with the seeds of the generation, and return the mean reward of each policy."""
     if not policies:
         return []
-    first_seed = FIRST_TRAINING_SEED + number * effort.fields
-    episodes_by_policy = episodes.run(policies, range(first_seed, first_seed + effort.fields))
-    while not all(episodes_by_policy):  # no field of these has room for its obstacles
+    first_seed = FIRST_TRAINING_SEED + number * effort.seeds
+    episodes_by_policy = episodes.run(policies, range(first_seed, first_seed + effort.seeds))
+    while not all(episodes_by_policy):  # no scene of these has room for its obstacles
         first_seed += RETRY_SEED_STEP
-        episodes_by_policy = episodes.run(policies, range(first_seed, first_seed + effort.fields))
+        episodes_by_policy = episodes.run(policies, range(first_seed, first_seed + effort.seeds))
     return [compute_mean(policy_episodes, "total_reward") for policy_episodes in episodes_by_policy]
 
 
@@ -146,7 +146,7 @@ def _make_curve_row(number: int, result: KeptGeneration, effort: SearchEffort) -
     check = result.check
     return SearchGeneration(
         generation=number,
-        episodes=min(number + 1, effort.generations) * effort.population * effort.fields,
+        episodes=min(number + 1, effort.generations) * effort.population * effort.seeds,
         mean_reward=float(np.mean(rewards)),
         best_reward=float(np.max(rewards)),
         check_reward=None if check is None else check.reward,

@@ -39,7 +39,7 @@ def train_policy(
         form: Name of the form in FORMS whose parameters are learned.
         begin: Shipped policy, or path of a policy file, with whose parameters the search starts. None starts with those
             of the form.
-        effort: Number of generations, policies and fields, and the seed of the search.
+        effort: Numbers of generations, policies and seeds, and the seed of the search.
         folder: Folder to write to.
         worker_count: Number of processes on this computer. None starts one for each processor.
         cluster: Address of a Dask scheduler, whose workers are used instead. None uses this computer.
@@ -86,7 +86,7 @@ def train_policy(
     assert newest is not None, "a search has at least its last check"
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     print_line(
-        f"{folder / POLICY_FILE}: reward {newest.best_reward:.2f} on fields that it was checked on; "
+        f"{folder / POLICY_FILE}: reward {newest.best_reward:.2f} with the check seeds; "
         f"{newest.row.episodes} episodes in {time.monotonic() - start_time_s:.0f} s, "
         f"{usage.ru_utime + usage.ru_stime:.0f} s of processor time"
     )
@@ -100,7 +100,7 @@ def _print_stopped(newest: SearchStep | None, folder: Path) -> None:
         return
     print_line(
         f"stopped after generation {newest.row.generation}: {folder / POLICY_FILE} is the best policy until then, "
-        f"reward {newest.best_reward:.2f} on fields that it was checked on; the same command goes on with --resume"
+        f"reward {newest.best_reward:.2f} with the check seeds; the same command continues with --resume"
     )
 
 

@@ -50,7 +50,7 @@ ERROR_CODES = {
     ),
     "config/duplicate-name": ErrorCode(
         "Two things have the same name.",
-        "Obstacles of a scene, or rows of a suite, must have different names.",
+        "Obstacles of a scene, or conditions of a suite, must have different names.",
         "Rename one of them.",
     ),
     "config/unknown-name": ErrorCode(
@@ -512,8 +512,8 @@ ERROR_CODES = {
     ),
     # --- further tools
     "evaluation/other-search": ErrorCode(
-        "The file or folder holds the trials of another search.",
-        "Settings, seeds or version differ, so that trials are not comparable.",
+        "The file or folder holds another search.",
+        "Values, seeds or version differ, so that the results are not comparable.",
         "Repeat the original command, or choose another file.",
     ),
     "lab/invalid-file": ErrorCode(

@@ -135,17 +135,35 @@ def add_duration_argument(
     parser.add_argument("--duration", type=parse, default=default, metavar="S", help=help_text)
 
 
-def add_fields_argument(
+def add_seeds_argument(
     parser: argparse.ArgumentParser, help_text: str, default: int | None = None
 ) -> None:
-    """Add the option --fields, the number of random fields, with more text for the help."""
+    """Add the option --seeds, the number of seeds and so of random scenes, with more text for the help."""
     parser.add_argument(
-        "--fields",
+        "--seeds",
         type=make_number_parser(1, 100_000),
         default=default,
         metavar="N",
-        help=f"number of random fields {help_text}",
+        help=f"number of seeds {help_text}",
     )
+
+
+class _FormerOption(argparse.Action):
+    """An option that was renamed before the first release. It ends the command with the name of today, its `const`."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        parser.error(f"{option_string} is now called {self.const}")
+
+
+def add_former_option(parser: argparse.ArgumentParser, former: str, new: str) -> None:
+    """Add a hidden option that ends the command with an error, which names the option that replaced it."""
+    parser.add_argument(former, action=_FormerOption, const=new, nargs="?", help=argparse.SUPPRESS)
 
 
 def add_resume_argument(parser: argparse.ArgumentParser) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from statistics import median
 
-from snakesim_operator.features.evaluate.table import compute_wilson_interval
+from snakesim_operator.results.metrics.intervals import compute_wilson_interval
 from verification.sysid.comparison import OURS, OURS_WITHOUT_IMUS, THEIRS, RobotComparison
 from verification.sysid.estimates import MAX_CLOSE_ERROR, PARAMETERS, Estimate, IdentificationResult
 

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snakesim_hal.programs.arguments import (
-    add_fields_argument,
+    add_former_option,
     add_output_argument,
     add_resume_argument,
     add_scenario_name_argument,
     add_seed_argument,
+    add_seeds_argument,
     add_set_argument,
     add_workers_argument,
     make_number_parser,
@@ -33,15 +34,16 @@ def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--controllers", metavar="A,B,...", help="installed controllers, or ./file.py:Class"
     )
-    add_fields_argument(parser, "for each row and controller (default: the suite's)")
-    _add_rows(parser, "only these rows of the table, by number")
+    add_seeds_argument(parser, "for each condition and controller (default: the suite's)")
+    add_former_option(parser, "--fields", "--seeds")
+    _add_conditions(parser, "only these conditions of the suite, by number")
     parser.add_argument(
         "--against",
         action="append",
         default=[],
         type=Path,
         metavar="DIR",
-        help="pair with the score card there",
+        help="folder of another evaluation to compare with (may be repeated)",
     )
     add_set_argument(parser)
     _add_shared_options(parser)
@@ -50,34 +52,35 @@ def _add_evaluate_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_sweep_arguments(parser: argparse.ArgumentParser) -> None:
     add_scenario_name_argument(parser)
     _add_vary(parser, "values of a key: KEY=LOW:HIGH:COUNT, or KEY=[A, B] (may be repeated)")
-    _add_seeds(parser, "runs for each value (default: 1)")
+    add_seeds_argument(parser, "for each value (default: 1)", 1)
     add_set_argument(parser)
     _add_shared_options(parser)
 
 
 def _add_optimize_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `snakesim study optimize`, which searches the values of keys for the best result."""
     parser.add_argument(
         "scenario",
         metavar="SCENARIO",
-        help="name of a shipped scenario, or path of its file, or of a suite with --rows",
+        help="name of a shipped scenario, or path of its file, or of a suite with --conditions",
     )
-    _add_rows(parser, "on these rows of a suite, with what it draws")
+    _add_conditions(parser, "use these conditions of a suite, by number, with its random values")
     _add_vary(parser, "range of a key: KEY=LOW:HIGH (may be repeated)")
     parser.add_argument(
-        "--goal", required=True, metavar="NAME", help="such as path_distance_m or energy_j_per_m"
+        "--goal",
+        required=True,
+        metavar="NAME",
+        help="number of the summary to maximize, such as path_distance_m",
     )
+    parser.add_argument("--minimize", action="store_true", help="minimize this number instead")
     parser.add_argument(
-        "--minimize", action="store_true", help="search the smallest instead of the largest"
-    )
-    parser.add_argument(
-        "--trials",
+        "--candidates",
         type=make_number_parser(1, 100_000),
         default=50,
         metavar="N",
-        help="in the file at the end (default: 50)",
+        help="number of candidates in the file at the end (default: 50)",
     )
-    _add_seeds(parser, "runs for each trial, or fields for each row (default: 1)")
+    add_former_option(parser, "--trials", "--candidates")
+    add_seeds_argument(parser, "for each candidate and condition (default: 1)", 1)
     parser.add_argument(
         "--storage",
         type=Path,
@@ -85,12 +88,13 @@ def _add_optimize_arguments(parser: argparse.ArgumentParser) -> None:
         help="SQLite file, which is continued if it exists (default: a new one in runs/)",
     )
     add_set_argument(parser)
-    _add_study_seed(parser)
+    add_seed_argument(parser, "of the first trials; default: 1", 1)
     add_workers_argument(parser)
 
 
-def _add_rows(parser: argparse.ArgumentParser, help_text: str) -> None:
-    parser.add_argument("--rows", metavar="1,2,...", help=help_text)
+def _add_conditions(parser: argparse.ArgumentParser, help_text: str) -> None:
+    parser.add_argument("--conditions", metavar="1,2,...", help=help_text)
+    add_former_option(parser, "--rows", "--conditions")
 
 
 def _add_vary(parser: argparse.ArgumentParser, help_text: str) -> None:
@@ -99,49 +103,41 @@ def _add_vary(parser: argparse.ArgumentParser, help_text: str) -> None:
     )
 
 
-def _add_seeds(parser: argparse.ArgumentParser, help_text: str) -> None:
-    parser.add_argument(
-        "--seeds", type=make_number_parser(1, 100_000), default=1, metavar="N", help=help_text
-    )
-
-
 def _add_shared_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--only", metavar="CONTROLLER:FIELD[:ROW]", help="run one case, with its folder and report"
+        "--trial",
+        metavar="CONTROLLER:SEED[:CONDITION]",
+        help="run one trial, with its folder and report",
     )
+    add_former_option(parser, "--only", "--trial")
     add_output_argument(parser, "folder of the results (default: runs/NAME-TIME)")
     add_resume_argument(parser)
-    _add_study_seed(parser)
+    add_seed_argument(
+        parser, "of the first trials; default: 1, or a new one if the suite has `new_seeds`"
+    )
     add_workers_argument(parser)
 
 
-def _add_study_seed(parser: argparse.ArgumentParser) -> None:
-    add_seed_argument(
-        parser,
-        "of the first field, of which each following field has the next number (default: 1, or drawn by the suite)",
-    )
-
-
 def _run_evaluate(arguments: argparse.Namespace) -> int:
-    return _run_guarded_if_single_case(arguments, _evaluate_suite)
+    return _run_guarded_if_single_trial(arguments, _evaluate_suite)
 
 
 def _run_sweep(arguments: argparse.Namespace) -> int:
-    return _run_guarded_if_single_case(arguments, _evaluate_sweep)
+    return _run_guarded_if_single_trial(arguments, _evaluate_sweep)
 
 
-def _run_guarded_if_single_case(
+def _run_guarded_if_single_trial(
     arguments: argparse.Namespace,
     run_command: "Callable[[argparse.Namespace, SharedStepTimes | None], int]",
 ) -> int:
-    """Run a command; with `--only`, run it in a child process that can be ended whatever its controller does.
+    """Run a command; with `--trial`, run it in a child process that can be ended whatever its controller does.
 
     Args:
         arguments: The parsed command line.
-        run_command: Runs the command and returns its exit code; its second argument is None without `--only`.
+        run_command: Runs the command and returns its exit code; its second argument is None without `--trial`.
     """
     _require_train_extra()
-    if arguments.only is None:
+    if arguments.trial is None:
         return run_command(arguments, None)
     from snakesim_operator.run.processes.guarded_process import run_in_guarded_child
 
@@ -165,12 +161,12 @@ def _evaluate_suite(arguments: argparse.Namespace, step_times: "SharedStepTimes 
     names = (arguments.controllers or "").split(",")
     controllers = [name.strip() for name in names if name.strip()]
 
-    # The command that runs one of the cases again, for the report.
+    # The command that repeats a trial, for the report.
     command_words = ["snakesim", "study", "evaluate", arguments.suite]
     if controllers:
         command_words += ["--controllers", ",".join(controllers)]
-    if arguments.rows:
-        command_words += ["--rows", arguments.rows]
+    if arguments.conditions:
+        command_words += ["--conditions", arguments.conditions]
     command_words += _repeat_option("--set", arguments.set)
 
     request = EvaluationRequest(
@@ -178,8 +174,8 @@ def _evaluate_suite(arguments: argparse.Namespace, step_times: "SharedStepTimes 
         source=source,
         name=Path(arguments.suite).stem,
         controllers=controllers or suite.controllers,
-        fields=arguments.fields or suite.fields,
-        rows=_parse_numbers(arguments.rows or "", "--rows"),
+        seeds=arguments.seeds or suite.seeds,
+        conditions=_parse_numbers(arguments.conditions or "", "--conditions"),
         against=arguments.against,
         **_collect_shared_values(arguments, command_words),
     )
@@ -205,7 +201,7 @@ def _evaluate_sweep(arguments: argparse.Namespace, step_times: "SharedStepTimes 
         vary=vary,
     )
 
-    # The command that runs one of the cases again, for the report.
+    # The command that repeats a trial, for the report.
     command_words = ["snakesim", "study", "sweep", arguments.scenario]
     command_words += _repeat_option("--vary", arguments.vary)
     command_words += _repeat_option("--set", arguments.set)
@@ -215,15 +211,15 @@ def _evaluate_sweep(arguments: argparse.Namespace, step_times: "SharedStepTimes 
         source="sweep",
         name="sweep",
         controllers=[],
-        fields=arguments.seeds,
+        seeds=arguments.seeds,
         **_collect_shared_values(arguments, command_words),
     )
     return run_evaluation(request, step_times)
 
 
 def _collect_shared_values(arguments: argparse.Namespace, command: list[str]) -> dict[str, Any]:
-    """Return the values of an `EvaluationRequest` that both commands have. `command` runs one of the cases again."""
-    names = ("seed", "only", "out", "resume", "cluster", "workers")
+    """Return the values of an `EvaluationRequest` that both commands have. `command` repeats a trial."""
+    names = ("seed", "trial", "out", "resume", "cluster", "workers")
     values = {name: getattr(arguments, name) for name in names}
     values["command"] = shlex.join(command)
     return values
@@ -238,23 +234,21 @@ def _run_optimize(arguments: argparse.Namespace) -> int:
     from snakesim_operator.run.conclusion import EXIT_INTERRUPTED
     from snakesim_operator.run.folder import choose_default_folder
 
-    # Every field of `SearchRequest` has the name of its option; three of them are converted below.
+    # Every field of `SearchRequest` has the name of its option; two of them are converted below.
     values = {
         field.name: getattr(arguments, field.name) for field in dataclasses.fields(SearchRequest)
     }
     # Without --storage, the file has the name that a new run folder would have.
     storage = arguments.storage or choose_default_folder("optimize").with_suffix(".db")
     values["storage"] = storage
-    values["rows"] = _parse_numbers(arguments.rows or "", "--rows")
-    # The option has no default, because the suite of `study evaluate` may draw its seed; a search does not.
-    values["seed"] = 1 if arguments.seed is None else arguments.seed
+    values["conditions"] = _parse_numbers(arguments.conditions or "", "--conditions")
     with raise_on_stop_signals():
         try:
             return run_optimization(SearchRequest(**values))
-        except KeyboardInterrupt:  # the storage keeps every finished trial
+        except KeyboardInterrupt:  # the storage keeps every finished candidate
             if storage.is_file():
                 print_line(
-                    f"stopped: {storage} keeps the trials that are done; the same command continues with"
+                    f"stopped: {storage} keeps the finished candidates; the same command continues with"
                 )
                 print_line(f"  --storage {shlex.quote(str(storage))}")
             return EXIT_INTERRUPTED
@@ -299,34 +293,35 @@ def _require_train_extra() -> None:
 COMMANDS: Commands = (
     Command(
         name="study evaluate",
-        help="Run controllers on many fields. Writes a table with confidence intervals, and a page.",
+        help="Run controllers on many random scenes. Writes a table with confidence intervals, and a page.",
         add=_add_evaluate_arguments,
         run=_run_evaluate,
-        details="Exit code 0: all cases ran, also if their runs failed. 1: some could not. 2: wrong input, nothing was "
+        details="A trial is one run: one controller, one condition and one seed, which gives the random scene. "
+        "Exit code 0: all trials ran, whatever their results are. 1: some could not run. 2: wrong input, nothing was "
         "run. 130: stopped by Ctrl-C, continue with --resume.",
         examples=(
-            "study evaluate clutter --controllers obstacle_aided,hold --fields 20",
+            "study evaluate clutter --controllers obstacle_aided,hold --seeds 20",
             "study evaluate ./suite.toml --out runs/suite --resume",
         ),
     ),
     Command(
         name="study sweep",
-        help="Run a scenario with different values of any setting.",
+        help="Run a scenario with different values of any key.",
         add=_add_sweep_arguments,
         run=_run_sweep,
         examples=(
-            "study sweep peg_row --vary control.speed_kp_s=0.1:0.5:5",
-            "study sweep peg_row --vary control.speed_kp_s=0.1:0.5:5 --seeds 4 --out runs/sweep",
+            "study sweep peg_row --vary control.propulsion_n=10:30:5",
+            "study sweep peg_row --vary control.propulsion_n=10:30:5 --seeds 4 --out runs/sweep",
         ),
     ),
     Command(
         name="study optimize",
-        help="Search settings for the best mean of a number of the summary.",
+        help="Search values of keys that give the best mean of a number of the summary.",
         add=_add_optimize_arguments,
         run=_run_optimize,
         examples=(
-            "study optimize peg_row --vary control.speed_kp_s=0.1:0.5 --goal path_distance_m",
-            "study optimize peg_row --vary control.speed_kp_s=0.1:0.5 --goal energy_j_per_m --minimize --trials 100",
+            "study optimize peg_row --vary control.propulsion_n=10:30 --goal path_distance_m",
+            "study optimize peg_row --vary control.propulsion_n=10:30 --goal energy_j_per_m --minimize --candidates 90",
         ),
     ),
 )

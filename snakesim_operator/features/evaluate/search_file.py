@@ -1,7 +1,8 @@
 """The file of a search: an Optuna study in SQLite, and the command that it belongs to.
 
-A search continues only with a file that the same command began. Trials of another goal, direction, range, setting,
-seed, configuration or version of the code are not comparable, and the sampler and the printed result would mix them.
+A search continues only with a file that the same command began. Candidates of another goal, direction, range, set
+value, seed, configuration or version of the code are not comparable: the sampler and the printed result would mix them.
+In Optuna, a candidate is called a trial.
 """
 
 import hashlib
@@ -21,31 +22,32 @@ from sqlalchemy import QueuePool
 from sqlalchemy.exc import SQLAlchemyError
 
 from snakesim_hal.base.errors import ConfigError
-from snakesim_operator.features.evaluate.case import EvaluationCase
+from snakesim_operator.features.evaluate.trial import EvaluationTrial
 
 # Attribute of the study: the `SearchCommand` as JSON types.
 SEARCH_COMMAND_ATTRIBUTE = "snakesim_command"
-TRIAL_NUMBER_ATTRIBUTE = "snakesim_number"  # attribute of a trial: as it was printed, from 1
-TRIAL_RESULTS_ATTRIBUTE = "snakesim_results"  # attribute of a trial: the goal of each of its runs
-# Attribute of a trial: whether its first run was ended because it was stuck.
-IS_STUCK_ATTRIBUTE = "snakesim_stuck"
+# Attributes of a candidate: its number as it is printed, from 1; the metric of each of its trials; and whether its
+# first trial was ended early because the robot did not advance.
+CANDIDATE_NUMBER_ATTRIBUTE = "snakesim_number"
+CANDIDATE_RESULTS_ATTRIBUTE = "snakesim_results"
+IS_STALLED_ATTRIBUTE = "snakesim_stalled"
 
 # What SQLite, SQLAlchemy and Optuna raise for a file of another kind, a folder, a full disk, another version.
 STORAGE_ERRORS = (OSError, sqlite3.Error, SQLAlchemyError, OptunaError, RuntimeError)
 
 
 class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
-    """Everything that decides what a trial's number means."""
+    """Everything on which the result of a candidate depends."""
 
     scenario: str
-    rows: list[int]
+    conditions: list[int]  # of a suite, by number
     vary: dict[str, str]  # key -> LOW:HIGH
-    set: dict[str, Any]
-    set_words: list[str]  # as they were typed
+    set: dict[str, Any]  # the values, which are compared
+    set_texts: list[str]  # KEY=VALUE as it was typed, for the command that continues the search
     goal: str
     direction: Literal["minimize", "maximize"]
-    seeds: int
-    seed: int
+    seeds: int  # number of seeds for each candidate
+    seed: int  # the first of them
     # Hash of what scenario, robot and scene files give at the ends of the ranges.
     configurations: str
     code: str  # hash of the installed code
@@ -53,12 +55,12 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
     def format_command_line(self, storage: Path) -> str:
         """Return the command that continues the search, as a user types it."""
         words = ["snakesim", "study", "optimize", self.scenario]
-        if self.rows:
-            words += ["--rows", ",".join(map(str, self.rows))]
+        if self.conditions:
+            words += ["--conditions", ",".join(map(str, self.conditions))]
         for key, limits in self.vary.items():
             words += ["--vary", f"{key}={limits}"]
-        for setting in self.set_words:
-            words += ["--set", setting]
+        for text in self.set_texts:
+            words += ["--set", text]
         words += ["--goal", self.goal]
         if self.direction == "minimize":
             words.append("--minimize")
@@ -66,25 +68,25 @@ class SearchCommand(msgspec.Struct, frozen=True, kw_only=True):
         return shlex.join(words)
 
 
-def hash_configurations(cases: Sequence[EvaluationCase]) -> str:
-    """Return a hash of the whole configurations of these cases."""
+def hash_configurations(trials: Sequence[EvaluationTrial]) -> str:
+    """Return a hash of the whole configurations of these trials."""
     digest = hashlib.sha256()
-    for case in cases:
-        digest.update(case.config)
+    for trial in trials:
+        digest.update(trial.config)
     return digest.hexdigest()[:16]
 
 
 def open_study(path: Path, command: SearchCommand) -> Study:
     """Open the search that a file holds, or create a search in an empty or new file.
 
-    Trials that another process started and did not finish are queued again.
+    Candidates that another process started and did not finish are queued again.
 
     Args:
         path: The SQLite file; its folder is made if it does not exist.
         command: The search; it must be the same as the search in the file.
 
     Returns:
-        The Optuna study with the trials so far.
+        The Optuna study with the candidates so far.
 
     Raises:
         ConfigError: The file holds another search, or is not usable.
@@ -100,7 +102,7 @@ def open_study(path: Path, command: SearchCommand) -> Study:
             if summary.n_trials or SEARCH_COMMAND_ATTRIBUTE in summary.user_attrs
         ]
         if not started_searches:
-            for summary in summaries:  # of a process that was killed before its first trial
+            for summary in summaries:  # of a process that was killed before its first candidate
                 optuna.delete_study(study_name=summary.study_name, storage=storage)
             return _create_study(storage, command)
         stored_summary = started_searches[0]
@@ -112,15 +114,15 @@ def open_study(path: Path, command: SearchCommand) -> Study:
         raise ConfigError(
             f"--storage {path}: {reason}; choose another file", code="file/not-writable"
         ) from None
-    _requeue_unfinished_trials(study)
+    _requeue_unfinished_candidates(study)
     return study
 
 
-def generate_unused_trial_numbers(study: Study) -> Iterator[int]:
-    """Yield the numbers from 1 that no trial with a result has, for further trials; there is no end."""
+def generate_unused_candidate_numbers(study: Study) -> Iterator[int]:
+    """Yield the numbers from 1 that no candidate with a result has, for further candidates; there is no end."""
     used_numbers = {
-        trial.user_attrs.get(TRIAL_NUMBER_ATTRIBUTE)
-        for trial in study.get_trials(states=(TrialState.COMPLETE,))
+        candidate.user_attrs.get(CANDIDATE_NUMBER_ATTRIBUTE)
+        for candidate in study.get_trials(states=(TrialState.COMPLETE,))
     }
     number = 0
     while True:
@@ -148,15 +150,17 @@ def _create_study(storage: BaseStorage, command: SearchCommand) -> Study:
     return study
 
 
-def _requeue_unfinished_trials(study: Study) -> None:
-    """End the trials of a process that was killed, and enqueue their values again."""
-    for trial in study.get_trials(states=(TrialState.RUNNING,)):
-        study.tell(trial.number, state=TrialState.FAIL)
-        study.enqueue_trial(trial.params)
+def _requeue_unfinished_candidates(study: Study) -> None:
+    """End the candidates of a process that was killed, and enqueue their values again."""
+    for candidate in study.get_trials(states=(TrialState.RUNNING,)):
+        study.tell(candidate.number, state=TrialState.FAIL)
+        study.enqueue_trial(candidate.params)
 
 
 def _check_same_search(path: Path, stored: Any, command: SearchCommand) -> None:
-    """Check that the search in a file is the one that this command asks for, because otherwise trials would be mixed.
+    """Check that the search in a file is the one that this command asks for.
+
+    Otherwise the candidates of two searches would be mixed.
 
     Args:
         path: Path of the file, for the error message.
@@ -170,8 +174,8 @@ def _check_same_search(path: Path, stored: Any, command: SearchCommand) -> None:
         stored_command = msgspec.convert(stored, SearchCommand)
     except msgspec.ValidationError:
         raise ConfigError(
-            f"--storage {path}: the file holds trials and does not contain the command that made them: an older "
-            f"version or another program wrote it. Trials of two searches are not comparable; choose another file",
+            f"--storage {path}: the file was written by an older version of SnakeSIM or by another program, and cannot "
+            "be continued; choose another file",
             code="evaluation/other-search",
         ) from None
     this_command = msgspec.convert(msgspec.to_builtins(command), SearchCommand)
@@ -179,8 +183,8 @@ def _check_same_search(path: Path, stored: Any, command: SearchCommand) -> None:
     if not differences:
         return
     raise ConfigError(
-        f"--storage {path}: the file holds another search, whose trials are not comparable with this one's. "
-        f"{'; '.join(differences)}. Go on with that search by "
+        f"--storage {path}: the file holds another search, whose candidates are not comparable with this one's. "
+        f"{'; '.join(differences)}. Continue that search with "
         f"`{stored_command.format_command_line(path)}`, or choose another file",
         code="evaluation/other-search",
     )
@@ -190,13 +194,13 @@ def _describe_differences(stored: SearchCommand, requested: SearchCommand) -> It
     """Describe each difference between two searches by the options of the command line.
 
     Args:
-        stored: The search whose trials the file holds.
+        stored: The search whose candidates the file holds.
         requested: The search that the user asks for now.
     """
     if stored.scenario != requested.scenario:
         yield f"scenario: {stored.scenario} there, {requested.scenario} here"
-    if stored.rows != requested.rows:
-        yield f"--rows: {_format_rows(stored)} there, {_format_rows(requested)} here"
+    if stored.conditions != requested.conditions:
+        yield f"--conditions: {_format_conditions(stored)} there, {_format_conditions(requested)} here"
     yield from _describe_differing_keys("--vary", stored.vary, requested.vary)
     yield from _describe_differing_keys("--set", stored.set, requested.set)
     if stored.goal != requested.goal:
@@ -215,7 +219,7 @@ def _describe_differences(stored: SearchCommand, requested: SearchCommand) -> It
         stored,
         configurations=requested.configurations,
         code=requested.code,
-        set_words=requested.set_words,
+        set_texts=requested.set_texts,
     )
     if command_with_same_files == requested and stored.configurations != requested.configurations:
         yield "the same command gives another configuration: the files of scenario, robot, scene or suite have changed"
@@ -231,5 +235,5 @@ def _describe_differing_keys(
             yield f"{option} {key}: {stored_value} there, {requested_value} here"
 
 
-def _format_rows(command: SearchCommand) -> str:
-    return ",".join(map(str, command.rows)) or "all"
+def _format_conditions(command: SearchCommand) -> str:
+    return ",".join(map(str, command.conditions)) or "all"

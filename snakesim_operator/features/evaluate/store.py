@@ -1,4 +1,4 @@
-"""Keeps results on disk: a line for each case as it is done, and at the end a table for other programs."""
+"""Keeps outcomes on disk: a line for each trial as it is finished, and at the end a table for other programs."""
 
 import csv
 import fcntl
@@ -16,44 +16,46 @@ import pyarrow.parquet as pq
 
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.textfiles import export_atomically
-from snakesim_operator.features.evaluate.case import (
-    GAVE_UP_FIELD,
-    WALL_CLOCK_FIELDS,
-    CaseOutcome,
-    EvaluationCase,
-    Number,
+from snakesim_operator.features.evaluate.trial import (
+    ENDED_BY_STALL_METRIC,
+    WALL_CLOCK_METRICS,
+    EvaluationTrial,
+    MetricValue,
+    TrialOutcome,
 )
 from snakesim_operator.results.signals import PARQUET_UNIT
 from snakesim_operator.results.summary import RunSummary
 
-CASES_FILENAME = "cases.jsonl"
+TRIALS_FILENAME = "trials.jsonl"
+# Name of the file of finished trials before the first release. Its lines cannot be continued: they are of other code.
+FORMER_TRIALS_FILENAME = "cases.jsonl"
 PARQUET_FILENAME = "results.parquet"
 CSV_FILENAME = "results.csv"
-Results = dict[str, CaseOutcome]  # by the case's id
+OutcomeById = dict[str, TrialOutcome]  # by the id of the trial
 ARROW_TYPE_BY_TYPE = {bool: pa.bool_(), int: pa.int64(), float: pa.float64(), str: pa.string()}
 
 
-class _StoredCase(msgspec.Struct, frozen=True):
-    """A line of the file of finished cases."""
+class _StoredTrial(msgspec.Struct, frozen=True):
+    """A line of the file of finished trials."""
 
     id: str
-    outcome: CaseOutcome
-    numbers: dict[str, Number] = {}
+    outcome: TrialOutcome
+    trial: dict[str, MetricValue] = {}  # the columns that identify the trial, for readers
 
 
 class ResultStore:
-    """The file of finished cases, open for appending."""
+    """The file of finished trials, open for appending."""
 
-    def __init__(self, handle: int, done: Results) -> None:
-        self._file_descriptor = handle
-        self.done = done
+    def __init__(self, file_descriptor: int, outcome_by_id: OutcomeById) -> None:
+        self._file_descriptor = file_descriptor
+        self.outcome_by_id = outcome_by_id
 
-    def append(self, case: EvaluationCase, outcome: CaseOutcome) -> None:
-        """Store a finished case; it is on the disk when this returns."""
-        line = _StoredCase(case.id, outcome, case.identifying_columns)
+    def append(self, trial: EvaluationTrial, outcome: TrialOutcome) -> None:
+        """Store a finished trial; it is on the disk when this returns."""
+        line = _StoredTrial(trial.id, outcome, trial.identifying_columns)
         os.write(self._file_descriptor, msgspec.json.encode(line) + b"\n")
         os.fsync(self._file_descriptor)
-        self.done[case.id] = outcome
+        self.outcome_by_id[trial.id] = outcome
 
 
 @contextmanager
@@ -67,7 +69,13 @@ def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
     Raises:
         ConfigError: The folder cannot be used, holds an evaluation, or another process writes there.
     """
-    path = folder / CASES_FILENAME
+    if (folder / FORMER_TRIALS_FILENAME).exists():
+        raise ConfigError(
+            f"--out {folder} holds an evaluation of an older version of SnakeSIM, which cannot be continued; "
+            "choose another folder",
+            code="file/already-exists",
+        )
+    path = folder / TRIALS_FILENAME
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file_descriptor = os.open(
@@ -84,7 +92,7 @@ def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
                 f"--out {folder} holds an evaluation; continue it with --resume, or choose another folder",
                 code="file/already-exists",
             )
-        yield ResultStore(file_descriptor, _read_results(path, file_descriptor))
+        yield ResultStore(file_descriptor, _read_outcomes(path, file_descriptor))
     except BlockingIOError:
         raise ConfigError(
             f"--out {folder}: another evaluation is writing there; choose another folder",
@@ -94,59 +102,61 @@ def open_store(folder: Path, *, resume: bool) -> Iterator[ResultStore]:
         os.close(file_descriptor)
 
 
-def _read_results(path: Path, file_descriptor: int) -> Results:
-    """Return the results of finished cases.
+def _read_outcomes(path: Path, file_descriptor: int) -> OutcomeById:
+    """Return the outcomes of finished trials.
 
-    A last line that is incomplete, because the process was killed, is removed. A case without a run is left out, so
-    that it is tried again.
+    A last line that is incomplete, because the process was killed, is removed. A trial that could not run is left out,
+    so that it is tried again.
     """
     content = path.read_bytes()
     os.ftruncate(file_descriptor, content.rfind(b"\n") + 1)
-    outcome_by_id: Results = {}
+    outcome_by_id: OutcomeById = {}
     for text in content.split(b"\n")[:-1]:
         with suppress(msgspec.DecodeError):
-            line = msgspec.json.decode(text, type=_StoredCase)
+            line = msgspec.json.decode(text, type=_StoredTrial)
             if line.outcome.error is None:
                 outcome_by_id[line.id] = line.outcome
     return outcome_by_id
 
 
 def write_tables(
-    folder: Path, cases: Sequence[EvaluationCase], outcome_by_id: Results
+    folder: Path, trials: Sequence[EvaluationTrial], outcome_by_id: OutcomeById
 ) -> list[Path]:
-    """Write the results in the order of the cases, as Parquet and as CSV.
+    """Write the results in the order of the trials, as Parquet and as CSV.
 
-    No value depends on the wall clock, so two evaluations of the same cases give the same files.
+    No value depends on the wall clock, so two evaluations of the same trials give the same files.
 
     Args:
         folder: Path of the evaluation's folder.
-        cases: All cases; those without a result are left out.
-        outcome_by_id: Outcome of each finished case by its id.
+        trials: All trials; those without an outcome are left out.
+        outcome_by_id: Outcome of each finished trial by its id.
 
     Returns:
         The paths of the two files.
     """
-    columns = _find_column_types()
-    rows: list[dict[str, Number]] = []
-    for case in cases:
-        if case.id in outcome_by_id:
-            outcome = outcome_by_id[case.id]
-            rows.append({**outcome.numbers, **case.identifying_columns, "error": outcome.error})
+    type_by_column = _find_column_types()
+    rows: list[dict[str, MetricValue]] = []
+    for trial in trials:
+        if trial.id in outcome_by_id:
+            outcome = outcome_by_id[trial.id]
+            rows.append({**outcome.metrics, **trial.identifying_columns, "error": outcome.error})
     parquet_path = folder / PARQUET_FILENAME
     csv_path = folder / CSV_FILENAME
-    units = _find_units()
-    fields = [
-        pa.field(name, type_, metadata=_make_unit_metadata(units.get(name)))
-        for name, type_ in columns.items()
+    unit_by_column = _find_units()
+    arrow_fields = [
+        pa.field(column, arrow_type, metadata=_make_unit_metadata(unit_by_column.get(column)))
+        for column, arrow_type in type_by_column.items()
     ]
-    schema = pa.schema(fields)
+    schema = pa.schema(arrow_fields)
     with export_atomically(parquet_path) as temporary_path:
         pq.write_table(pa.Table.from_pylist(rows, schema=schema), temporary_path)
     with (
         export_atomically(csv_path) as temporary_path,
         temporary_path.open("x", newline="", encoding="utf-8") as file,
     ):
-        writer = csv.DictWriter(file, list(columns), extrasaction="ignore", lineterminator="\n")
+        writer = csv.DictWriter(
+            file, list(type_by_column), extrasaction="ignore", lineterminator="\n"
+        )
         writer.writeheader()
         writer.writerows(rows)
     return [parquet_path, csv_path]
@@ -155,17 +165,17 @@ def write_tables(
 def _find_column_types() -> dict[str, Any]:
     """Return name and Arrow type of each column of the table of results.
 
-    The first columns identify a case. Then follow the fields of a run's summary that are plain values and do not
-    depend on the wall clock.
+    The first columns identify a trial. They are followed by the plain values of a run's summary that do not depend on
+    the wall clock.
     """
-    columns = {
-        "row": ARROW_TYPE_BY_TYPE[int],
-        "setting": ARROW_TYPE_BY_TYPE[str],
+    type_by_column = {
+        "condition_number": ARROW_TYPE_BY_TYPE[int],
+        "condition_name": ARROW_TYPE_BY_TYPE[str],
         "controller": ARROW_TYPE_BY_TYPE[str],
-        "field": ARROW_TYPE_BY_TYPE[int],
+        "seed": ARROW_TYPE_BY_TYPE[int],
     }
     for name, hint in typing.get_type_hints(RunSummary).items():
-        if name in WALL_CLOCK_FIELDS:
+        if name in WALL_CLOCK_METRICS:
             continue
         alternatives = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
         # A column may be empty, so only the type besides None counts.
@@ -174,23 +184,25 @@ def _find_column_types() -> dict[str, Any]:
         ]
         is_plain = len(value_types) == 1 and value_types[0] in ARROW_TYPE_BY_TYPE
         if is_plain:
-            columns.setdefault(name, ARROW_TYPE_BY_TYPE[value_types[0]])
-    columns[GAVE_UP_FIELD] = ARROW_TYPE_BY_TYPE[bool]
-    columns["error"] = ARROW_TYPE_BY_TYPE[str]
-    return columns
+            type_by_column.setdefault(name, ARROW_TYPE_BY_TYPE[value_types[0]])
+    type_by_column[ENDED_BY_STALL_METRIC] = ARROW_TYPE_BY_TYPE[bool]
+    type_by_column["error"] = ARROW_TYPE_BY_TYPE[str]
+    return type_by_column
 
 
 def _find_units() -> dict[str, str]:
     """Return the unit of each number of a run's summary that has one."""
-    units: dict[str, str] = {}
+    unit_by_name: dict[str, str] = {}
     for name, hint in typing.get_type_hints(RunSummary, include_extras=True).items():
         for note in getattr(hint, "__metadata__", ()):
             unit = (note.extra_json_schema or {}).get("unit")
             if unit is not None:
-                units[name] = unit
-    return units
+                unit_by_name[name] = unit
+    return unit_by_name
 
 
 def _make_unit_metadata(unit: str | None) -> dict[bytes, bytes] | None:
     """Return the metadata of a column of Parquet."""
-    return None if unit is None else {PARQUET_UNIT: unit.encode()}
+    if unit is None:
+        return None
+    return {PARQUET_UNIT: unit.encode()}

@@ -1,4 +1,4 @@
-"""Confidence intervals of means over runs, by Student's t."""
+"""Confidence intervals: of means over runs, by Student's t, and of success rates, by Wilson."""
 
 import math
 from collections.abc import Sequence
@@ -48,3 +48,23 @@ def find_student_t_quantile_95(degrees_of_freedom: int) -> float:
     first = (z**3 + z) / 4
     second = (5 * z**5 + 16 * z**3 + 3 * z) / 96
     return z + first / n + second / n**2
+
+
+def compute_wilson_interval(success_count: int, trial_count: int) -> tuple[float, float]:
+    """Return the 95 % confidence interval of a success rate.
+
+    With p = successes / n, n trials and z = 1.96:
+
+        (p + z^2 / (2 n) -+ z sqrt(p (1 - p) / n + z^2 / (4 n^2))) / (1 + z^2 / n)
+
+    Source: Wilson (1927), "Probable inference, the law of succession, and statistical inference".
+    """
+    if trial_count == 0:
+        return 0.0, 1.0
+    p = success_count / trial_count
+    z2_by_n = Z95**2 / trial_count
+    center = (p + z2_by_n / 2) / (1 + z2_by_n)
+    half_width = (
+        Z95 * math.sqrt(p * (1 - p) / trial_count + z2_by_n / (4 * trial_count)) / (1 + z2_by_n)
+    )
+    return max(center - half_width, 0.0), min(center + half_width, 1.0)

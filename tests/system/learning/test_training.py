@@ -19,7 +19,7 @@ from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.documents import REPOSITORY
 
 RANDOMIZE = ("--randomize", "scene.ground.friction=0.1:0.4")
-FEW = ("--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1")
+FEW = ("--generations", "2", "--population", "4", "--seeds", "1", "--check-seeds", "1")
 SMALL = (*FEW, "--duration", "0.5", "--frame-skip", "4", *RANDOMIZE)
 
 
@@ -73,9 +73,9 @@ def test_a_search_begins_where_another_one_ended(trained: Path, tmp_path: Path) 
         "1",
         "--population",
         "4",
-        "--fields",
+        "--seeds",
         "1",
-        "--check-fields",
+        "--check-seeds",
         "1",
         "--duration",
         "0.1",

@@ -1,4 +1,4 @@
-"""A search goes on with its own file only, and what it prints is of that search."""
+"""A search continues only with its own file, and prints only the results of that search."""
 
 import shlex
 from collections.abc import Iterator, Sequence
@@ -14,68 +14,69 @@ from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.files import resolve_file_path
 from snakesim_hal.model.textfiles import read_text
 from snakesim_operator.features.evaluate import optimize as search
-from snakesim_operator.features.evaluate.case import CaseOutcome, EvaluationCase
 from snakesim_operator.features.evaluate.optimize import SearchRequest, run_optimization
+from snakesim_operator.features.evaluate.trial import EvaluationTrial, TrialOutcome
 from snakesim_testing.messages import raises_error
 
 PROPULSION = "control.propulsion_n"
-FIRST = {
+FIRST_SEARCH = {
     "scenario": "triplet",
     "vary": [f"{PROPULSION}=5:40"],
     "set": ["duration_s=2"],
     "goal": "path_distance_m",
     "minimize": False,
-    "trials": 2,
+    "candidates": 2,
     "seeds": 1,
     "seed": 1,
 }
 
 
 @pytest.fixture(autouse=True, scope="module")
-def quick_runs() -> Iterator[None]:
-    """Every run has a result at once: its propulsion, and something for its seed."""
+def instant_trials() -> Iterator[None]:
+    """Replace the workers, so that every trial has a result at once: its propulsion plus 100 times its seed."""
 
     class InstantWorkers:
         def count_workers(self) -> int:
             return 2
 
-        def run_cases(
-            self, cases: Sequence[EvaluationCase]
-        ) -> Iterator[tuple[EvaluationCase, CaseOutcome]]:
-            for case in cases:
-                config = msgspec.json.decode(case.config)
-                value = (
-                    config["controllers"]["obstacle_triplet"]["propulsion_n"] + 100 * config["seed"]
-                )
-                yield case, CaseOutcome(numbers={"path_distance_m": value, "advance_m": value})
+        def run_trials(
+            self, trials: Sequence[EvaluationTrial]
+        ) -> Iterator[tuple[EvaluationTrial, TrialOutcome]]:
+            for trial in trials:
+                config = msgspec.json.decode(trial.config)
+                propulsion_n = config["controllers"]["obstacle_triplet"]["propulsion_n"]
+                value = propulsion_n + 100 * config["seed"]
+                yield trial, TrialOutcome(metrics={"path_distance_m": value, "advance_m": value})
 
     @contextmanager
-    def instant_workers(*_arguments: Any) -> Iterator[InstantWorkers]:
+    def start_instant_workers(*_arguments: Any) -> Iterator[InstantWorkers]:
         yield InstantWorkers()
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(search, "start_workers", instant_workers)
+        patched.setattr(search, "start_workers", start_instant_workers)
         yield
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def first_storage(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The file of the first search."""
-    storage = tmp_path_factory.mktemp("kept") / "search.db"
-    searched(storage)
+    storage = tmp_path_factory.mktemp("first") / "search.db"
+    search_values(storage)
     return storage
 
 
-def searched(storage: Path, **other: Any) -> None:
-    assert run_optimization(SearchRequest(**{**FIRST, **other, "storage": storage})) == 0
+def search_values(storage: Path, **changes: Any) -> None:
+    """Run the first search with a file, with some values of its request changed."""
+    request = SearchRequest(**{**FIRST_SEARCH, **changes, "storage": storage})
+    assert run_optimization(request) == 0
 
 
-def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
+def read_printed_lines(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return capsys.readouterr().out.splitlines()
 
 
 @pytest.mark.parametrize(
-    "other",
+    "changes",
     [
         {"minimize": True},
         {"goal": "advance_m"},
@@ -88,32 +89,36 @@ def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
         {"scenario": "peg_row"},
     ],
 )
-def test_another_search_is_refused_with_every_difference(kept: Path, other: dict[str, Any]) -> None:
-    before = kept.read_bytes()
-    with raises_error(ConfigError, code="evaluation/other-search", field=f"--storage {kept}"):
-        searched(kept, **other)
-    assert kept.read_bytes() == before
+def test_another_search_is_refused_with_every_difference(
+    first_storage: Path, changes: dict[str, Any]
+) -> None:
+    content_before = first_storage.read_bytes()
+    with raises_error(
+        ConfigError, code="evaluation/other-search", field=f"--storage {first_storage}"
+    ):
+        search_values(first_storage, **changes)
+    assert first_storage.read_bytes() == content_before
 
 
-def test_a_scenario_file_that_has_changed_is_another_search(tmp_path: Path) -> None:
+def test_search_with_a_changed_scenario_file_is_refused(tmp_path: Path) -> None:
     scenario = tmp_path / "own.toml"
     text = read_text(resolve_file_path("triplet", "scenarios"))
     scenario.write_text(text)
-    searched(tmp_path / "search.db", scenario=str(scenario))
+    search_values(tmp_path / "search.db", scenario=str(scenario))
     assert "rate_hz = 100" in text
     scenario.write_text(text.replace("rate_hz = 100", "rate_hz = 50"))
     with raises_error(ConfigError, code="evaluation/other-search"):
-        searched(tmp_path / "search.db", scenario=str(scenario))
+        search_values(tmp_path / "search.db", scenario=str(scenario))
 
 
-def test_search_file_of_unknown_search_stays_unchanged(tmp_path: Path) -> None:
+def test_search_file_without_its_command_stays_unchanged(tmp_path: Path) -> None:
     storage = tmp_path / "search.db"
     study = optuna.create_study(
         storage=f"sqlite:///{storage}", study_name="triplet path_distance_m"
     )
     study.add_trial(optuna.trial.create_trial(value=1.0))
     with raises_error(ConfigError, code="evaluation/other-search"):
-        searched(storage)
+        search_values(storage)
     assert len(study.get_trials()) == 1
 
 
@@ -121,49 +126,54 @@ def test_search_file_of_unknown_search_stays_unchanged(tmp_path: Path) -> None:
 def test_search_accepts_any_file_name(
     tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    searched(tmp_path / name)
+    search_values(tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == [name]
-    printed(capsys)
-    searched(tmp_path / name, trials=3)
-    assert "holds 2 trials already" in printed(capsys)[0]
+    read_printed_lines(capsys)
+    search_values(tmp_path / name, candidates=3)
+    assert "holds 2 candidates already" in read_printed_lines(capsys)[0]
 
 
-@pytest.mark.parametrize("what", ["text", "folder"])
-def test_search_invalid_request_is_named(tmp_path: Path, what: str) -> None:
+@pytest.mark.parametrize("kind", ["text", "folder"])
+def test_search_storage_that_is_no_database_is_refused(tmp_path: Path, kind: str) -> None:
     storage = tmp_path / "search.db"
-    storage.mkdir() if what == "folder" else storage.write_text("mine\n" * 1000)
+    if kind == "folder":
+        storage.mkdir()
+    else:
+        storage.write_text("mine\n" * 1000)
     with raises_error(ConfigError, code="file/not-writable", field="search.db"):
-        searched(storage)
+        search_values(storage)
 
 
-def test_search_trials_are_numbered_from_one_to_requested_count(
+def test_search_killed_numbers_candidates_without_gaps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also after a kill, which leaves trials without a result."""
+    """A killed search leaves a candidate without a result; the next search gives its number to another one."""
     storage = tmp_path / "search.db"
-    searched(storage)
+    search_values(storage)
     study = optuna.load_study(study_name=None, storage=f"sqlite:///{storage}")
     study.ask({PROPULSION: optuna.distributions.IntDistribution(5, 40)})
-    searched(storage, trials=5)
-    lines = printed(capsys)
-    numbers = [int(line.split()[1].strip(":")) for line in lines if line.startswith("trial ")]
+    search_values(storage, candidates=5)
+    lines = read_printed_lines(capsys)
+    numbers = [int(line.split()[1].strip(":")) for line in lines if line.startswith("candidate ")]
     assert numbers == list(range(1, 6))
     best = next(line for line in lines[::-1] if line.startswith("best "))
-    value, _, number = best.removeprefix("best path_distance_m: ").partition(", trial ")
+    value, _, number = best.removeprefix("best path_distance_m: ").partition(", candidate ")
     assert any(
-        line.startswith(f"trial {number}:") and line.endswith(f": {value}") for line in lines
+        line.startswith(f"candidate {number}:") and line.endswith(f": {value}") for line in lines
     )
 
 
 def test_search_printout_for_several_seeds_names_the_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    searched(tmp_path / "search.db", seeds=3, seed=5)
-    *_, best, about, command = printed(capsys)
+    search_values(tmp_path / "search.db", seeds=3, seed=5)
+    *_, best, explanation, command = read_printed_lines(capsys)
     words = shlex.split(command)
-    propulsion = float(
-        next(word for word in words if word.startswith(PROPULSION)).partition("=")[2]
-    )
-    assert best.startswith(f"best path_distance_m: {propulsion + 600:.4g}, trial ")
+    propulsion_text = next(word for word in words if word.startswith(PROPULSION))
+    propulsion_n = float(propulsion_text.partition("=")[2])
+    assert best.startswith(f"best path_distance_m: {propulsion_n + 600:.4g}, candidate ")
     assert "seed=5" in words
-    assert about == f"  the mean of 3 runs; the first of them, {propulsion + 500:.4g}, again:"
+    assert (
+        explanation
+        == f"  the mean of 3 trials; to repeat the first one, with {propulsion_n + 500:.4g}:"
+    )
