@@ -1,4 +1,4 @@
-"""Evaluations in real worker processes: the same table however often, wherever, and whatever was killed on the way."""
+"""Evaluations, searches and trainings in worker processes give the same result after a repetition, kill or resume."""
 
 import contextlib
 import json
@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import psutil
 import pytest
@@ -28,7 +29,7 @@ from snakesim_testing.runs.command import (
 
 pytestmark = pytest.mark.e2e
 
-SUITE = """
+SUITE_FILE = """
 title = "A quick one"
 scenario = "peg_row"
 controllers = ["path_following", "hold"]
@@ -41,59 +42,73 @@ mission.goal = { kind = "heading", distance_m = 0.06 }
 [vary]
 "scene.ground.friction" = [0.1, 0.2]
 """
-CASES = 8
-DASK = (sys.executable, "-m", "dask")
-TABLES = ("results.csv", "results.parquet", "evaluation.html")
+CASE_COUNT = 8
+DASK_PROGRAM = (sys.executable, "-m", "dask")
+RESULT_FILES = ("results.csv", "results.parquet", "evaluation.html")
+
+
+class Evaluation(NamedTuple):
+    """A completed evaluation and the folder of its results."""
+
+    completed: CompletedRun
+    folder: Path
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a folder with a suite of eight short cases."""
     folder = tmp_path_factory.mktemp("evaluate")
-    (folder / "quick.toml").write_text(SUITE)
+    (folder / "quick.toml").write_text(SUITE_FILE)
     return folder
 
 
 @pytest.fixture(scope="module")
-def undisturbed(home: Path) -> tuple[CompletedRun, Path]:
-    """An evaluation to compare others with."""
-    ended = evaluate(home, "undisturbed", "--workers", "2")
-    assert ended.code == 0 and not ended.err, ended.out + ended.err
-    return ended, home / "undisturbed"
+def reference(home: Path) -> Evaluation:
+    """Run the undisturbed evaluation with which others are compared."""
+    completed = evaluate(home, "undisturbed", "--workers", "2")
+    assert completed.code == 0, completed.out + completed.err
+    assert not completed.err, completed.out + completed.err
+    return Evaluation(completed, home / "undisturbed")
 
 
 def evaluate(home: Path, out: str, *arguments: str) -> CompletedRun:
+    """Evaluate the suite, with results in the folder `out`."""
     return snakesim("study", "evaluate", "./quick.toml", "--out", out, *arguments, cwd=home)
 
 
-def table_of(ended: CompletedRun) -> str:
-    return ended.out[ended.out.index("setting ") : ended.out.index("written:")]
+def extract_table(completed: CompletedRun) -> str:
+    """Return the table that an evaluation printed."""
+    return completed.out[completed.out.index("setting ") : completed.out.index("written:")]
 
 
-def done(out: Path) -> int:
+def count_completed_cases(out: Path) -> int:
+    """Return the number of cases whose results are in a folder."""
     path = out / "cases.jsonl"
     return path.read_bytes().count(b"\n") if path.is_file() else 0
 
 
-def lives(process: psutil.Process) -> bool:
+def is_running(process: psutil.Process) -> bool:
+    """Return whether a process exists and is no zombie."""
     with contextlib.suppress(psutil.NoSuchProcess):
         return process.status() != psutil.STATUS_ZOMBIE
     return False
 
 
 @pytest.mark.slow
-def test_a_part_of_it_pairs_with_the_card_of_another(
-    home: Path, undisturbed: tuple[CompletedRun, Path]
-) -> None:
-    ended = evaluate(
-        home, "part", "--rows", "2", "--controller", "hold", "--against", str(undisturbed[1])
+def test_evaluation_against_another_pairs_its_cases(home: Path, reference: Evaluation) -> None:
+    completed = evaluate(
+        home, "part", "--rows", "2", "--controller", "hold", "--against", str(reference.folder)
     )
-    assert ended.code == 0, ended.out + ended.err
-    assert sum(line.strip().startswith("cost of transport") for line in ended.out.splitlines()) == 1
-    assert "code " in ended.out
-    assert "fields 1 to 2" in ended.out
-    assert "hold against path_following" in ended.out
-    assert "of 2; p = " in ended.out
-    assert "Holm's correction for 2 comparisons" in ended.out
+    assert completed.code == 0, completed.out + completed.err
+    assert (
+        sum(line.strip().startswith("cost of transport") for line in completed.out.splitlines())
+        == 1
+    )
+    assert "code " in completed.out
+    assert "fields 1 to 2" in completed.out
+    assert "hold against path_following" in completed.out
+    assert "of 2; p = " in completed.out
+    assert "Holm's correction for 2 comparisons" in completed.out
     (score,) = json.loads((home / "part" / "card.json").read_bytes())["scores"]
     assert score["controller"] == "hold"
     assert score["runs"] == 2
@@ -103,61 +118,68 @@ def test_a_part_of_it_pairs_with_the_card_of_another(
 
 
 @pytest.mark.slow
-def test_the_table_tells_which_goals_were_reached(undisturbed: tuple[CompletedRun, Path]) -> None:
-    ended, out = undisturbed
-    rows = [line.split() for line in table_of(ended).splitlines()[1:5]]
+def test_evaluation_table_has_success_counts_of_each_controller(
+    reference: Evaluation,
+) -> None:
+    completed, out = reference
+    rows = [line.split() for line in extract_table(completed).splitlines()[1:5]]
     assert [row[2:4] for row in rows] == [["path_following", "2/2"], ["hold", "0/2"]] * 2
-    assert done(out) == CASES
-    assert all((out / name).is_file() for name in TABLES)
+    assert count_completed_cases(out) == CASE_COUNT
+    assert all((out / name).is_file() for name in RESULT_FILES)
     scores = json.loads((out / "card.json").read_bytes())["scores"]
     assert all(0 < score["medians"]["planning_fraction"] <= 1 for score in scores)
     assert all(0 <= score["medians"]["form_closure"] <= 1 for score in scores)
 
 
 @pytest.mark.slow
-def test_it_can_be_repeated(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
-    again = evaluate(home, "again", "--workers", "1")
-    assert table_of(again) == table_of(undisturbed[0])
-    for name in TABLES:
-        assert (home / "again" / name).read_bytes() == (undisturbed[1] / name).read_bytes(), name
+def test_evaluation_repeated_has_same_results(home: Path, reference: Evaluation) -> None:
+    repeated = evaluate(home, "again", "--workers", "1")
+    assert extract_table(repeated) == extract_table(reference.completed)
+    for name in RESULT_FILES:
+        assert (home / "again" / name).read_bytes() == (reference.folder / name).read_bytes(), name
     lines = (home / "again" / "cases.jsonl").read_text().splitlines()
-    fields = [json.loads(line)["outcome"]["numbers"]["seed"] for line in lines]
-    assert fields == [1] * 4 + [2] * 4, "cut short, it would have as many fields in each row"
+    seeds = [json.loads(line)["outcome"]["numbers"]["seed"] for line in lines]
+    # An evaluation that is cut short has as many random scenes in each row.
+    assert seeds == [1] * 4 + [2] * 4
 
 
 @pytest.mark.slow
-def test_killed_it_leaves_nobody_behind_and_goes_on(
-    home: Path, undisturbed: tuple[CompletedRun, Path]
+def test_evaluation_killed_leaves_no_process_and_can_resume(
+    home: Path, reference: Evaluation
 ) -> None:
     out = home / "killed"
     with run_in_background(
         home, "study", "evaluate", "./quick.toml", "--workers", "2", "--out", str(out)
     ) as process:
-        wait_until(lambda: done(out) >= 2, "two cases done")
-        command_itself = psutil.Process(process.pid)
-        left = command_itself.children()
-        assert len(left) >= 2
+        wait_until(lambda: count_completed_cases(out) >= 2, "two completed cases")
+        parent = psutil.Process(process.pid)
+        workers = parent.children()
+        assert len(workers) >= 2
         sockets = [
-            socket for one in (command_itself, *left) for socket in one.net_connections("tcp")
+            socket
+            for evaluator in (parent, *workers)
+            for socket in evaluator.net_connections("tcp")
         ]
         assert not [socket for socket in sockets if socket.status == psutil.CONN_LISTEN]
-        left[-1].suspend()  # it cannot see that its parent dies
-    wait_until(lambda: not any(map(lives, left)), "no process left", 10)
-    before = done(out)
-    assert 2 <= before < CASES
+        workers[-1].suspend()  # This worker cannot notice the end of its parent.
+    wait_until(lambda: not any(map(is_running, workers)), "no process left", 10)
+    count_before = count_completed_cases(out)
+    assert 2 <= count_before < CASE_COUNT
     with (out / "cases.jsonl").open("a") as file:
         file.write('{"id": "cut')
     refused = evaluate(home, "killed")
     assert refused.code == 2
     assert "--resume" in refused.err
-    ended = evaluate(home, "killed", "--resume")
-    assert f"{before} of {CASES} cases are done already" in ended.out, ended.out + ended.err
-    assert table_of(ended) == table_of(undisturbed[0])
-    for name in TABLES:
-        assert (out / name).read_bytes() == (undisturbed[1] / name).read_bytes(), name
+    resumed = evaluate(home, "killed", "--resume")
+    assert f"{count_before} of {CASE_COUNT} cases are done already" in resumed.out, (
+        resumed.out + resumed.err
+    )
+    assert extract_table(resumed) == extract_table(reference.completed)
+    for name in RESULT_FILES:
+        assert (out / name).read_bytes() == (reference.folder / name).read_bytes(), name
 
 
-STOPPED = {
+INTERRUPTED_OUTPUT = {  # what the command prints before the test interrupts it, and at its end
     "evaluate": (
         "workers, on this computer",
         "cases are done; the same command continues with\n  --resume --out stopped",
@@ -168,7 +190,7 @@ STOPPED = {
         "stopped/policy.onnx is the best policy until then, .* goes on with --resume",
     ),
 }
-TYPED = {
+INTERRUPTED_COMMANDS = {
     "evaluate": ("study", "evaluate", "./quick.toml", "--fields", "400", "--out", "stopped"),
     "optimize": (
         "study",
@@ -201,35 +223,37 @@ TYPED = {
     "command",
     ["evaluate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("optimize", "train"))],
 )
-def test_evaluate_interrupted_stops_at_once_and_keeps_only_results(
+def test_evaluation_interrupted_stops_at_once_and_keeps_results(
     command: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "quick.toml").write_text(SUITE)
+    (tmp_path / "quick.toml").write_text(SUITE_FILE)
     (tmp_path / "tmp").mkdir()
-    begun, kept = STOPPED[command]
-    environment_of_it = {**make_environment(tmp_path), "TMPDIR": str(tmp_path / "tmp")}
+    start_text, end_pattern = INTERRUPTED_OUTPUT[command]
+    environment = {**make_environment(tmp_path), "TMPDIR": str(tmp_path / "tmp")}
     with subprocess.Popen(
-        [*SNAKESIM_COMMAND, *TYPED[command], "--workers", "2"],
+        [*SNAKESIM_COMMAND, *INTERRUPTED_COMMANDS[command], "--workers", "2"],
         cwd=tmp_path,
-        env=environment_of_it,
+        env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
     ) as process:
         assert process.stdout is not None
-        said = ""
-        while begun not in said and (line := process.stdout.readline()):
-            said += line
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-        said += process.stdout.read()
-    assert process.returncode == 130 and re.search(kept, said), said
-    assert "Traceback" not in said and "leaked" not in said, said
+        output = ""
+        while start_text not in output and (line := process.stdout.readline()):
+            output += line
+        os.killpg(process.pid, signal.SIGINT)  # A terminal also signals the whole group.
+        output += process.stdout.read()
+    assert process.returncode == 130, output
+    assert re.search(end_pattern, output), output
+    assert "Traceback" not in output, output
+    assert "leaked" not in output, output
     assert not list((tmp_path / "tmp").glob("snakesim-*"))
 
 
-def dask() -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-    """Where a scheduler of our own will listen, and what Dask is told to be it and a worker."""
+def make_dask_arguments() -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+    """Return the address of a new Dask scheduler, and the arguments of scheduler and worker."""
     port = str(find_free_port())
     address = f"tcp://127.0.0.1:{port}"
     scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
@@ -247,79 +271,58 @@ def dask() -> tuple[str, tuple[str, ...], tuple[str, ...]]:
 
 
 @pytest.mark.slow
-def test_training_on_a_cluster_finds_the_same_policy(home: Path) -> None:
-    address, scheduler, worker = dask()
-    small = [
-        "--generations",
-        "2",
-        "--population",
-        "4",
-        "--fields",
-        "1",
-        "--check-fields",
-        "1",
-        "--duration",
-        "0.5",
-    ]
-    train = ["policy", "train", "surveyed_clutter", *small]
+def test_training_on_cluster_finds_same_policy(home: Path) -> None:
+    address, scheduler, worker = make_dask_arguments()
+    small = ["--generations", "2", "--population", "4", "--fields", "1", "--check-fields", "1"]
+    train = ["policy", "train", "surveyed_clutter", *small, "--duration", "0.5"]
     with (
-        run_in_background(home, *scheduler, program=DASK),
-        run_in_background(home, *worker, program=DASK),
+        run_in_background(home, *scheduler, program=DASK_PROGRAM),
+        run_in_background(home, *worker, program=DASK_PROGRAM),
     ):
-        there = snakesim(
-            "policy",
-            "train",
-            "surveyed_clutter",
-            *small,
-            "--cluster",
-            address,
-            "--out",
-            "there",
-            cwd=home,
-        )
-    here = snakesim(*train, "--workers", "1", "--out", "here", cwd=home)
-    assert there.code == here.code == 0, there.out + there.err + here.err
-    assert (home / "there" / "policy.onnx").read_bytes() == (
-        home / "here" / "policy.onnx"
-    ).read_bytes()
+        on_cluster = snakesim(*train, "--cluster", address, "--out", "cluster_policy", cwd=home)
+    local = snakesim(*train, "--workers", "1", "--out", "local_policy", cwd=home)
+    assert on_cluster.code == local.code == 0, on_cluster.out + on_cluster.err + local.err
+    cluster_policy = (home / "cluster_policy" / "policy.onnx").read_bytes()
+    assert cluster_policy == (home / "local_policy" / "policy.onnx").read_bytes()
 
 
 @pytest.mark.slow
-def test_a_cluster_that_loses_a_worker_gives_the_same_table(
-    home: Path, undisturbed: tuple[CompletedRun, Path]
+def test_evaluation_on_cluster_with_lost_worker_has_same_results(
+    home: Path, reference: Evaluation
 ) -> None:
-    address, scheduler, worker = dask()
+    address, scheduler, worker = make_dask_arguments()
     out = home / "cluster"
     with (
-        run_in_background(home, *scheduler, program=DASK),
-        run_in_background(home, *worker, program=DASK) as lost,
-        run_in_background(home, *worker, program=DASK),
+        run_in_background(home, *scheduler, program=DASK_PROGRAM),
+        run_in_background(home, *worker, program=DASK_PROGRAM) as lost_worker,
+        run_in_background(home, *worker, program=DASK_PROGRAM),
         run_in_background(
             home, "study", "evaluate", "./quick.toml", "--cluster", address, "--out", str(out)
         ) as process,
     ):
-        wait_until(lambda: done(out) >= 2, "two cases done")
-        lost.kill()
+        wait_until(lambda: count_completed_cases(out) >= 2, "two completed cases")
+        lost_worker.kill()
         assert process.wait(90) == 0
-    for name in TABLES:
-        assert (out / name).read_bytes() == (undisturbed[1] / name).read_bytes(), name
+    for name in RESULT_FILES:
+        assert (out / name).read_bytes() == (reference.folder / name).read_bytes(), name
 
 
 @pytest.mark.slow
-def test_one_case_again_as_a_whole_run(home: Path, undisturbed: tuple[CompletedRun, Path]) -> None:
-    ended = evaluate(home, "one", "--only", "path_following:2:2")
-    assert ended.code == 0 and (home / "one" / REPORT_FILENAME).is_file(), ended.out + ended.err
+def test_evaluation_of_one_case_repeats_it_as_a_run(home: Path, reference: Evaluation) -> None:
+    completed = evaluate(home, "one", "--only", "path_following:2:2")
+    assert completed.code == 0, completed.out + completed.err
+    assert (home / "one" / REPORT_FILENAME).is_file()
     digest = json.loads((home / "one" / HOST_RECORD).read_bytes())["command_digest"]
-    rows = [line.split(",") for line in (undisturbed[1] / "results.csv").read_text().splitlines()]
-    names = rows[0]
-    chosen = [row for row in rows if row[0] == "2" and row[2:4] == ["path_following", "2"]]
-    assert [row[names.index("command_digest")] for row in chosen] == [digest]
-    unclear = evaluate(home, "none", "--only", "path_following:2")
-    assert unclear.code == 2
-    assert "path_following:2:1" in unclear.err
+    rows = [line.split(",") for line in (reference.folder / "results.csv").read_text().splitlines()]
+    column = rows[0].index("command_digest")
+    matching_rows = [row for row in rows if row[0] == "2" and row[2:4] == ["path_following", "2"]]
+    assert [row[column] for row in matching_rows] == [digest]
+    ambiguous = evaluate(home, "none", "--only", "path_following:2")
+    assert ambiguous.code == 2
+    assert "path_following:2:1" in ambiguous.err
 
 
-DEADLY = """
+DEADLY_CONTROLLER = """
 import os
 from snakesim_gnc.control.hold import HoldPose
 
@@ -333,115 +336,76 @@ class Deadly(HoldPose):
 
 
 @pytest.mark.slow
-def test_a_case_that_kills_its_workers_costs_no_other(
-    home: Path, undisturbed: tuple[CompletedRun, Path]
+def test_evaluation_with_case_that_kills_workers_completes_the_others(
+    home: Path, reference: Evaluation
 ) -> None:
-    (home / "deadly.py").write_text(DEADLY)
-    ended = evaluate(
+    (home / "deadly.py").write_text(DEADLY_CONTROLLER)
+    completed = evaluate(
         home, "deadly", "--controllers", "path_following,./deadly.py:Deadly", "--fields", "1"
     )
-    assert ended.code == 1 and "its worker process died" in ended.out, ended.out + ended.err
-    rows = [line.split() for line in table_of(ended).splitlines()[1:5]]
+    assert completed.code == 1, completed.out + completed.err
+    assert "its worker process died" in completed.out, completed.out + completed.err
+    rows = [line.split() for line in extract_table(completed).splitlines()[1:5]]
     assert [row[3] for row in rows] == ["1/1", "0/1"] * 2
 
 
 @pytest.mark.slow
-def test_a_sweep_runs_every_value(home: Path) -> None:
-    span = "controllers.path_following.look_ahead_m=0.02:0.06:3"
-    given = [
-        "--vary",
-        span,
-        "--set",
-        "duration_s=0.5",
-        "--seeds",
-        "2",
-        "--set",
-        "controller=path_following",
-    ]
-    ended = snakesim("study", "sweep", "peg_row", *given, "--out", "sweep", cwd=home)
-    assert ended.code == 0, ended.out + ended.err
-    assert [line.split()[1] for line in table_of(ended).splitlines()[1:4]] == [
-        "0.02",
-        "0.04",
-        "0.06",
-    ]
-    page = re.sub(
-        r"<(script|style).*?</\1>",
-        "",
-        (home / "sweep" / "evaluation.html").read_text(),
-        flags=re.DOTALL,
-    )
-    assert not re.findall("goal", ended.out + page), "a scenario without a goal"
+def test_sweep_evaluates_every_value(home: Path) -> None:
+    options = ["--vary", "controllers.path_following.look_ahead_m=0.02:0.06:3"]
+    options += ["--set", "duration_s=0.5", "--seeds", "2", "--set", "controller=path_following"]
+    completed = snakesim("study", "sweep", "peg_row", *options, "--out", "sweep", cwd=home)
+    assert completed.code == 0, completed.out + completed.err
+    values = [line.split()[1] for line in extract_table(completed).splitlines()[1:4]]
+    assert values == ["0.02", "0.04", "0.06"]
+    html = (home / "sweep" / "evaluation.html").read_text()
+    text = re.sub(r"<(script|style).*?</\1>", "", html, flags=re.DOTALL)
+    assert not re.findall("goal", completed.out + text), "the scenario has no goal"
+
+
+def parse_best_trial(output: str, goal: str) -> tuple[str, list[str]]:
+    """Return the value of the best trial of a search, and the arguments of the command that repeats it."""
+    _, best = output.split(f"best {goal}: ")
+    program, *arguments = shlex.split(best.splitlines()[1])
+    assert program == "snakesim"
+    return best.split(",")[0], arguments
 
 
 @pytest.mark.slow
-def test_evaluate_search_resumes_and_prints_a_runnable_command(home: Path) -> None:
-    given = [
-        "study",
-        "optimize",
-        "peg_row",
-        "--set",
-        "duration_s=0.5",
-        "--vary",
-        "control.propulsion_n=5:40",
-        "--seed",
-        "2",
-    ]
-    given += ["--goal", "path_distance_m", "--workers", "2"]
-    first = snakesim(*given, "--trials", "2", cwd=home)
-    assert first.code == 0 and first.out.count("trial ") >= 3, first.out + first.err
-    (kept,) = (home / "runs").glob("optimize-*.db")
-    assert f"runs/{kept.name} keeps all trials" in first.out, first.out + first.err
-    more = snakesim(*given, "--storage", f"runs/{kept.name}", "--trials", "4", cwd=home)
-    assert "holds 2 trials already" in more.out and "trial 4:" in more.out, more.out + more.err
-    _, said = more.out.split("best path_distance_m: ")
-    command = shlex.split(said.splitlines()[1])
-    assert command.pop(0) == "snakesim"
+def test_search_resumes_and_prints_command_that_repeats_its_best(home: Path) -> None:
+    search = ["study", "optimize", "peg_row", "--set", "duration_s=0.5"]
+    search += ["--vary", "control.propulsion_n=5:40", "--seed", "2"]
+    search += ["--goal", "path_distance_m", "--workers", "2"]
+    first = snakesim(*search, "--trials", "2", cwd=home)
+    assert first.code == 0, first.out + first.err
+    assert first.out.count("trial ") >= 3, first.out + first.err
+    (storage,) = (home / "runs").glob("optimize-*.db")
+    assert f"runs/{storage.name} keeps all trials" in first.out, first.out + first.err
+    resumed = snakesim(*search, "--storage", f"runs/{storage.name}", "--trials", "4", cwd=home)
+    assert "holds 2 trials already" in resumed.out, resumed.out + resumed.err
+    assert "trial 4:" in resumed.out, resumed.out + resumed.err
+    best_distance_m, command = parse_best_trial(resumed.out, "path_distance_m")
     assert "--until-goal" not in command, "`snakesim run` refuses it for a mission without a goal"
-    again, summary = run_to_summary(home / "again", *command[1:])
-    assert again.code == 0 and f"{summary.path_distance_m:.4g}" == said.split(",")[0], (
-        again.out + again.err
-    )
+    repeated, summary = run_to_summary(home / "again", *command[1:])
+    assert repeated.code == 0, repeated.out + repeated.err
+    assert f"{summary.path_distance_m:.4g}" == best_distance_m
 
 
 @pytest.mark.slow
-def test_evaluate_search_on_a_suite_row_prints_an_evaluation(home: Path) -> None:
-    given = [
-        "study",
-        "optimize",
-        "./quick.toml",
-        "--rows",
-        "2",
-        "--set",
-        "controller=path_following",
-        "--set",
-        "duration_s=0.4",
-    ]
-    given += [
-        "--vary",
-        "control.look_ahead_m=0.02:0.1",
-        "--goal",
-        "advance_m",
-        "--trials",
-        "1",
-        "--seeds",
-        "2",
-    ]
-    found = snakesim(*given, "--storage", "row.db", cwd=home)
-    _, said = found.out.split("best advance_m: ")
-    command = shlex.split(said.splitlines()[1])
-    assert command.pop(0) == "snakesim" and command[:5] == [
-        "study",
-        "evaluate",
-        "./quick.toml",
-        "--rows",
-        "2",
-    ], found.out
-    ended = snakesim(*command, "--controllers", "path_following", "--out", "best", cwd=home)
-    assert ended.code == 0, ended.out + ended.err
+def test_search_on_suite_row_prints_evaluation_of_its_best(home: Path) -> None:
+    search = ["study", "optimize", "./quick.toml", "--rows", "2"]
+    search += ["--set", "controller=path_following", "--set", "duration_s=0.4"]
+    search += ["--vary", "control.look_ahead_m=0.02:0.1"]
+    search += ["--goal", "advance_m", "--trials", "1", "--seeds", "2"]
+    completed_search = snakesim(*search, "--storage", "row.db", cwd=home)
+    best_advance_m, command = parse_best_trial(completed_search.out, "advance_m")
+    assert command[:5] == ["study", "evaluate", "./quick.toml", "--rows", "2"], completed_search.out
+    completed = snakesim(*command, "--controllers", "path_following", "--out", "best", cwd=home)
+    assert completed.code == 0, completed.out + completed.err
     lines = (home / "best" / "cases.jsonl").read_text().splitlines()
     cases = [json.loads(line)["outcome"]["numbers"] for line in lines]
-    assert len(cases) == 2 and {case["ticks"] for case in cases} == {40}, (
-        "what is set is set in a row, too"
+    assert len(cases) == 2
+    assert {case["ticks"] for case in cases} == {40}, (
+        "the duration that was set is not that of a row"
     )
-    assert f"{sum(case['advance_m'] for case in cases) / 2:.4g}" == said.split(",")[0]
+    mean_advance_m = sum(case["advance_m"] for case in cases) / 2
+    assert f"{mean_advance_m:.4g}" == best_advance_m

@@ -47,7 +47,7 @@ def has_complete_observations(running: RunningServices, since: int = 0) -> bool:
     """Return whether the newest observations have both a world and a trajectory.
 
     Args:
-        made: The running services, whose controller records its observations.
+        running: The running services, whose controller records its observations.
         since: Index of the first observation that counts.
     """
     observations = running.observations[since:][-REQUIRED_OBSERVATIONS:]
