@@ -1,4 +1,4 @@
-"""Clients of a running robot: those of docs/how-to/client.md, and `snakesim.Robot` of docs/how-to/python.md."""
+"""Clients control a running robot: the examples of docs/how-to/client.md, and `snakesim.Robot`."""
 
 import ast
 import sys
@@ -28,11 +28,13 @@ from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 
 pytestmark = pytest.mark.e2e
 
-CLIENT, STEER, STOP = (
-    REPOSITORY / "examples" / name for name in ("client.py", "steer.py", "stop.py")
-)
-DEPTH = 8192
-LATENCY_TICKS = 2  # of control in this scenario: so many commands may be on their way
+CLIENT = REPOSITORY / "examples" / "client.py"
+STEER = REPOSITORY / "examples" / "steer.py"
+STOP = REPOSITORY / "examples" / "stop.py"
+MAX_CLIENT_LINES = 100
+STOP_CODE_LINES = 9
+READER_DEPTH = 8192  # joint states of the whole motion
+LATENCY_TICKS = 2  # of control in this scenario: the number of commands that may be in transit
 ROBOT = ("triplet", "--set", "rate_hz=50", "--duration", "600", "--stay", "--clock-mode")
 EXTERNAL = ("--set", "services.control.external=true")
 
@@ -40,10 +42,10 @@ EXTERNAL = ("--set", "services.control.external=true")
 @pytest.fixture(
     scope="module", params=["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)]
 )
-def waiting(
+def waiting_run(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[RunningCommand]:
-    """A robot that waits for its controller."""
+    """Run a robot that waits for its controller."""
     with running_snakesim(
         tmp_path_factory.mktemp("robot") / "run", *ROBOT, request.param, *EXTERNAL
     ) as started:
@@ -52,8 +54,8 @@ def waiting(
 
 
 @pytest.fixture(scope="module")
-def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
-    """A robot with a controller of its own."""
+def controlled_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
+    """Run a robot that has a controller already."""
     with running_armed_snakesim(
         tmp_path_factory.mktemp("driven") / "run", *ROBOT, "realtime"
     ) as started:
@@ -61,83 +63,89 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]
 
 
 @pytest.mark.parametrize(
-    ("client", "known"),
+    ("client", "packages"),
     [(CLIENT, {"msgpack", "zenoh"}), (STEER, {"msgpack", "zenoh"}), (STOP, set[str]())],
 )
-def test_a_client_needs_nothing_of_ours(client: Path, known: set[str]) -> None:
+def test_example_client_imports_only_documented_packages(client: Path, packages: set[str]) -> None:
     tree = ast.parse(client.read_text(encoding="utf-8"))
     assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     imported = {
         name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names
     }
-    assert imported - sys.stdlib_module_names == known
+    assert imported - sys.stdlib_module_names == packages
 
 
 def test_example_clients_are_as_short_as_documented() -> None:
-    assert len(CLIENT.read_text(encoding="utf-8").splitlines()) < 100
+    assert len(CLIENT.read_text(encoding="utf-8").splitlines()) < MAX_CLIENT_LINES
     lines = STOP.read_text(encoding="utf-8").split("import sys\n")[1].split("\n")
-    assert len([line for line in lines if line]) == 9
+    assert len([line for line in lines if line]) == STOP_CODE_LINES
 
 
-def status(session: Session) -> RobotStatus:
-    found = session.wait_for_latched(keys.STATUS, RobotStatus, 10.0)
-    assert found is not None
-    return found
+def read_status(session: Session) -> RobotStatus:
+    """Return the status of the robot."""
+    status = session.wait_for_latched(keys.STATUS, RobotStatus, 10.0)
+    assert status is not None
+    return status
 
 
-def urgently() -> None:
-    """As a run's own control, where that is allowed: a busy computer holds it up otherwise."""
+def raise_priority() -> None:
+    """Give a client the priority of control where that is allowed, because a busy computer would delay it."""
     set_realtime_priority(SERVICE_PRIORITY)
 
 
-def test_a_client_leases_arms_moves_and_disarms(waiting: RunningCommand) -> None:
-    """First of those who wait with the robot: what it has counted is of this client."""
-    with open_session(ConnectionSettings(waiting.endpoint, "planar13")) as session:
+def test_example_client_arms_moves_one_joint_and_disarms(waiting_run: RunningCommand) -> None:
+    """The test is the first that uses this robot, so that all counted commands are those of the client."""
+    with open_session(ConnectionSettings(waiting_run.endpoint, "planar13")) as session:
         wait_until(
-            lambda: status(session).waiting_for == ["control"], "a run that waits for control alone"
+            lambda: read_status(session).waiting_for == ["control"],
+            "a run that waits only for control",
         )
-        joints = session.declare_reader(keys.JOINTS, JointState, depth=DEPTH)
-        ended = run_program(
-            [sys.executable, CLIENT, waiting.endpoint, "planar13"],
-            waiting.home,
-            preexec_fn=urgently,
+        joints = session.declare_reader(keys.JOINTS, JointState, depth=READER_DEPTH)
+        completed = run_program(
+            [sys.executable, CLIENT, waiting_run.endpoint, "planar13"],
+            waiting_run.home,
+            preexec_fn=raise_priority,
         )
-        assert ended.code == 0, ended.out + ended.err
+        assert completed.code == 0, completed.out + completed.err
         angles = [state.angle_rad for state in joints.drain()]
-        furthest = [
-            max(abs(angle - joint[0]) for angle in joint) for joint in zip(*angles, strict=True)
+        motions_rad = [
+            max(abs(angle - joint_angles[0]) for angle in joint_angles)
+            for joint_angles in zip(*angles, strict=True)
         ]
-        assert 0.09 < furthest[2] < 0.11, furthest
-        assert max(furthest[:2] + furthest[3:]) < 0.03, furthest
-        now = status(session)
-        assert now.lifecycle == "disarmed"
-        assert set(now.commands_rejected) <= {"no_lease"}
-        # The last ones, if the host notices first that the client has left.
-        assert now.commands_rejected.get("no_lease", 0) <= LATENCY_TICKS
-        assert now.commands_accepted > 50
-        assert {fault.what for fault in now.faults} <= {"service_lost"}
+        assert 0.09 < motions_rad[2] < 0.11, motions_rad
+        assert max(motions_rad[:2] + motions_rad[3:]) < 0.03, motions_rad
+        end_status = read_status(session)
+        assert end_status.lifecycle == "disarmed"
+        assert set(end_status.commands_rejected) <= {"no_lease"}
+        # The last commands are rejected if the host first notices that the client has left.
+        assert end_status.commands_rejected.get("no_lease", 0) <= LATENCY_TICKS
+        assert end_status.commands_accepted > 50
+        assert {fault.what for fault in end_status.faults} <= {"service_lost"}
 
 
-def test_a_stop_by_udp_stops_the_robot(waiting: RunningCommand) -> None:
-    host, _, port = waiting.endpoint.removeprefix("tcp/").partition(":")
-    ended = run_program([sys.executable, STOP, host, port], waiting.home)
-    assert ended.code == 0 and ended.out.startswith("planar13\n") and "anna" in ended.out, (
-        ended.out + ended.err
-    )
-    with open_session(ConnectionSettings(waiting.endpoint, "planar13")) as session:
-        assert status(session).lifecycle == "estop"
-    settled(waiting)
+def test_example_stop_by_udp_stops_the_robot(waiting_run: RunningCommand) -> None:
+    host, _, port = waiting_run.endpoint.removeprefix("tcp/").partition(":")
+    completed = run_program([sys.executable, STOP, host, port], waiting_run.home)
+    assert completed.code == 0, completed.out + completed.err
+    assert completed.out.startswith("planar13\n"), completed.out
+    assert "anna" in completed.out
+    with open_session(ConnectionSettings(waiting_run.endpoint, "planar13")) as session:
+        assert read_status(session).lifecycle == "estop"
+    reset_robot(waiting_run)
 
 
-def script(text: str, run: RunningCommand, folder: Path) -> CompletedRun:
-    """Run a script to its end, on a robot that waits for a controller."""
-    settled(run)
+def run_script(text: str, run: RunningCommand, folder: Path) -> CompletedRun:
+    """Run a Python script to its end, with a robot that waits for a controller."""
+    reset_robot(run)
     (folder / "script.py").write_text(textwrap.dedent(text))
     env = make_environment(folder, PYTHONPATH=str(REPOSITORY))
-    return run_program([sys.executable, "script.py", run.endpoint], folder, env, 60.0, urgently)
+    return run_program(
+        [sys.executable, "script.py", run.endpoint], folder, env, 60.0, raise_priority
+    )
 
 
-def settled(run: RunningCommand) -> None:
+def reset_robot(run: RunningCommand) -> None:
+    """Wait until the robot waits for a controller, and reset its fault or emergency stop."""
     with snakesim.Robot.connect(run.endpoint) as robot:
         wait_until(
             lambda: "control" in robot.status.waiting_for, "a run that waits for its controller"
@@ -146,45 +154,46 @@ def settled(run: RunningCommand) -> None:
             robot.reset_fault()
 
 
-def test_the_script_of_the_documents_turns_a_joint_and_records(
-    waiting: RunningCommand, tmp_path: Path
+def test_documented_python_script_turns_joint_and_records(
+    waiting_run: RunningCommand, tmp_path: Path
 ) -> None:
-    nod = next(
-        s
-        for s in parse_sections(REPOSITORY / "docs" / "how-to" / "python.md")
-        if "nod.py" in s.files
-    ).files["nod.py"]
-    ended = script(nod, waiting, tmp_path)
-    assert ended.code == 0, ended.err
+    sections = parse_sections(REPOSITORY / "docs" / "how-to" / "python.md")
+    section = next(section for section in sections if "nod.py" in section.files)
+    completed = run_script(section.files["nod.py"], waiting_run, tmp_path)
+    assert completed.code == 0, completed.err
     assert (
-        "planar13, sim: disarmed\njoint_3 turned by +0.0" in ended.out
-        or "turned by +0.1" in ended.out
+        "planar13, sim: disarmed\njoint_3 turned by +0.0" in completed.out
+        or "turned by +0.1" in completed.out
     )
-    assert ended.out.endswith("the robot is disarmed\n")
-    with snakesim.Robot.connect(waiting.endpoint) as robot:
+    assert completed.out.endswith("the robot is disarmed\n")
+    with snakesim.Robot.connect(waiting_run.endpoint) as robot:
         assert robot.status.lifecycle == "disarmed"
-    held = inspect_recording(tmp_path / "nod.mcap").keys
-    assert held["actuator/joints"]["count"] > 50
-    assert "hal/description" in held
+    recorded_keys = inspect_recording(tmp_path / "nod.mcap").keys
+    assert recorded_keys["actuator/joints"]["count"] > 50
+    assert "hal/description" in recorded_keys
 
 
-def test_an_exception_disarms_what_was_armed(waiting: RunningCommand, tmp_path: Path) -> None:
-    failing = """
+def test_python_client_with_exception_disarms_the_robot(
+    waiting_run: RunningCommand, tmp_path: Path
+) -> None:
+    program = """
         import sys, snakesim
         with snakesim.Robot.connect(sys.argv[1]) as robot:
             robot.arm()
             print(robot.status.lifecycle, flush=True)
             raise ValueError("no idea")
     """
-    ended = script(failing, waiting, tmp_path)
-    assert ended.out == "armed\n", ended.err
-    assert "no idea" in ended.err
-    with snakesim.Robot.connect(waiting.endpoint) as robot:
+    completed = run_script(program, waiting_run, tmp_path)
+    assert completed.out == "armed\n", completed.err
+    assert "no idea" in completed.err
+    with snakesim.Robot.connect(waiting_run.endpoint) as robot:
         assert robot.status.lifecycle == "disarmed", robot.status.reason
 
 
-def test_a_stop_by_somebody_else_ends_the_wait(waiting: RunningCommand, tmp_path: Path) -> None:
-    stopped = """
+def test_python_client_stopped_by_another_client_gets_error(
+    waiting_run: RunningCommand, tmp_path: Path
+) -> None:
+    program = """
         import sys, snakesim
         with snakesim.Robot.connect(sys.argv[1]) as robot:
             robot.arm()
@@ -196,13 +205,13 @@ def test_a_stop_by_somebody_else_ends_the_wait(waiting: RunningCommand, tmp_path
             except snakesim.RefusedError as error:
                 print(error)
     """
-    ended = script(stopped, waiting, tmp_path)
-    assert ended.out.startswith("planar13 is no longer armed, but estop: "), ended.printed
-    settled(waiting)
+    completed = run_script(program, waiting_run, tmp_path)
+    assert completed.out.startswith("planar13 is no longer armed, but estop: "), completed.printed
+    reset_robot(waiting_run)
 
 
-def test_what_is_no_command_is_refused_before_it_is_sent(waiting: RunningCommand) -> None:
-    with snakesim.Robot.connect(waiting.endpoint) as robot:
+def test_python_client_invalid_command_or_key_is_refused(waiting_run: RunningCommand) -> None:
+    with snakesim.Robot.connect(waiting_run.endpoint) as robot:
         with raises_error(snakesim.ConfigError, code="python/invalid-argument"):
             robot.command([0.0])
         with raises_error(snakesim.ConfigError, code="network/unknown-key", field="sensor/joint"):
@@ -210,12 +219,12 @@ def test_what_is_no_command_is_refused_before_it_is_sent(waiting: RunningCommand
 
 
 @pytest.mark.quiet
-def test_a_robot_with_a_controller_is_watched_tuned_and_recorded(
-    driven: RunningCommand, tmp_path: Path
+def test_python_client_of_controlled_robot_reads_tunes_and_records(
+    controlled_run: RunningCommand, tmp_path: Path
 ) -> None:
-    with snakesim.Robot.connect(driven.endpoint, name="planar13") as robot:
-        before = robot.wait()
-        assert robot.wait() > before
+    with snakesim.Robot.connect(controlled_run.endpoint, name="planar13") as robot:
+        first_tick = robot.wait()
+        assert robot.wait() > first_tick
         joints = robot.joints
         assert joints is not None
         assert len(joints.angle_rad) == len(robot.joint_names) == 13
@@ -240,7 +249,7 @@ def test_a_robot_with_a_controller_is_watched_tuned_and_recorded(
 
 
 @pytest.mark.slow
-def test_where_there_is_no_robot_it_says_so() -> None:
+def test_python_client_without_robot_is_refused() -> None:
     with raises_error(snakesim.NotConnectedError, code="network/no-robot"):
         snakesim.Robot.connect("tcp/127.0.0.1:9")
     with raises_error(snakesim.ConfigError, code="network/invalid-address"):

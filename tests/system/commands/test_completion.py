@@ -1,4 +1,4 @@
-"""Tab completion: the printed scripts, asked by a real bash and a real zsh."""
+"""A real bash and a real zsh complete `snakesim` commands with the printed scripts."""
 
 import shutil
 from pathlib import Path
@@ -12,13 +12,15 @@ from snakesim_testing.runs.in_process_command import snakesim
 
 pytestmark = pytest.mark.e2e
 
-# What a shell does when TAB is pressed behind these words; zsh counts them from 1 where bash counts from 0.
-ASKED = 'COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _snakesim; printf "%s\\n" "${COMPREPLY[@]}"'
-ASK = {
-    "bash": f'source "$1"; shift; {ASKED}',
-    "zsh": f'source "$1"; shift; setopt ksharrays; {ASKED}',
+# Completes the last word as a shell does when Tab is pressed, and prints the candidates. zsh counts words from 1.
+PRINT_CANDIDATES = (
+    'COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _snakesim; printf "%s\\n" "${COMPREPLY[@]}"'
+)
+SHELL_PROGRAMS = {
+    "bash": f'source "$1"; shift; {PRINT_CANDIDATES}',
+    "zsh": f'source "$1"; shift; setopt ksharrays; {PRINT_CANDIDATES}',
 }
-TYPED: dict[str, tuple[list[str], set[str]]] = {
+CASES: dict[str, tuple[list[str], set[str]]] = {  # typed words, and the expected candidates
     "command": (["ru"], {"run"}),
     "all commands": ([""], {"run", "topic", "fault", "drive", "lab", "completion"}),
     "scenario": (["run", ""], set(list_shipped_names("scenarios"))),
@@ -41,35 +43,41 @@ TYPED: dict[str, tuple[list[str], set[str]]] = {
         {"planar13", "planar13_camera", "planar13_mixed", "planar13_scales", "planar13_wheels"},
     ),
     "shell": (["completion", "z"], {"zsh"}),
-    "file": (["start", "router", "./"], set()),  # nothing of ours: the shell completes file names
+    "file": (["start", "router", "./"], set()),  # The shell itself completes file names.
 }
 
 
-@pytest.fixture(scope="module", params=sorted(ASK))
+@pytest.fixture(scope="module", params=sorted(SHELL_PROGRAMS))
 def script(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[str, Path]:
+    """Write the completion script of a shell, and return the name of the shell and the path."""
     shell = request.param
     if shutil.which(shell) is None:
         pytest.skip(f"{shell} is not installed")
     folder = tmp_path_factory.mktemp("completion")
-    ended = snakesim("completion", shell, cwd=folder)
-    assert ended.code == 0 and ended.err == "", ended.err
-    (folder / shell).write_text(ended.out)
+    completed = snakesim("completion", shell, cwd=folder)
+    assert completed.code == 0, completed.err
+    assert completed.err == ""
+    (folder / shell).write_text(completed.out)
     return shell, folder / shell
 
 
-@pytest.mark.parametrize("typed", TYPED)
-def test_what_can_follow(script: tuple[str, Path], typed: str) -> None:
+@pytest.mark.parametrize("case", CASES)
+def test_completion_of_typed_words_gives_expected_candidates(
+    script: tuple[str, Path], case: str
+) -> None:
     shell, path = script
-    words, wanted = TYPED[typed]
-    plain = ["--norc", "--noprofile"] if shell == "bash" else ["-f"]
-    done = run_program(
-        [shell, *plain, "-c", ASK[shell], shell, path, "snakesim", *words], path.parent
+    words, expected = CASES[case]
+    options = ["--norc", "--noprofile"] if shell == "bash" else ["-f"]
+    completed = run_program(
+        [shell, *options, "-c", SHELL_PROGRAMS[shell], shell, path, "snakesim", *words], path.parent
     )
-    assert done.code == 0, done.printed
-    # Which zsh leaves to its matcher.
-    found = {word for word in done.out.split() if word.startswith(words[-1])}
-    assert done.err == "" and (found >= wanted if typed == "all commands" else found == wanted), (
-        done.out
-    )
+    assert completed.code == 0, completed.printed
+    # The script for zsh prints all candidates, which zsh itself compares with the typed word.
+    candidates = {word for word in completed.out.split() if word.startswith(words[-1])}
+    assert completed.err == ""
+    if case == "all commands":
+        assert candidates >= expected, completed.out
+    else:
+        assert candidates == expected, completed.out

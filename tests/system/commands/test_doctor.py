@@ -1,4 +1,4 @@
-"""`snakesim doctor`: a verdict on everything, and what to type where something is missing."""
+"""`snakesim doctor` checks this computer, and names a remedy for each problem."""
 
 import fcntl
 import json
@@ -15,41 +15,44 @@ from snakesim_operator.this_computer.network_findings import check_ports, check_
 from snakesim_testing.harness.endpoint import find_free_endpoint
 
 
-def test_it_checks_everything_and_leaves_this_process_as_it_was(
+def test_doctor_reports_all_findings_and_keeps_scheduler_of_process(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    before = os.sched_getscheduler(0)
+    scheduler_before = os.sched_getscheduler(0)
     assert main(["doctor", "--json", "--endpoint", find_free_endpoint()]) == 1, (
-        "nobody answers there"
+        "a robot answered at a free endpoint"
     )
-    reported = json.loads(capsys.readouterr().out)
+    report = json.loads(capsys.readouterr().out)
     assert {"Python", "OpenGL", "CAN", "disk", "kernel"} < {
-        finding["what"] for finding in reported["findings"]
+        finding["what"] for finding in report["findings"]
     }
-    assert not reported["ok"]
-    assert reported["findings"][-1]["state"] == "fail"
-    for finding in reported["findings"]:
+    assert not report["ok"]
+    assert report["findings"][-1]["state"] == "fail"
+    for finding in report["findings"]:
         assert finding["state"] in ("ok", "warn", "fail")
         assert finding["detail"]
+        # Nothing can be done about a computer without KVM.
         assert finding["state"] == "ok" or finding["fix"] or finding["what"] == "KVM"
-    assert os.sched_getscheduler(0) == before
+    assert os.sched_getscheduler(0) == scheduler_before
 
 
 def test_doctor_endpoint_without_zenoh_fails_within_seconds() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as mute:
-        (finding,) = check_routers(RobotSelection(f"tcp/127.0.0.1:{mute.getsockname()[1]}"))
+    with socket.create_server(("127.0.0.1", 0)) as silent_server:
+        (finding,) = check_routers(
+            RobotSelection(f"tcp/127.0.0.1:{silent_server.getsockname()[1]}")
+        )
     assert finding.state == "fail"
     assert finding.fix
 
 
-def test_the_default_port_is_free_or_has_a_user() -> None:
+def test_doctor_default_port_is_free_or_in_use() -> None:
     (finding,) = check_ports()
     assert finding.what == "port 7447"
     assert finding.state in ("ok", "warn")
 
 
 @pytest.mark.parametrize(
-    ("files", "warned"),
+    ("files", "expected_warnings"),
     [
         ({"proc/version": "Linux version 6.12 SMP PREEMPT_DYNAMIC"}, ["kernel"]),
         ({"proc/version": "Linux version 6.12-rt SMP PREEMPT_RT"}, []),
@@ -59,15 +62,15 @@ def test_the_default_port_is_free_or_has_a_user() -> None:
         ({"sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "1"}, []),
     ],
 )
-def test_what_makes_ticks_late_is_named_with_its_remedy(
-    tmp_path: Path, files: dict[str, str], warned: list[str]
+def test_doctor_kernel_setting_that_delays_ticks_is_a_warning(
+    tmp_path: Path, files: dict[str, str], expected_warnings: list[str]
 ) -> None:
     for name, content in files.items():
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_text(f"{content}\n")
-    found = list(check_kernel(tmp_path))
-    assert [finding.what for finding in found if finding.state == "warn"] == warned
-    assert all(finding.fix for finding in found if finding.state == "warn")
+    warnings = [finding for finding in check_kernel(tmp_path) if finding.state == "warn"]
+    assert [finding.what for finding in warnings] == expected_warnings
+    assert all(finding.fix for finding in warnings)
 
 
 def test_doctor_serial_port_in_use_is_named_then_free(tmp_path: Path) -> None:
@@ -75,12 +78,13 @@ def test_doctor_serial_port_in_use_is_named_then_free(tmp_path: Path) -> None:
     port.parent.mkdir()
     port.write_text("")
 
-    def said() -> tuple[str, str]:
-        (finding,) = (one for one in check_kernel(tmp_path) if one.what == "serial port")
+    def check_serial_port() -> tuple[str, str]:
+        findings = check_kernel(tmp_path)
+        (finding,) = (finding for finding in findings if finding.what == "serial port")
         return finding.state, finding.detail
 
-    assert said() == ("ok", "ttyUSB0 can be opened")
-    with port.open("r+") as holder:
-        fcntl.flock(holder, fcntl.LOCK_EX)
-        assert said() == ("warn", "ttyUSB0 is in use by another program")
-    assert said()[0] == "ok"
+    assert check_serial_port() == ("ok", "ttyUSB0 can be opened")
+    with port.open("r+") as locked_port:
+        fcntl.flock(locked_port, fcntl.LOCK_EX)
+        assert check_serial_port() == ("warn", "ttyUSB0 is in use by another program")
+    assert check_serial_port()[0] == "ok"

@@ -1,4 +1,4 @@
-"""Examples that have no test of their own."""
+"""Tests of the programs in examples/ that have no other test, and of the page that describes all."""
 
 import re
 import subprocess
@@ -10,17 +10,19 @@ REPOSITORY = Path(__file__).parents[3]
 
 def test_example_policy_is_evaluated_on_an_unseen_scene() -> None:
     command = [sys.executable, "examples/held_out.py", "clutter", "98100", "1"]
-    ended = subprocess.run(
+    completed = subprocess.run(
         command, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=110
     )
-    assert ended.returncode == 0, ended.stderr
+    assert completed.returncode == 0, completed.stderr
     assert re.search(
-        r"^98100: (goal|stuck|.+), \d+\.\d\d m in \d+\.\d\d s, \d+ J$", ended.stdout, re.MULTILINE
+        r"^98100: (goal|stuck|.+), \d+\.\d\d m in \d+\.\d\d s, \d+ J$",
+        completed.stdout,
+        re.MULTILINE,
     )
-    assert re.search(r"^clutter : reached the goal in [01] of 1$", ended.stdout, re.MULTILINE)
+    assert re.search(r"^clutter : reached the goal in [01] of 1$", completed.stdout, re.MULTILINE)
 
 
-def test_every_example_is_described() -> None:
+def test_examples_page_describes_every_example() -> None:
     page = (REPOSITORY / "examples" / "README.md").read_text()
     files = [
         path.name for path in (REPOSITORY / "examples").glob("*.*") if path.name != "README.md"

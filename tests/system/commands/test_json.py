@@ -1,4 +1,4 @@
-"""With `--json`, `status`, `scenarios` and `config` print one line with the content of the table and a code."""
+"""`status`, `scenario list` and `config` print JSON with `--json`, and `status` names what moves and how to recover."""
 
 import json
 from typing import Any
@@ -15,20 +15,22 @@ from snakesim_testing.hal.small_robots import make_description, make_status
 from snakesim_testing.harness.endpoint import find_free_endpoint
 
 
-def test_scenarios_and_configurations(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_of_scenarios_and_config_has_names_and_origins(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["scenario", "list", "--json"]) == 0
-    reported = json.loads(capsys.readouterr().out)
-    assert sorted(reported["robots"]) == list_shipped_names("robots")
-    assert reported["scenarios"]["triplet"]
+    listed = json.loads(capsys.readouterr().out)
+    assert sorted(listed["robots"]) == list_shipped_names("robots")
+    assert listed["scenarios"]["triplet"]
     assert main(["config", "triplet", "--json", "--set", "robot.limits.torque_nm=3"]) == 0
-    reported = json.loads(capsys.readouterr().out)
-    assert reported["robot.limits.torque_nm"] == {
+    config = json.loads(capsys.readouterr().out)
+    assert config["robot.limits.torque_nm"] == {
         "value": 3,
         "origin": "--set robot.limits.torque_nm=3",
     }
 
 
-def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_status_lists_robot_or_none(capsys: pytest.CaptureFixture[str]) -> None:
     endpoint = find_free_endpoint()
     assert main(["status", "--json", "--endpoint", endpoint]) == 1
     assert json.loads(capsys.readouterr().out) == {"robots": [], "silent": []}
@@ -38,16 +40,14 @@ def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixtu
         )
         assert main(["status", "--json", "--endpoint", endpoint]) == 0
     (robot,) = json.loads(capsys.readouterr().out)["robots"]
-    assert (robot["namespace"], robot["impostor"], robot["status"]["lifecycle"]) == (
-        "worm",
-        False,
-        "disarmed",
-    )
-    assert robot["emulated"] is None  # its host has not described it
+    assert robot["namespace"] == "worm"
+    assert robot["impostor"] is False
+    assert robot["status"]["lifecycle"] == "disarmed"
+    assert robot["emulated"] is None  # The host has not described the robot.
 
 
 @pytest.mark.parametrize(
-    ("described", "said"),
+    ("description_changes", "expected_line"),
     [
         ({"emulated": True}, "  EMULATED: nothing real moves (backend lag)"),
         (
@@ -62,32 +62,34 @@ def test_the_state_of_a_robot_and_that_there_is_none(capsys: pytest.CaptureFixtu
         (None, "  UNKNOWN whether motors move: the host has not described the robot"),
     ],
 )
-def test_status_and_top_say_whether_something_real_moves(
-    capsys: pytest.CaptureFixture[str], described: dict[str, Any] | None, said: str
+def test_status_and_rate_state_whether_motors_move(
+    capsys: pytest.CaptureFixture[str],
+    description_changes: dict[str, Any] | None,
+    expected_line: str,
 ) -> None:
-    """In the second line of a robot; a description of another host counts nothing."""
+    """The second line of a robot states it. The description of another host is ignored."""
     endpoint = find_free_endpoint()
     with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as session:
         session.declare_latched_publisher(keys.STATUS, RobotStatus).put(make_status())
-        if described is not None:
-            robot = msgspec.structs.replace(make_description(), **described)
-            session.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(robot)
+        if description_changes is not None:
+            description = msgspec.structs.replace(make_description(), **description_changes)
+            session.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(description)
         main(["status", "--endpoint", endpoint])
-        assert capsys.readouterr().out.splitlines()[1].startswith(said)
-        if described is None or "host" not in described:
+        assert capsys.readouterr().out.splitlines()[1].startswith(expected_line)
+        if description_changes is None or "host" not in description_changes:
             assert main(["topic", "rate", "--once", "--endpoint", endpoint]) == 0
-            assert capsys.readouterr().out.startswith(f"worm: {said.strip()}")
+            assert capsys.readouterr().out.startswith(f"worm: {expected_line.strip()}")
 
 
-def test_json_isolated_joint_is_reported_with_how_to_recover(
+def test_status_of_isolated_joint_names_commands_to_recover(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     endpoint = find_free_endpoint()
     with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as session:
-        lost = make_status(lifecycle="disarmed", isolated=["joint_3"], ready_to_arm=True)
-        session.declare_latched_publisher(keys.STATUS, RobotStatus).put(lost)
+        status = make_status(lifecycle="disarmed", isolated=["joint_3"], ready_to_arm=True)
+        session.declare_latched_publisher(keys.STATUS, RobotStatus).put(status)
         assert main(["status", "--endpoint", endpoint]) == 0
-    said = capsys.readouterr().out
-    assert "isolated: joint_3; passive until a reset" in said
-    assert "to end the isolation of joint_3" in said
-    assert "or, without: `snakesim robot arm worm lag" in said
+    output = capsys.readouterr().out
+    assert "isolated: joint_3; passive until a reset" in output
+    assert "to end the isolation of joint_3" in output
+    assert "or, without: `snakesim robot arm worm lag" in output

@@ -1,4 +1,4 @@
-"""What a person tells a robot: arm, disarm, reset, estop; and that a stop outlives the host."""
+"""An operator arms, disarms, resets and stops a robot, and a stop outlives the host."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ from snakesim_testing.runs.in_process_command import run_command_for_robot, snak
 
 pytestmark = pytest.mark.e2e
 
-LONG = (
+RUN_ARGUMENTS = (
     "triplet",
     "--controller",
     "hold",
@@ -30,53 +30,57 @@ LONG = (
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
-    with running_armed_snakesim(tmp_path_factory.mktemp("operator") / "run", *LONG) as started:
+    """Run an armed robot for all tests of this file."""
+    with running_armed_snakesim(
+        tmp_path_factory.mktemp("operator") / "run", *RUN_ARGUMENTS
+    ) as started:
         yield started
         assert started.interrupt() == 130, started.printed()
 
 
-def until_armed(run: RunningCommand) -> None:
-    """As a person does it: until the answer is yes."""
+def arm_robot(run: RunningCommand) -> None:
+    """Repeat `snakesim robot arm` until it succeeds."""
     wait_until(
         lambda: run_command_for_robot(run, "robot", "arm", "planar13", "sim").code == 0,
-        "armed",
+        "an armed robot",
         30.0,
     )
 
 
-def test_arming_is_for_what_is_named(run: RunningCommand) -> None:
+def test_operator_arms_only_the_named_robot_and_backend(run: RunningCommand) -> None:
     assert run_command_for_robot(run, "robot", "disarm").code == 0
-    for robot, backend, word in (
+    for robot, backend, expected_text in (
         ("mamba", "sim", "'planar13', not 'mamba'"),
         ("planar13", "can", "'sim', not 'can'"),
     ):
-        ended = run_command_for_robot(run, "robot", "arm", robot, backend)
-        assert ended.code == 1
-        assert word in ended.err
-        assert "snakesim robot arm planar13 sim" in ended.err
-    until_armed(run)
+        completed = run_command_for_robot(run, "robot", "arm", robot, backend)
+        assert completed.code == 1
+        assert expected_text in completed.err
+        assert "snakesim robot arm planar13 sim" in completed.err
+    arm_robot(run)
     assert "planar13: armed" in run_command_for_robot(run, "status").out
-    again = run_command_for_robot(run, "robot", "arm", "planar13", "sim")
-    assert again.code == 1
-    assert "must be disarmed" in again.err
+    refused = run_command_for_robot(run, "robot", "arm", "planar13", "sim")
+    assert refused.code == 1
+    assert "must be disarmed" in refused.err
     assert run_command_for_robot(run, "robot", "reset").code == 1
 
 
-def test_a_stop_is_latched_and_outlives_the_host(run: RunningCommand) -> None:
-    until_armed(run) if "planar13: armed" not in run_command_for_robot(run, "status").out else None
+def test_operator_stop_is_latched_and_outlives_the_host(run: RunningCommand) -> None:
+    if "planar13: armed" not in run_command_for_robot(run, "status").out:
+        arm_robot(run)
     stopped = run_command_for_robot(run, "estop")
     assert stopped.code == 0
     assert "planar13: stopped" in stopped.out
-    kept = run.out.parent / "snakesim" / "robots" / "planar13-sim" / ESTOP
-    assert kept.is_file()
-    first = run.part("host")
-    os.kill(first, signal.SIGKILL)
+    latch_file = run.out.parent / "snakesim" / "robots" / "planar13-sim" / ESTOP
+    assert latch_file.is_file()
+    first_host_pid = run.part("host")
+    os.kill(first_host_pid, signal.SIGKILL)
     wait_until(
         lambda: "planar13: estop" in run_command_for_robot(run, "status").out,
         "a new host in estop",
         30.0,
     )
-    assert run.part("host") != first
+    assert run.part("host") != first_host_pid
     status = run_command_for_robot(run, "status").out
     assert "before this host" in status
     assert "`snakesim robot reset" in status
@@ -85,13 +89,13 @@ def test_a_stop_is_latched_and_outlives_the_host(run: RunningCommand) -> None:
     assert refused.code == 1
     assert "state is estop" in refused.err
     assert run_command_for_robot(run, "robot", "reset").code == 0
-    assert not kept.exists()
-    until_armed(run)
+    assert not latch_file.exists()
+    arm_robot(run)
     assert run.printed().count("; restart in") == 1
 
 
 @pytest.mark.slow
-def test_nobody_there(tmp_path: Path) -> None:
+def test_operator_command_without_robot_fails(tmp_path: Path) -> None:
     for arguments in (
         ["estop"],
         ["robot", "reset"],
@@ -99,7 +103,8 @@ def test_nobody_there(tmp_path: Path) -> None:
         ["fault", "inject", "mute", "joint_1"],
         ["status"],
     ):
-        ended = snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
-        words = "no robot answers" if arguments == ["status"] else "no robot on tcp/127.0.0.1:9"
-        assert ended.code == 1
-        assert words in ended.err + ended.out
+        completed = snakesim(*arguments, "--endpoint", "tcp/127.0.0.1:9", cwd=tmp_path)
+        is_status = arguments == ["status"]
+        expected_text = "no robot answers" if is_status else "no robot on tcp/127.0.0.1:9"
+        assert completed.code == 1
+        assert expected_text in completed.err + completed.out

@@ -1,4 +1,4 @@
-"""`schemas/protocol.md` and the meanings in the schemas are enough for a stranger, and say what the code does."""
+"""`schemas/protocol.md` and the descriptions in the schemas agree with the code, and suffice to write a client."""
 
 import json
 import re
@@ -36,34 +36,34 @@ PROTOCOL = (REPOSITORY / "schemas" / "protocol.md").read_text(encoding="utf-8")
 
 
 @cache
-def published_contract() -> dict[str, str]:
+def generate_files_by_path() -> dict[str, str]:
+    """Return the published schema files, generated from the code."""
     return dict(generate_contract_files())
 
 
-def texts_in(schema: Any) -> Iterator[str]:
-    """Every unit and description below a field."""
+def iterate_descriptions(schema: Any) -> Iterator[str]:
+    """Yield every unit and description in a schema and below it."""
     if isinstance(schema, dict):
-        yield from (schema[word] for word in ("unit", "description") if word in schema)
+        yield from (schema[key] for key in ("unit", "description") if key in schema)
         schema = list(schema.values())
     if isinstance(schema, list):
         for inner in schema:
-            yield from texts_in(inner)
+            yield from iterate_descriptions(inner)
 
 
 @pytest.mark.parametrize("path", [f"messages/{message.__name__}.json" for message in VERSIONS])
-def test_whole_numbers_flags_and_null_say_what_they_mean(path: str) -> None:
-    for struct, schema in json.loads(published_contract()[path])["$defs"].items():
+def test_schema_integers_flags_and_nulls_have_descriptions(path: str) -> None:
+    for struct, schema in json.loads(generate_files_by_path()[path])["$defs"].items():
         for name, field in schema.get("properties", {}).items():
             if {"type": "null"} in field.get("anyOf", []):
                 assert "null" in field.get("description", ""), f"{struct}.{name}"
             if field.get("type") in ("integer", "boolean"):
-                assert list(texts_in(field)), f"{struct}.{name}"
+                assert list(iterate_descriptions(field)), f"{struct}.{name}"
 
 
-def test_the_modes_are_told_with_their_numbers_and_units() -> None:
-    reported = json.loads(published_contract()["messages/JointCommand.json"])["$defs"]["JointMode"][
-        "description"
-    ]
+def test_schema_joint_modes_have_numbers_and_units() -> None:
+    schema = json.loads(generate_files_by_path()["messages/JointCommand.json"])
+    description = schema["$defs"]["JointMode"]["description"]
     for mode, unit in (
         (JointMode.PASSIVE, "ignored"),
         (JointMode.POSITION, "rad"),
@@ -71,12 +71,12 @@ def test_the_modes_are_told_with_their_numbers_and_units() -> None:
         (JointMode.TORQUE, "N·m"),
     ):
         assert re.search(
-            rf"^{mode.value} {mode.name.lower()}: .*\b{unit}$", reported, re.MULTILINE
+            rf"^{mode.value} {mode.name.lower()}: .*\b{unit}$", description, re.MULTILINE
         ), mode
 
 
-def test_every_refusal_is_told() -> None:
-    commands = {*get_args(limiter.RejectionReason), "before_arming"}
+def test_protocol_page_lists_every_refusal_code() -> None:
+    command_refusals = {*get_args(limiter.RejectionReason), "before_arming"}
     source = "".join(
         (REPOSITORY / name).read_text(encoding="utf-8")
         for name in (
@@ -87,26 +87,27 @@ def test_every_refusal_is_told() -> None:
             "snakesim_hal/wire/codec.py",
         )
     )
-    words = set(re.findall(r'(?:refusal|word)="(\w+)"|_no\([^"]*"[^"]*", "(\w+)"\)', source))
-    asked = {word for pair in words for word in pair if word} | set(lifecycle.REFUSAL_ORDER)
-    assert len(asked) > len(lifecycle.REFUSAL_ORDER) + 3
-    for word in commands | asked:
-        assert f"`{word}`" in PROTOCOL, word
+    matches = set(re.findall(r'(?:refusal|word)="(\w+)"|_no\([^"]*"[^"]*", "(\w+)"\)', source))
+    request_refusals = {code for groups in matches for code in groups if code}
+    request_refusals |= set(lifecycle.REFUSAL_ORDER)
+    assert len(request_refusals) > len(lifecycle.REFUSAL_ORDER) + 3
+    for code in command_refusals | request_refusals:
+        assert f"`{code}`" in PROTOCOL, code
 
 
-def test_the_rates_are_those_of_the_code() -> None:
-    when = {row.key: row.when for row in keys.SPACE}
-    assert f"{1e9 / STATUS_PERIOD_NS:g} Hz" in when[keys.STATUS]
-    assert f"{1 / TELEMETRY_PERIOD_S:g} Hz" in when[keys.CONTROL_STATE]
+def test_key_table_has_the_rates_of_the_code() -> None:
+    rates_by_key = {row.key: row.when for row in keys.SPACE}
+    assert f"{1e9 / STATUS_PERIOD_NS:g} Hz" in rates_by_key[keys.STATUS]
+    assert f"{1 / TELEMETRY_PERIOD_S:g} Hz" in rates_by_key[keys.CONTROL_STATE]
     for row in keys.SPACE:
-        assert f"| {row.kind} | {row.when} |" in published_contract()["keys.md"]
+        assert f"| {row.kind} | {row.when} |" in generate_files_by_path()["keys.md"]
 
 
-def test_the_endpoint_is_the_default() -> None:
+def test_protocol_page_names_the_default_endpoint() -> None:
     assert f"| endpoint | `{DEFAULT_ENDPOINT}`" in PROTOCOL
 
 
-ROWS = {
+TABLE_ROWS = {  # first cell of a row in the table of priorities: one of its keys, and its message
     "`actuator/joints`": (keys.JOINT_COMMAND, JointCommand),
     "`hal/clock`, `hal/done/*`": (keys.done_key("control"), TickDone),
     "`sensor/depth/*`, `sensor/color/*`": (keys.depth_key("head"), DepthImage),
@@ -116,56 +117,58 @@ ROWS = {
 
 
 @pytest.mark.parametrize("lossless", [False, True], ids=["realtime", "lockstep"])
-@pytest.mark.parametrize("name", ROWS)
-def test_streams_are_sent_with_the_priorities_of_the_table(name: str, lossless: bool) -> None:
-    (key, message), endpoint = ROWS[name], find_free_endpoint()
+@pytest.mark.parametrize("name", TABLE_ROWS)
+def test_streams_have_priorities_of_the_protocol_table(name: str, lossless: bool) -> None:
+    key, message = TABLE_ROWS[name]
+    endpoint = find_free_endpoint()
     row = next(line for line in PROTOCOL.splitlines() if line.startswith(f"| {name} |"))
     priority, congestion, express = (cell.strip() for cell in row.strip("|").split("|")[1:])
     latched = key == keys.DESCRIPTION
     with (
-        open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal,
-        plain(endpoint) as stranger,
+        open_session(ConnectionSettings(endpoint, "worm", listen=True)) as host,
+        open_plain_session(endpoint) as client,
     ):
-        arrived = stranger.declare_subscriber(key)
-        publisher = (
-            hal.declare_latched_publisher(key, message)
-            if latched
-            else hal.declare_publisher(key, message, lossless=lossless)
-        )
-        found: list[zenoh.Sample] = []
+        subscriber = client.declare_subscriber(key)
+        if latched:
+            publisher = host.declare_latched_publisher(key, message)
+        else:
+            publisher = host.declare_publisher(key, message, lossless=lossless)
+        samples: list[zenoh.Sample] = []
         wait_until(
             lambda: (
-                publisher.send(b"") or found.extend(filter(None, [arrived.try_recv()])) or found
+                publisher.send(b"")
+                or samples.extend(filter(None, [subscriber.try_recv()]))
+                or samples
             ),
             "a sample",
         )
-    assert str(found[0].priority).endswith(f".{priority}")
-    assert found[0].express == (express == "yes")
+    assert str(samples[0].priority).endswith(f".{priority}")
+    assert samples[0].express == (express == "yes")
     blocks = lossless and not latched
-    wanted = zenoh.CongestionControl.BLOCK if blocks else zenoh.CongestionControl.DROP
-    assert found[0].congestion_control == wanted
+    expected_control = zenoh.CongestionControl.BLOCK if blocks else zenoh.CongestionControl.DROP
+    assert samples[0].congestion_control == expected_control
     assert congestion.startswith("DROP")
     assert ("lockstep BLOCK" in congestion) != latched
 
 
-def test_a_plain_client_gets_the_latched_description_by_a_query() -> None:
-    endpoint, robot = find_free_endpoint(), make_description()
-    with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as hal:
-        hal.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(robot)
-        with plain(endpoint) as stranger:
+def test_plain_client_gets_latched_description_by_query() -> None:
+    endpoint = find_free_endpoint()
+    description = make_description()
+    with open_session(ConnectionSettings(endpoint, "worm", listen=True)) as host:
+        host.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(description)
+        with open_plain_session(endpoint) as client:
             assert "`hal/description/@adv/**`" in PROTOCOL
             replies = list(
-                stranger.get(
+                client.get(
                     "hal/description/@adv/**", accept_replies=zenoh.ReplyKeyExpr.ANY, timeout=5.0
                 )
             )
-    assert [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None] == [
-        encode(robot)
-    ]
+    payloads = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+    assert payloads == [encode(description)]
 
 
-def plain(endpoint: str) -> zenoh.Session:
-    """A session as the protocol describes it."""
-    link = {"mode": "client", "namespace": "worm", "connect": {"endpoints": [endpoint]}}
-    quiet = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
-    return zenoh.open(zenoh.Config.from_json5(json.dumps({**link, "scouting": quiet})))
+def open_plain_session(endpoint: str) -> zenoh.Session:
+    """Open a Zenoh session with only the settings that the protocol describes."""
+    connection = {"mode": "client", "namespace": "worm", "connect": {"endpoints": [endpoint]}}
+    scouting = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    return zenoh.open(zenoh.Config.from_json5(json.dumps({**connection, "scouting": scouting})))

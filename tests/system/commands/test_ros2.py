@@ -1,6 +1,7 @@
-"""`snakesim start ros2` in real processes: what a ROS node would see on its router, and what it may ask of the robot.
+"""`snakesim start ros2` connects a robot to a ROS network: sensors, parameters, steering, and joint commands.
 
-The ROS side is plain Zenoh with rmw_zenoh's keys, and rosbags for the messages; nothing of the bridge is imported.
+The ROS node of the tests is plain Zenoh with the keys of rmw_zenoh, and rosbags for the messages. It imports nothing
+of the bridge.
 """
 
 import json
@@ -33,7 +34,7 @@ from snakesim_testing.runs.in_process_command import run_command_for_robot
 pytestmark = pytest.mark.e2e
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-DEFINED = {
+SERVICE_DEFINITIONS = {  # name: definitions of request and response
     "std_srvs/srv/Trigger": (
         "uint8 structure_needs_at_least_one_member",
         "bool success\nstring message",
@@ -59,24 +60,37 @@ DEFINED = {
         "rcl_interfaces/msg/SetParametersResult result",
     ),
 }
-for _name, _texts in DEFINED.items():
-    for _text, _part in zip(_texts, ("_Request", "_Response"), strict=True):
-        ((_, _fields),) = get_types_from_msg(_text, f"{_name}{_part}").items()
+for _name, _definitions in SERVICE_DEFINITIONS.items():
+    for _definition, _part in zip(_definitions, ("_Request", "_Response"), strict=True):
+        ((_, _fields),) = get_types_from_msg(_definition, f"{_name}{_part}").items()
         STORE.register({f"{_name}{_part}": _fields})
-ROUTER = '{mode: "router", listen: {endpoints: ["%s"]}, scouting: {multicast: {enabled: false}}}'
+ROUTER_CONFIGURATION = (
+    '{mode: "router", listen: {endpoints: ["%s"]}, scouting: {multicast: {enabled: false}}}'
+)
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TRIGGER = "std_srvs/srv/Trigger"
+DOUBLE_TYPE = 3  # of a ROS parameter
+NOT_SET_TYPE = 0
+# Sequence number, timestamp, length and global id of a publisher, as rmw_zenoh attaches them to a message.
+ATTACHMENT_FORMAT = "<qqB16s"
+ATTACHMENT_BYTES = 33
+SEQUENCE = 7
+GID = bytes(range(16))
+FIRST_MESSAGE_TIMEOUT_S = 30
 RUN = ("clutter", "--clock-mode", "lockstep", "--duration", "600", "--stay", "--set", "rate_hz=50")
 
 
 @contextmanager
-def ros_router(folder: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """The router of a ROS network, and where it listens."""
-    at = find_free_endpoint()
-    (folder / "ros.json5").write_text(ROUTER % at)
+def running_ros_router(folder: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """Run the router of a ROS network, and yield its endpoint and its process."""
+    endpoint = find_free_endpoint()
+    (folder / "ros.json5").write_text(ROUTER_CONFIGURATION % endpoint)
     with run_in_background(folder, "start", "router", "ros.json5") as router:
-        yield at, router
+        yield endpoint, router
 
 
-def session_at(endpoint: str) -> zenoh.Session:
+def open_ros_session(endpoint: str) -> zenoh.Session:
+    """Open the session of a ROS node at a router."""
     settings = {
         "mode": "client",
         "connect": {"endpoints": [endpoint], "timeout_ms": 20000},
@@ -85,123 +99,161 @@ def session_at(endpoint: str) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
 
 
-class RosSide:
-    """Subscribes as rmw_zenoh does, and decodes with rosbags."""
+def make_attachment(timestamp_ns: int) -> bytes:
+    """Return the attachment that rmw_zenoh adds to a message."""
+    return struct.pack(ATTACHMENT_FORMAT, SEQUENCE, timestamp_ns, len(GID), GID)
+
+
+class RosNode:
+    """A ROS node that uses the keys of rmw_zenoh, and encodes messages with rosbags."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
 
-    def key(self, topic: str, kind: str) -> str:
+    def make_key(self, topic: str, kind: str) -> str:
+        """Return the Zenoh key of a topic with a message type."""
         package, _, name = kind.split("/")
         return f"0/{topic}/{package}::msg::dds_::{name}_/{STORE.hash_rihs01(kind)}"
 
-    def first(
+    def wait_for_message(
         self,
         topic: str,
         kind: str,
-        wanted: Callable[[Any], bool] = lambda _: True,
+        accept: Callable[[Any], bool] = lambda _: True,
         *,
         latched: bool = False,
     ) -> Any:
-        key, ring = self.key(topic, kind), handlers.RingChannel(20)
+        """Subscribe to a topic, and return the first message that is accepted.
+
+        Args:
+            topic: Name of the topic.
+            kind: Its message type.
+            accept: Returns whether a message is the awaited one.
+            latched: Whether to request the last message that was published before.
+        """
+        key = self.make_key(topic, kind)
+        ring = handlers.RingChannel(20)
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-        declared: Any = (
-            ext.declare_advanced_subscriber(self.session, key, ring, history=history)
-            if latched
-            else self.session.declare_subscriber(key, ring)
-        )
-        until = time.monotonic() + 30
+        subscriber: Any
+        if latched:
+            subscriber = ext.declare_advanced_subscriber(self.session, key, ring, history=history)
+        else:
+            subscriber = self.session.declare_subscriber(key, ring)
+        deadline_s = time.monotonic() + FIRST_MESSAGE_TIMEOUT_S
         try:
-            while time.monotonic() < until:
-                if (sample := declared.try_recv()) is None:
+            while time.monotonic() < deadline_s:
+                sample = subscriber.try_recv()
+                if sample is None:
                     time.sleep(0.01)
                     continue
                 assert sample.attachment is not None
-                assert len(sample.attachment.to_bytes()) == 33
-                if wanted(found := STORE.deserialize_cdr(sample.payload.to_bytes(), kind)):
-                    return found
+                assert len(sample.attachment.to_bytes()) == ATTACHMENT_BYTES
+                message = STORE.deserialize_cdr(sample.payload.to_bytes(), kind)
+                if accept(message):
+                    return message
         finally:
-            declared.undeclare()
-        raise AssertionError(f"nothing wanted on {topic} within 30 s")
+            subscriber.undeclare()
+        raise AssertionError(f"no awaited message on {topic} within {FIRST_MESSAGE_TIMEOUT_S} s")
 
-    def made(self, kind: str, *fields: Any) -> Any:
+    def make_message(self, kind: str, *fields: Any) -> Any:
+        """Return a message of a type with its fields in order."""
         return STORE.types[kind](*fields)
 
-    def asked(self, name: str, kind: str, request: Any) -> Any:
-        """As a client of rmw_zenoh: target and attachment are its own; None: nobody answers."""
+    def call_service(self, name: str, kind: str, request: Any) -> Any:
+        """Call a service as a client of rmw_zenoh, and return its response; None if no node has the service."""
         key = f"0/{name}/{kind.replace('/', '::').replace('::srv::', '::srv::dds_::')}_/RIHS01_{SERVICE_HASHES[kind]}"
-        sent = struct.pack("<qqB16s", 7, time.time_ns(), 16, bytes(range(16)))
+        attachment = make_attachment(time.time_ns())
         payload = bytes(STORE.serialize_cdr(request, f"{kind}_Request"))
-        complete = zenoh.QueryTarget.ALL_COMPLETE
-        (*_, reply) = [
-            None,
-            *self.session.get(key, payload=payload, attachment=sent, target=complete, timeout=20.0),
-        ]
-        if reply is None:
+        replies = list(
+            self.session.get(
+                key,
+                payload=payload,
+                attachment=attachment,
+                target=zenoh.QueryTarget.ALL_COMPLETE,
+                timeout=20.0,
+            )
+        )
+        if not replies:
             return None
+        reply = replies[-1]
         assert reply.ok is not None
         assert reply.ok.attachment is not None
-        sequence, _, length, gid = struct.unpack("<qqB16s", reply.ok.attachment.to_bytes())
-        assert sequence == 7
-        assert length == 16
-        assert gid == bytes(range(16))
+        sequence, _, length, gid = struct.unpack(ATTACHMENT_FORMAT, reply.ok.attachment.to_bytes())
+        assert sequence == SEQUENCE
+        assert length == len(GID)
+        assert gid == GID
         return STORE.deserialize_cdr(reply.ok.payload.to_bytes(), f"{kind}_Response")
 
+    def call_trigger(self, name: str) -> Any:
+        """Call a trigger service, and return its response; None if no node has the service."""
+        return self.call_service(name, TRIGGER, self.make_message(f"{TRIGGER}_Request", 0))
+
     def trigger(self, name: str) -> None:
-        answer = self.asked(
-            name, "std_srvs/srv/Trigger", self.made("std_srvs/srv/Trigger_Request", 0)
-        )
-        assert answer is not None and answer.success, f"{name}: {answer}"
+        """Call a trigger service, which must succeed."""
+        response = self.call_trigger(name)
+        assert response is not None, f"{name}: no response"
+        assert response.success, f"{name}: {response}"
 
-    def parameters(self, name: str, kind: str, *fields: Any) -> Any:
+    def call_parameter_service(self, name: str, kind: str, *fields: Any) -> Any:
+        """Call a parameter service of the bridge, and return its response."""
         kind = f"rcl_interfaces/srv/{kind}"
-        return self.asked(f"snakesim/{name}", kind, self.made(f"{kind}_Request", *fields))
+        request = self.make_message(f"{kind}_Request", *fields)
+        return self.call_service(f"snakesim/{name}", kind, request)
 
-    def parameter(self, name: str, value: float) -> Any:
+    def make_parameter(self, name: str, value: float) -> Any:
+        """Return a parameter with a number as its value."""
         arrays = [np.array([], dtype=kind) for kind in (np.uint8, np.bool_, np.int64, np.float64)]
-        made = self.made("rcl_interfaces/msg/ParameterValue", 3, False, 0, value, "", *arrays, [])
-        return self.made("rcl_interfaces/msg/Parameter", name, made)
-
-    def command(self, names: list[str], **numbers: list[float]) -> None:
-        stamp = self.made("builtin_interfaces/msg/Time", 0, 0)
-        fields = [
-            np.array(numbers.get(word, []), dtype=np.float64)
-            for word in ("position", "velocity", "effort")
-        ]
-        sent = self.made(
-            "sensor_msgs/msg/JointState",
-            self.made("std_msgs/msg/Header", stamp, ""),
-            names,
-            *fields,
+        parameter_value = self.make_message(
+            "rcl_interfaces/msg/ParameterValue", DOUBLE_TYPE, False, 0, value, "", *arrays, []
         )
-        kind = "sensor_msgs/msg/JointState"
-        self.session.put(self.key("joint_commands", kind), bytes(STORE.serialize_cdr(sent, kind)))
+        return self.make_message("rcl_interfaces/msg/Parameter", name, parameter_value)
 
-    def moved(
-        self, act: Callable[[], None], there: Callable[[dict[str, float]], bool]
+    def command_joints(self, names: list[str], **values: list[float]) -> None:
+        """Publish a joint command.
+
+        Args:
+            names: The commanded joints.
+            values: Their values for `position`, `velocity` or `effort`.
+        """
+        timestamp = self.make_message("builtin_interfaces/msg/Time", 0, 0)
+        header = self.make_message("std_msgs/msg/Header", timestamp, "")
+        arrays = [
+            np.array(values.get(field, []), dtype=np.float64)
+            for field in ("position", "velocity", "effort")
+        ]
+        message = self.make_message(JOINT_STATE, header, names, *arrays)
+        payload = bytes(STORE.serialize_cdr(message, JOINT_STATE))
+        self.session.put(self.make_key("joint_commands", JOINT_STATE), payload)
+
+    def repeat_until_joints(
+        self, act: Callable[[], None], are_there: Callable[[dict[str, float]], bool]
     ) -> dict[str, float]:
-        """Repeat it until the joints are there; their angles in rad."""
+        """Repeat an action until the joint angles satisfy a condition, and return the angles in rad."""
 
-        def wanted(state: Any) -> bool:
+        def act_and_check(state: Any) -> bool:
             act()
-            return there(dict(zip(state.name, state.position, strict=True)))
+            return are_there(dict(zip(state.name, state.position, strict=True)))
 
-        state = self.first("joint_states", "sensor_msgs/msg/JointState", wanted)
+        state = self.wait_for_message("joint_states", JOINT_STATE, act_and_check)
         return dict(zip(state.name, state.position, strict=True))
 
-    def tokens(self) -> list[str]:
+    def list_liveliness_tokens(self) -> list[str]:
+        """Return the tokens of all nodes, publishers and services in the ROS graph."""
         replies = self.session.liveliness().get("@ros2_lv/0/**", timeout=2.0)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
 
-def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
-    with running_snakesim(tmp_path / "run", *RUN) as run, ros_router(tmp_path) as (at, router):
+def test_ros_node_reads_sensors_steers_and_sets_parameters(tmp_path: Path) -> None:
+    with (
+        running_snakesim(tmp_path / "run", *RUN) as run,
+        running_ros_router(tmp_path) as (ros_endpoint, router),
+    ):
         run.wait_for(" s  ")
         refused = run_command_for_robot(run, "start", "ros2", "--ros-router", run.endpoint)
         assert refused.code == 2
         assert "itself is on this endpoint" in refused.err
         refused = run_command_for_robot(
-            run, "start", "ros2", "--ros-router", at, "--joint-commands"
+            run, "start", "ros2", "--ros-router", ros_endpoint, "--joint-commands"
         )
         assert refused.code != 0
         assert "has a controller already, which holds the lease" in refused.err
@@ -211,27 +263,29 @@ def test_a_robot_among_ros_nodes(tmp_path: Path) -> None:
             "--endpoint",
             run.endpoint,
             "--ros-router",
-            at,
+            ros_endpoint,
             "--cmd-vel",
             "--operate",
         )
-        with session_at(at) as session, run_in_background(tmp_path, *bridge):
-            _sees(RosSide(session))
-            _steers(RosSide(session), run.endpoint)
-            _tunes(RosSide(session))
-            _outlasts_a_frozen_router(RosSide(session), router.pid, run.endpoint)
-            with session_at(at) as anew:
-                RosSide(anew).first("joint_states", "sensor_msgs/msg/JointState")
-        with session_at(at) as session:
+        with open_ros_session(ros_endpoint) as session, run_in_background(tmp_path, *bridge):
+            _check_sensor_topics(RosNode(session))
+            _check_steering(RosNode(session), run.endpoint)
+            _check_parameters(RosNode(session))
+            _check_frozen_router(RosNode(session), router.pid, run.endpoint)
+            with open_ros_session(ros_endpoint) as new_session:
+                RosNode(new_session).wait_for_message("joint_states", JOINT_STATE)
+        with open_ros_session(ros_endpoint) as session:
             wait_until(
-                lambda: not RosSide(session).tokens(), "the node gone from the ROS graph", 10.0
+                lambda: not RosNode(session).list_liveliness_tokens(),
+                "a ROS graph without the bridge",
+                10.0,
             )
 
 
 @pytest.mark.slow
-def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
+def test_ros_bridge_started_before_the_robot_waits_for_it(tmp_path: Path) -> None:
     endpoint = find_free_endpoint()
-    late = (
+    run_arguments = (
         "run",
         "triplet",
         "--clock-mode",
@@ -243,32 +297,25 @@ def test_the_bridge_waits_for_a_robot_that_is_starting(tmp_path: Path) -> None:
         endpoint,
     )
     with (
-        ros_router(tmp_path) as (at, _),
-        session_at(at) as session,
+        running_ros_router(tmp_path) as (ros_endpoint, _),
+        open_ros_session(ros_endpoint) as session,
         run_in_background(
-            tmp_path, "start", "ros2", "--endpoint", endpoint, "--ros-router", at
-        ) as waiting,
+            tmp_path, "start", "ros2", "--endpoint", endpoint, "--ros-router", ros_endpoint
+        ) as bridge,
     ):
-        assert waiting.stdout is not None
-        assert "Waiting for it up to 60 s" in waiting.stdout.readline()
-        with run_in_background(tmp_path, *late):
-            ros = RosSide(session)
-            ros.first("joint_states", "sensor_msgs/msg/JointState")
-            assert (
-                ros.asked(
-                    "arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)
-                )
-                is None
-            )
-            assert ros.asked(
-                "stop", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)
-            ).success
+        assert bridge.stdout is not None
+        assert "Waiting for it up to 60 s" in bridge.stdout.readline()
+        with run_in_background(tmp_path, *run_arguments):
+            ros = RosNode(session)
+            ros.wait_for_message("joint_states", JOINT_STATE)
+            assert ros.call_trigger("arm") is None
+            assert ros.call_trigger("stop").success
 
 
 @pytest.mark.slow
-def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
-    """Arm, command single joints, fall silent, stop, reset, disarm: all of it as a node of rmw_zenoh would."""
-    alone = (
+def test_ros_node_with_joint_commands_drives_joints_and_stops(tmp_path: Path) -> None:
+    """A ROS node arms the robot, commands single joints, sends nothing, stops, resets and disarms."""
+    run_arguments = (
         "triplet",
         "--clock-mode",
         "lockstep",
@@ -278,52 +325,54 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
         "--set",
         "services.control.external=true",
     )
-    with running_snakesim(tmp_path / "run", *alone) as run, ros_router(tmp_path) as (at, _):
+    with (
+        running_snakesim(tmp_path / "run", *run_arguments) as run,
+        running_ros_router(tmp_path) as (ros_endpoint, _),
+    ):
         bridge = (
             "start",
             "ros2",
             "--endpoint",
             run.endpoint,
             "--ros-router",
-            at,
+            ros_endpoint,
             "--joint-commands",
             "--operate",
         )
-        with session_at(at) as session, run_in_background(tmp_path, *bridge):
-            ros = RosSide(session)
-            limp = ros.first("joint_states", "sensor_msgs/msg/JointState")
+        with open_ros_session(ros_endpoint) as session, run_in_background(tmp_path, *bridge):
+            ros = RosNode(session)
+            initial = ros.wait_for_message("joint_states", JOINT_STATE)
             ros.trigger("arm")
-            ros.command(["joint_99"], position=[0.3])
-            ros.command(["joint_7", "joint_8"], position=[0.3])
-            there = ros.moved(
-                lambda: ros.command(["joint_7"], position=[0.3]), lambda now: now["joint_7"] > 0.28
+            ros.command_joints(["joint_99"], position=[0.3])
+            ros.command_joints(["joint_7", "joint_8"], position=[0.3])
+            angles_rad = ros.repeat_until_joints(
+                lambda: ros.command_joints(["joint_7"], position=[0.3]),
+                lambda angles: angles["joint_7"] > 0.28,
             )
-            # The others hold their angles between pegs, which give: a position loop is as stiff as its gains.
-            others = [
-                abs(there[name] - was) for name, was in zip(limp.name, limp.position, strict=True)
+            # The other joints hold their angles between pegs, but their position loops are not stiff.
+            changes_rad = [
+                abs(angles_rad[name] - initial_rad)
+                for name, initial_rad in zip(initial.name, initial.position, strict=True)
             ]
-            assert sorted(others)[-2] < 0.15
-            assert there["joint_7"] == pytest.approx(0.3, abs=0.03)
-            ros.moved(
-                lambda: ros.command(["joint_3"], velocity=[-0.5]), lambda now: now["joint_3"] < -0.2
+            second_largest_rad = sorted(changes_rad)[-2]
+            assert second_largest_rad < 0.15
+            assert angles_rad["joint_7"] == pytest.approx(0.3, abs=0.03)
+            ros.repeat_until_joints(
+                lambda: ros.command_joints(["joint_3"], velocity=[-0.5]),
+                lambda angles: angles["joint_3"] < -0.2,
             )
-            ros.first(
-                "joint_states",
-                "sensor_msgs/msg/JointState",
-                lambda now: max(abs(now.velocity)) < 0.05,
+            # Without commands the robot comes to rest, and remains at rest for three seconds.
+            ros.wait_for_message(
+                "joint_states", JOINT_STATE, lambda state: max(abs(state.velocity)) < 0.05
             )
-            stood = ros.first("joint_states", "sensor_msgs/msg/JointState")
-            later = stood.header.stamp.sec + 3
-            stands = ros.first(
-                "joint_states",
-                "sensor_msgs/msg/JointState",
-                lambda now: now.header.stamp.sec >= later,
+            at_rest = ros.wait_for_message("joint_states", JOINT_STATE)
+            end_s = at_rest.header.stamp.sec + 3
+            later = ros.wait_for_message(
+                "joint_states", JOINT_STATE, lambda state: state.header.stamp.sec >= end_s
             )
-            assert max(abs(stands.position - stood.position)) < 0.02
+            assert max(abs(later.position - at_rest.position)) < 0.02
             ros.trigger("stop")
-            refused = ros.asked(
-                "arm", "std_srvs/srv/Trigger", ros.made("std_srvs/srv/Trigger_Request", 0)
-            )
+            refused = ros.call_trigger("arm")
             assert not refused.success
             assert "stop" in refused.message
             ros.trigger("reset")
@@ -331,101 +380,119 @@ def test_ros_drives_joints_under_the_lease(tmp_path: Path) -> None:
             ros.trigger("disarm")
 
 
-def _tunes(ros: RosSide) -> None:
-    """`ros2 param list`, `describe`, `set` and `get`."""
+def _check_parameters(ros: RosNode) -> None:
+    """Check what `ros2 param list`, `describe`, `set` and `get` request."""
     name = "control.speed_kp_s"
-    listed = ros.parameters("list_parameters", "ListParameters", [], 0)
+    listed = ros.call_parameter_service("list_parameters", "ListParameters", [], 0)
     assert name in listed.result.names
-    (about,) = ros.parameters("describe_parameters", "DescribeParameters", [name]).descriptors
-    assert about.name == name
-    assert about.type == 3
-    assert "[s]" in about.description
-    assert about.floating_point_range
-    wanted = ros.parameter(name, 0.3)
-    (done,) = ros.parameters("set_parameters", "SetParameters", [wanted]).results
-    assert done.successful, done.reason
-    (now, nothing) = ros.parameters("get_parameters", "GetParameters", [name, "control.x"]).values
-    assert now.type == 3
-    assert now.double_value == 0.3
-    assert nothing.type == 0
-    wanted = ros.parameter(name, -1.0)
-    refused = ros.parameters(
-        "set_parameters_atomically", "SetParametersAtomically", [wanted]
+    (descriptor,) = ros.call_parameter_service(
+        "describe_parameters", "DescribeParameters", [name]
+    ).descriptors
+    assert descriptor.name == name
+    assert descriptor.type == DOUBLE_TYPE
+    assert "[s]" in descriptor.description
+    assert descriptor.floating_point_range
+    parameter = ros.make_parameter(name, 0.3)
+    (result,) = ros.call_parameter_service("set_parameters", "SetParameters", [parameter]).results
+    assert result.successful, result.reason
+    (present, unknown) = ros.call_parameter_service(
+        "get_parameters", "GetParameters", [name, "control.x"]
+    ).values
+    assert present.type == DOUBLE_TYPE
+    assert present.double_value == 0.3
+    assert unknown.type == NOT_SET_TYPE
+    parameter = ros.make_parameter(name, -1.0)
+    refused = ros.call_parameter_service(
+        "set_parameters_atomically", "SetParametersAtomically", [parameter]
     ).result
     assert not refused.successful
     assert "speed_kp_s" in refused.reason
 
 
-def _sees(ros: RosSide) -> None:
-    described = ros.first("robot_description", "std_msgs/msg/String", latched=True)
-    assert described.data.count("<joint") == 14
-    joints = ros.first("joint_states", "sensor_msgs/msg/JointState")
+def _check_sensor_topics(ros: RosNode) -> None:
+    """Check that the bridge publishes description, sensors, images, transforms and obstacles."""
+    description = ros.wait_for_message("robot_description", "std_msgs/msg/String", latched=True)
+    assert description.data.count("<joint") == 14
+    joints = ros.wait_for_message("joint_states", JOINT_STATE)
     assert len(joints.name) == len(joints.position) == len(joints.effort) == 13
-    clock = ros.first("clock", "rosgraph_msgs/msg/Clock").clock
+    clock = ros.wait_for_message("clock", "rosgraph_msgs/msg/Clock").clock
     assert abs(clock.sec - joints.header.stamp.sec) <= 2
-    image = ros.first("head/depth/image_raw", "sensor_msgs/msg/Image")
+    image = ros.wait_for_message("head/depth/image_raw", "sensor_msgs/msg/Image")
     assert image.encoding == "16UC1"
     assert image.width == 160
     assert image.height == 120
     assert len(image.data) == 38400
-    png = ros.first("head/depth/image_raw/compressedDepth", "sensor_msgs/msg/CompressedImage")
-    assert png.format == "16UC1; compressedDepth png"
-    assert png.data[12:20].tobytes() == b"\x89PNG\r\n\x1a\n"
-    imu = ros.first("link_7/imu", "sensor_msgs/msg/Imu")
+    compressed = ros.wait_for_message(
+        "head/depth/image_raw/compressedDepth", "sensor_msgs/msg/CompressedImage"
+    )
+    assert compressed.format == "16UC1; compressedDepth png"
+    assert compressed.data[12:20].tobytes() == b"\x89PNG\r\n\x1a\n"
+    imu = ros.wait_for_message("link_7/imu", "sensor_msgs/msg/Imu")
     assert imu.header.frame_id == "link_7_imu_frame"
     assert 8 < imu.linear_acceleration.z < 12
-    wrench = ros.first("link_3/contact", "geometry_msgs/msg/WrenchStamped")
+    wrench = ros.wait_for_message("link_3/contact", "geometry_msgs/msg/WrenchStamped")
     assert wrench.header.frame_id == "link_3"
     assert abs(wrench.wrench.force.y) < 1000
-    info = ros.first("head/depth/camera_info", "sensor_msgs/msg/CameraInfo")
+    info = ros.wait_for_message("head/depth/camera_info", "sensor_msgs/msg/CameraInfo")
     assert info.header.frame_id == image.header.frame_id
     assert info.k[0] == info.p[0] > 0
-    placed = "link_7_imu_frame"
-    static = ros.first(
+    _check_frames(ros, image.header.frame_id)
+    markers = ros.wait_for_message(
+        "obstacles", "visualization_msgs/msg/MarkerArray", lambda array: len(array.markers) > 1
+    ).markers
+    assert {marker.header.frame_id for marker in markers} == {"odom"}
+    kinds = [token.split("/")[5] for token in ros.list_liveliness_tokens()]
+    assert kinds.count("NN") == 1  # nodes
+    assert kinds.count("MS") == 1  # subscribers
+    assert kinds.count("MP") >= 9  # publishers
+
+
+def _check_frames(ros: RosNode, camera_frame: str) -> None:
+    """Check that the transforms of the bridge connect the camera with the map."""
+    static = ros.wait_for_message(
         "tf_static",
         "tf2_msgs/msg/TFMessage",
-        lambda found: placed in {one.child_frame_id for one in found.transforms},
+        lambda message: (
+            "link_7_imu_frame" in {transform.child_frame_id for transform in message.transforms}
+        ),
         latched=True,
     ).transforms
-    assert image.header.frame_id in {one.child_frame_id for one in static}
-    parents = {one.child_frame_id: one.header.frame_id for one in static}
-    moving = ros.first(
-        "tf", "tf2_msgs/msg/TFMessage", lambda found: len(found.transforms) == 13
+    assert camera_frame in {transform.child_frame_id for transform in static}
+    joints = ros.wait_for_message(
+        "tf", "tf2_msgs/msg/TFMessage", lambda message: len(message.transforms) == 13
     ).transforms
-    base = ros.first(
-        "tf", "tf2_msgs/msg/TFMessage", lambda found: len(found.transforms) == 1
+    base = ros.wait_for_message(
+        "tf", "tf2_msgs/msg/TFMessage", lambda message: len(message.transforms) == 1
     ).transforms
-    parents |= {one.child_frame_id: one.header.frame_id for one in (*moving, *base)}
-    frame, steps = image.header.frame_id, 0
+    parents = {
+        transform.child_frame_id: transform.header.frame_id
+        for transform in (*static, *joints, *base)
+    }
+    frame = camera_frame
+    steps = 0
     while frame != "map":
-        frame, steps = parents[frame], steps + 1
-    assert steps == 18  # optical, camera, 14 links, base, odom
-    drawn = ros.first(
-        "obstacles", "visualization_msgs/msg/MarkerArray", lambda found: len(found.markers) > 1
-    )
-    assert {marker.header.frame_id for marker in drawn.markers} == {"odom"}
-    kinds = [token.split("/")[5] for token in ros.tokens()]
-    assert kinds.count("NN") == 1
-    assert kinds.count("MS") == 1
-    assert kinds.count("MP") >= 9
+        frame = parents[frame]
+        steps += 1
+    assert steps == 18  # optical frame, camera, 14 links, base, odom
 
 
-def _steers(ros: RosSide, endpoint: str) -> None:
-    """A Twist becomes an intent that navigation follows; without Twists the robot stops."""
-    kind = {name: STORE.types[f"geometry_msgs/msg/{name}"] for name in ("Twist", "Vector3")}
-    twist = kind["Twist"](kind["Vector3"](0.1, 0.0, 0.0), kind["Vector3"](0.0, 0.0, 0.2))
+def _check_steering(ros: RosNode, endpoint: str) -> None:
+    """Check that navigation follows a Twist message, and that the robot stops without fresh ones."""
+    linear_m_s = ros.make_message("geometry_msgs/msg/Vector3", 0.1, 0.0, 0.0)
+    angular_rad_s = ros.make_message("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.2)
+    twist = ros.make_message("geometry_msgs/msg/Twist", linear_m_s, angular_rad_s)
     payload = bytes(STORE.serialize_cdr(twist, "geometry_msgs/msg/Twist"))
-    key = ros.key("cmd_vel", "geometry_msgs/msg/Twist")
+    key = ros.make_key("cmd_vel", "geometry_msgs/msg/Twist")
     with open_session(ConnectionSettings(endpoint, "planar13_camera")) as robot:
         intents = robot.declare_reader(keys.INTENT, LocomotionIntent)
         plans = robot.declare_reader(keys.TRAJECTORY, Trajectory)
 
-        def followed() -> bool:
+        def publish_and_check_plan() -> bool:
             ros.session.put(key, payload)
             plan = plans.pop_newest(lambda _: True)
             return plan is not None and "ros2 /cmd_vel" in plan.reason and plan.speed_m_s > 0
 
-        wait_until(followed, "navigation at the speed of /cmd_vel", 30.0)
+        wait_until(publish_and_check_plan, "navigation at the speed of /cmd_vel", 30.0)
         (*_, newest) = intents.drain()
         assert newest.speed_m_s == 0.1
         assert newest.heading_w_rad is not None
@@ -435,49 +502,46 @@ def _steers(ros: RosSide, endpoint: str) -> None:
                 plans.pop_newest(lambda plan: plan.speed_m_s == 0 and "has expired" in plan.reason)
                 is not None
             ),
-            "standing still without /cmd_vel",
+            "a stop without /cmd_vel",
             30.0,
         )
 
-        def sent(ago_s: float) -> bool:
-            """Whether a Twist that its node sent so long ago becomes an intent."""
-            timestamp_ns = time.time_ns() - round(ago_s * 1e9)
-            ros.session.put(
-                key,
-                payload,
-                attachment=struct.pack("<qqB16s", 7, timestamp_ns, 16, bytes(range(16))),
-            )
+        def becomes_intent(age_s: float) -> bool:
+            """Publish a Twist of this age, and return whether it becomes an intent."""
+            timestamp_ns = time.time_ns() - round(age_s * 1e9)
+            ros.session.put(key, payload, attachment=make_attachment(timestamp_ns))
             time.sleep(0.1)
             return bool(intents.drain())
 
-        wait_until(lambda: sent(0.0), "a Twist of a moment ago", 10.0)
+        wait_until(lambda: becomes_intent(0.0), "an intent from a fresh Twist", 10.0)
         time.sleep(0.5)
         intents.drain()
-        assert not any(sent(14.0 - 0.1 * number) for number in range(5)), (
-            "Twists that a network held back"
+        assert not any(becomes_intent(14.0 - 0.1 * number) for number in range(5)), (
+            "a Twist that the network delayed became an intent"
         )
-        wait_until(lambda: sent(0.0), "the next Twist", 10.0)
+        wait_until(lambda: becomes_intent(0.0), "an intent from the next Twist", 10.0)
 
 
-def _outlasts_a_frozen_router(ros: RosSide, router: int, endpoint: str) -> None:
-    """While nothing gets through to ROS the robot goes on, and afterwards so does the bridge."""
+def _check_frozen_router(ros: RosNode, router_pid: int, endpoint: str) -> None:
+    """Check that the robot continues while the ROS router is suspended."""
     images = ros.session.declare_subscriber(
-        ros.key("head/depth/image_raw", "sensor_msgs/msg/Image"), handlers.RingChannel(1)
+        ros.make_key("head/depth/image_raw", "sensor_msgs/msg/Image"), handlers.RingChannel(1)
     )
     with open_session(ConnectionSettings(endpoint, "planar13_camera")) as robot:
         clocks = robot.declare_reader(keys.CLOCK, Clock)
-        os.kill(router, signal.SIGSTOP)
+        os.kill(router_pid, signal.SIGSTOP)
         try:
-            (first, *_) = _within(3.0, clocks)
+            (first, *_) = _collect_clocks(3.0, clocks)
             assert first.lifecycle == "armed"
-            (*_, last) = _within(1.0, clocks)
+            (*_, last) = _collect_clocks(1.0, clocks)
             assert last.tick > first.tick
             assert last.lifecycle == "armed"
         finally:
-            os.kill(router, signal.SIGCONT)
+            os.kill(router_pid, signal.SIGCONT)
     images.undeclare()
 
 
-def _within(seconds: float, clocks: SampleReader[Clock]) -> list[Clock]:
-    time.sleep(seconds)
+def _collect_clocks(duration_s: float, clocks: SampleReader[Clock]) -> list[Clock]:
+    """Wait for a duration, and return all clock messages until then."""
+    time.sleep(duration_s)
     return clocks.drain()

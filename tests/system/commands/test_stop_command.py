@@ -1,4 +1,4 @@
-"""`snakesim estop`, `disarm`: who is asked, who is believed, and what is said when nobody is."""
+"""`snakesim estop` and `disarm` report every robot, trust only a confirmed status, and load little code."""
 
 from pathlib import Path
 
@@ -18,57 +18,54 @@ from snakesim_testing.runs.command import snakesim
 
 
 @pytest.mark.slow
-def test_a_robot_that_does_not_answer_a_stop_is_named() -> None:
+def test_estop_with_silent_robot_names_it() -> None:
     with running_host(make_run_config()) as run:
-        at, said = run.link.endpoint, list[str]()
-        assert stop.stop_robots(RobotSelection(at), said.append) == 0
-        assert said == [f"lab/worm: stopped: {run.status.reason} ({at})"]
+        endpoint = run.link.endpoint
+        lines = list[str]()
+        assert stop.stop_robots(RobotSelection(endpoint), lines.append) == 0
+        assert lines == [f"lab/worm: stopped: {run.status.reason} ({endpoint})"]
         assert run.status.lifecycle == "estop"
-        with open_session(ConnectionSettings(at, "lab/deaf")) as deaf:
-            deaf.declare_alive("hal")
-            said.clear()
-            assert stop.stop_robots(RobotSelection(at), said.append) == 1
-            assert {line.split(": ")[1] for line in said if line.startswith("lab/worm")} == {
-                "stopped"
-            }
-            assert any(line.startswith("lab/deaf: NOT STOPPED: NO ANSWER") for line in said)
-            said.clear()
-            assert stop.stop_robots(RobotSelection(at, "lab/nobody"), said.append) == 1
-            assert said[0].startswith("lab/nobody: NOT STOPPED: NO ANSWER")
-            assert [line.split()[2] for line in said[1:]] == ["lab/deaf,", "lab/worm,"], (
-                "those that are there"
-            )
+        with open_session(ConnectionSettings(endpoint, "lab/deaf")) as silent_host:
+            silent_host.declare_alive("hal")
+            lines.clear()
+            assert stop.stop_robots(RobotSelection(endpoint), lines.append) == 1
+            results = {line.split(": ")[1] for line in lines if line.startswith("lab/worm")}
+            assert results == {"stopped"}
+            assert any(line.startswith("lab/deaf: NOT STOPPED: NO ANSWER") for line in lines)
+            lines.clear()
+            assert stop.stop_robots(RobotSelection(endpoint, "lab/nobody"), lines.append) == 1
+            assert lines[0].startswith("lab/nobody: NOT STOPPED: NO ANSWER")
+            # The next lines name the robots on the network.
+            assert [line.split()[2] for line in lines[1:]] == ["lab/deaf,", "lab/worm,"]
 
 
-def test_a_stop_waits_for_no_slow_import(tmp_path: Path) -> None:
-    ended = snakesim(
+def test_estop_imports_stop_port_before_slow_modules(tmp_path: Path) -> None:
+    completed = snakesim(
         "estop", "--namespace", "nobody", cwd=tmp_path, extra_env={"PYTHONPROFILEIMPORTTIME": "1"}
     )
-    imported = [line.rpartition("|")[2].strip() for line in ended.err.splitlines()]
-    assert not {"numpy", "jinja2", "mujoco"} & set(imported)
-    slow = min(imported.index("msgspec"), imported.index("zenoh"))
-    assert imported.index("snakesim_hal.network.stop_port") < slow
+    modules = [line.rpartition("|")[2].strip() for line in completed.err.splitlines()]
+    assert not {"numpy", "jinja2", "mujoco"} & set(modules)
+    first_slow_import = min(modules.index("msgspec"), modules.index("zenoh"))
+    assert modules.index("snakesim_hal.network.stop_port") < first_slow_import
 
 
-def test_stop_answer_without_matching_status_is_not_trusted() -> None:
+def test_disarm_answer_without_matching_status_is_not_trusted() -> None:
     with running_host(make_run_config()) as run, running_follower(run.link, SineFollower()):
         run.arm()
         with open_session(ConnectionSettings(run.link.endpoint, "lab/other")) as impostor:
             impostor.declare_alive("hal")
             impostor.on_query(
                 keys.LIFECYCLE,
-                lambda question: question.reply(
-                    Answer(ok=True, reason="done", lifecycle="disarmed")
-                ),
+                lambda query: query.reply(Answer(ok=True, reason="done", lifecycle="disarmed")),
             )
             with raises_error(RefusedError, code="robot/not-confirmed"):
                 command.disarm_robot(RobotSelection(run.link.endpoint, "lab/other"))
         assert run.status.lifecycle == "armed"
 
 
-def test_an_emergency_stop_looks_up_no_entry_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_group: str) -> list[str]:
+def test_estop_looks_up_no_entry_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail_to_list_plugins(_group: str) -> list[str]:
         raise ConfigError("entry points were looked up")
 
-    monkeypatch.setattr("snakesim_hal.model.plugins.list_installed_plugins", refuse)
+    monkeypatch.setattr("snakesim_hal.model.plugins.list_installed_plugins", fail_to_list_plugins)
     assert main(["estop", "--endpoint", "tcp/127.0.0.1:9"]) == 1

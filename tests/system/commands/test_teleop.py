@@ -1,4 +1,4 @@
-"""`snakesim teleop` in a pseudo-terminal, with a run: keys move the robot, and whoever loses the operator stops."""
+"""`snakesim teleop` in a pseudo-terminal drives the robot of a run, which stops when the operator is lost."""
 
 import contextlib
 import math
@@ -20,54 +20,59 @@ from snakesim_testing.runs.teleop_terminal import LEFT, UP, running_teleop
 
 pytestmark = pytest.mark.e2e
 STEER = Path(__file__).parents[3] / "examples" / "steer.py"
-NOTHING = LocomotionIntent(timestamp_ns=0, requester="nobody")
+NO_INTENT = LocomotionIntent(timestamp_ns=0, requester="nobody")
 
 
-class Way:
-    """What navigation makes of it: the newest speed along the path, and why."""
+class PathFollower:
+    """The newest speed along the path that navigation plans, with its reason."""
 
     def __init__(self, session: Session) -> None:
         self._reader = session.declare_reader(keys.TRAJECTORY, Trajectory)
-        self.speed_m_s, self.reason = math.nan, ""
+        self.speed_m_s = math.nan
+        self.reason = ""
 
-    def is_at(self, speed_m_s: float, why: str) -> bool:
+    def has_speed(self, speed_m_s: float, reason: str) -> bool:
+        """Return whether the newest path has a speed, and a reason that contains a text."""
         for newest in self._reader.drain()[-1:]:
-            self.speed_m_s, self.reason = newest.speed_m_s, newest.reason
-        return self.speed_m_s == speed_m_s and why in self.reason
+            self.speed_m_s = newest.speed_m_s
+            self.reason = newest.reason
+        return self.speed_m_s == speed_m_s and reason in self.reason
 
 
-def lifecycle(session: Session) -> str:
-    found = session.wait_for_latched(keys.STATUS, RobotStatus, 5.0)
-    return "" if found is None else found.lifecycle
+def read_lifecycle(session: Session) -> str:
+    """Return the lifecycle state of the robot, or an empty text if it sends no status."""
+    status = session.wait_for_latched(keys.STATUS, RobotStatus, 5.0)
+    return "" if status is None else status.lifecycle
 
 
-def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
+def test_teleop_keys_drive_robot_and_lost_operator_stops_it(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with running_snakesim(out, "peg_row", "--clock-mode", "realtime", "--duration", "300") as run:
         run.wait_for("Locomoting")
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
-            intents, way = session.declare_reader(keys.INTENT, LocomotionIntent), Way(session)
-            with running_teleop(run, tmp_path) as lost:
+            intents = session.declare_reader(keys.INTENT, LocomotionIntent)
+            path = PathFollower(session)
+            with running_teleop(run, tmp_path) as lost_operator:
                 assert intents.drain() == []
-                assert lost.wait_for_text("nothing requested yet") is None
-                lost.type(2 * UP)
-                wait_until(lambda: way.is_at(0.1, "teleop"), "navigation to go at 0.1 m/s")
-                lost.type(LEFT)
+                assert lost_operator.wait_for_text("nothing requested yet") is None
+                lost_operator.type(2 * UP)
+                wait_until(lambda: path.has_speed(0.1, "teleop"), "navigation to go at 0.1 m/s")
+                lost_operator.type(LEFT)
                 wait_until(
-                    lambda: (intents.drain() or [NOTHING])[-1].heading_w_rad is not None,
+                    lambda: (intents.drain() or [NO_INTENT])[-1].heading_w_rad is not None,
                     "a direction",
                 )
-                lost.wait_for_text("requested: +0.10 m/s")
-                lost.process.send_signal(signal.SIGKILL)
-                wait_until(lambda: way.is_at(0.0, "expired"), "navigation to stop", 5.0)
-            with running_teleop(run, tmp_path) as left:
-                left.type(UP)
-                wait_until(lambda: way.is_at(0.05, "teleop"), "navigation to go at 0.05 m/s")
-                left.type(b"q")
-                assert left.process.wait(10) == 0
-                assert left.is_restored
+                lost_operator.wait_for_text("requested: +0.10 m/s")
+                lost_operator.process.send_signal(signal.SIGKILL)
+                wait_until(lambda: path.has_speed(0.0, "expired"), "navigation to stop", 5.0)
+            with running_teleop(run, tmp_path) as leaving_operator:
+                leaving_operator.type(UP)
+                wait_until(lambda: path.has_speed(0.05, "teleop"), "navigation to go at 0.05 m/s")
+                leaving_operator.type(b"q")
+                assert leaving_operator.process.wait(10) == 0
+                assert leaving_operator.is_restored
                 wait_until(
-                    lambda: way.speed_m_s == 0.0 or way.is_at(0.0, "wants it to stop"),
+                    lambda: path.speed_m_s == 0.0 or path.has_speed(0.0, "wants it to stop"),
                     "navigation to stop",
                     5.0,
                 )
@@ -75,23 +80,23 @@ def test_keys_move_it_and_a_lost_operator_stops_it(tmp_path: Path) -> None:
                 [sys.executable, str(STEER), run.endpoint, "planar13"], stderr=subprocess.PIPE
             ) as program:
                 wait_until(
-                    lambda: way.is_at(0.1, "as steer.py wants it"),
+                    lambda: path.has_speed(0.1, "as steer.py wants it"),
                     "navigation to follow the documented client",
                 )
                 program.terminate()
                 assert program.stderr is not None
                 assert program.stderr.read() == b""
-            with running_teleop(run, tmp_path) as stops:
-                stops.type(b" ")
-                wait_until(lambda: lifecycle(session) == "estop", "the emergency stop", 5.0)
-                stops.process.send_signal(signal.SIGTERM)
-                assert stops.process.wait(10) == 0
-                assert stops.is_restored
+            with running_teleop(run, tmp_path) as stopping_operator:
+                stopping_operator.type(b" ")
+                wait_until(lambda: read_lifecycle(session) == "estop", "the emergency stop", 5.0)
+                stopping_operator.process.send_signal(signal.SIGTERM)
+                assert stopping_operator.process.wait(10) == 0
+                assert stopping_operator.is_restored
 
 
 @pytest.fixture(scope="module")
-def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
-    """A robot on its way, whose processes wait for one another."""
+def lockstep_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
+    """Run a moving robot in lockstep, whose processes wait for each other."""
     out = tmp_path_factory.mktemp("lockstep") / "run"
     with running_snakesim(out, "peg_row", "--duration", "300", "--set", "stall_limit_s=60") as run:
         run.wait_for("Locomoting")
@@ -99,8 +104,8 @@ def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCom
 
 
 @contextlib.contextmanager
-def frozen(pid: int) -> Iterator[None]:
-    """A process, meanwhile."""
+def suspended_process(pid: int) -> Iterator[None]:
+    """Suspend a process while the context is open."""
     os.kill(pid, signal.SIGSTOP)
     try:
         yield
@@ -108,37 +113,38 @@ def frozen(pid: int) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-def test_teleop_says_what_a_paused_clock_waits_for(
-    in_lockstep: RunningCommand, tmp_path: Path
+def test_teleop_with_paused_clock_shows_its_reason(
+    lockstep_run: RunningCommand, tmp_path: Path
 ) -> None:
-    """By the robot's own account; it has not gone."""
-    why, run = " waits for navigation's answer to tick ", in_lockstep
+    """The reason is that of the robot, which teleop does not report as lost."""
+    reason = " waits for navigation's answer to tick "
+    run = lockstep_run
     with (
         open_session(ConnectionSettings(run.endpoint, "planar13")) as session,
         running_teleop(run, tmp_path) as operator,
     ):
         operator.type(UP)
         operator.wait_for_text("requested: +0.05 m/s")
-        states, found = (
-            session.declare_reader(keys.CONTROL_STATE, ControlState),
-            list[ControlState](),
-        )
+        reader = session.declare_reader(keys.CONTROL_STATE, ControlState)
+        states = list[ControlState]()
 
-        def told() -> bool:
-            found.extend(states.drain())
-            return any(one.state == "NotLocomoting" and why in one.reason for one in found)
+        def has_reported_reason() -> bool:
+            states.extend(reader.drain())
+            return any(
+                state.state == "NotLocomoting" and reason in state.reason for state in states
+            )
 
-        with frozen(run.part("navigation")):
-            operator.wait_for_text(why)
-            wait_until(told, "control to say so, too")
-        assert "PowerOff" not in {one.state for one in found}
+        with suspended_process(run.part("navigation")):
+            operator.wait_for_text(reason)
+            wait_until(has_reported_reason, "the same reason from control")
+        assert "PowerOff" not in {state.state for state in states}
 
 
-def test_teleop_says_that_robot_stopped_sending(
-    in_lockstep: RunningCommand, tmp_path: Path
+def test_teleop_with_silent_host_shows_missing_clock(
+    lockstep_run: RunningCommand, tmp_path: Path
 ) -> None:
-    with running_teleop(in_lockstep, tmp_path) as operator:
+    with running_teleop(lockstep_run, tmp_path) as operator:
         operator.wait_for_text("armed: ")
-        with frozen(in_lockstep.part("host")):
+        with suspended_process(lockstep_run.part("host")):
             operator.wait_for_text("the robot has sent no clock for ")
-            operator.wait_for_text("s ago): ")  # before what may be cut off at the edge
+            operator.wait_for_text("s ago): ")  # The terminal may cut off the rest of the line.

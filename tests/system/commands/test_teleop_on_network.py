@@ -1,4 +1,4 @@
-"""The loop of teleop with a joystick, on a real network."""
+"""The teleop loop stops the robot on a real network when its joystick is silent or unplugged."""
 
 import itertools
 import os
@@ -25,102 +25,109 @@ from snakesim_testing.hal.small_robots import make_clock
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 
-SILENT_S = 0.3  # in the place of STICK_AGE_S
+MAX_STICK_AGE_S = 0.3  # replaces STICK_AGE_S, so that the tests are short
+SPEED_M_S = 0.2
+LAST_TICK = 60
 
 
 @pytest.fixture(autouse=True)
-def handlers() -> Iterator[None]:
-    """Those of this process, given back."""
+def restored_signal_handlers() -> Iterator[None]:
+    """Restore the signal handlers of this process after each test."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.getsignal(number) for number in numbers]
+    handlers = [signal.getsignal(number) for number in numbers]
     yield
-    for number, handler in zip(numbers, before, strict=True):
+    for number, handler in zip(numbers, handlers, strict=True):
         signal.signal(number, handler)
 
 
-def test_a_stick_that_falls_silent_asks_for_nothing_any_more(
+def test_teleop_with_silent_joystick_requests_speed_zero(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Such as a receiver whose pad is switched off while it is pushed forward: its device stays, without events."""
-    monkeypatch.setattr(joystick, "STICK_AGE_S", SILENT_S)
-    monkeypatch.setattr(command, "STICK_AGE_S", SILENT_S)
-    read, write = os.pipe()
-    os.set_blocking(read, False)
-    link = ConnectionSettings(find_free_endpoint(), "worm")
+    """A wireless receiver remains connected without events if its pad is switched off while it is pushed."""
+    monkeypatch.setattr(joystick, "STICK_AGE_S", MAX_STICK_AGE_S)
+    monkeypatch.setattr(command, "STICK_AGE_S", MAX_STICK_AGE_S)
+    device_end, test_end = os.pipe()
+    os.set_blocking(device_end, False)
+    connection = ConnectionSettings(find_free_endpoint(), "worm")
     with (
-        open_session(ConnectionSettings(link.endpoint, "worm", listen=True)) as robot,
-        open_session(link) as session,
+        open_session(ConnectionSettings(connection.endpoint, "worm", listen=True)) as robot,
+        open_session(connection) as session,
     ):
-        heard, clocks = (
-            robot.declare_reader(keys.INTENT, LocomotionIntent, depth=256),
-            robot.declare_publisher(keys.CLOCK, Clock),
-        )
-        stick = Joystick(read, JoystickAxis(0, 255), JoystickAxis(0, 255))
-        teleop = TeleopLoop(session, link, 0.2, None, stick)
-        loop = threading.Thread(target=teleop.run)
-        # Of the main thread alone.
+        intent_reader = robot.declare_reader(keys.INTENT, LocomotionIntent, depth=256)
+        clock_publisher = robot.declare_publisher(keys.CLOCK, Clock)
+        stick = Joystick(device_end, JoystickAxis(0, 255), JoystickAxis(0, 255))
+        teleop = TeleopLoop(session, connection, SPEED_M_S, None, stick)
+        teleop_thread = threading.Thread(target=teleop.run)
+        # Only the main thread may set signal handlers, and the loop runs in another thread.
         monkeypatch.setattr(command, "call_on_stop_signals", lambda _stop: None)
         monkeypatch.setattr(signal, "signal", lambda *_: None)
-        loop.start()
-        intents, ticks = list[LocomotionIntent](), itertools.count(1)
+        teleop_thread.start()
+        intents = list[LocomotionIntent]()
+        ticks = itertools.count(1)
 
-        def speeds_at_last(count: int) -> set[float | None]:
-            clocks.put(make_clock(next(ticks), arm_session=1, clock_mode="realtime"))
+        def read_newest_speeds(count: int) -> set[float | None]:
+            """Publish the next tick, and return the speeds in the newest intents."""
+            clock_publisher.put(make_clock(next(ticks), arm_session=1, clock_mode="realtime"))
             time.sleep(0.02)
-            intents.extend(heard.drain())
+            intents.extend(intent_reader.drain())
             return {intent.speed_m_s for intent in intents[-count:]}
 
         for _ in range(2):
             pushed_s = time.monotonic()
-            os.write(write, event(pushed_s, ABS_Y, 0))
-            wait_until(lambda: speeds_at_last(1) == {0.2}, "to go", 5.0)
-            wait_until(lambda: speeds_at_last(3) == {0.0}, "to stand", 5.0)
-            assert time.monotonic() - pushed_s > SILENT_S
-        os.write(write, event(time.monotonic() - 10.0, ABS_Y, 0))  # read late
+            os.write(test_end, make_event(pushed_s, ABS_Y, 0))
+            wait_until(lambda: read_newest_speeds(1) == {SPEED_M_S}, "the requested speed", 5.0)
+            wait_until(lambda: read_newest_speeds(3) == {0.0}, "speed 0", 5.0)
+            assert time.monotonic() - pushed_s > MAX_STICK_AGE_S
+        os.write(
+            test_end, make_event(time.monotonic() - 10.0, ABS_Y, 0)
+        )  # This event arrives late.
         for _ in range(10):
-            assert speeds_at_last(1) == {0.0}
-        os.close(write)
-        loop.join(10.0)
+            assert read_newest_speeds(1) == {0.0}
+        os.close(test_end)
+        teleop_thread.join(10.0)
         stick.close()
 
 
-def event(at_s: float, axis: int, value: int) -> bytes:
-    seconds, microseconds = divmod(round(1e6 * at_s), 1_000_000)
+def make_event(time_s: float, axis: int, value: int) -> bytes:
+    """Return an event of a joystick as the kernel encodes it."""
+    seconds, microseconds = divmod(round(1e6 * time_s), 1_000_000)
     return EVENT.pack(seconds, microseconds, EV_ABS, axis, value)
 
 
-def test_a_stick_that_is_unplugged_ends_it_with_a_stop(capsys: pytest.CaptureFixture[str]) -> None:
-    read, write = os.pipe()
-    os.set_blocking(read, False)
-    link = ConnectionSettings(find_free_endpoint(), "worm")
+def test_teleop_with_unplugged_joystick_requests_stop_and_ends(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    device_end, test_end = os.pipe()
+    os.set_blocking(device_end, False)
+    connection = ConnectionSettings(find_free_endpoint(), "worm")
     with (
-        open_session(ConnectionSettings(link.endpoint, "worm", listen=True)) as robot,
-        open_session(link) as session,
+        open_session(ConnectionSettings(connection.endpoint, "worm", listen=True)) as robot,
+        open_session(connection) as session,
     ):
-        heard, clocks = (
-            robot.declare_reader(keys.INTENT, LocomotionIntent, depth=256),
-            robot.declare_publisher(keys.CLOCK, Clock),
-        )
+        intent_reader = robot.declare_reader(keys.INTENT, LocomotionIntent, depth=256)
+        clock_publisher = robot.declare_publisher(keys.CLOCK, Clock)
 
-        def be_a_robot_and_a_hand() -> None:
-            os.write(write, event(time.monotonic(), ABS_Y, 0))
-            for tick in itertools.takewhile(lambda tick: tick < 60, itertools.count(1)):
-                clocks.put(make_clock(tick, arm_session=1, clock_mode="realtime"))
+        def push_stick_and_unplug_it() -> None:
+            """Push the stick, publish the clock of a robot, and close the device."""
+            os.write(test_end, make_event(time.monotonic(), ABS_Y, 0))
+            for tick in range(1, LAST_TICK):
+                clock_publisher.put(make_clock(tick, arm_session=1, clock_mode="realtime"))
                 time.sleep(0.01)
-            os.close(write)
+            os.close(test_end)
 
-        hand = threading.Thread(target=be_a_robot_and_a_hand)
-        hand.start()
-        stick = Joystick(read, JoystickAxis(0, 255), JoystickAxis(0, 255))
-        assert TeleopLoop(session, link, 0.2, None, stick).run() == 1
-        hand.join()
+        robot_thread = threading.Thread(target=push_stick_and_unplug_it)
+        robot_thread.start()
+        stick = Joystick(device_end, JoystickAxis(0, 255), JoystickAxis(0, 255))
+        assert TeleopLoop(session, connection, SPEED_M_S, None, stick).run() == 1
+        robot_thread.join()
         stick.close()
-        intents = heard.drain()
+        intents = intent_reader.drain()
         wait_until(
-            lambda: intents.extend(heard.drain()) or not intents[-1].go,
-            "the stop, which is asked for last",
+            lambda: intents.extend(intent_reader.drain()) or not intents[-1].go,
+            "a stop as the last intent",
         )
     assert len(intents) > 3
-    assert {intent.speed_m_s for intent in intents[:-1]} == {0.2}
-    assert all(a.timestamp_ns <= b.timestamp_ns for a, b in itertools.pairwise(intents))
+    assert {intent.speed_m_s for intent in intents[:-1]} == {SPEED_M_S}
+    timestamps_ns = [intent.timestamp_ns for intent in intents]
+    assert timestamps_ns == sorted(timestamps_ns)
     assert "the joystick is gone" in capsys.readouterr().out

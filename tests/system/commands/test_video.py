@@ -1,4 +1,4 @@
-"""A recorded run, looked at: as a film, and as the console shows it."""
+"""A recorded run is rendered as a video, and the console shows it at any time."""
 
 from pathlib import Path
 
@@ -13,65 +13,70 @@ from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run a scenario of one second, and return its folder."""
     out = tmp_path_factory.mktemp("filmed") / "run"
-    ended, _ = run_to_summary(out, "triplet", "--duration", "1")
-    assert ended.code == 0, ended.printed
+    completed, _ = run_to_summary(out, "triplet", "--duration", "1")
+    assert completed.code == 0, completed.printed
     return out
 
 
-def film(run: Path, out: Path, *more: str) -> str:
+def render_video(run: Path, out: Path, *options: str) -> str:
+    """Render a small video of a run, and return what the command printed as errors."""
     size = ("--width", "96", "--height", "64", "--fps", "10")
-    ended = snakesim(
-        "recording", "video", str(run), "--out", str(out), *size, *more, cwd=run.parent
+    completed = snakesim(
+        "recording", "video", str(run), "--out", str(out), *size, *options, cwd=run.parent
     )
-    if "OpenGL" in ended.err:
-        pytest.skip(f"no OpenGL here: {ended.err}")
-    return ended.err
+    if "OpenGL" in completed.err:
+        pytest.skip(f"no OpenGL here: {completed.err}")
+    return completed.err
 
 
-def test_a_gif_shows_the_snake_in_every_picture(run: Path) -> None:
+def test_video_gif_shows_the_snake_in_every_frame(run: Path) -> None:
     out = run.parent / "film.gif"
-    assert film(run, out, "--speed", "2") == ""
+    assert render_video(run, out, "--speed", "2") == ""
     with Image.open(out) as gif:
         assert gif.size == (96, 64)
         assert 4 <= gif.n_frames <= 6  # pyright: ignore[reportAttributeAccessIssue]
         for frame in range(gif.n_frames):  # pyright: ignore[reportAttributeAccessIssue]
             gif.seek(frame)
             red, _, blue = np.moveaxis(np.asarray(gif.convert("RGB")).astype(int), 2, 0)
-            assert (blue > red + 40).sum() > 100, f"no blue snake in picture {frame}"
+            assert (blue > red + 40).sum() > 100, f"no blue snake in frame {frame}"
 
 
 @pytest.mark.slow
-def test_an_mp4_is_one(run: Path) -> None:
+def test_video_mp4_has_the_mp4_format(run: Path) -> None:
     out = run.parent / "film.mp4"
-    assert film(run, out) == ""
+    assert render_video(run, out) == ""
     assert out.read_bytes()[4:8] == b"ftyp"
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("options", "expected_text"),
     [
         (["--out", "film.avi"], "ends in .mp4 or .gif"),
         (["--out", "film.gif", "--from", "5"], "the run has poses for"),
         (["--out", "film.gif", "--width", "65"], "give even numbers of pixels"),
     ],
 )
-def test_what_cannot_be_filmed_is_said(run: Path, more: list[str], said: str) -> None:
-    ended = snakesim("recording", "video", str(run), *more, cwd=run.parent)
-    assert ended.code == 2
-    assert said in ended.err
+def test_video_with_invalid_option_is_refused(
+    run: Path, options: list[str], expected_text: str
+) -> None:
+    completed = snakesim("recording", "video", str(run), *options, cwd=run.parent)
+    assert completed.code == 2
+    assert expected_text in completed.err
 
 
-def test_the_console_shows_a_recorded_instant_as_it_was(run: Path) -> None:
-    recorded = RunPlayback(run)
-    record = recorded.record
-    begin_s, end_s = recorded.span_s
+def test_playback_snapshot_draws_the_recorded_pose(run: Path) -> None:
+    playback = RunPlayback(run)
+    record = playback.record
+    begin_s, end_s = playback.span_s
     assert end_s - begin_s == pytest.approx(0.99, abs=0.03)
-    moment = recorded.make_snapshot(begin_s + 0.5)
+    snapshot = playback.make_snapshot(begin_s + 0.5)
     row = record.find_nearest_row(begin_s + 0.5)
-    drawing, nodes = draw(moment, TrueSurroundings(record.config)), record.find_body_points_w(row)
+    drawing = draw(snapshot, TrueSurroundings(record.config))
+    body_points_w = record.find_body_points_w(row)
     assert drawing is not None
-    assert nodes is not None
-    assert drawing.hinges_w == pytest.approx(nodes[1:-1])
-    assert moment.control is not None
-    assert abs(moment.control.timestamp_ns * 1e-9 - begin_s - 0.5) < 0.1
+    assert body_points_w is not None
+    assert drawing.hinges_w == pytest.approx(body_points_w[1:-1])
+    assert snapshot.control is not None
+    assert abs(snapshot.control.timestamp_ns * 1e-9 - begin_s - 0.5) < 0.1

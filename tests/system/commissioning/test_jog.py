@@ -1,4 +1,4 @@
-"""`snakesim robot jog` on a robot that nobody checked, from a terminal whose key is held, let go, or lost."""
+"""`snakesim robot jog` moves one joint of an unchecked robot while a key is held, and stops it with the terminal."""
 
 import os
 import pty
@@ -20,79 +20,94 @@ from snakesim_testing.runs.jogged_robot import (
     read_setpoints,
 )
 
-REPEAT_S = 0.03  # of a key
-HELD_BACK = 270  # keys that come at once, as after a stall of some seconds
-UP = b"\x1b[A"
+REPEAT_S = 0.03  # between repetitions of a held key
+DELAYED_KEY_COUNT = 270  # keys that arrive at once after the network stalled for some seconds
+UP_KEY = b"\x1b[A"
+HALF_SECOND_TICKS = 25
+MIN_MOTION_RAD = 0.04
+MAX_TORQUE_NM = 7.0  # of the robot file; a jog may use 30 % of it
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
+    """Make a folder with a robot whose setpoints are written into a file."""
     return make_jogged_folder(tmp_path)
 
 
 @contextmanager
-def jogging(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """The command, once it is armed, and the other end of its terminal."""
-    (ours, theirs), words = (
-        pty.openpty(),
-        ("robot", "jog", "snake.toml", "joint_2", "--endpoint", endpoint),
-    )
+def running_jog(home: Path, endpoint: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """Run the jog command, and yield it with the test's end of its terminal after the robot is armed."""
+    test_end, command_end = pty.openpty()
+    arguments = ("robot", "jog", "snake.toml", "joint_2", "--endpoint", endpoint)
     try:
-        with run_in_background(home, *words, stdin=theirs) as process:
+        with run_in_background(home, *arguments, stdin=command_end) as process:
             assert process.stdout is not None
-            process.stdout.readline()  # "joint_2: from ...", once it is armed
-            yield process, ours
+            process.stdout.readline()  # "joint_2: from ..." is printed when the robot is armed.
+            yield process, test_end
     finally:
-        os.close(ours)
-        os.close(theirs)
+        os.close(test_end)
+        os.close(command_end)
 
 
 @pytest.mark.quiet
-def test_it_moves_while_the_key_repeats_and_only_that_joint(home: Path) -> None:
+def test_jog_moves_only_its_joint_while_key_is_held(home: Path) -> None:
     with running_bench_host(home, BACKEND) as endpoint:
-        assert moved_and_stood(home, endpoint)
-        wait_until(lambda: read_setpoints(home)["lifecycle"] == "disarmed", "the end of it")
-        assert stopped_when_killed(home, endpoint)
+        assert jog_and_release_key(home, endpoint)
+        wait_until(lambda: read_setpoints(home)["lifecycle"] == "disarmed", "a disarmed robot")
+        assert kill_jog_command(home, endpoint)
 
 
-def moved_and_stood(home: Path, endpoint: str) -> bool:
-    """Hold the key, let it go, quit; False when the robot was not armed, or stopped meanwhile."""
-    with jogging(home, endpoint) as (process, terminal):
+def jog_and_release_key(home: Path, endpoint: str) -> bool:
+    """Hold the key, release it, and quit.
 
-        def ended() -> bool:
+    The joint must move while the key is held and remain at rest afterwards, also if delayed keys arrive.
+
+    Returns:
+        False if the robot was not armed, or if a fault stopped it.
+    """
+    with running_jog(home, endpoint) as (process, terminal):
+
+        def has_ended() -> bool:
             return process.poll() is not None or is_at_fault(home)
 
         wait_until(
-            lambda: ended() or read_setpoints(home)["mode"] == [0, 1, 0, 0],
+            lambda: has_ended() or read_setpoints(home)["mode"] == [0, 1, 0, 0],
             "one joint with current",
         )
-        before = read_setpoints(home)["target"][1]
-        while not ended() and read_setpoints(home)["target"][1] < before + 0.04:
-            os.write(terminal, UP)
+        initial_rad = read_setpoints(home)["target"][1]
+        while not has_ended() and read_setpoints(home)["target"][1] < initial_rad + MIN_MOTION_RAD:
+            os.write(terminal, UP_KEY)
             time.sleep(REPEAT_S)
-        let_go = read_setpoints(home)["tick"]
-        wait_until(lambda: read_setpoints(home)["tick"] > let_go + 25, "half a second")
-        half = read_setpoints(home)
-        wait_until(lambda: read_setpoints(home)["tick"] > let_go + 50, "another half second")
-        if ended():
+        release_tick = read_setpoints(home)["tick"]
+        wait_until(
+            lambda: read_setpoints(home)["tick"] > release_tick + HALF_SECOND_TICKS, "half a second"
+        )
+        released = read_setpoints(home)
+        wait_until(
+            lambda: read_setpoints(home)["tick"] > release_tick + 2 * HALF_SECOND_TICKS,
+            "another half second",
+        )
+        if has_ended():
             return False
-        assert half["limit_nm"][1] == pytest.approx(0.3 * 7.0)
-        assert read_setpoints(home)["target"][1] == half["target"][1]
-        os.write(terminal, HELD_BACK * UP)
-        held_back = read_setpoints(home)["tick"]
-        wait_until(lambda: read_setpoints(home)["tick"] > held_back + 25, "half a second")
-        if ended():
+        assert released["limit_nm"][1] == pytest.approx(0.3 * MAX_TORQUE_NM)
+        assert read_setpoints(home)["target"][1] == released["target"][1]
+        os.write(terminal, DELAYED_KEY_COUNT * UP_KEY)
+        delayed_tick = read_setpoints(home)["tick"]
+        wait_until(
+            lambda: read_setpoints(home)["tick"] > delayed_tick + HALF_SECOND_TICKS, "half a second"
+        )
+        if has_ended():
             return False
-        assert read_setpoints(home)["target"][1] == half["target"][1], (
-            "moved by keys that a network has held back"
+        assert read_setpoints(home)["target"][1] == released["target"][1], (
+            "delayed keys moved the joint"
         )
         os.write(terminal, b"q")
         return process.wait(20) == 0
 
 
-def stopped_when_killed(home: Path, endpoint: str) -> bool:
-    """Kill the command; False when it was not armed."""
-    with jogging(home, endpoint) as (process, _terminal):
+def kill_jog_command(home: Path, endpoint: str) -> bool:
+    """Kill the command, and wait for the stop. Return False if the robot was not armed."""
+    with running_jog(home, endpoint) as (process, _terminal):
         wait_until(
             lambda: process.poll() is not None or read_setpoints(home)["lifecycle"] != "disarmed",
             "armed again",

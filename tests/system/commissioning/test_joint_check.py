@@ -1,4 +1,4 @@
-"""The start check: seven defects at once on emulated modules, each named; and a robot without any."""
+"""`snakesim robot check` names every defect of emulated joint modules, and none on a robot without defects."""
 
 import re
 from pathlib import Path
@@ -7,8 +7,8 @@ import pytest
 
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
-JOINTS = 9
-DEFECTS = {
+JOINT_COUNT = 9
+DEFECTS = {  # settings of an emulated module, and the line that the command must print
     "joint_1.zero_rad=0.15": "joint_1 .* its zero is off by .0.150 rad: zero_rad = 0.1",
     "joint_3.sign=-1": "joint_3 .* turns the other way: sign = -1",
     "joint_5.connected=false": "joint_5 .* did not move",
@@ -19,40 +19,43 @@ DEFECTS = {
 }
 
 
-def check(out: Path, *sets: str) -> tuple[int, list[str]]:
-    truth = [word for text in sets for word in ("--set", f"backends.can.mounted.{text}")]
-    short = ("--set", f"robot.chain.modules={JOINTS}", "--duration", "32")
-    run, _ = run_to_summary(out, "joint_check", "--backend", "can", *short, *truth)
+def run_joint_check(out: Path, *defects: str) -> tuple[int, list[str]]:
+    """Run the start check, and return exit code and lines of `snakesim robot check`."""
+    mounting = [
+        argument for defect in defects for argument in ("--set", f"backends.can.mounted.{defect}")
+    ]
+    short_robot = ("--set", f"robot.chain.modules={JOINT_COUNT}", "--duration", "32")
+    run, _ = run_to_summary(out, "joint_check", "--backend", "can", *short_robot, *mounting)
     assert "Every joint was moved. Judge the run with `snakesim robot check " in run.out
     assert "no fault." in run.out
-    ended = snakesim("robot", "check", str(out), "--straight", cwd=out.parent)
-    return ended.code, ended.out.splitlines()
+    completed = snakesim("robot", "check", str(out), "--straight", cwd=out.parent)
+    return completed.code, completed.out.splitlines()
 
 
 @pytest.mark.slow  # verification/test_commissioning_trials.py hides one defect of each kind
-def test_every_defect_is_named_and_no_sound_joint_is(tmp_path: Path) -> None:
-    code, lines = check(tmp_path / "run", *DEFECTS)
+def test_joint_check_names_every_defect_and_no_sound_joint(tmp_path: Path) -> None:
+    code, lines = run_joint_check(tmp_path / "run", *DEFECTS)
     assert code == 1
-    for defect, said in DEFECTS.items():
-        assert any(re.match(said, line) for line in lines), f"{defect}: {lines}"
-    assert (
-        f"{JOINTS - len(DEFECTS)} of {JOINTS} joints match the robot file; {len(DEFECTS)} wrong"
-        in lines
-    )
+    for defect, pattern in DEFECTS.items():
+        assert any(re.match(pattern, line) for line in lines), f"{defect}: {lines}"
+    sound_count = JOINT_COUNT - len(DEFECTS)
+    summary = f"{sound_count} of {JOINT_COUNT} joints match the robot file; {len(DEFECTS)} wrong"
+    assert summary in lines
 
 
 @pytest.mark.slow
-def test_a_sound_robot_passes(tmp_path: Path) -> None:
-    code, lines = check(tmp_path / "run")
-    assert code == 0 and f"{JOINTS} of {JOINTS} joints match the robot file" in lines, lines
+def test_joint_check_of_sound_robot_passes(tmp_path: Path) -> None:
+    code, lines = run_joint_check(tmp_path / "run")
+    assert code == 0, lines
+    assert f"{JOINT_COUNT} of {JOINT_COUNT} joints match the robot file" in lines, lines
 
 
-def test_a_run_of_another_scenario_is_neither_checked_nor_identified(tmp_path: Path) -> None:
+def test_check_and_identify_of_other_scenario_are_refused(tmp_path: Path) -> None:
     run_to_summary(tmp_path / "run", "triplet", "--duration", "0.1")
-    for typed, wanted in (
+    for arguments, scenario in (
         (("robot", "check", "run"), "joint_check"),
         (("robot", "identify", "run"), "identify"),
     ):
-        ended = snakesim(*typed, cwd=tmp_path)
-        assert ended.code == 2
-        assert f"snakesim run {wanted}" in ended.err
+        completed = snakesim(*arguments, cwd=tmp_path)
+        assert completed.code == 2
+        assert f"snakesim run {scenario}" in completed.err

@@ -1,4 +1,4 @@
-"""`snakesim robot shape draw` and `check`: robots without IMUs, whose emulated drives an operator bends into shapes."""
+"""`snakesim robot shape draw` and `check` check robots without IMUs, which an operator bends into drawn shapes."""
 
 import re
 from pathlib import Path
@@ -21,40 +21,41 @@ DRIVE_TYPES = [
         for name in ("can", "cia402", "dynamixel", "moteus")
     ),
 ]
-MOUNTED = """
+WRONG_MOUNTING = """
 [backends.{backend}.mounted.joint_1]
 sign = -1
 
 [backends.{backend}.mounted.joint_2]
 zero_rad = 0.2
 """
-REAL = ("--backend", "./real.py:Real")
+REAL_BACKEND = ("--backend", "./real.py:Real")
 
 
 @pytest.mark.parametrize("backend", DRIVE_TYPES)
-def test_faults_of_robot_without_imus_are_named_on_every_drive_type(
+def test_shape_check_names_mounting_faults_on_every_drive_type(
     tmp_path: Path, backend: str
 ) -> None:
     home = make_bent_folder(tmp_path, backend)
     with (home / "bench.toml").open("a") as scenario:
-        scenario.write(MOUNTED.format(backend=backend))
+        scenario.write(WRONG_MOUNTING.format(backend=backend))
     with running_bench_host(home, backend) as endpoint:
         code, printed = ScriptedOperator(home, endpoint, drive_order=(0, 1, 3, 2)).check()
     assert code == 1, printed
     lines = {line.split()[0]: line for line in printed.splitlines() if line.startswith("joint_")}
     assert "sign wrong: turns the other way: sign = -1" in lines["joint_1"]
-    off_by_rad = re.search(r"zero wrong: its zero is off by ([+-]\d.\d+) rad", lines["joint_2"])
-    assert off_by_rad is not None
-    assert abs(float(off_by_rad[1]) - 0.2) < PLACEMENT_TOLERANCE_RAD
+    zero_error_rad = re.search(r"zero wrong: its zero is off by ([+-]\d.\d+) rad", lines["joint_2"])
+    assert zero_error_rad is not None
+    assert abs(float(zero_error_rad[1]) - 0.2) < PLACEMENT_TOLERANCE_RAD
     assert "order wrong: exchanged with joint_4: id = 4" in lines["joint_3"]
     assert "order wrong: exchanged with joint_3: id = 3" in lines["joint_4"]
     assert "0 of 4 joints match the robot file; 4 wrong; 0 unknown" in printed
     assert "[checked]" not in (home / "snake.toml").read_text()
 
 
-def start(home: Path, out: str, *words: str) -> CompletedRun:
+def run_real_robot(home: Path, out: str, *options: str) -> CompletedRun:
+    """Run the robot to its end in lockstep, and return the completed command."""
     flags = (
-        *REAL,
+        *REAL_BACKEND,
         "--out",
         out,
         "--endpoint",
@@ -62,12 +63,10 @@ def start(home: Path, out: str, *words: str) -> CompletedRun:
         "--set",
         "clock_mode=lockstep",
     )
-    return run_snakesim("run", "bench.toml", *flags, *words, cwd=home)
+    return run_snakesim("run", "bench.toml", *flags, *options, cwd=home)
 
 
-def test_robot_without_imus_can_be_armed_after_shapes_shaking_and_start_check(
-    tmp_path: Path,
-) -> None:
+def test_robot_without_imus_can_be_armed_after_both_checks(tmp_path: Path) -> None:
     home = make_bent_folder(tmp_path, "Real")
     robot_file = home / "snake.toml"
 
@@ -85,14 +84,14 @@ def test_robot_without_imus_can_be_armed_after_shapes_shaking_and_start_check(
     assert 'by_shape = ["order", "sign", "gear", "zero"]' in text
     assert 'confirmed = ["order", "sign", "zero"]' in text
     assert 'shaken = ["joint_1", "joint_3", "joint_4"]' in text
-    refused = start(home, "never", "--duration", "0.1")
+    refused = run_real_robot(home, "never", "--duration", "0.1")
     assert refused.code == 1
     assert "did not confirm of every joint: drive, gear" in refused.out
 
-    checking = start(home, "check", "--controller", "joint_check", "--duration", "14")
-    assert checking.code == 0, checking.out
-    evaluate = ("robot", "check", "check", "--write", "snake.toml")
-    unknown = snakesim(*evaluate, cwd=home)
+    check_run = run_real_robot(home, "check", "--controller", "joint_check", "--duration", "14")
+    assert check_run.code == 0, check_run.out
+    check = ("robot", "check", "check", "--write", "snake.toml")
+    unknown = snakesim(*check, cwd=home)
     assert unknown.code == 1
     assert "gear of joint_2: backlash and ratio unknown, as the floor hardly" in unknown.out
     assert "nothing was written" in unknown.out
@@ -102,18 +101,19 @@ def test_robot_without_imus_can_be_armed_after_shapes_shaking_and_start_check(
         code, printed = ScriptedOperator(home, endpoint).check()
     assert code == 0, printed
     assert "no link moves before its drive does" in printed
-    judged = snakesim(*evaluate, cwd=home)
+    judged = snakesim(*check, cwd=home)
     assert judged.code == 0, judged.out
     assert f"{JOINT_COUNT} with properties that drawn shapes confirmed" in judged.out
     assert 'shaken = ["joint_1", "joint_2", "joint_3", "joint_4"]' in robot_file.read_text()
-    assert start(home, "moves", "--duration", "0.1").code == 0
+    assert run_real_robot(home, "moves", "--duration", "0.1").code == 0
 
-    # The shapes count for the mounting that was checked.
+    # The result of the shapes is valid only for the mounting that was checked.
     robot_file.write_text(f"{robot_file.read_text()}\n[joints.joint_2]\nsign = -1\n")
-    assert "was changed in its file since" in start(home, "changed", "--duration", "0.1").out
+    changed = run_real_robot(home, "changed", "--duration", "0.1")
+    assert "was changed in its file since" in changed.out
 
 
-def test_link_that_a_person_finds_loose_is_wrong_and_nothing_is_written(tmp_path: Path) -> None:
+def test_shape_check_with_loose_link_writes_nothing(tmp_path: Path) -> None:
     home = make_bent_folder(tmp_path, "Real")
     with running_bench_host(home, "./real.py:Real") as endpoint:
         answers = ("no", "no", "yes", "unknown")
@@ -125,7 +125,7 @@ def test_link_that_a_person_finds_loose_is_wrong_and_nothing_is_written(tmp_path
     assert "[checked]" not in (home / "snake.toml").read_text()
 
 
-def test_drawing_of_shapes_is_printable_and_names_what_stays_unknown(tmp_path: Path) -> None:
+def test_shape_draw_writes_pdf_and_names_unknown_properties(tmp_path: Path) -> None:
     drawn = snakesim("robot", "shape", "draw", "planar13", "--out", "shapes.pdf", cwd=tmp_path)
     assert drawn.code == 0, drawn.err
     assert "shapes A, B, C, drawing " in drawn.out

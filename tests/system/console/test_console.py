@@ -1,4 +1,4 @@
-"""The console of a run, as people use it: in a browser."""
+"""The console of a run shows, stops and controls the robot in a real browser."""
 
 import os
 import signal
@@ -39,53 +39,60 @@ RUN = (
     ),
     *("--duration", "600", "--stay", "--console"),
 )
-STOP_LIMIT_S = 10.0  # from the key to motors that are off: far above what it takes when no other tests run beside
-SILENT = "THE STOP DOES NOT ANSWER"
-COAST_LIMIT_S = 2.0  # of robot time, until joints without torque are at rest
-# Width, height, pixels a dot: the browser draws without a graphics card here.
-SMALL = 800, 400, 0.25
-LOOK = "document.documentElement.dataset.mantineColorScheme"
+MAX_STOP_S = 10.0  # from the key to motors that are off, on a computer that runs other tests, too
+UNANSWERED_STOP = "THE STOP DOES NOT ANSWER"
+MAX_COAST_S = 2.0  # robot time until joints without torque are at rest
+REST_SAMPLE_COUNT = 5  # consecutive samples of a robot at rest
+REST_SPEED_RAD_S = 0.02
+# Width, height and scale of a page that draws quickly without a graphics card.
+SMALL_PAGE = 800, 400, 0.25
+COLOR_SCHEME = "document.documentElement.dataset.mantineColorScheme"
 STATE_TOP = "document.querySelector('[data-robot]').getBoundingClientRect().top"
 PANEL_WIDTHS = (
     "(panel => [panel.scrollWidth, "
     "panel.clientWidth])(document.querySelector('[class*=ScrollArea-viewport]'))"
 )
-HIDE = "Object.defineProperty(document, 'hidden', {value: true}); document.dispatchEvent(new Event('visibilitychange'))"
-# Of the page: scene without notices.
-GROUND = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}
+HIDE_PAGE = (
+    "Object.defineProperty(document, 'hidden', {value: true}); "
+    "document.dispatchEvent(new Event('visibilitychange'))"
+)
+# Part of the page that shows only the scene, without notices.
+SCENE_CLIP = {"x": 0, "y": 200, "width": 370, "height": 200, "scale": 1}
 
 
-def fastest_rad_s(joints: JointState) -> float:
+def find_max_speed_rad_s(joints: JointState) -> float:
+    """Return the speed of the fastest joint."""
     return max(abs(speed) for speed in joints.velocity_rad_s)
 
 
 @pytest.mark.quiet
 def test_console_page_shows_moving_snake_and_escape_stops_it(tmp_path: Path) -> None:
     with open_chromium() as browser, running_snakesim(tmp_path / "run", *RUN) as run:
-        began_s = time.monotonic()
+        start_s = time.monotonic()
         address = run.console()
-        told_after_s = time.monotonic() - began_s
-        page = browser.open_page(address, *SMALL)
+        address_after_s = time.monotonic() - start_s
+        page = browser.open_page(address, *SMALL_PAGE)
         page.wait_for("planar13")
-        drawn_after_s = time.monotonic() - began_s
+        drawn_after_s = time.monotonic() - start_s
         page.wait_for("SIMULATOR")
-        live_after_s = time.monotonic() - began_s
+        live_after_s = time.monotonic() - start_s
         page.wait_for("armed by snakesim run")
-        before = page.capture_screenshot(clip=GROUND)
+        first_image = page.capture_screenshot(clip=SCENE_CLIP)
         wait_until(
-            lambda: page.capture_screenshot(clip=GROUND) != before, "a snake that moves on the page"
+            lambda: page.capture_screenshot(clip=SCENE_CLIP) != first_image,
+            "a snake that moves on the page",
         )
-        stopped_after_s = stop_in(page, run)
-        assert stopped_after_s < STOP_LIMIT_S, f"{stopped_after_s:.2f} s"
+        stopped_after_s = stop_with_escape(page, run)
+        assert stopped_after_s < MAX_STOP_S, f"{stopped_after_s:.2f} s"
         print(
-            f"address after {told_after_s:.1f} s, robot on the page after {drawn_after_s:.1f} s and live after "
+            f"address after {address_after_s:.1f} s, robot on the page after {drawn_after_s:.1f} s and live after "
             f"{live_after_s:.1f} s, motors off {stopped_after_s:.2f} s after the key"
         )
         page.wait_for("ESTOP")
         page.evaluate(
             "document.querySelectorAll('[class*=ScrollArea-viewport]').forEach(e => { e.scrollTop = 300; })"
         )
-        assert page.evaluate(STATE_TOP) >= 0  # in sight all the same
+        assert page.evaluate(STATE_TOP) >= 0, "the state scrolled out of sight"
         # On a busy computer the second stop may report for a moment that its self-test is late (503).
         assert not [error for error in page.errors if not error.endswith("/stop")], page.errors
 
@@ -96,22 +103,30 @@ TAB_LINES = "new Set([...document.querySelectorAll('[role=tab]')].map(tab => tab
 
 
 def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
-    """Dark until the viewer chooses; left when it loses the keyboard, or is hidden."""
+    """The page follows the browser until the viewer chooses a color scheme.
+
+    A held button is released if the page loses the keyboard focus or is hidden.
+    """
     with running_console(ReadyStop()) as (server, address), open_chromium() as browser:
         ConsolePage(server, None, None, PageLog(), recorded="a run")
-        page = browser.open_page("about:blank", *SMALL)
-        for prefers in ("light", "dark"):
+        page = browser.open_page("about:blank", *SMALL_PAGE)
+        for preference in ("light", "dark"):
             page.send(
                 "Emulation.setEmulatedMedia",
-                features=[{"name": "prefers-color-scheme", "value": prefers}],
+                features=[{"name": "prefers-color-scheme", "value": preference}],
             )
             page.send("Page.navigate", url=address)
             page.wait_for("Dark page")
-            wait_until(lambda prefers=prefers: page.evaluate(LOOK) == prefers, f"a {prefers} page")
+            wait_until(
+                lambda preference=preference: page.evaluate(COLOR_SCHEME) == preference,
+                f"a {preference} page",
+            )
         page.click("Dark page")
-        wait_until(lambda: page.evaluate(LOOK) == "light", "the viewer's choice")
+        wait_until(lambda: page.evaluate(COLOR_SCHEME) == "light", "the viewer's choice")
         page.evaluate("window.ends = 0; addEventListener('pointercancel', () => { ends += 1; })")
-        for count, leave in enumerate(("window.dispatchEvent(new Event('blur'))", HIDE), start=1):
+        for count, leave in enumerate(
+            ("window.dispatchEvent(new Event('blur'))", HIDE_PAGE), start=1
+        ):
             page.evaluate(
                 "document.body.dispatchEvent(new PointerEvent('pointerdown', {bubbles: true}))"
             )
@@ -121,15 +136,13 @@ def test_console_page_follows_dark_mode_and_releases_button_on_leave() -> None:
 
 @pytest.mark.slow
 def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
-    """And a wide screen shows the tabs in one line."""
-    config, log = load_scenario("triplet").config, PageLog()
+    """On a wide screen the tabs are in one line."""
+    config = load_scenario("triplet").config
+    log = PageLog()
     with running_console(ReadyStop()) as (server, address), open_chromium() as browser:
-        ConsolePage(
-            server,
-            None,
-            RobotOperations(ConnectionSettings(find_free_endpoint(), "planar13"), log),
-            log,
-        ).show_snapshot(make_expected_snapshot(config))
+        connection = ConnectionSettings(find_free_endpoint(), "planar13")
+        console_page = ConsolePage(server, None, RobotOperations(connection, log), log)
+        console_page.show_snapshot(make_expected_snapshot(config))
         page = browser.open_page(address, 400, 800, 0.5)
         page.wait_for("planar13")
         for tab in ("Joints", "State", "Signals", "Log"):
@@ -142,7 +155,7 @@ def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
         wait_until(lambda: page.evaluate(f"{STOP_BOX}.bottom") < 100, "a second stop at the top")
         page.wait_for("Stops the robot even if EMERGENCY STOP does not react. Self-test: ready")
         assert page.evaluate(f"{NOTICE_BOX}.top > {STOP_BOX}.bottom"), (
-            "a notice, such as of missing WebGL, is not covered"
+            "the second stop covers a notice, such as that of missing WebGL"
         )
         page.set_window_size(1400, 860)
         wait_until(lambda: page.evaluate(TAB_LINES) == 1, "tabs in one line")
@@ -150,54 +163,58 @@ def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
 
 @pytest.mark.slow
 def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -> None:
-    """On the page of the signals, which has the second stop and draws no scene."""
+    """The page of the signals has the second stop, and draws no scene."""
     with open_chromium() as browser, running_snakesim(tmp_path / "run", *RUN) as run:
         address = run.console()
         origin = origin_of(address)
         port = origin.rpartition(":")[2]
-        for wrong in (f"{origin}/", f"{origin}/signals", f"{origin}/{'x' * 22}/"):
-            browser.open_page(wrong, *SMALL).wait_for("open the address that the console printed")
-        evil = browser.open_page("data:text/html,<title>another site</title>", *SMALL)
-        evil.evaluate(
-            ANOTHER_SITE.format(
+        for wrong_address in (f"{origin}/", f"{origin}/signals", f"{origin}/{'x' * 22}/"):
+            browser.open_page(wrong_address, *SMALL_PAGE).wait_for(
+                "open the address that the console printed"
+            )
+        other_site = browser.open_page("data:text/html,<title>another site</title>", *SMALL_PAGE)
+        other_site.evaluate(
+            OTHER_SITE_SCRIPT.format(
                 page=address.replace("http", "ws").rstrip("/"), stop=f"{address}stop"
             )
         )
         wait_until(
-            lambda: evil.evaluate("[opened, posted]") == [False, True], "what another site may do"
+            lambda: other_site.evaluate("[opened, posted]") == [False, True],
+            "the attempts of another site",
         )
-        page = browser.open_page(f"http://localhost:{port}{urlsplit(address).path}signals", *SMALL)
+        page = browser.open_page(
+            f"http://localhost:{port}{urlsplit(address).path}signals", *SMALL_PAGE
+        )
         page.wait_for("Self-test: ready")
-        assert SILENT not in page.read_text()
+        assert UNANSWERED_STOP not in page.read_text()
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             status = session.wait_for_latched(keys.STATUS, RobotStatus, 10.0)
-            assert status is not None and status.lifecycle != "estop", (
-                "another site has stopped the robot"
-            )
-            front = console_process(run, ".front")
-            os.kill(front, signal.SIGSTOP)
+            assert status is not None
+            assert status.lifecycle != "estop", "another site has stopped the robot"
+            front_pid = find_console_process(run, ".front")
+            os.kill(front_pid, signal.SIGSTOP)
             try:
-                page.wait_for(SILENT)
+                page.wait_for(UNANSWERED_STOP)
             finally:
-                os.kill(front, signal.SIGCONT)
-            wait_until(lambda: SILENT not in page.read_text(), "a second stop that answers")
-            pages = console_process(run)
-            os.kill(pages, signal.SIGSTOP)
+                os.kill(front_pid, signal.SIGCONT)
+            wait_until(
+                lambda: UNANSWERED_STOP not in page.read_text(), "a second stop that answers"
+            )
+            page_pid = find_console_process(run)
+            os.kill(page_pid, signal.SIGSTOP)
             try:
                 page.click("SECOND STOP")
                 page.wait_for("planar13: stopped")
             finally:
-                os.kill(pages, signal.SIGCONT)
-            assert (
-                session.wait_for_latched(
-                    keys.STATUS, RobotStatus, 10.0, lambda one: one.lifecycle == "estop"
-                )
-                is not None
+                os.kill(page_pid, signal.SIGCONT)
+            stopped = session.wait_for_latched(
+                keys.STATUS, RobotStatus, 10.0, lambda newest: newest.lifecycle == "estop"
             )
+            assert stopped is not None
 
 
-# What another site tries, if it knows the token.
-ANOTHER_SITE = """
+# Another site that knows the token tries to connect and to stop the robot.
+OTHER_SITE_SCRIPT = """
   var opened = null, posted = false;
   const socket = new WebSocket("{page}");
   socket.onopen = () => {{ opened = true; }};
@@ -206,47 +223,48 @@ ANOTHER_SITE = """
 """
 
 
-def console_process(run: RunningCommand, part: str = "") -> int:
-    """Return the process id of the pages, or of the front server."""
-    found = find_processes_with("cmdline", f"snakesim_operator.features.console{part}\0")
-    return next(pid for pid, line in found if f"\0{run.endpoint}\0" in line)
+def find_console_process(run: RunningCommand, part: str = "") -> int:
+    """Return the process id of the page server, or of the front server with part `.front`."""
+    processes = find_processes_with("cmdline", f"snakesim_operator.features.console{part}\0")
+    return next(pid for pid, line in processes if f"\0{run.endpoint}\0" in line)
 
 
 @pytest.mark.slow
-def test_one_viewer_has_control_and_anybody_stops_it(tmp_path: Path) -> None:
+def test_console_gives_control_to_one_viewer_and_stop_to_all(tmp_path: Path) -> None:
     with open_chromium() as browser, running_snakesim(tmp_path / "run", *RUN) as run:
         address = run.console()
-        first = browser.open_page(address, *SMALL)
+        first = browser.open_page(address, *SMALL_PAGE)
         first.wait_for("Take control")
-        second = browser.open_page(address, *SMALL)  # after the first, whose number is thus 1
+        second = browser.open_page(address, *SMALL_PAGE)  # The first page has viewer number 1.
         for tab in (first, second):
             tab.wait_for("armed by snakesim run")
             tab.wait_for("Take control")
         first.click("Take control")
         second.wait_for("viewer 1 has control")
-        second.click("Take control")  # greyed out
+        second.click("Take control")  # has no effect while viewer 1 has control
         first.wait_for("Release control")
         assert "Release control" not in second.read_text()
         first.click("Pause")
         second.wait_for("PAUSED")
-        change_settings(first, run)
+        change_amplitude(first, run)
         first.click("Resume")
         wait_until(lambda: "PAUSED" not in second.read_text(), "the end of the pause")
-        # No limit: two pages drawn without a graphics card take seconds for a key.
-        stop_in(second, run)
+        # There is no time limit, because two pages without a graphics card take seconds for a key.
+        stop_with_escape(second, run)
         first.wait_for("ESTOP")
         first.click("Reset fault")
         first.wait_for("DISARMED")
-        first.send("Page.navigate", url="about:blank")  # and control is free again
+        first.send("Page.navigate", url="about:blank")  # releases control
         second.wait_for("no viewer has control")
-        assert not first.errors and not second.errors, first.errors + second.errors
+        assert not first.errors, first.errors
+        assert not second.errors, second.errors
         run.process.terminate()
         run.end()
     assert_no_process_left(tmp_path / "run")
 
 
-def change_settings(tab: BrowserTab, run: RunningCommand) -> None:
-    """Of the controller, while it runs, by typing one into the page."""
+def change_amplitude(tab: BrowserTab, run: RunningCommand) -> None:
+    """Change the amplitude of the running controller on the page, and wait until it is in force."""
     tab.click("Parameters")
     tab.wait_for("amplitude_rad, rad")
     tab.enter_text("amplitude_rad, rad", "0.4")
@@ -256,36 +274,42 @@ def change_settings(tab: BrowserTab, run: RunningCommand) -> None:
             keys.PARAMETERS_IN_FORCE,
             ControlParameters,
             10.0,
-            lambda one: one.requester == "viewer 1",
+            lambda newest: newest.requester == "viewer 1",
         )
     assert in_force is not None
     assert '"amplitude_rad":0.4' in in_force.parameters
 
 
-def stop_in(tab: BrowserTab, run: RunningCommand) -> float:
-    """Press the emergency stop's key in a page; seconds until the motors are off. Then the joints coast to rest."""
+def stop_with_escape(tab: BrowserTab, run: RunningCommand) -> float:
+    """Press the key of the emergency stop in a page, and check that the joints coast to rest.
+
+    Returns:
+        Seconds from the key to motors that are off.
+    """
     with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
-        joints, status = (
-            session.declare_reader(keys.JOINTS, JointState),
-            session.declare_latched_reader(keys.STATUS, RobotStatus),
-        )
+        joints = session.declare_reader(keys.JOINTS, JointState)
+        status = session.declare_latched_reader(keys.STATUS, RobotStatus)
         wait_until(
-            lambda: any(fastest_rad_s(one) > 0.05 for one in joints.drain()), "moving joints"
+            lambda: any(find_max_speed_rad_s(state) > 0.05 for state in joints.drain()),
+            "moving joints",
         )
         pressed_s = time.monotonic()
         tab.press_key("Escape", 27)
         wait_until(
-            lambda: status.pop_newest(lambda one: one.lifecycle == "estop") is not None, "the stop"
+            lambda: status.pop_newest(lambda newest: newest.lifecycle == "estop") is not None,
+            "the stop",
         )
         stopped_after_s = time.monotonic() - pressed_s
         joints.drain()
-        from_ns, recent = None, deque[float](maxlen=5)
-        while len(recent) < 5 or max(recent) > 0.02:
-            for one in joints.drain():
-                from_ns = one.timestamp_ns if from_ns is None else from_ns
-                assert one.timestamp_ns < from_ns + COAST_LIMIT_S * 1e9, (
-                    f"joints still move: {list(recent)} rad/s"
+        first_ns = None
+        speeds_rad_s = deque[float](maxlen=REST_SAMPLE_COUNT)
+        while len(speeds_rad_s) < REST_SAMPLE_COUNT or max(speeds_rad_s) > REST_SPEED_RAD_S:
+            for state in joints.drain():
+                if first_ns is None:
+                    first_ns = state.timestamp_ns
+                assert state.timestamp_ns < first_ns + MAX_COAST_S * 1e9, (
+                    f"joints still move: {list(speeds_rad_s)} rad/s"
                 )
-                recent.append(fastest_rad_s(one))
+                speeds_rad_s.append(find_max_speed_rad_s(state))
             time.sleep(0.005)
     return stopped_after_s

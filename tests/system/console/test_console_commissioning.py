@@ -1,4 +1,4 @@
-"""Commissioning in the console of a real robot, by what a page says and is shown: without a browser."""
+"""The console of a real robot arms it unchecked, sets its zeros, and jogs it. The tests need no browser."""
 
 import asyncio
 from collections.abc import Iterator
@@ -25,30 +25,37 @@ from snakesim_testing.runs.jogged_robot import (
 pytestmark = pytest.mark.e2e
 REAL = ("bench.toml", "--backend", "./real.py:Real", "--unchecked")
 RUN = (*REAL, "--stay", "--duration", "36000", "--console", "--no-record")
-FORWARDS, HOLD_HZ = "Hold: forwards (+)", 20.0
-HELD_IN_STALL, LIFTED_S = 40, 0.6  # messages, and more than a held button may be old
+FORWARDS = "Hold: forwards (+)"
+HOLD_RATE_HZ = 20.0
+MIN_MOTION_RAD = 0.04
+HALF_SECOND_TICKS = 25
+STALLED_MESSAGE_COUNT = 40
+RELEASE_S = 0.6  # longer than the maximum age of a held button
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
+    """Make a folder with a real robot whose joints were never checked."""
     return make_checked_folder(tmp_path)
 
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Path:
+    """Make a folder with a robot whose setpoints are written into a file."""
     return make_jogged_folder(tmp_path)
 
 
-def test_console_arms_unchecked_robot_only_by_explicit_confirmation(home: Path) -> None:
+def test_console_arms_unchecked_robot_only_after_explicit_confirmation(home: Path) -> None:
     with running_snakesim(home / "run", *RUN) as run:
         asyncio.run(asyncio.wait_for(arm_unchecked(run.console()), 2 * LIMIT_S))
 
 
 async def arm_unchecked(address: str) -> None:
+    """Disarm the robot, and arm it again as a viewer who confirms that it is unchecked."""
     async with connect_viewer(address) as socket:
         viewer = ConsoleViewer(socket)
         await viewer.register_as_viewer()
-        watching = asyncio.create_task(viewer.receive_until_closed())
+        viewer_task = asyncio.create_task(viewer.receive_until_closed())
         await wait_for_condition(
             lambda: viewer.shows_text("armed by snakesim run"), "an armed robot"
         )
@@ -56,25 +63,25 @@ async def arm_unchecked(address: str) -> None:
         await wait_for_condition(lambda: viewer.has_label("Release control"), "control")
         await viewer.choose("Robot", "Disarm")
         await wait_for_condition(lambda: viewer.shows_text(">DISARMED<"), "a disarmed robot")
-        await viewer.click("Arm it unchecked")  # nothing has been asked and refused yet
+        await viewer.click("Arm it unchecked")  # has no effect before a refusal
         await viewer.choose("Robot", "Arm")
-        await wait_for_condition(lambda: viewer.is_visible("Arm it unchecked"), "the word")
+        await wait_for_condition(lambda: viewer.is_visible("Arm it unchecked"), "the confirmation")
         assert viewer.shows_text("its joints have not been checked against its file")
         assert viewer.shows_text(">DISARMED<")
         await viewer.click("Arm it unchecked")
         await wait_for_condition(
             lambda: viewer.shows_text(", unchecked, commanded by control"),
-            "a robot armed by the word",
+            "a robot that was armed unchecked",
         )
         await wait_for_condition(
             lambda: not viewer.is_visible("Arm it unchecked"), "the end of the offer"
         )
-        watching.cancel()
+        viewer_task.cancel()
 
 
 @contextmanager
-def console(home: Path, endpoint: str) -> Iterator[str]:
-    """The address of one that may write into the robot file."""
+def running_commissioning_console(home: Path, endpoint: str) -> Iterator[str]:
+    """Run a console that may write into the robot file, and yield its address."""
     with run_in_background(
         home, "console", "--endpoint", endpoint, "--commission", "snake.toml"
     ) as process:
@@ -84,11 +91,15 @@ def console(home: Path, endpoint: str) -> Iterator[str]:
 
 @pytest.mark.quiet
 def test_console_sets_zeros_and_jogs_while_button_is_held(bench: Path) -> None:
-    with running_bench_host(bench, BACKEND) as endpoint, console(bench, endpoint) as address:
-        asyncio.run(asyncio.wait_for(commission(address, bench, endpoint), 3 * LIMIT_S))
+    with (
+        running_bench_host(bench, BACKEND) as endpoint,
+        running_commissioning_console(bench, endpoint) as address,
+    ):
+        asyncio.run(asyncio.wait_for(commission(address, bench), 3 * LIMIT_S))
 
 
-async def commission(address: str, home: Path, endpoint: str) -> None:
+async def commission(address: str, home: Path) -> None:
+    """Set the zeros and jog joint_2 as a viewer whose network can stall, then close the page."""
     parts = urlsplit(address)
     assert parts.hostname is not None and parts.port is not None
     async with (
@@ -97,7 +108,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
     ):
         viewer = ConsoleViewer(socket)
         await viewer.register_as_viewer()
-        watching = asyncio.create_task(viewer.receive_until_closed())
+        viewer_task = asyncio.create_task(viewer.receive_until_closed())
         await wait_for_condition(
             lambda: viewer.shows_text("not checked: its joints have not been checked"), "the table"
         )
@@ -105,7 +116,7 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         await wait_for_condition(
             lambda: viewer.has_label("Start step"), "the controls of the viewer"
         )
-        await viewer.click("Start step")  # of somebody who has no control
+        await viewer.click("Start step")  # has no effect without control
         await viewer.click("Take control")
         await wait_for_condition(lambda: viewer.has_label("Release control"), "control")
         assert not viewer.shows_text("data-step")
@@ -118,23 +129,24 @@ async def commission(address: str, home: Path, endpoint: str) -> None:
         assert "straight pose" not in (home / "snake.toml").read_text()
         await viewer.click("Enter")
         await wait_for_condition(
-            lambda: viewer.shows_text("4 joints changed; restart the host with it"), "its end"
+            lambda: viewer.shows_text("4 joints changed; restart the host with it"),
+            "the end of the step",
         )
         assert "straight pose, " in (home / "snake.toml").read_text()
         assert read_robot_file(home).joint_table[0].drive.zero_rad == pytest.approx(0.0, abs=1e-3)
 
         await viewer.choose("Step", "jog")
-        assert await moved_and_stood(viewer, relay, home)
-        await armed(viewer, home)
-    await watching  # the page is closed
+        assert await jog_and_release_button(viewer, relay, home)
+        await start_jog(viewer, home)
+    await viewer_task  # The page is closed.
     await wait_for_condition(
         lambda: read_setpoints(home)["lifecycle"] != "armed",
         "the end of a step whose viewer has left",
     )
 
 
-async def armed(viewer: ConsoleViewer, home: Path) -> None:
-    """Jog joint_2, which arms the robot."""
+async def start_jog(viewer: ConsoleViewer, home: Path) -> None:
+    """Start to jog joint_2, which arms the robot."""
     await wait_for_condition(
         lambda: viewer.shows_text("<div>done") or viewer.shows_text("<div>ended"),
         "the end of the step before",
@@ -144,52 +156,64 @@ async def armed(viewer: ConsoleViewer, home: Path) -> None:
     await wait_for_condition(
         lambda: viewer.shows_text("<div>joint_2: from -0.2"), "a joint that may be moved"
     )
-    await wait_for_condition(lambda: read_setpoints(home)["lifecycle"] != "disarmed", "armed")
+    await wait_for_condition(
+        lambda: read_setpoints(home)["lifecycle"] != "disarmed", "an armed robot"
+    )
 
 
-async def moved_and_stood(viewer: ConsoleViewer, relay: StallingRelay, home: Path) -> bool:
-    """Hold the button, let it go, also while the network stalls; False when the robot was stopped meanwhile."""
-    await armed(viewer, home)
+async def jog_and_release_button(viewer: ConsoleViewer, relay: StallingRelay, home: Path) -> bool:
+    """Hold the button and release it, then do the same while the network stalls.
+
+    The joint must move only while the button is held, and not after delayed messages.
+
+    Returns:
+        False if a fault stopped the robot.
+    """
+    await start_jog(viewer, home)
     await wait_for_condition(
         lambda: is_at_fault(home) or read_setpoints(home)["mode"] == [0, 1, 0, 0],
         "one joint with current",
     )
-    before = read_setpoints(home)["target"][1]
-    held = {
+    initial_rad = read_setpoints(home)["target"][1]
+    hold_message = {
         "type": "GuiButtonHoldMessage",
         "uuid": await viewer.wait_for_uuid(FORWARDS),
-        "frequency": HOLD_HZ,
+        "frequency": HOLD_RATE_HZ,
     }
-    while not is_at_fault(home) and read_setpoints(home)["target"][1] < before + 0.04:
-        await viewer.send_message(held)
-        await asyncio.sleep(1 / HOLD_HZ)
-    await ticks(home, 25)
-    half = read_setpoints(home)
-    await ticks(home, 25)
+    while (
+        not is_at_fault(home) and read_setpoints(home)["target"][1] < initial_rad + MIN_MOTION_RAD
+    ):
+        await viewer.send_message(hold_message)
+        await asyncio.sleep(1 / HOLD_RATE_HZ)
+    await wait_for_ticks(home, HALF_SECOND_TICKS)
+    released = read_setpoints(home)
+    await wait_for_ticks(home, HALF_SECOND_TICKS)
     if is_at_fault(home):
         return False
-    assert read_setpoints(home)["target"][1] == half["target"][1]
+    assert read_setpoints(home)["target"][1] == released["target"][1]
     relay.stall()
-    for _ in range(HELD_IN_STALL):
-        await viewer.send_message(held)
-        await asyncio.sleep(1 / HOLD_HZ)
-    await asyncio.sleep(LIFTED_S)  # the finger is lifted, and only then does the network recover
+    for _ in range(STALLED_MESSAGE_COUNT):
+        await viewer.send_message(hold_message)
+        await asyncio.sleep(1 / HOLD_RATE_HZ)
+    await asyncio.sleep(RELEASE_S)  # The network recovers only after the release of the button.
     relay.go_on()
-    await ticks(home, 50)
+    await wait_for_ticks(home, 2 * HALF_SECOND_TICKS)
     if is_at_fault(home):
         return False
-    assert read_setpoints(home)["target"][1] == half["target"][1], (
-        "moved by what was held before the finger was lifted"
+    assert read_setpoints(home)["target"][1] == released["target"][1], (
+        "delayed messages moved the joint"
     )
     await viewer.click("End step")
-    await wait_for_condition(lambda: viewer.shows_text("<div>done"), "its end")
+    await wait_for_condition(lambda: viewer.shows_text("<div>done"), "the end of the step")
     await wait_for_condition(
         lambda: read_setpoints(home)["lifecycle"] == "disarmed", "a robot without current"
     )
     return True
 
 
-async def ticks(home: Path, count: int) -> None:
-    """Of the robot's."""
-    since = read_setpoints(home)["tick"]
-    await wait_for_condition(lambda: read_setpoints(home)["tick"] > since + count, f"{count} ticks")
+async def wait_for_ticks(home: Path, count: int) -> None:
+    """Wait until the robot has made more than a number of ticks."""
+    start_tick = read_setpoints(home)["tick"]
+    await wait_for_condition(
+        lambda: read_setpoints(home)["tick"] > start_tick + count, f"{count} ticks"
+    )

@@ -1,4 +1,4 @@
-"""A viewer's keys at the console of a run: they drive the robot, and stop it. Without a browser, so in CI too."""
+"""A viewer drives and stops the robot with the keys of the console. The test needs no browser."""
 
 import asyncio
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from snakesim_testing.operator.viewer import ConsoleViewer, connect_viewer
 from snakesim_testing.runs.command import running_snakesim
 
 pytestmark = pytest.mark.e2e
-REPEAT_S = 0.04  # of a held key
+REPEAT_S = 0.04  # between repetitions of a held key
 RUN = (
     "peg_row",
     "--clock-mode",
@@ -27,61 +27,61 @@ RUN = (
 )
 
 
-def test_keys_drive_a_lost_page_stands_still_and_another_stops(tmp_path: Path) -> None:
+def test_console_keys_drive_and_stop_the_robot(tmp_path: Path) -> None:
     with running_snakesim(tmp_path / "run", *RUN) as run:
         asyncio.run(asyncio.wait_for(drive_and_stop(run.console(), run.endpoint), 2 * LIMIT_S))
 
 
 async def drive_and_stop(address: str, endpoint: str) -> None:
-    async with connect_viewer(address) as others:
-        other = ConsoleViewer(others)
+    """Drive as one viewer, close its page while a key is held, and stop as another viewer."""
+    async with connect_viewer(address) as other_socket:
+        other = ConsoleViewer(other_socket)
         await other.register_as_viewer()
-        watching = asyncio.create_task(other.receive_until_closed())
+        other_task = asyncio.create_task(other.receive_until_closed())
         await wait_for_condition(
             lambda: other.shows_text("armed by snakesim run"), "an armed robot"
         )
         with open_session(ConnectionSettings(endpoint, "planar13")) as session:
-            intents, paths = (
-                session.declare_reader(keys.INTENT, LocomotionIntent),
-                session.declare_reader(keys.TRAJECTORY, Trajectory),
-            )
+            intents = session.declare_reader(keys.INTENT, LocomotionIntent)
+            paths = session.declare_reader(keys.TRAJECTORY, Trajectory)
             status = session.declare_latched_reader(keys.STATUS, RobotStatus)
-            async with connect_viewer(address) as mine:
-                driver = ConsoleViewer(mine)
+            async with connect_viewer(address) as driver_socket:
+                driver = ConsoleViewer(driver_socket)
                 await driver.register_as_viewer()
-                driving = asyncio.create_task(driver.receive_until_closed())
+                driver_task = asyncio.create_task(driver.receive_until_closed())
                 await wait_for_condition(lambda: driver.has_label("Take control"), "the controls")
-                await driver.trigger("Drive: ahead")  # of somebody who has no control
+                await driver.trigger("Drive: ahead")  # has no effect without control
                 await driver.click("Take control")
                 await wait_for_condition(lambda: driver.has_label("Release control"), "control")
-                await hold(
+                await hold_key(
                     driver,
                     "Drive: ahead",
                     lambda: any(path.reason for path in paths.drain()),
-                    "who drives",
+                    "a requester",
                 )
-                asked = intents.drain()
-                assert asked
-                assert all(
-                    intent.requester == "viewer 2" and (intent.speed_m_s or 0) > 0
-                    for intent in asked
-                )
-                before = asked[-1].heading_w_rad
-                assert before is not None
+                requested = intents.drain()
+                assert requested
+                assert all(intent.requester == "viewer 2" for intent in requested)
+                assert all((intent.speed_m_s or 0) > 0 for intent in requested)
+                heading_before_rad = requested[-1].heading_w_rad
+                assert heading_before_rad is not None
                 await driver.trigger("Drive: left")
-                await hold(
+                await hold_key(
                     driver,
                     "Drive: ahead",
-                    lambda: any((i.heading_w_rad or 0) > before for i in intents.drain()),
+                    lambda: any(
+                        (intent.heading_w_rad or 0) > heading_before_rad
+                        for intent in intents.drain()
+                    ),
                 )
-                await hold(
+                await hold_key(
                     driver,
                     "Drive: backwards",
-                    lambda: any((i.speed_m_s or 0) < 0 for i in intents.drain()),
+                    lambda: any((intent.speed_m_s or 0) < 0 for intent in intents.drain()),
                 )
-            await driving  # the page is closed while its key is held
+            await driver_task  # The page was closed while its key was held.
             stopped = await wait_for_condition(
-                lambda: paths.pop_newest(lambda path: path.speed_m_s == 0), "a robot told to stand"
+                lambda: paths.pop_newest(lambda path: path.speed_m_s == 0), "a path with speed 0"
             )
             assert "viewer 2" in stopped.reason
             await wait_for_condition(
@@ -89,18 +89,18 @@ async def drive_and_stop(address: str, endpoint: str) -> None:
             )
             await other.trigger("Emergency stop")
             await wait_for_condition(
-                lambda: status.pop_newest(lambda one: one.lifecycle == "estop"), "the stop"
+                lambda: status.pop_newest(lambda newest: newest.lifecycle == "estop"), "the stop"
             )
             await wait_for_condition(lambda: other.shows_text(">ESTOP<"), "the stop on the page")
-        watching.cancel()
+        other_task.cancel()
 
 
-async def hold(
-    viewer: ConsoleViewer, key: str, done: Callable[[], bool], what: str = "an effect"
+async def hold_key(
+    viewer: ConsoleViewer, key: str, is_done: Callable[[], bool], awaited: str = "an effect"
 ) -> None:
-    """Hold a key, as its keyboard repeats it."""
-    deadline = asyncio.get_running_loop().time() + LIMIT_S
-    while not done():
-        assert asyncio.get_running_loop().time() < deadline, f"not in time: {what} of {key!r}"
+    """Repeat a key, as a keyboard does, until its effect is there."""
+    deadline_s = asyncio.get_running_loop().time() + LIMIT_S
+    while not is_done():
+        assert asyncio.get_running_loop().time() < deadline_s, f"not in time: {awaited} of {key!r}"
         await viewer.trigger(key)
         await asyncio.sleep(REPEAT_S)

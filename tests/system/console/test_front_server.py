@@ -1,4 +1,4 @@
-"""In front of the pages: no number of connections, and no error, keeps a stop from being asked for and answered."""
+"""The front server of the console answers every stop, whatever number of connections or errors there is."""
 
 import contextlib
 import errno
@@ -23,8 +23,8 @@ from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.operator.ready_stop import ReadyStop
 from snakesim_testing.operator.served_console import running_front_server
 
-FEW = 4
-HALF = (b"", b"GET / HTTP/1.1\r\nHost: ", b"POST /stop HTTP/1.1\r\n")
+MAX_WAITING = 4  # incomplete requests that the server keeps in these tests
+INCOMPLETE_REQUESTS = (b"", b"GET / HTTP/1.1\r\nHost: ", b"POST /stop HTTP/1.1\r\n")
 
 
 class Client:
@@ -45,26 +45,33 @@ class Client:
         """Open a connection for requests."""
         return http.client.HTTPConnection(*self.address, timeout=5.0)
 
-    def ask(self, method: str) -> tuple[int, str]:
-        """Return status and text of the second stop's answer."""
-        with contextlib.closing(self.connect()) as connection:
-            return self.ask_over(connection, method)
+    def request_stop_page(self, method: str) -> tuple[int, str]:
+        """Request the second stop over a new connection, and return status and text of the answer.
 
-    def ask_over(self, connection: http.client.HTTPConnection, method: str) -> tuple[int, str]:
-        """Ask over a connection that is open."""
+        Args:
+            method: `POST` stops the robot, `GET` returns whether the stop is ready.
+        """
+        with contextlib.closing(self.connect()) as connection:
+            return self.request_stop_page_over(connection, method)
+
+    def request_stop_page_over(
+        self, connection: http.client.HTTPConnection, method: str
+    ) -> tuple[int, str]:
+        """Request the second stop over an open connection."""
         connection.request(method, f"/{self.ports.token}/stop")
         answer = connection.getresponse()
         return answer.status, answer.read().decode()
 
 
 @contextmanager
-def front(stop: ReadyStop | None) -> Iterator[Client]:
+def running_client(stop: ReadyStop | None) -> Iterator[Client]:
+    """Run a front server with a stop, and yield its client."""
     with open_console_ports(None) as ports, running_front_server(ports, stop) as server:
         yield Client(ports, server)
 
 
 def is_closed(connection: socket.socket) -> bool:
-    """Return whether the other end has closed it, without an answer."""
+    """Return whether the server has closed a connection without an answer."""
     connection.setblocking(False)
     with contextlib.suppress(BlockingIOError):
         try:
@@ -74,46 +81,53 @@ def is_closed(connection: socket.socket) -> bool:
     return False
 
 
-def test_of_too_many_incomplete_requests_the_oldest_is_closed_and_a_stop_is_answered(
+def test_front_server_with_many_incomplete_requests_still_answers_stop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(front_server, "MAX_WAITING", FEW)
+    monkeypatch.setattr(front_server, "MAX_WAITING", MAX_WAITING)
     stop = ReadyStop()
     with (
-        front(stop) as client,
+        running_client(stop) as client,
         contextlib.ExitStack() as stack,
-        contextlib.closing(client.connect()) as kept,
+        contextlib.closing(client.connect()) as kept_connection,
     ):
-        assert client.ask_over(kept, "GET") == (200, "ready")
+        assert client.request_stop_page_over(kept_connection, "GET") == (200, "ready")
         opened = [
-            stack.enter_context(client.send(HALF[number % len(HALF)])) for number in range(3 * FEW)
+            stack.enter_context(client.send(INCOMPLETE_REQUESTS[number % len(INCOMPLETE_REQUESTS)]))
+            for number in range(3 * MAX_WAITING)
         ]
-        wait_until(lambda: sum(map(is_closed, opened)) == 2 * FEW, "the oldest ones closed", 5.0)
-        assert not is_closed(opened[-1])
-        assert client.ask("POST") == (200, "stopped") and stop.requesters == [REQUESTER]
-        used = kept.sock
-        assert client.ask_over(kept, "POST") == (200, "stopped") and kept.sock is used, (
-            "a page's connection is kept"
+        wait_until(
+            lambda: sum(map(is_closed, opened)) == 2 * MAX_WAITING,
+            "the oldest connections closed",
+            5.0,
         )
+        assert not is_closed(opened[-1])
+        assert client.request_stop_page("POST") == (200, "stopped")
+        assert stop.requesters == [REQUESTER]
+        socket_before = kept_connection.sock
+        assert client.request_stop_page_over(kept_connection, "POST") == (200, "stopped")
+        assert kept_connection.sock is socket_before, "the connection of a page was closed"
 
 
-def test_of_too_many_stops_all_are_carried_out_and_some_are_not_reported(
+def test_front_server_with_many_stops_requests_every_stop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(front_server, "MAX_AT_STOP", 1)
     stop = ReadyStop()
-    with front(stop) as client, contextlib.closing(client.connect()) as kept:
-        assert client.ask_over(kept, "POST") == (200, "stopped")
-        status, text = client.ask("POST")
-        assert status == 503 and "is being stopped" in text and len(stop.requesters) == 2
-        assert client.ask("GET") == (200, "ready")
+    with running_client(stop) as client, contextlib.closing(client.connect()) as kept_connection:
+        assert client.request_stop_page_over(kept_connection, "POST") == (200, "stopped")
+        status, text = client.request_stop_page("POST")
+        assert status == 503
+        assert "is being stopped" in text
+        assert len(stop.requesters) == 2
+        assert client.request_stop_page("GET") == (200, "ready")
 
 
-def test_pages_are_limited_and_get_the_request_without_the_token(
+def test_front_server_limits_pages_and_removes_their_token(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(front_server, "MAX_PAGES", 1)
-    with front(None) as client:
+    with running_client(None) as client:
         request = (
             f"GET /{client.ports.token}/signals?a=/b HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
         )
@@ -125,24 +139,24 @@ def test_pages_are_limited_and_get_the_request_without_the_token(
                 assert first.recv(6) == b"answer"
                 with client.send(request) as refused:
                     assert refused.recv(1000).startswith(b"HTTP/1.1 503")
-            wait_until(lambda: is_closed(first), "the end that the page server made", 5.0)
+            wait_until(lambda: is_closed(first), "the connection that the page server closed", 5.0)
         with client.send(request):
             pages, _ = client.ports.page_socket.accept()
             pages.close()
 
 
-def test_without_pages_there_is_an_answer() -> None:
-    with front(ReadyStop()) as client:
+def test_front_server_without_page_server_answers_pages_and_stop() -> None:
+    with running_client(ReadyStop()) as client:
         client.ports.page_socket.close()
         with client.send(
             f"GET /{client.ports.token}/ HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
         ) as page:
             assert b"503" in page.recv(1000)
-        assert client.ask("POST") == (200, "stopped")
+        assert client.request_stop_page("POST") == (200, "stopped")
 
 
 class BrokenStop(ReadyStop):
-    """Fails once in each of its ways, with an error that was not expected."""
+    """A stop that fails twice, once in its result and once when it is requested, and then works."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -162,33 +176,33 @@ class BrokenStop(ReadyStop):
         return stopped
 
 
-def test_an_error_of_a_stop_is_its_answer_and_the_next_stop_is_carried_out() -> None:
-    with front(BrokenStop()) as client:
-        assert client.ask("POST") == (503, "[Errno 24] Too many open files")
+def test_front_server_after_failed_stop_carries_out_the_next() -> None:
+    with running_client(BrokenStop()) as client:
+        assert client.request_stop_page("POST") == (503, "[Errno 24] Too many open files")
         with pytest.raises((http.client.RemoteDisconnected, ConnectionResetError)):
-            client.ask("POST")
-        assert client.ask("POST") == (200, "stopped")
+            client.request_stop_page("POST")
+        assert client.request_stop_page("POST") == (200, "stopped")
 
 
 class UnreadyStop(ReadyStop):
-    """Its self-test fails."""
+    """A stop whose self-test fails."""
 
     def check_readiness(self) -> StopReadiness:
         return StopReadiness(is_ready=False, text="the robot's host does not answer")
 
 
-def test_ready_is_what_the_self_test_reports() -> None:
-    with front(UnreadyStop()) as client:
-        assert client.ask("GET") == (503, "the robot's host does not answer")
+def test_front_server_readiness_is_result_of_stop_self_test() -> None:
+    with running_client(UnreadyStop()) as client:
+        assert client.request_stop_page("GET") == (503, "the robot's host does not answer")
 
 
-def check(first_line: str, *headers: str) -> FrontRequest | BadRequest:
-    """Check a request to a console with the token `secret`."""
+def parse_request(first_line: str, *headers: str) -> FrontRequest | BadRequest:
+    """Parse and authorize a request to a console with the token `secret`."""
     return parse_and_authorize_head("\r\n".join([first_line, *headers, "", ""]).encode(), "secret")
 
 
 @pytest.mark.parametrize(
-    ("target", "path", "passed_on"),
+    ("target", "path", "forwarded"),
     [
         ("/secret/", "/", "/"),
         ("/secret", "", "/"),
@@ -196,35 +210,33 @@ def check(first_line: str, *headers: str) -> FrontRequest | BadRequest:
         ("/secret/signals/values?name=a/b", "/signals/values", "/signals/values?name=a/b"),
     ],
 )
-def test_the_token_is_removed(target: str, path: str, passed_on: str) -> None:
-    request = check(f"GET {target} HTTP/1.1", "Host: localhost:8080", "upgrade: websocket")
-    assert isinstance(request, FrontRequest) and request.path == path and request.is_websocket
-    assert (
-        request.head
-        == f"GET {passed_on} HTTP/1.1\r\nHost: localhost:8080\r\nupgrade: websocket\r\n\r\n".encode()
+def test_front_request_is_forwarded_without_token(target: str, path: str, forwarded: str) -> None:
+    request = parse_request(f"GET {target} HTTP/1.1", "Host: localhost:8080", "upgrade: websocket")
+    assert isinstance(request, FrontRequest)
+    assert request.path == path
+    assert request.is_websocket
+    forwarded_head = (
+        f"GET {forwarded} HTTP/1.1\r\nHost: localhost:8080\r\nupgrade: websocket\r\n\r\n"
     )
+    assert request.head == forwarded_head.encode()
 
 
 @pytest.mark.parametrize(
     "target", ["/", "/secre/", "/secrets/", "secret", "//secret/", "/%73ecret/", "/?secret", "*"]
 )
-def test_another_token_is_refused(target: str) -> None:
-    request = check(f"GET {target} HTTP/1.1", "Host: localhost:8080")
-    assert isinstance(request, BadRequest) and (request.status, request.kind) == (
-        403,
-        "wrong token",
-    )
+def test_front_request_with_wrong_token_is_refused(target: str) -> None:
+    request = parse_request(f"GET {target} HTTP/1.1", "Host: localhost:8080")
+    assert isinstance(request, BadRequest)
+    assert (request.status, request.kind) == (403, "wrong token")
 
 
-def test_another_origin_is_refused_with_the_token_too() -> None:
+def test_front_request_from_another_origin_is_refused_despite_token() -> None:
     for headers in (
         ("Host: evil.example",),
         ("Host: localhost:1", "Origin: http://localhost:2"),
         (),
     ):
-        request = check("GET /secret/ HTTP/1.1", *headers)
-        assert isinstance(request, BadRequest) and (request.status, request.kind) == (
-            403,
-            "another origin",
-        )
-    assert isinstance(check("nonsense", "Host: localhost"), BadRequest)
+        request = parse_request("GET /secret/ HTTP/1.1", *headers)
+        assert isinstance(request, BadRequest)
+        assert (request.status, request.kind) == (403, "another origin")
+    assert isinstance(parse_request("nonsense", "Host: localhost"), BadRequest)

@@ -1,4 +1,4 @@
-"""A page that cannot keep up gets the newest state when it is ready for it, not all states."""
+"""A slow console page receives only the newest state when it is ready for it, and a quick page every change."""
 
 import asyncio
 from typing import Any
@@ -9,65 +9,72 @@ from snakesim_testing.operator.served_console import running_console
 from snakesim_testing.operator.viewer import STORAGE_REQUEST_TYPE, ConsoleViewer, connect_viewer
 
 CHANGES = 200
-LIMIT_S = 20.0
+TIMEOUT_S = 20.0
+MAX_SHOWN_BY_SLOW_PAGE = 5
 
 
-def test_a_slow_page_gets_the_newest_state_only() -> None:
+def test_slow_console_page_gets_only_the_newest_state() -> None:
     with running_console() as (server, address):
         text = server.gui.add_text("Tick", "0")
 
-        async def slow() -> list[str]:
+        async def show_slowly() -> list[str]:
+            """Draw until all changes have been made, then receive the newest; return the values shown."""
             async with connect_viewer(address) as socket:
                 viewer = ConsoleViewer(socket)
                 await viewer.register_as_viewer()
-                changing = asyncio.create_task(_change(text))
-                batch = await _until_asked(viewer)
-                await changing  # while the page still draws
-                last = str(CHANGES - 1)
-                seen = list[str]()
-                while last not in seen:
+                changes = asyncio.create_task(change_text(text))
+                batch = await receive_until_confirmation_request(viewer)
+                await changes  # The page has not confirmed its first batch yet.
+                last_value = str(CHANGES - 1)
+                shown = list[str]()
+                while last_value not in shown:
                     await viewer.confirm_batch(batch)
-                    batch = await _until_asked(viewer)
-                    seen += _values(batch)
-                return seen
+                    batch = await receive_until_confirmation_request(viewer)
+                    shown += list_values(batch)
+                return shown
 
-        assert len(asyncio.run(asyncio.wait_for(slow(), LIMIT_S))) < 5
+        shown = asyncio.run(asyncio.wait_for(show_slowly(), TIMEOUT_S))
+        assert len(shown) < MAX_SHOWN_BY_SLOW_PAGE
 
 
-def test_a_page_that_keeps_up_gets_every_change() -> None:
+def test_quick_console_page_gets_every_change() -> None:
     with running_console() as (server, address):
         text = server.gui.add_text("Tick", "")
 
-        async def quick() -> list[str]:
+        async def show_quickly() -> list[str]:
+            """Confirm every batch at once, and return the values shown."""
             async with connect_viewer(address) as socket:
                 viewer = ConsoleViewer(socket)
                 await viewer.register_as_viewer()
-                seen = list[str]()
-                for i in range(5):
-                    text.value = str(i)
-                    while str(i) not in seen:
+                shown = list[str]()
+                for number in range(5):
+                    text.value = str(number)
+                    while str(number) not in shown:
                         batch = await viewer.receive_batch()
                         await viewer.confirm_batch(batch)
-                        seen += _values(batch)
-                return seen
+                        shown += list_values(batch)
+                return shown
 
-        assert asyncio.run(asyncio.wait_for(quick(), LIMIT_S))[-5:] == ["0", "1", "2", "3", "4"]
+        shown = asyncio.run(asyncio.wait_for(show_quickly(), TIMEOUT_S))
+        assert shown[-5:] == ["0", "1", "2", "3", "4"]
 
 
-async def _change(text: viser.GuiTextHandle) -> None:
-    for i in range(CHANGES):
-        text.value = str(i)
+async def change_text(text: viser.GuiTextHandle) -> None:
+    """Change the text many times, faster than a slow page draws."""
+    for number in range(CHANGES):
+        text.value = str(number)
         await asyncio.sleep(0.002)
 
 
-async def _until_asked(viewer: ConsoleViewer) -> list[dict[str, Any]]:
-    """All messages up to the question whether they have been shown."""
-    found = list[dict[str, Any]]()
-    while not any(message["type"] == STORAGE_REQUEST_TYPE for message in found):
-        found += await viewer.receive_batch()
-    return found
+async def receive_until_confirmation_request(viewer: ConsoleViewer) -> list[dict[str, Any]]:
+    """Return all messages up to the request to confirm that they were shown."""
+    messages = list[dict[str, Any]]()
+    while not any(message["type"] == STORAGE_REQUEST_TYPE for message in messages):
+        messages += await viewer.receive_batch()
+    return messages
 
 
-def _values(batch: list[dict[str, Any]]) -> list[str]:
+def list_values(batch: list[dict[str, Any]]) -> list[str]:
+    """Return the values of the text in a batch of messages."""
     updates = [message["updates"] for message in batch if message["type"] == "GuiUpdateMessage"]
     return [update["value"] for update in updates if "value" in update]

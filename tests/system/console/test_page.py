@@ -1,4 +1,4 @@
-"""The console's page: who may open it, who may command, and what strangers can write on it."""
+"""The console page restricts who may open it and command the robot, and escapes text from the network."""
 
 import asyncio
 import socket
@@ -29,12 +29,8 @@ from snakesim_testing.operator.viewer import watch
 
 
 def test_page_request_from_other_host_or_port_is_refused():
-    for host in (
-        "127.0.0.1:8080",
-        "localhost:9000",
-        "[::1]:8080",
-        "localhost",
-    ):  # a tunnel has another port
+    # A tunnel may have another port than the console.
+    for host in ("127.0.0.1:8080", "localhost:9000", "[::1]:8080", "localhost"):
         assert explain_refusal(host, f"http://{host}") is None
         assert explain_refusal(host, None) is None
         assert explain_refusal(host, "http://evil.example")
@@ -54,40 +50,43 @@ def test_page_request_from_other_host_or_port_is_refused():
 
 def test_page_port_in_use_is_an_error_without_fallback():
     with open_port(None) as first:
-        port = first.getsockname()[1]  # 8080, or any free one
+        port = first.getsockname()[1]  # 8080, or a free port if it is in use
         with raises_error(NotConnectedError, code="network/port-in-use", mask=str(port)):
             open_port(port)
 
 
-def test_a_browser_that_comes_before_the_page_gets_it():
+def test_page_requested_before_its_server_starts_is_delivered():
     with open_console_ports(None) as ports:
-        with socket.create_connection(ports.browser_socket.getsockname(), timeout=10.0) as early:
-            early.sendall(f"GET /{ports.token}/ HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
-            viewers = [threading.Thread(target=come, args=(ports.address,)) for _ in range(3)]
+        with socket.create_connection(
+            ports.browser_socket.getsockname(), timeout=10.0
+        ) as early_connection:
+            early_connection.sendall(
+                f"GET /{ports.token}/ HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()
+            )
+            viewers = [threading.Thread(target=open_page, args=(ports.address,)) for _ in range(3)]
             for viewer in viewers:
                 viewer.start()
             with (
                 running_front_server(ports, None),
                 serve_pages(ports.page_socket, has_stop=False) as server,
             ):
-                assert early.recv(15) == b"HTTP/1.1 200 OK"
-                wait_until(
-                    lambda: len(server.get_clients()) == len(viewers), "the viewers that came early"
-                )
+                assert early_connection.recv(15) == b"HTTP/1.1 200 OK"
+                wait_until(lambda: len(server.get_clients()) == len(viewers), "the early viewers")
         for viewer in viewers:
             viewer.join(10.0)
 
 
-def come(address: str) -> None:
+def open_page(address: str) -> None:
+    """Connect as a viewer until the page is closed."""
     asyncio.run(watch(address))
 
 
-def test_nobody_can_open_a_tunnel_to_the_internet():
+def test_page_offers_no_tunnel_to_the_internet():
     with running_console() as (server, _):
         assert server.request_share_url() is None
 
 
-def test_control_is_taken_while_free_and_never_taken_away():
+def test_control_token_is_acquired_only_while_free():
     token = ControlToken()
     assert token.acquire(1)
     assert token.acquire(1)
@@ -101,60 +100,60 @@ def test_control_is_taken_while_free_and_never_taken_away():
     assert token.holder == 2
 
 
-def test_text_from_the_network_is_no_markup():
-    evil = "<img src=x onerror=alert(1)>\x1b[2J"
+def test_page_escapes_text_from_the_network():
+    markup = "<img src=x onerror=alert(1)>\x1b[2J"
     robot = make_description()
-    named = {"lease_holder": evil[:40], "alive": [evil[:40]], "waiting_for": [evil[:40]]}
-    reported = make_status(
-        lifecycle="fault", reason=evil, commands_rejected={evil[:40]: 1}, **named
+    names = {"lease_holder": markup[:40], "alive": [markup[:40]], "waiting_for": [markup[:40]]}
+    status = make_status(
+        lifecycle="fault", reason=markup, commands_rejected={markup[:40]: 1}, **names
     )
-    snapshot = RobotSnapshot(robot=robot, status=reported)
-    shown = (
+    snapshot = RobotSnapshot(robot=robot, status=status)
+    html = (
         page_html.format_header(snapshot)
         + page_html.format_state_table(snapshot)
-        + page_html.format_log([evil])
+        + page_html.format_log([markup])
     )
-    assert "<img" not in shown
-    assert "&lt;img" in shown
-    assert "\x1b" not in shown
+    assert "<img" not in html
+    assert "&lt;img" in html
+    assert "\x1b" not in html
 
 
-def test_page_says_that_simulator_is_paused_and_by_whom():
-    shown = page_html.format_header(
+def test_page_of_paused_simulator_names_who_paused_it():
+    html = page_html.format_header(
         RobotSnapshot(robot=make_description(), status=make_status(paused_by="<b>ada"))
     )
-    assert ">PAUSED<" in shown
-    assert "by &lt;b&gt;ada" in shown
+    assert ">PAUSED<" in html
+    assert "by &lt;b&gt;ada" in html
     assert "PAUSED" not in page_html.format_header(
         RobotSnapshot(robot=make_description(), status=make_status())
     )
 
 
-def test_page_draws_an_expected_robot_at_its_start():
+def test_page_without_robot_draws_expected_robot_at_its_start():
     config = load_scenario("triplet").config
     snapshot = make_expected_snapshot(config)
     drawing = draw(snapshot, None)
     assert drawing is not None
     start = make_start_capsules(config)
-    middles = [np.add(capsule.rear_m, capsule.front_m) / 2 for capsule in start]
-    assert drawing.links_w[:, :2] == pytest.approx(np.array(middles))
+    expected_positions_m = [np.add(capsule.rear_m, capsule.front_m) / 2 for capsule in start]
+    assert drawing.links_w[:, :2] == pytest.approx(np.array(expected_positions_m))
     assert "WAITING FOR THE ROBOT" in page_html.format_header(snapshot)
     assert "SIMULATOR" not in page_html.format_header(snapshot)
 
 
 @pytest.mark.parametrize(
-    ("backend", "emulated", "words"),
+    ("backend", "emulated", "label"),
     [
         ("sim", True, "EMULATED BY A SIMULATOR"),
-        ("sim", False, "REAL ROBOT ON SIM"),  # a name alone says nothing
+        ("sim", False, "REAL ROBOT ON SIM"),  # The name of the backend does not decide.
         ("can", True, "EMULATED ROBOT ON CAN"),
         ("can", False, "REAL ROBOT ON CAN"),
     ],
 )
-def test_the_page_says_what_moves(backend: str, emulated: bool, words: str):
+def test_page_header_states_whether_the_robot_is_real(backend: str, emulated: bool, label: str):
     robot = msgspec.structs.replace(make_description(), backend=backend, emulated=emulated)
-    assert f">{words}<" in page_html.format_header(RobotSnapshot(robot=robot))
+    assert f">{label}<" in page_html.format_header(RobotSnapshot(robot=robot))
 
 
-def test_the_legend_has_a_colour_for_each_thing():
+def test_page_legend_has_a_different_color_for_each_item():
     assert len({color for _, color in LEGEND}) == len(LEGEND)

@@ -1,4 +1,4 @@
-"""What guidance perceives is drawn about where it believes it to be, beside the truth."""
+"""The scene of the console draws contact forces and the obstacles that guidance perceives."""
 
 import pytest
 
@@ -16,31 +16,31 @@ from snakesim_testing.operator.drawn_samples import (
 from snakesim_testing.operator.served_console import running_console
 
 
-def test_scene_force_without_contact_is_dashed_until_contact():
+def test_scene_desired_force_without_contact_is_dashed():
     point = make_contact((0.0, 10.0, 0.0))
     control = make_control_state([point], [10.0])
     with running_console() as (server, _):
         scene = RobotScene(server.scene, make_description(), None)
-        for felt in ([], [point], []):
+        for contacts in ([], [point], []):
             snapshot = RobotSnapshot(
                 robot=make_description(),
                 body=make_joints(),
-                world=make_world_model(felt, []),
+                world=make_world_model(contacts, []),
                 control=control,
             )
             drawing = draw(snapshot, None)
             assert drawing is not None
             scene.update_nodes(drawing)
             desired = scene._arrows.get("forces/desired")
-            assert scene._dashed_forces.visible is not bool(felt)
-            assert (desired is not None and desired.visible) is bool(felt)
-        ends = scene._dashed_forces.points.reshape(-1, 3)
-        assert len(ends) == 10
-        assert ends[-1] - ends[0] == pytest.approx([0.0, 10 * M_PER_N, 0.0], abs=1e-6)
+            assert scene._dashed_forces.visible is not bool(contacts)
+            assert (desired is not None and desired.visible) is bool(contacts)
+        dash_ends = scene._dashed_forces.points.reshape(-1, 3)
+        assert len(dash_ends) == 10
+        assert dash_ends[-1] - dash_ends[0] == pytest.approx([0.0, 10 * M_PER_N, 0.0], abs=1e-6)
 
 
 def test_scene_perceived_shapes_are_drawn_until_forgotten():
-    found = [
+    perceived = [
         KnownObstacle(
             name="a", shape="sphere", position_w=(1.0, 0.0, 0.0), radius_m=0.1, touched=True
         ),
@@ -62,7 +62,7 @@ def test_scene_perceived_shapes_are_drawn_until_forgotten():
     ]
     with running_console() as (server, _):
         scene = RobotScene(server.scene, make_description(), None)
-        for obstacles in (found, []):
+        for obstacles in (perceived, []):
             drawing = draw(
                 RobotSnapshot(
                     robot=make_description(),
@@ -73,9 +73,9 @@ def test_scene_perceived_shapes_are_drawn_until_forgotten():
             )
             assert drawing is not None
             scene.update_nodes(drawing)
-            shown = list(scene._perceived_obstacles.meshes.batches.values())
-            assert [batch.visible for batch in shown] == [bool(obstacles)] * 3
-            assert sorted(float(batch.batched_positions[0, 0]) for batch in shown) == [
+            batches = list(scene._perceived_obstacles.meshes.batches.values())
+            assert [batch.visible for batch in batches] == [bool(obstacles)] * 3
+            assert sorted(float(batch.batched_positions[0, 0]) for batch in batches) == [
                 1.0,
                 2.0,
                 3.0,

@@ -1,4 +1,4 @@
-"""The parts of deploy/vm that need no virtual machine."""
+"""Tests of deploy/vm that need no virtual machine: its archive, kernel, scripts, and QEMU command."""
 
 import argparse
 import lzma
@@ -36,11 +36,11 @@ REQUEST = machine.GuestRequest(
 )
 
 
-def test_every_entry_of_an_archive_is_aligned() -> None:
+def test_archive_entry_of_any_length_is_aligned() -> None:
     for length in range(5):
         entry = cpio.make_file_entry("n" * length + "x", b"c" * length)
         assert len(entry) % 4 == 0
-        # The size, seventh of the eight-digit fields after the magic.
+        # The size is the seventh of the eight-digit fields after the magic number.
         assert int(entry[54:62], 16) == length
 
 
@@ -49,7 +49,7 @@ def test_vm_modules_are_ordered_by_dependency_without_builtin_ones() -> None:
     assert order == ["can", "can_raw", "sja1000", "can_dev", "kvaser_pci", "vcan"]
 
 
-def test_a_kernel_without_the_module_is_named() -> None:
+def test_vm_kernel_without_required_module_is_refused() -> None:
     with raises_error(PreparationError):
         kernel.order_modules(["flexcan"], KERNEL)
 
@@ -62,33 +62,36 @@ def test_a_kernel_without_the_module_is_named() -> None:
         (b"license=GPL\0", []),
     ],
 )
-def test_dependencies_are_read_from_the_module(section: bytes, names: list[str]) -> None:
+def test_vm_module_dependencies_are_read_from_its_file(section: bytes, names: list[str]) -> None:
     assert kernel.find_dependencies(b"\x7fELF\0" + section) == names
 
 
-def test_module_names_have_no_dash_and_no_ending() -> None:
+def test_vm_module_name_has_no_dash_and_no_suffix() -> None:
     assert kernel.parse_module_name("kernel/net/can/can-raw.ko.xz") == "can_raw"
 
 
-def bz_image(payload: bytes) -> bytes:
-    """As the boot protocol lays it out: one sector, four of setup, then the compressed kernel."""
+def make_bz_image(payload: bytes) -> bytes:
+    """Return a kernel image as the boot protocol defines it, with a payload.
+
+    A boot sector and four setup sectors precede the compressed kernel.
+    """
     head = bytearray(5 * 512)
-    head[0x1F1] = 4
+    head[0x1F1] = 4  # setup sectors
     struct.pack_into("<II", head, 0x248, 16, len(payload))
     return bytes(head) + bytes(16) + payload
 
 
-def test_the_plain_kernel_is_taken_out_of_its_image() -> None:
+def test_vm_kernel_image_yields_its_plain_kernel() -> None:
     plain = b"\x7fELF" + struct.pack("<III", 4, 8, 18) + b"Xen\0" + bytes(64)
-    assert kernel.extract_plain_kernel(bz_image(lzma.compress(plain) + b"size")) == plain
+    assert kernel.extract_plain_kernel(make_bz_image(lzma.compress(plain) + b"size")) == plain
 
 
-def test_a_kernel_that_qemu_could_not_start_directly_stays_packed() -> None:
-    assert kernel.extract_plain_kernel(bz_image(lzma.compress(b"\x7fELF" + bytes(64)))) is None
-    assert kernel.extract_plain_kernel(bz_image(b"\x1f\x8b gzip")) is None
+def test_vm_kernel_without_pvh_entry_stays_packed() -> None:
+    assert kernel.extract_plain_kernel(make_bz_image(lzma.compress(b"\x7fELF" + bytes(64)))) is None
+    assert kernel.extract_plain_kernel(make_bz_image(b"\x1f\x8b gzip")) is None
 
 
-def test_the_command_keeps_its_words_folder_and_environment(tmp_path: Path) -> None:
+def test_vm_command_keeps_arguments_folder_and_environment(tmp_path: Path) -> None:
     request = machine.GuestRequest(
         command=["sh", "-c", 'echo "$0 $GREETING $SNAKESIM_VCAN" > out', "it's"], folder=tmp_path
     )
@@ -101,7 +104,7 @@ def test_the_command_keeps_its_words_folder_and_environment(tmp_path: Path) -> N
     assert "BASH_FUNC" not in script
 
 
-def test_interfaces_are_brought_up_as_asked() -> None:
+def test_vm_interface_script_configures_requested_interfaces() -> None:
     request = machine.GuestRequest(
         [], Path("/"), channels=["vcan0", "vcan1"], controllers=True, forward=[(17447, 7447)]
     )
@@ -112,33 +115,36 @@ def test_interfaces_are_brought_up_as_asked() -> None:
     assert "can1 type can" not in machine.make_interface_script(REQUEST)
 
 
-def qemu(request: machine.GuestRequest, monkeypatch: pytest.MonkeyPatch, kvm: bool = False) -> str:
+def make_qemu_line(
+    request: machine.GuestRequest, monkeypatch: pytest.MonkeyPatch, kvm: bool = False
+) -> str:
+    """Return the QEMU command line for a request, as if all tools were installed."""
     monkeypatch.setattr(machine, "require_tool", str)
     ports = {name: number for number, name in enumerate(machine.PORTS, start=10)}
     return " ".join(machine.make_qemu_command(request, KERNEL, kvm, "/proc/self/fd/9", ports))
 
 
-def test_the_host_is_read_only_but_for_the_given_folders(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = qemu(REQUEST, monkeypatch)
+def test_vm_host_files_are_read_only_except_given_folders(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = make_qemu_line(REQUEST, monkeypatch)
     assert "path=/,security_model=none,readonly=on" in line
     assert "id=share0,path=/re,,po,security_model=none,multidevs" in line
     assert "accel tcg" in line
-    assert "accel kvm" in qemu(REQUEST, monkeypatch, kvm=True)
+    assert "accel kvm" in make_qemu_line(REQUEST, monkeypatch, kvm=True)
 
 
 def test_vm_guest_has_network_only_for_forwarded_loopback_ports(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert "-netdev" not in qemu(REQUEST, monkeypatch)
-    line = qemu(machine.GuestRequest([], Path("/"), forward=[(17447, 7447)]), monkeypatch)
+    assert "-netdev" not in make_qemu_line(REQUEST, monkeypatch)
+    line = make_qemu_line(machine.GuestRequest([], Path("/"), forward=[(17447, 7447)]), monkeypatch)
     assert "restrict=on,hostfwd=tcp:127.0.0.1:17447-:7447" in line
 
 
-def test_controllers_share_one_bus(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = qemu(machine.GuestRequest([], Path("/"), controllers=True), monkeypatch)
+def test_vm_can_controllers_share_one_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = make_qemu_line(machine.GuestRequest([], Path("/"), controllers=True), monkeypatch)
     assert line.count("kvaser_pci,canbus=canbus0") == 2
     assert line.index("sja1000,") < line.index("kvaser_pci ")
-    assert "kvaser_pci" not in qemu(REQUEST, monkeypatch)
+    assert "kvaser_pci" not in make_qemu_line(REQUEST, monkeypatch)
 
 
 @pytest.mark.parametrize(
@@ -158,16 +164,16 @@ def test_vm_invalid_port_forward_and_channel_name_are_refused(
         parse(text)
 
 
-def test_a_command_is_needed() -> None:
-    done = subprocess.run(
+def test_vm_without_command_is_refused() -> None:
+    completed = subprocess.run(
         [sys.executable, with_vcan.__file__, "--channels", "vcan0"],
         capture_output=True,
         text=True,
         timeout=30,
         check=False,
     )
-    assert done.returncode == 2
-    assert "it comes after --" in done.stderr
+    assert completed.returncode == 2
+    assert "it comes after --" in completed.stderr
 
 
 PROGRAM_WITHOUT_MACHINE = """
@@ -180,7 +186,7 @@ with_vcan.run_in_guest = wait_in_place_of_a_machine
 sys.argv = ["with_vcan", "--guest", "--", "true"]
 with_vcan.main()
 """
-PARENT = """
+PARENT_PROGRAM = """
 import subprocess, sys, time
 child = subprocess.Popen([sys.executable, "-c", sys.argv[1]])
 time.sleep(60)
@@ -189,7 +195,7 @@ time.sleep(60)
 
 def test_vm_command_dies_with_its_killed_parent() -> None:
     parent = subprocess.Popen(
-        [sys.executable, "-c", PARENT, PROGRAM_WITHOUT_MACHINE],
+        [sys.executable, "-c", PARENT_PROGRAM, PROGRAM_WITHOUT_MACHINE],
         stdout=subprocess.PIPE,
         text=True,
         cwd=Path(machine.__file__).parents[2],

@@ -1,4 +1,4 @@
-"""Whatever a backend raises stops the robot, with a record of what it was."""
+"""Every error of a backend stops the robot, and the host records its cause."""
 
 import math
 from collections.abc import Mapping
@@ -17,47 +17,47 @@ from snakesim_testing.hal.small_robots import make_pose, make_power, make_run_co
 from snakesim_testing.harness.wait import wait_until
 
 
-@pytest.mark.parametrize("where", ["sample", "enact", "advance", "faults"])
+@pytest.mark.parametrize("method", ["sample", "enact", "advance", "faults"])
 @pytest.mark.parametrize(
     ("error", "cause"),
     [
-        (BackendError("diverged"), "diverged"),  # our own errors stay as they are
+        (BackendError("diverged"), "diverged"),  # The host keeps the text of a BackendError.
         (OSError(19, "No such device"), "LagBackend.{} failed: OSError: [Errno 19] No such device"),
     ],
 )
-def test_backend_error_is_latched_and_joints_are_made_safe(
-    where: str, error: Exception, cause: str
+def test_backend_error_is_latched_and_stops_the_joints(
+    method: str, error: Exception, cause: str
 ) -> None:
     with running_commanded_host(make_run_config()) as (run, _):
-        run.backend.fails_in, run.backend.fails_with = where, error
+        run.backend.fails_in = method
+        run.backend.fails_with = error
         wait_until(run.has_ended, "the end of the host")
         assert run.host.ending_status == "failed"
         assert run.host.authority.state == "fault"
         causes = {fault.what: fault.cause for fault in run.host.authority.faults_since_start.faults}
-        assert causes["backend_failed"] == cause.format(where)
-        if where != "enact":
+        assert causes["backend_failed"] == cause.format(method)
+        if method != "enact":
             assert run.backend.enacted[-1].mode == [JointMode.VELOCITY] * 3
 
 
-class Wrong(LagBackend):
-    """Has a wrong sample in it from some tick on."""
+class InvalidSampleBackend(LagBackend):
+    """A backend that publishes invalid samples after a test has set them."""
 
-    wrong: Mapping[str, Any] = {}
+    invalid_samples: Mapping[str, Any] = {}  # by key
 
     def sample(self, tick: int, timestamp_ns: int) -> Samples:
-        right = super().sample(tick, timestamp_ns)
-        joints = msgspec.structs.replace(right.joints, **self.wrong.get(keys.JOINTS, {}))
-        return Samples(
-            joints,
-            {**right.by_key, **{key: one for key, one in self.wrong.items() if key != keys.JOINTS}},
-        )
+        valid = super().sample(tick, timestamp_ns)
+        invalid_by_key = dict(self.invalid_samples)
+        invalid_joint_fields = invalid_by_key.pop(keys.JOINTS, {})
+        joints = msgspec.structs.replace(valid.joints, **invalid_joint_fields)
+        return Samples(joints, {**valid.by_key, **invalid_by_key})
 
 
 @pytest.mark.parametrize(
     "clock_mode", [pytest.param("realtime", marks=pytest.mark.quiet), "lockstep"]
 )
 @pytest.mark.parametrize(
-    ("key", "sample", "why"),
+    ("key", "sample", "problem"),
     [
         (
             keys.POSE,
@@ -88,13 +88,13 @@ class Wrong(LagBackend):
         ),
     ],
 )
-def test_backend_sample_out_of_bounds_is_a_named_latched_fault(
-    clock_mode: ClockMode, key: str, sample: Any, why: str, monkeypatch: pytest.MonkeyPatch
+def test_backend_with_invalid_sample_is_a_latched_fault(
+    clock_mode: ClockMode, key: str, sample: Any, problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("snakesim_testing.hal.local_network.LagBackend", Wrong)
+    monkeypatch.setattr("snakesim_testing.hal.local_network.LagBackend", InvalidSampleBackend)
     with running_commanded_host(make_run_config(clock_mode=clock_mode)) as (run, _):
         backend: Any = run.backend
-        backend.wrong = {key: sample}
+        backend.invalid_samples = {key: sample}
         wait_until(run.has_ended, "the end of the host")
         assert run.host.ending_status == "failed"
         assert run.host.authority.state == "fault"
@@ -103,4 +103,6 @@ def test_backend_sample_out_of_bounds_is_a_named_latched_fault(
             for fault in run.host.authority.faults_since_start.faults
             if fault.what == "backend_failed"
         )
-        assert cause.startswith(f"Wrong.sample: {key} cannot be published: {why}"), cause
+        assert cause.startswith(
+            f"InvalidSampleBackend.sample: {key} cannot be published: {problem}"
+        ), cause

@@ -17,31 +17,34 @@ pytestmark = pytest.mark.usefixtures("quick_threads")
 
 
 @contextmanager
-def navigation(link: ConnectionSettings) -> Iterator[HostClient]:
-    """A navigation service that answers only when the test says so."""
-    with open_session(link) as session:
+def connected_navigation_service(connection: ConnectionSettings) -> Iterator[HostClient]:
+    """Connect a navigation service that answers only if the test calls `report_done`."""
+    with open_session(connection) as session:
         client = HostClient(session, "navigation")
         client.wait_for_description()
         client.announce()
         yield client
 
 
-def test_host_does_not_await_an_answer_to_a_tick_that_a_service_has_not_received() -> None:
+def test_host_with_restarted_service_awaits_only_answers_to_received_ticks() -> None:
     config = make_run_config(clock_mode="lockstep", services=SERVICES, stall_limit_s=60.0)
-    with running_host(config) as run, navigation(run.link) as slow:
+    with running_host(config) as run, connected_navigation_service(run.link) as navigation:
         with running_follower(run.link, SineFollower()):
             wait_until(lambda: run.status.waiting_for == ["navigation"], "control")
-            slow.report_done(0)
+            navigation.report_done(0)
             run.arm()
             # An armed robot that loses its controller goes to fault.
             assert run.request_lifecycle("disarm").ok
             wait_until(
-                lambda: slow.newest_clock is not None and slow.newest_clock.tick == 1, "tick 1"
+                lambda: navigation.newest_clock is not None and navigation.newest_clock.tick == 1,
+                "tick 1",
             )
         wait_until(lambda: not run.host.participants["control"].is_connected, "control has left")
-        late = SineFollower()
-        with running_follower(run.link, late):
+        restarted_control = SineFollower()
+        with running_follower(run.link, restarted_control):
             wait_until(lambda: run.host.participants["control"].is_connected, "control is back")
-            assert late.ticks_seen == [], "the host waits for navigation, and publishes nothing"
-            slow.report_done(1)
-            wait_until(lambda: late.ticks_seen == [2], "the next tick", 20.0)
+            assert restarted_control.ticks_seen == [], (
+                "the host published a tick without navigation"
+            )
+            navigation.report_done(1)
+            wait_until(lambda: restarted_control.ticks_seen == [2], "the next tick", 20.0)

@@ -1,4 +1,4 @@
-"""What a host leaves on disk: there within a second, whole when the disk comes back, and never waited for."""
+"""The record of a host reaches the disk within a second, survives a full disk, and never delays a tick."""
 
 import errno
 import os
@@ -13,7 +13,7 @@ import pytest
 
 from snakesim_hal.backend import SafeSetpoints, Samples
 from snakesim_hal.programs.host_program import create_host_record
-from snakesim_hal.run_log import writer as under_test
+from snakesim_hal.run_log import writer as writer_module
 from snakesim_hal.run_log.black_box import BlackBox, compute_digest, read_black_box
 from snakesim_hal.run_log.host_record import BLACK_BOX, DESCRIPTION, HOST_RECORD, HostRecord
 from snakesim_hal.run_log.writer import HostRecordWriter
@@ -24,69 +24,89 @@ from snakesim_testing.hal.small_robots import make_description, make_joint_state
 from snakesim_testing.harness.wait import wait_until
 
 ROBOT = make_description()
-TOLD = TickOutput(SafeSetpoints([JointMode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
-ROW = BlackBox(ROBOT).layout.row_bytes
+TICK_OUTPUT = TickOutput(SafeSetpoints([JointMode.POSITION] * 3, [0.1] * 3, [4.0] * 3), 1, {})
+ROW_BYTES = BlackBox(ROBOT).layout.row_bytes
+UNLIMITED_BYTES = 2**30
+MAX_RECORD_BYTES = 2**20
 
 
-class Numbers(msgspec.Struct):
+class RecordNumbers(msgspec.Struct):
+    """The numbers of a host record that these tests compare."""
+
     ticks: int
     lost_ticks: int
     failure: str
 
 
-def fill(box: BlackBox, *ticks: int) -> None:
+def record_ticks(box: BlackBox, *ticks: int) -> None:
+    """Record a row for each tick in the black box."""
     for tick in ticks:
         box.record_tick(
-            tick, tick * 10_000_000, Samples(make_joint_state(ROBOT, 0.001 * tick)), TOLD
+            tick, tick * 10_000_000, Samples(make_joint_state(ROBOT, 0.001 * tick)), TICK_OUTPUT
         )
 
 
-def recorder(box: BlackBox, folder: Path | None, memory: int | None = None) -> HostRecordWriter:
-    def numbers(*, lost_ticks: int, failure: str) -> Numbers:
-        return Numbers(box.row_count, lost_ticks, failure)
+def make_writer(box: BlackBox, folder: Path | None, memory: int | None = None) -> HostRecordWriter:
+    """Create a writer of the host record.
 
-    return HostRecordWriter(box, ROBOT, numbers, folder, memory)
+    Args:
+        box: The black box whose rows it writes.
+        folder: Folder of the record; None for a run without a folder.
+        memory: Handle of the shared memory that receives the numbers, too.
+    """
+
+    def make_numbers(*, lost_ticks: int, failure: str) -> RecordNumbers:
+        return RecordNumbers(box.row_count, lost_ticks, failure)
+
+    return HostRecordWriter(box, ROBOT, make_numbers, folder, memory)
 
 
-def reported(folder: Path) -> Numbers:
-    return msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=Numbers)
+def read_numbers_on_disk(folder: Path) -> RecordNumbers:
+    return msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=RecordNumbers)
 
 
-def ticks_on_disk(folder: Path) -> list[int]:
-    return (
-        read_black_box(folder / BLACK_BOX)[1]["tick"].tolist()
-        if (folder / BLACK_BOX).exists()
-        else []
-    )
+def read_ticks_on_disk(folder: Path) -> list[int]:
+    """Return the ticks of the rows on disk, or an empty list if there is no file yet."""
+    path = folder / BLACK_BOX
+    if not path.exists():
+        return []
+    _, columns = read_black_box(path)
+    return columns["tick"].tolist()
 
 
 @pytest.fixture
 def memory() -> Iterator[int]:
+    """Open a memory file like the one that the supervisor shares with the host."""
     handle = os.memfd_create("test")
     yield handle
     for thread in [thread for thread in threading.enumerate() if thread.name == "recorder"]:
-        thread.join(5.0)  # one that suspended would write to whatever has this number next
+        # A suspended thread would write into the next file that gets this handle.
+        thread.join(5.0)
     os.close(handle)
 
 
-def remembered(memory: int) -> Numbers:
-    return msgspec.json.decode(os.pread(memory, 2**20, 0), type=Numbers)
+def read_numbers_in_memory(memory: int) -> RecordNumbers:
+    return msgspec.json.decode(os.pread(memory, MAX_RECORD_BYTES, 0), type=RecordNumbers)
 
 
 def test_recorder_writes_rows_within_a_second_and_all_at_end(tmp_path: Path, memory: int) -> None:
     box = BlackBox(ROBOT)
-    with recorder(box, tmp_path, memory):
-        fill(box, *range(40))
-        assert under_test.WRITE_PERIOD_S < 1.0
-        wait_until(lambda: ticks_on_disk(tmp_path) == list(range(40)), "the rows", 30.0)
+    with make_writer(box, tmp_path, memory):
+        record_ticks(box, *range(40))
+        assert writer_module.WRITE_PERIOD_S < 1.0
+        wait_until(lambda: read_ticks_on_disk(tmp_path) == list(range(40)), "the rows", 30.0)
         wait_until(
-            lambda: (tmp_path / HOST_RECORD).exists() and reported(tmp_path).ticks == 40,
+            lambda: (
+                (tmp_path / HOST_RECORD).exists() and read_numbers_on_disk(tmp_path).ticks == 40
+            ),
             "the numbers",
             30.0,
         )
-        fill(box, *range(40, 45))
-    assert ticks_on_disk(tmp_path) == list(range(45))
-    assert reported(tmp_path) == remembered(memory) == Numbers(45, 0, "")
+        record_ticks(box, *range(40, 45))
+    assert read_ticks_on_disk(tmp_path) == list(range(45))
+    assert (
+        read_numbers_on_disk(tmp_path) == read_numbers_in_memory(memory) == RecordNumbers(45, 0, "")
+    )
     assert compute_digest(read_black_box(tmp_path / BLACK_BOX)[1]) == box.command_digest
     assert (
         msgspec.json.decode((tmp_path / DESCRIPTION).read_bytes(), type=RobotDescription) == ROBOT
@@ -94,12 +114,12 @@ def test_recorder_writes_rows_within_a_second_and_all_at_end(tmp_path: Path, mem
     assert {path.name for path in tmp_path.iterdir()} == {BLACK_BOX, HOST_RECORD, DESCRIPTION}
 
 
-def test_recorder_of_restarted_host_keeps_the_earlier_record(tmp_path: Path) -> None:
-    for first in (0, 100, 200):
+def test_recorder_of_restarted_host_keeps_earlier_record(tmp_path: Path) -> None:
+    for first_tick in (0, 100, 200):
         box = BlackBox(ROBOT)
-        with recorder(box, tmp_path):
-            fill(box, first)
-    assert ticks_on_disk(tmp_path) == [200]
+        with make_writer(box, tmp_path):
+            record_ticks(box, first_tick)
+    assert read_ticks_on_disk(tmp_path) == [200]
     for number in (1, 2):
         _, columns = read_black_box(tmp_path / f"blackbox-{number}.rows")
         assert columns["tick"].tolist() == [100 * (number - 1)]
@@ -107,25 +127,31 @@ def test_recorder_of_restarted_host_keeps_the_earlier_record(tmp_path: Path) -> 
 
 
 class Disk:
-    """A disk that takes `space` bytes of rows, and is then full, or hangs; everything else goes its way."""
+    """A disk that accepts `free_bytes` of each file, and is then full or hangs.
+
+    Writes to the memory file are not limited.
+    """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, memory: int) -> None:
-        self.space, self.hangs, self.should_continue = 2**30, False, Event()
+        self.free_bytes = UNLIMITED_BYTES
+        self.hangs_when_full = False
+        self.should_continue = Event()
         self.is_hanging = Event()
-        self._memory, self._pwrite = memory, os.pwrite
-        monkeypatch.setattr(under_test.os, "pwrite", self.pwrite)
-        monkeypatch.setattr(under_test, "WRITE_PERIOD_S", 0.02)
+        self._memory = memory
+        self._pwrite = os.pwrite
+        monkeypatch.setattr(writer_module.os, "pwrite", self.pwrite)
+        monkeypatch.setattr(writer_module, "WRITE_PERIOD_S", 0.02)
 
     def pwrite(self, handle: int, content: bytes, offset: int) -> int:
         if handle == self._memory:
             return self._pwrite(handle, content, offset)
-        room = max(self.space - offset, 0)
-        if room == 0 and content:
-            if self.hangs:
+        free_bytes = max(self.free_bytes - offset, 0)
+        if free_bytes == 0 and content:
+            if self.hangs_when_full:
                 self.is_hanging.set()
                 self.should_continue.wait(30)
             raise OSError(errno.ENOSPC, "No space left on device")
-        return self._pwrite(handle, content[:room], offset)
+        return self._pwrite(handle, content[:free_bytes], offset)
 
 
 @pytest.fixture
@@ -137,45 +163,51 @@ def test_recorder_writes_what_full_disk_refused_when_space_returns(
     tmp_path: Path, memory: int, disk: Disk, capfd: pytest.CaptureFixture[str]
 ) -> None:
     box = BlackBox(ROBOT)
-    disk.space = len(box.layout.encode_header()) + 7 * ROW + 11  # the eighth row is torn
-    with recorder(box, tmp_path, memory):
-        fill(box, *range(20))
+    # The disk has room for seven rows and a part of the eighth.
+    disk.free_bytes = len(box.layout.encode_header()) + 7 * ROW_BYTES + 11
+    with make_writer(box, tmp_path, memory):
+        record_ticks(box, *range(20))
         wait_until(
-            lambda: len(os.pread(memory, 9, 0)) and remembered(memory).failure, "a word about it"
+            lambda: len(os.pread(memory, 9, 0)) and read_numbers_in_memory(memory).failure,
+            "the failure in the record",
         )
-        assert ticks_on_disk(tmp_path) == list(range(7))
-        assert remembered(memory).lost_ticks == 0
-        disk.space = 2**30
-        wait_until(lambda: not remembered(memory).failure, "room")
-    assert ticks_on_disk(tmp_path) == list(range(20))
-    assert reported(tmp_path) == remembered(memory) == Numbers(20, 0, "")
-    assert capfd.readouterr().err == f"record: {tmp_path}: No space left on device\n"  # once
+        assert read_ticks_on_disk(tmp_path) == list(range(7))
+        assert read_numbers_in_memory(memory).lost_ticks == 0
+        disk.free_bytes = UNLIMITED_BYTES
+        wait_until(lambda: not read_numbers_in_memory(memory).failure, "free space")
+    assert read_ticks_on_disk(tmp_path) == list(range(20))
+    assert (
+        read_numbers_on_disk(tmp_path) == read_numbers_in_memory(memory) == RecordNumbers(20, 0, "")
+    )
+    assert (
+        capfd.readouterr().err == f"record: {tmp_path}: No space left on device\n"
+    )  # printed once
 
 
 def test_recorder_counts_unwritten_rows_and_gaps_show_in_ticks(
     tmp_path: Path, memory: int, disk: Disk
 ) -> None:
-    box = BlackBox(ROBOT, memory_bytes=10 * ROW)
-    begins = len(box.layout.encode_header())
-    disk.space = begins + 3 * ROW
-    with recorder(box, tmp_path, memory):
-        fill(box, *range(5))
-        wait_until(lambda: ticks_on_disk(tmp_path) == [0, 1, 2], "the first rows")
-        fill(box, *range(5, 30))
-        disk.space = begins + 8 * ROW
-        wait_until(lambda: len(ticks_on_disk(tmp_path)) == 8, "some of the newest")
-    assert ticks_on_disk(tmp_path) == [0, 1, 2, 21, 22, 23, 24, 25]
-    last = remembered(memory)
+    box = BlackBox(ROBOT, memory_bytes=10 * ROW_BYTES)
+    header_bytes = len(box.layout.encode_header())
+    disk.free_bytes = header_bytes + 3 * ROW_BYTES
+    with make_writer(box, tmp_path, memory):
+        record_ticks(box, *range(5))
+        wait_until(lambda: read_ticks_on_disk(tmp_path) == [0, 1, 2], "the first rows")
+        record_ticks(box, *range(5, 30))
+        disk.free_bytes = header_bytes + 8 * ROW_BYTES
+        wait_until(lambda: len(read_ticks_on_disk(tmp_path)) == 8, "some of the newest")
+    assert read_ticks_on_disk(tmp_path) == [0, 1, 2, 21, 22, 23, 24, 25]
+    last = read_numbers_in_memory(memory)
     assert last.lost_ticks == 18 + 4
     assert last.failure == f"{tmp_path}: No space left on device"
 
 
 def test_recorder_in_unwritable_folder_leaves_no_empty_file(tmp_path: Path, memory: int) -> None:
     box = BlackBox(ROBOT)
-    with recorder(box, tmp_path / "gone", memory):
-        fill(box, 1, 2)
+    with make_writer(box, tmp_path / "gone", memory):
+        record_ticks(box, 1, 2)
     assert not (tmp_path / "gone").exists()
-    last = remembered(memory)
+    last = read_numbers_in_memory(memory)
     assert last.lost_ticks == 2
     assert "No such file" in last.failure
 
@@ -183,7 +215,7 @@ def test_recorder_in_unwritable_folder_leaves_no_empty_file(tmp_path: Path, memo
 def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
     tmp_path: Path, memory: int, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(under_test, "CLOSE_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(writer_module, "CLOSE_TIMEOUT_S", 0.3)
     with (
         running_host(make_run_config(clock_mode="lockstep"), max_ticks=75) as run,
         running_follower(run.link, SineFollower()),
@@ -196,15 +228,16 @@ def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
             memory,
         ):
             layout = run.host.black_box.layout
-            disk.space, disk.hangs = len(layout.encode_header()) + 6 * layout.row_bytes, True
+            disk.free_bytes = len(layout.encode_header()) + 6 * layout.row_bytes
+            disk.hangs_when_full = True
             run.arm()
             wait_until(run.has_ended, "the end of the run")
             assert disk.is_hanging.wait(5.0)
-        # Neither the run nor its recorder's end waited for it.
+        # Neither the run nor the end of its recorder waited for the disk.
         assert not disk.should_continue.is_set()
         assert run.host.ending_status == "complete"
         assert not run.host.authority.faults
-    last = msgspec.json.decode(os.pread(memory, 2**20, 0), type=HostRecord)
+    last = msgspec.json.decode(os.pread(memory, MAX_RECORD_BYTES, 0), type=HostRecord)
     assert last.ended == "complete"
     assert last.armed_ticks == 75
     assert 0 < last.lost_ticks < 75
@@ -212,29 +245,29 @@ def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
     disk.should_continue.set()
 
 
-def test_without_a_folder_only_the_memory_knows(memory: int) -> None:
+def test_recorder_without_folder_writes_numbers_into_memory(memory: int) -> None:
     box = BlackBox(ROBOT)
-    with recorder(box, None, memory):
-        fill(box, 1, 2, 3)
-    assert remembered(memory) == Numbers(3, 3, "")
+    with make_writer(box, None, memory):
+        record_ticks(box, 1, 2, 3)
+    assert read_numbers_in_memory(memory) == RecordNumbers(3, 3, "")
 
 
-def test_numbers_are_written_although_the_disk_never_catches_up(
+def test_recorder_with_too_slow_disk_still_writes_numbers(
     tmp_path: Path, memory: int, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     box = BlackBox(ROBOT)
-    taken = disk.pwrite
+    write_to_disk = disk.pwrite
 
-    def slow(handle: int, content: bytes, offset: int) -> int:
+    def write_while_host_continues(handle: int, content: bytes, offset: int) -> int:
         if handle != memory:
-            fill(box, box.row_count)  # the host goes on meanwhile
-        return taken(handle, content, offset)
+            record_ticks(box, box.row_count)  # The host adds a row during each write.
+        return write_to_disk(handle, content, offset)
 
-    monkeypatch.setattr(under_test.os, "pwrite", slow)
-    with recorder(box, tmp_path, memory):
-        fill(box, 0)
+    monkeypatch.setattr(writer_module.os, "pwrite", write_while_host_continues)
+    with make_writer(box, tmp_path, memory):
+        record_ticks(box, 0)
         wait_until(
-            lambda: (tmp_path / HOST_RECORD).exists() and reported(tmp_path).ticks > 3,
+            lambda: (tmp_path / HOST_RECORD).exists() and read_numbers_on_disk(tmp_path).ticks > 3,
             "numbers",
             5.0,
         )

@@ -1,4 +1,7 @@
-"""Robot, router, workstation and laptop as four machines with rendered files: mTLS and access control between them."""
+"""A robot runs in lockstep across four machines that use the rendered files of a lab, with mTLS and access control.
+
+The machines are network namespaces: a hub with the router, the robot, a workstation and a laptop.
+"""
 
 import os
 import re
@@ -20,66 +23,74 @@ pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="network namespaces need root"),
 ]
 SCENARIO = ("triplet", "--clock-mode", "lockstep", "--duration", "1")
-LIMIT_S = 120.0
+STEP_TIMEOUT_S = 120.0  # for each step of the test, on a busy computer
+MIN_TICKS = 100  # control cycles of a complete run
 
 
 class Lab:
-    """The example lab, rendered, its machines and programs running."""
+    """The example lab with its rendered files, whose machines and programs are running."""
 
     def __init__(self, folder: Path, backend: str, stack: ExitStack) -> None:
         self.folder = folder
         self.machines = connect_machines(["hub", "robot1", "ws1", "laptop"], stack)
-        (folder / "lab.toml").write_text(example(folder, backend))
+        (folder / "lab.toml").write_text(format_lab_file(folder, backend))
         for step in ("certs", "render"):
-            self.at("hub", "lab", step, "lab.toml", "--out", ".")
+            self.run_snakesim("hub", "lab", step, "lab.toml", "--out", ".")
         scenario = (*SCENARIO, "--backend", backend)
-        self.start("hub", "router", "start", "router", str(folder / "hub" / "router.main.json5"))
+        self.start_snakesim(
+            "hub", "router", "start", "router", str(folder / "hub" / "router.main.json5")
+        )
         out = ("--end-after-duration", "--out", str(folder / "record"))
-        self.start(
+        self.start_snakesim(
             "robot1",
             "host",
             "start",
             "host",
             *scenario,
-            *self.session("robot1", "robot.planar13"),
+            *self.make_session_options("robot1", "robot.planar13"),
             *out,
         )
         for name in ("guidance", "navigation", "control"):
-            self.start(
+            self.start_snakesim(
                 "ws1",
                 name,
                 "start",
                 "service",
                 name,
                 *scenario,
-                *self.session("ws1", "gnc.planar13"),
+                *self.make_session_options("ws1", "gnc.planar13"),
             )
 
-    def at(self, machine: str, *arguments: str, check: bool = True) -> str:
-        """A `snakesim` command on one machine; what it says."""
-        state = {"XDG_STATE_HOME": str(self.folder / "state" / machine)}
+    def run_snakesim(self, machine: str, *arguments: str, check: bool = True) -> str:
+        """Run a `snakesim` command on one machine, and return its output."""
+        environment = {"XDG_STATE_HOME": str(self.folder / "state" / machine)}
         return self.machines[machine].run(
-            *SNAKESIM_COMMAND, *arguments, check=check, cwd=self.folder, env=state
+            *SNAKESIM_COMMAND, *arguments, check=check, cwd=self.folder, env=environment
         )
 
-    def start(self, machine: str, name: str, *arguments: str) -> None:
-        """A program of ours on one machine."""
-        state = {"XDG_STATE_HOME": str(self.folder / "state" / machine), "OMP_NUM_THREADS": "1"}
+    def start_snakesim(self, machine: str, name: str, *arguments: str) -> None:
+        """Start a `snakesim` program on one machine, with its output in `name`.log."""
+        environment = {
+            "XDG_STATE_HOME": str(self.folder / "state" / machine),
+            "OMP_NUM_THREADS": "1",
+        }
         self.machines[machine].start(
-            *SNAKESIM_COMMAND, *arguments, log=self.folder / f"{name}.log", env=state
+            *SNAKESIM_COMMAND, *arguments, log=self.folder / f"{name}.log", env=environment
         )
 
-    def session(self, machine: str, label: str) -> tuple[str, str]:
+    def make_session_options(self, machine: str, label: str) -> tuple[str, str]:
+        """Return the options that select a session file of a machine."""
         return "--session", str(self.folder / machine / f"{label}.json5")
 
-    def logs(self) -> str:
+    def read_logs(self) -> str:
+        """Return the end of each program's log."""
         return "\n".join(
             f"{path.name}: {path.read_text()[-800:]}" for path in self.folder.glob("*.log")
         )
 
 
-def example(folder: Path, backend: str) -> str:
-    """The example with its folders here, without the recorder."""
+def format_lab_file(folder: Path, backend: str) -> str:
+    """Return the example lab file without its recorder, with machine folders below `folder`."""
     text = re.sub(
         r"^\[machines\.(\w+)\]$",
         rf'\g<0>\nfolder = "{folder}/\1"',
@@ -92,52 +103,61 @@ def example(folder: Path, backend: str) -> str:
     )
 
 
-def until(lab: Lab, words: str, *arguments: str) -> None:
-    """Repeat an operator's command until it says these words."""
-    deadline = time.monotonic() + LIMIT_S
-    while words not in (said := lab.at("laptop", *arguments, check=False)):
-        assert time.monotonic() < deadline, f"{said}\n{lab.logs()}"
+def repeat_until_printed(lab: Lab, text: str, *arguments: str) -> None:
+    """Repeat a `snakesim` command on the laptop until its output contains a text."""
+    deadline_s = time.monotonic() + STEP_TIMEOUT_S
+    output = lab.run_snakesim("laptop", *arguments, check=False)
+    while text not in output:
+        assert time.monotonic() < deadline_s, f"{output}\n{lab.read_logs()}"
         time.sleep(0.2)
+        output = lab.run_snakesim("laptop", *arguments, check=False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["sim", pytest.param("can", marks=pytest.mark.slow)])
-def test_lockstep_across_four_machines_has_digest_of_one(tmp_path: Path, backend: str) -> None:
-    """With `can` the joints are emulated modules, on a bus in the host's memory.
+def test_lockstep_on_four_machines_has_digest_of_one_machine(tmp_path: Path, backend: str) -> None:
+    """The digest is the same although an intruder attacks with the certificate of a viewer.
 
-    Even while somebody with a viewer's certificate repeats, commands and answers whatever they can.
+    The intruder repeats messages, sends commands, and answers queries.
+    With `can`, the joints are emulated modules on a bus in the host's memory.
     """
     with ExitStack() as stack:
         lab = Lab(tmp_path, backend, stack)
-        operator, viewer = (
-            lab.session("laptop", "operator.planar13"),
-            lab.session("laptop", "viewer.planar13"),
-        )
-        until(lab, "next: `snakesim robot arm planar13", "status", *viewer)
-        checked = lab.at("hub", "lab", "check", "lab.toml", "--out", ".")
-        assert "all is as it should be" in checked, checked
+        operator = lab.make_session_options("laptop", "operator.planar13")
+        viewer = lab.make_session_options("laptop", "viewer.planar13")
+        repeat_until_printed(lab, "next: `snakesim robot arm planar13", "status", *viewer)
+        check_output = lab.run_snakesim("hub", "lab", "check", "lab.toml", "--out", ".")
+        assert "all is as it should be" in check_output, check_output
         lab.machines["laptop"].start_module(
             "snakesim_testing.lab.intruder", viewer[1], log=tmp_path / "intruder.log"
         )
-        refused = lab.at("laptop", "robot", "arm", "planar13", backend, *viewer, check=False)
-        assert "exit code 1" in refused, refused
-        until(lab, "planar13: armed", "robot", "arm", "planar13", backend, *operator)
-        record = finished(lab)
-        more = ("--in-process",) if backend == "sim" else ()
-        # By this machine alone.
-        lab.at("robot1", "run", *SCENARIO, "--backend", backend, "--out", "alone", *more)
-    assert record.command_digest == read_summary(tmp_path / "alone").command_digest, lab.logs()
-    did = (tmp_path / "intruder.log").read_text().splitlines()[-1]
-    assert re.fullmatch(r"\{'repeated': \d{3,}, 'commanded': \d{2,}\}", did), did
+        refusal = lab.run_snakesim(
+            "laptop", "robot", "arm", "planar13", backend, *viewer, check=False
+        )
+        assert "exit code 1" in refusal, refusal
+        repeat_until_printed(lab, "planar13: armed", "robot", "arm", "planar13", backend, *operator)
+        record = wait_for_host_record(lab)
+        # Repeat the run on one machine.
+        options = ("--in-process",) if backend == "sim" else ()
+        lab.run_snakesim(
+            "robot1", "run", *SCENARIO, "--backend", backend, "--out", "alone", *options
+        )
+    expected_digest = read_summary(tmp_path / "alone").command_digest
+    assert record.command_digest == expected_digest, lab.read_logs()
+    attack_counts = (tmp_path / "intruder.log").read_text().splitlines()[-1]
+    assert re.fullmatch(r"\{'repeated': \d{3,}, 'commanded': \d{2,}\}", attack_counts), (
+        attack_counts
+    )
 
 
-def finished(lab: Lab) -> HostRecord:
-    """The host's record, when it has ended."""
-    path, deadline = lab.folder / "record" / "host.json", time.monotonic() + LIMIT_S
+def wait_for_host_record(lab: Lab) -> HostRecord:
+    """Wait until the host has completed its run, and return its record."""
+    path = lab.folder / "record" / "host.json"
+    deadline_s = time.monotonic() + STEP_TIMEOUT_S
     while True:
         if path.is_file():
             record = msgspec.json.decode(path.read_bytes(), type=HostRecord)
-            if record.ended == "complete" and record.ticks >= 100:
+            if record.ended == "complete" and record.ticks >= MIN_TICKS:
                 return record
-        assert time.monotonic() < deadline, lab.logs()
+        assert time.monotonic() < deadline_s, lab.read_logs()
         time.sleep(0.1)

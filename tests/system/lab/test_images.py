@@ -1,4 +1,4 @@
-"""A camera's images behind a lab's router, over the connection of their own."""
+"""A lab's router forwards camera images from a robot to a viewer, over their own connection."""
 
 import json
 import time
@@ -15,36 +15,36 @@ from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.lab.small_lab import OWN_ROBOT, RunningLab
 
 KEY = keys.depth_key("head")
-# The largest that a robot may have: it is sent in many pieces, each of which waits for the one before it.
-SIZE = {"width": 1280, "height": 960, "depth": bytes(2 * 1280 * 960)}
-IMAGE = msgspec.convert({**make_plain_example(DepthImage), **SIZE, "tick": 1}, DepthImage)
+# The largest image that a robot may send. Zenoh sends it in many fragments, one after the other.
+MAX_SIZE = {"width": 1280, "height": 960, "depth": bytes(2 * 1280 * 960)}
+IMAGE = msgspec.convert({**make_plain_example(DepthImage), **MAX_SIZE, "tick": 1}, DepthImage)
 
 
-def link(lab: RunningLab, role: Role) -> ConnectionSettings:
-    """As a rendered session file says; only the router that runs."""
+def make_connection_settings(lab: RunningLab, role: Role) -> ConnectionSettings:
+    """Return the connection settings of a role's session file, with only the router that is running."""
     identity = lab.find_identity_by_role(role, OWN_ROBOT)
     path = lab.folder / f"{identity.common_name}.json5"
     path.write_text(json.dumps(lab.make_session_settings(identity, namespace=OWN_ROBOT)))
     return ConnectionSettings.from_session_file(read_session(path), OWN_ROBOT)
 
 
-def test_the_largest_image_arrives_and_a_viewer_can_send_none(lab: RunningLab) -> None:
-    viewer_link, robot_link = link(lab, Role.VIEWER), link(lab, Role.ROBOT)
-    with open_session(viewer_link) as viewer, open_session(robot_link) as robot:
-        reader, found = viewer.declare_reader(KEY, DepthImage), list[DepthImage]()
-        robots, viewers = (
-            robot.declare_publisher(KEY, DepthImage),
-            viewer.declare_publisher(KEY, DepthImage),
-        )
-        wait_until(robots.has_subscriber, "the viewer subscribes")
-        viewers.put(msgspec.structs.replace(IMAGE, tick=2))
+def test_largest_image_reaches_viewer_and_viewer_image_is_dropped(lab: RunningLab) -> None:
+    viewer_settings = make_connection_settings(lab, Role.VIEWER)
+    robot_settings = make_connection_settings(lab, Role.ROBOT)
+    with open_session(viewer_settings) as viewer, open_session(robot_settings) as robot:
+        reader = viewer.declare_reader(KEY, DepthImage)
+        received = list[DepthImage]()
+        robot_publisher = robot.declare_publisher(KEY, DepthImage)
+        viewer_publisher = viewer.declare_publisher(KEY, DepthImage)
+        wait_until(robot_publisher.has_subscriber, "the viewer subscribes")
+        viewer_publisher.put(msgspec.structs.replace(IMAGE, tick=2))
 
-        def arrived() -> bool:
-            robots.put(IMAGE)  # one that a busy router drops is not sent again
+        def send_and_receive() -> bool:
+            robot_publisher.put(IMAGE)  # Zenoh does not repeat an image that a busy router drops.
             time.sleep(0.1)
-            found.extend(reader.drain())
-            return bool(found)
+            received.extend(reader.drain())
+            return bool(received)
 
-        wait_until(arrived, "the image")
-        assert {image.tick for image in found} == {1}
-        assert found[0].depth == IMAGE.depth
+        wait_until(send_and_receive, "the image")
+        assert {image.tick for image in received} == {1}
+        assert received[0].depth == IMAGE.depth

@@ -1,4 +1,7 @@
-"""Who has no certificate, a wrong one, or a right one and wrong intentions: nothing of theirs passes the router."""
+"""The router drops all traffic of unauthorized clients and of authorized clients that exceed their rights.
+
+The tests connect without a certificate, with an invalid one, or with a valid one of the wrong role.
+"""
 
 import contextlib
 import itertools
@@ -28,28 +31,40 @@ from snakesim_operator.features.lab.identities import CertificateIdentity
 from snakesim_testing.lab.router_waits import eventually, settle
 from snakesim_testing.lab.small_lab import OTHER_ROBOT, OWN_ROBOT, RunningLab, open_zenoh_session
 
-COMMAND = f"{OWN_ROBOT}/actuator/joints"
+COMMAND_KEY = f"{OWN_ROBOT}/actuator/joints"
+CONNECT_TIMEOUT_MS = 400
+MAX_PAYLOAD_BYTES = 65536  # of a joint command, as the rules of the router limit it
+MAX_REPEATED_LOG_LINES = 5  # a refusal that happens 100 times is logged fewer times
+SHORT_LIFE_S = 2  # validity of a certificate that expires during a test
 
 
-def with_certificate(
+def make_settings_with_certificate(
     lab: RunningLab,
     folder: Path,
-    who: CertificateIdentity,
+    identity: CertificateIdentity,
     issuer: CertificateIssuer,
     life: timedelta,
 ) -> dict[str, Any]:
-    """Settings of a session with a certificate that the lab did not make."""
-    certificate, key = issue_certificate(issuer, who, lab.lab, life)
+    """Return session settings with a new certificate.
+
+    Args:
+        lab: The lab whose router the session connects to.
+        folder: Receives the certificate and its private key.
+        identity: Whom the certificate names.
+        issuer: Who signs the certificate.
+        life: How long the certificate is valid.
+    """
+    certificate, key = issue_certificate(issuer, identity, lab.lab, life)
     (folder / "own.pem").write_bytes(certificate)
     (folder / "own.key").write_bytes(key)
-    settings = lab.make_session_settings(who)
+    settings = lab.make_session_settings(identity)
     settings["transport"]["link"]["tls"].update(
         connect_certificate=str(folder / "own.pem"), connect_private_key=str(folder / "own.key")
     )
     return settings
 
 
-REASONS = {  # in the words of the router's log
+LOGGED_REASONS = {  # text in the router's log, by the flaw of the certificate
     "another authority": "invalid peer certificate: BadSignature",
     "signed by a role": "invalid peer certificate: UnknownIssuer",
     "expired": "invalid peer certificate: certificate expired",
@@ -58,112 +73,112 @@ REASONS = {  # in the words of the router's log
 }
 
 
-@pytest.mark.parametrize("flaw", REASONS)
-def test_without_a_valid_certificate_nobody_is_let_in(
+@pytest.mark.parametrize("flaw", LOGGED_REASONS)
+def test_router_without_valid_certificate_refuses_connection(
     lab: RunningLab, tmp_path: Path, flaw: str
 ) -> None:
-    who, day = lab.find_identity_by_role(Role.GNC, OWN_ROBOT), timedelta(days=1)
-    own = load_or_create_authority(lab.folder / "authority", lab.lab)
+    identity = lab.find_identity_by_role(Role.GNC, OWN_ROBOT)
+    day = timedelta(days=1)
+    authority = load_or_create_authority(lab.folder / "authority", lab.lab)
     if flaw == "another authority":
-        settings = with_certificate(
-            lab, tmp_path, who, load_or_create_authority(tmp_path / "foreign", lab.lab), day
-        )
+        foreign_authority = load_or_create_authority(tmp_path / "foreign", lab.lab)
+        settings = make_settings_with_certificate(lab, tmp_path, identity, foreign_authority, day)
     elif flaw == "signed by a role":
-        settings = with_certificate(lab, tmp_path, who, role_as_issuer(lab, own), day)
+        settings = make_settings_with_certificate(
+            lab, tmp_path, identity, make_issuer_from_role(lab, authority), day
+        )
     elif flaw == "expired":
-        settings = with_certificate(lab, tmp_path, who, own, timedelta(seconds=-5))
+        settings = make_settings_with_certificate(
+            lab, tmp_path, identity, authority, timedelta(seconds=-5)
+        )
     else:
-        settings = lab.make_session_settings(who)
+        settings = lab.make_session_settings(identity)
         tls = settings["transport"]["link"]["tls"]
         settings["transport"]["link"]["tls"] = {"root_ca_certificate": tls["root_ca_certificate"]}
         if flaw == "plain tcp":
             settings["transport"]["link"]["protocols"] = ["tcp"]
             settings["connect"]["endpoints"] = [lab.lab.list_endpoints()[0].replace("tls/", "tcp/")]
-    settings["connect"]["timeout_ms"] = 400
+    settings["connect"]["timeout_ms"] = CONNECT_TIMEOUT_MS
     with pytest.raises(zenoh.ZError):
         open_zenoh_session(settings).close()
-    assert_told(lab, REASONS[flaw])
+    assert_logged(lab, LOGGED_REASONS[flaw])
 
 
-def role_as_issuer(lab: RunningLab, own: CertificateIssuer) -> CertificateIssuer:
-    """Somebody who signs with the certificate of a role."""
+def make_issuer_from_role(lab: RunningLab, authority: CertificateIssuer) -> CertificateIssuer:
+    """Return an issuer that signs with the certificate of a viewer instead of an authority."""
     certificate, key = issue_certificate(
-        own, lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT), lab.lab
+        authority, lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT), lab.lab
     )
-    private: Any = load_pem_private_key(key, None)
-    return CertificateIssuer(x509.load_pem_x509_certificate(certificate), private)
+    private_key: Any = load_pem_private_key(key, None)
+    return CertificateIssuer(x509.load_pem_x509_certificate(certificate), private_key)
 
 
-def test_who_was_taken_out_of_the_lab_file_is_nobody(lab: RunningLab, tmp_path: Path) -> None:
-    """Their certificate is still valid, but no rule names it."""
-    own = load_or_create_authority(lab.folder / "authority", lab.lab)
+def test_identity_removed_from_lab_file_cannot_send_commands(
+    lab: RunningLab, tmp_path: Path
+) -> None:
+    """The certificate of the removed identity is still valid, but no rule names it."""
+    authority = load_or_create_authority(lab.folder / "authority", lab.lab)
     former = replace(lab.find_identity_by_role(Role.GNC, OWN_ROBOT), machine="laptop")
-    settings = with_certificate(lab, tmp_path, former, own, timedelta(days=1))
-    assert passed(lab, settings, "command") == []
-    assert_told(lab, f"refused: {former.common_name} from 127.0.0.1")
+    settings = make_settings_with_certificate(lab, tmp_path, former, authority, timedelta(days=1))
+    assert send_command(lab, settings, "command") == []
+    assert_logged(lab, f"refused: {former.common_name} from 127.0.0.1")
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
-def test_intruder_peer_or_router_has_rights_of_its_certificate(lab: RunningLab, mode: str) -> None:
-    assert (
-        passed(
-            lab,
-            lab.make_session_settings(lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT), mode=mode),
-            "command",
-        )
-        == []
-    )
-    assert passed(
-        lab,
-        lab.make_session_settings(lab.find_identity_by_role(Role.GNC, OWN_ROBOT), mode=mode),
-        "command",
-    ) == ["command"]
+def test_peer_or_router_session_has_rights_of_its_certificate(lab: RunningLab, mode: str) -> None:
+    viewer = lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT)
+    gnc = lab.find_identity_by_role(Role.GNC, OWN_ROBOT)
+    viewer_settings = lab.make_session_settings(viewer, mode=mode)
+    gnc_settings = lab.make_session_settings(gnc, mode=mode)
+    assert send_command(lab, viewer_settings, "command") == []
+    assert send_command(lab, gnc_settings, "command") == ["command"]
 
 
-def test_no_session_can_be_reached_around_the_router(lab: RunningLab) -> None:
-    """The robot's session listens nowhere, so nobody connects to it but through the router."""
-    before = listening()
+def test_robot_session_listens_on_no_port(lab: RunningLab) -> None:
+    """The robot's session listens on no port, so that clients reach it only through the router."""
+    before = list_listening_addresses()
     with lab.open_session(lab.find_identity_by_role(Role.ROBOT, OWN_ROBOT)):
-        assert listening() == before
+        assert list_listening_addresses() == before
 
 
-def test_a_longer_message_than_the_key_can_have_is_dropped(lab: RunningLab) -> None:
+def test_message_longer_than_key_allows_is_dropped(lab: RunningLab) -> None:
     settings = lab.make_session_settings(lab.find_identity_by_role(Role.GNC, OWN_ROBOT))
-    assert passed(lab, settings, "x" * 65536) == ["x" * 65536]
-    assert passed(lab, settings, "x" * 65537) == []
+    longest = "x" * MAX_PAYLOAD_BYTES
+    assert send_command(lab, settings, longest) == [longest]
+    assert send_command(lab, settings, longest + "x") == []
 
 
-def test_bytes_that_are_sent_again_command_nothing(lab: RunningLab) -> None:
-    """An eavesdropper repeats, byte by byte, what the controller sent to the router."""
+def test_replayed_connection_bytes_send_no_command(lab: RunningLab) -> None:
+    """An eavesdropper repeats byte by byte what the controller sent to the router."""
     host, port = lab.lab.list_endpoints()[0].removeprefix("tls/").split(":")
     settings = lab.make_session_settings(lab.find_identity_by_role(Role.GNC, OWN_ROBOT))
-    with socket.create_server(("127.0.0.1", 0)) as tap:
-        settings["connect"]["endpoints"] = [f"tls/127.0.0.1:{tap.getsockname()[1]}"]
+    with socket.create_server(("127.0.0.1", 0)) as relay_socket:
+        settings["connect"]["endpoints"] = [f"tls/127.0.0.1:{relay_socket.getsockname()[1]}"]
         sent = bytearray()
-        threading.Thread(target=relay, args=(tap, (host, int(port)), sent), daemon=True).start()
-        assert passed(lab, settings, "command") == ["command"]
+        threading.Thread(
+            target=relay_one_connection, args=(relay_socket, (host, int(port)), sent), daemon=True
+        ).start()
+        assert send_command(lab, settings, "command") == ["command"]
     assert len(sent) > 1000
     with lab.open_session(lab.find_identity_by_name("router.spare.hub")) as witness:
-        heard: list[str] = []
-        _kept = witness.declare_subscriber(
-            "**", lambda sample: heard.append(sample.payload.to_string())
+        received: list[str] = []
+        _subscriber = witness.declare_subscriber(
+            "**", lambda sample: received.append(sample.payload.to_string())
         )
         settle(witness)
-        with socket.create_connection((host, int(port))) as again:
-            again.sendall(sent)
-            again.settimeout(1.0)
-            while again.recv(65536):  # until the router hangs up
+        with socket.create_connection((host, int(port))) as connection:
+            connection.sendall(sent)
+            connection.settimeout(1.0)
+            while connection.recv(65536):  # until the router closes the connection
                 pass
         settle(witness)
-    assert heard == []
+    assert received == []
 
 
-def test_a_role_cannot_pose_as_the_router(lab: RunningLab) -> None:
-    """A viewer's certificate at the router's address: nobody gives it a command."""
-    viewer, gnc = (
-        lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT),
-        lab.find_identity_by_role(Role.GNC, OWN_ROBOT),
-    )
+def test_router_with_certificate_of_a_role_gets_no_connection(lab: RunningLab) -> None:
+    """A controller does not connect to a router that has the certificate of a viewer."""
+    viewer = lab.find_identity_by_role(Role.VIEWER, OWN_ROBOT)
+    gnc = lab.find_identity_by_role(Role.GNC, OWN_ROBOT)
     endpoint = f"tls/127.0.0.1:{find_free_port()}"
     settings = lab.make_session_settings(
         viewer, mode="router", listen={"endpoints": [endpoint]}, connect={"endpoints": []}
@@ -173,107 +188,119 @@ def test_a_role_cannot_pose_as_the_router(lab: RunningLab) -> None:
         listen_certificate=tls["connect_certificate"], listen_private_key=tls["connect_private_key"]
     )
     with open_zenoh_session(settings), pytest.raises(zenoh.ZError):
-        lab.open_session(gnc, connect={"endpoints": [endpoint], "timeout_ms": 400}).close()
+        lab.open_session(
+            gnc, connect={"endpoints": [endpoint], "timeout_ms": CONNECT_TIMEOUT_MS}
+        ).close()
 
 
-def test_router_log_states_only_who_joined_and_what_was_refused(lab: RunningLab) -> None:
-    """Once a line, however often it happens; what nobody asked for is not in it."""
-    who = lab.find_identity_by_role(Role.ADMINISTRATOR, OTHER_ROBOT)
-    with lab.open_session(who) as session:
+def test_router_log_contains_only_admissions_and_refusals(lab: RunningLab) -> None:
+    """A refusal that happens often has few lines, and messages that the client did not send have none."""
+    administrator = lab.find_identity_by_role(Role.ADMINISTRATOR, OTHER_ROBOT)
+    with lab.open_session(administrator) as session:
         for _ in range(100):
-            session.put(COMMAND, "x")
+            session.put(COMMAND_KEY, "x")
         session.get(f"{OWN_ROBOT}/hal/lifecycle", timeout=0.2)
         settle(session)
-    assert_told(lab, f"let in: {who.common_name} from 127.0.0.1")
-    for what in (f"Put (ingress) on {COMMAND}", f"Query (ingress) on {OWN_ROBOT}/hal/lifecycle"):
-        assert_told(lab, f"refused: {who.common_name}: {what}")
-    own = [
-        line
-        for line in lab.read_router_log()
-        if who.common_name in line and " on unused/key" not in line
+    name = administrator.common_name
+    assert_logged(lab, f"let in: {name} from 127.0.0.1")
+    assert_logged(lab, f"refused: {name}: Put (ingress) on {COMMAND_KEY}")
+    assert_logged(lab, f"refused: {name}: Query (ingress) on {OWN_ROBOT}/hal/lifecycle")
+    lines = [
+        line for line in lab.read_router_log() if name in line and " on unused/key" not in line
     ]
-    assert len([line for line in own if "Put (ingress)" in line]) < 5
-    assert not [line for line in own if "Reply" in line or "Delete" in line]
+    assert len([line for line in lines if "Put (ingress)" in line]) < MAX_REPEATED_LOG_LINES
+    assert not [line for line in lines if "Reply" in line or "Delete" in line]
 
 
-def assert_told(lab: RunningLab, what: str) -> None:
-    """The router's log has it, at the latest in a moment."""
-    eventually(lambda: any(what in line for line in lab.read_router_log()), True)
+def assert_logged(lab: RunningLab, text: str) -> None:
+    """Wait until a line of the router's log contains a text."""
+    eventually(lambda: any(text in line for line in lab.read_router_log()), True)
 
 
-def passed(lab: RunningLab, settings: dict[str, Any], command: str) -> list[str]:
-    """What the robot hears when a session with these settings puts a command."""
-    heard: list[str] = []
+def send_command(lab: RunningLab, settings: dict[str, Any], command: str) -> list[str]:
+    """Put a command with a session of these settings, and return the payloads that reach the robot."""
+    received: list[str] = []
     with lab.open_session(lab.find_identity_by_role(Role.ROBOT, OWN_ROBOT)) as robot:
-        _kept = robot.declare_subscriber(
-            COMMAND, lambda sample: heard.append(sample.payload.to_string())
+        _subscriber = robot.declare_subscriber(
+            COMMAND_KEY, lambda sample: received.append(sample.payload.to_string())
         )
         settle(robot)
         with open_zenoh_session(settings) as session:
             settle(session)
-            session.put(COMMAND, command)
+            session.put(COMMAND_KEY, command)
             settle(session, robot)
-    return heard
+    return received
 
 
-def listening() -> set[tuple[str, int]]:
-    """Where somebody could connect to this process by TCP."""
+def list_listening_addresses() -> set[tuple[str, int]]:
+    """Return the TCP addresses on which this process accepts connections."""
     sockets = psutil.Process().net_connections("tcp")
     return {socket.laddr for socket in sockets if socket.status == psutil.CONN_LISTEN}
 
 
-def relay(tap: socket.socket, router: tuple[str, int], sent: bytearray) -> None:
-    """Pass one connection on, and keep what the client sent."""
-    client, _ = tap.accept()
-    onward = socket.create_connection(router)
+def relay_one_connection(
+    relay_socket: socket.socket, router_address: tuple[str, int], sent: bytearray
+) -> None:
+    """Relay one connection to the router, and append the bytes of the client to `sent`."""
+    client, _ = relay_socket.accept()
+    router = socket.create_connection(router_address)
 
     def relay_answers() -> None:
         with contextlib.suppress(ConnectionError):
-            while piece := onward.recv(65536):
+            while piece := router.recv(65536):
                 client.sendall(piece)
         with contextlib.suppress(OSError):  # The client is gone, too.
-            # This ends the receive below. Closing would take its descriptor away.
+            # A shutdown ends the `recv` below. Closing would make its descriptor invalid.
             client.shutdown(socket.SHUT_RDWR)
 
     answers = threading.Thread(target=relay_answers, daemon=True)
-    with client, onward:
+    with client, router:
         answers.start()
         with contextlib.suppress(ConnectionError):
             while piece := client.recv(65536):
                 sent += piece
-                onward.sendall(piece)
+                router.sendall(piece)
         with contextlib.suppress(OSError):  # The router is gone, too.
-            onward.shutdown(socket.SHUT_RDWR)
+            router.shutdown(socket.SHUT_RDWR)
         answers.join()
 
 
-def test_renewed_certificate_continues_and_expired_one_is_excluded(
+def test_session_with_renewed_certificate_continues_and_expired_one_ends(
     lab: RunningLab, tmp_path: Path
 ) -> None:
-    """A session with a short certificate connects again by itself when it is renewed on the disk; otherwise it ends."""
-    own, life = load_or_create_authority(lab.folder / "authority", lab.lab), timedelta(seconds=2)
-    heard: dict[str, list[float]] = {"renewed": [], "ended": []}
-    for name in heard:
+    """A session reconnects by itself if its short-lived certificate was renewed on disk; otherwise it ends."""
+    authority = load_or_create_authority(lab.folder / "authority", lab.lab)
+    life = timedelta(seconds=SHORT_LIFE_S)
+    arrival_times_s: dict[str, list[float]] = {"renewed": [], "ended": []}
+    for name in arrival_times_s:
         (tmp_path / name).mkdir()
-    who = lab.find_identity_by_role(Role.GNC, OWN_ROBOT)
-    settings = {name: with_certificate(lab, tmp_path / name, who, own, life) for name in heard}
+    identity = lab.find_identity_by_role(Role.GNC, OWN_ROBOT)
+    settings = {
+        name: make_settings_with_certificate(lab, tmp_path / name, identity, authority, life)
+        for name in arrival_times_s
+    }
     with (
         lab.open_session(lab.find_identity_by_role(Role.ROBOT, OWN_ROBOT)) as robot,
-        ExitStack() as held,
+        ExitStack() as stack,
     ):
-        sessions = {name: held.enter_context(open_zenoh_session(settings[name])) for name in heard}
-        with_certificate(lab, tmp_path / "renewed", who, own, timedelta(days=1))
+        sessions = {
+            name: stack.enter_context(open_zenoh_session(settings[name]))
+            for name in arrival_times_s
+        }
+        make_settings_with_certificate(
+            lab, tmp_path / "renewed", identity, authority, timedelta(days=1)
+        )
 
-        def take(sample: zenoh.Sample) -> None:
-            heard[sample.payload.to_string()].append(time.monotonic())
+        def record_arrival(sample: zenoh.Sample) -> None:
+            arrival_times_s[sample.payload.to_string()].append(time.monotonic())
 
-        _kept = robot.declare_subscriber(COMMAND, take)
-        began = time.monotonic()
-        while time.monotonic() < began + 4.0:
+        _subscriber = robot.declare_subscriber(COMMAND_KEY, record_arrival)
+        start_s = time.monotonic()
+        while time.monotonic() < start_s + 4.0:
             for name, session in sessions.items():
-                session.put(COMMAND, name)
+                session.put(COMMAND_KEY, name)
             time.sleep(0.005)
-    assert heard["ended"][-1] < began + 2.5
-    assert heard["renewed"][-1] > began + 3.5
-    gaps = [after - before for before, after in itertools.pairwise(heard["renewed"])]
-    print(f"the longest gap of a session that connects again: {1e3 * max(gaps):.0f} ms")
+    assert arrival_times_s["ended"][-1] < start_s + 2.5
+    assert arrival_times_s["renewed"][-1] > start_s + 3.5
+    gaps_s = [later - earlier for earlier, later in itertools.pairwise(arrival_times_s["renewed"])]
+    print(f"longest gap of a session that reconnects: {1e3 * max(gaps_s):.0f} ms")

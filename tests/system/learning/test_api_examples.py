@@ -1,4 +1,4 @@
-"""The examples of the Python API that run a scenario, and the one in the docstring of `Controller`."""
+"""The examples of the Python API and of the docstring of `Controller` run without errors."""
 
 import subprocess
 import sys
@@ -10,21 +10,24 @@ import pytest
 import snakesim
 from docs.site.api_contents import PAGES, Page
 
-RUNS = [page for page in PAGES if "snakesim.run" in page.example or "gymnasium" in page.example]
+PAGES_THAT_RUN = [
+    page for page in PAGES if "snakesim.run" in page.example or "gymnasium" in page.example
+]
 
 
-@pytest.mark.parametrize("page", RUNS, ids=lambda page: page.file)
-def test_the_example_runs(page: Page, tmp_path: Path) -> None:
+@pytest.mark.parametrize("page", PAGES_THAT_RUN, ids=lambda page: page.file)
+def test_api_page_example_runs(page: Page, tmp_path: Path) -> None:
     program = tmp_path / "example.py"
     program.write_text(page.example, encoding="utf-8")
-    ended = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, program], cwd=tmp_path, capture_output=True, text=True, timeout=120
     )
-    assert ended.returncode == 0, ended.stderr
+    assert completed.returncode == 0, completed.stderr
 
 
-def test_the_controller_of_the_docstring_runs(tmp_path: Path) -> None:
-    _, _, rest = (snakesim.Controller.__doc__ or "").partition("with one parameter:\n")
+def test_controller_docstring_example_runs(tmp_path: Path) -> None:
+    docstring = snakesim.Controller.__doc__ or ""
+    _, _, rest = docstring.partition("with one parameter:\n")
     program = tmp_path / "swing.py"
     code = textwrap.dedent(rest.partition("Run it with")[0])
     program.write_text(f"import math\n\nimport snakesim\n{code}", encoding="utf-8")

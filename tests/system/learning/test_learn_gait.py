@@ -1,4 +1,4 @@
-"""The recipe in examples/learning: a wave, its corrections by PPO, and policy files that drive the robot by the HAL."""
+"""The programs in examples/learning tune a wave, learn corrections with PPO, and write policies that drive a robot."""
 
 import csv
 import importlib
@@ -28,14 +28,14 @@ WAVE = {
     "steering": 0.1,
     "head_steering": 0.05,
 }
-SHORT_S = 0.2  # of an episode
+SHORT_S = 0.2  # duration of an episode
 SHORT_TICKS = 20
 SEED = 7
 MISSING = "the recipe needs `pip install stable-baselines3 tensorboard onnxscript`"
 
 
 @pytest.fixture(autouse=True)
-def _find_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+def _add_examples_to_path(monkeypatch: pytest.MonkeyPatch) -> None:
     """Find the modules of the recipe, as Python does when one of its programs is started."""
     monkeypatch.syspath_prepend(EXAMPLE)
 
@@ -60,7 +60,7 @@ def wave_file(tmp_path: Path) -> Path:
     return tmp_path / "wave.onnx"
 
 
-def test_actions_of_zero_leave_the_wave_as_it_is(task: Any, wave_file: Path) -> None:
+def test_wave_correction_with_zero_action_changes_nothing(task: Any, wave_file: Path) -> None:
     correction = importlib.import_module("wave_correction")
     wave = task.load_wave(str(wave_file))
     plain = task.make_environments(2)
@@ -68,14 +68,14 @@ def test_actions_of_zero_leave_the_wave_as_it_is(task: Any, wave_file: Path) -> 
     observations, _ = plain.reset(seed=SEED)
     assert np.array_equal(corrected.reset(seed=SEED)[0], observations)
     no_correction = np.zeros(corrected.action_space.shape, dtype=np.float32)
-    for _ in range(SHORT_TICKS + 2):  # into the next episode
+    for _ in range(SHORT_TICKS + 2):  # The last steps belong to the next episode.
         observations, rewards, *_ = plain.step(wave.compute_targets(observations))
         corrected_observations, corrected_rewards, *_ = corrected.step(no_correction)
         assert np.array_equal(corrected_observations, observations)
         assert np.array_equal(corrected_rewards, rewards)
 
 
-def test_an_action_bends_the_body_in_a_smooth_shape() -> None:
+def test_wave_correction_shapes_are_smooth_along_the_body() -> None:
     correction = importlib.import_module("wave_correction")
     shapes_rad = correction.make_shapes_rad(13)
     assert shapes_rad.shape == (correction.SHAPE_COUNT, 13)
@@ -84,16 +84,18 @@ def test_an_action_bends_the_body_in_a_smooth_shape() -> None:
     assert sign_changes.tolist() == list(range(1, correction.SHAPE_COUNT))
 
 
-def test_measured_gait_counts_one_whole_episode_of_each_seed(task: Any, wave_file: Path) -> None:
+def test_measured_policy_has_one_episode_of_each_seed(task: Any, wave_file: Path) -> None:
     result = task.measure_policy(str(wave_file), SEED, 3)
     with EpisodeRunner(task.ENVIRONMENT, worker_count=1) as runner:
         (episodes,) = runner.run([WAVE], range(SEED, SEED + 3))
-    # Not to the bit: onnxruntime rounds a sine in other ways than NumPy.
+    # The numbers differ slightly, because onnxruntime rounds a sine in other ways than NumPy.
     assert np.allclose(result.advance_m, [episode.advance_m for episode in episodes], atol=1e-6)
     assert np.allclose(result.energy_j, [episode.energy_j for episode in episodes], rtol=1e-4)
 
 
-def test_tuned_serpenoid_stays_within_its_energy_budget(task: Any, tmp_path: Path) -> None:
+def test_tuned_serpenoid_with_smaller_energy_budget_uses_less_energy(
+    task: Any, tmp_path: Path
+) -> None:
     tuning = importlib.import_module("tune_serpenoid")
     generations = 3
     ticks = generations * tuning.POPULATION * tuning.EPISODES_PER_WAVE * SHORT_TICKS
@@ -113,7 +115,7 @@ def adapter() -> ModuleType:
     return importlib.import_module("batch_vec_env")
 
 
-def test_adapter_hands_over_the_last_observation_of_an_episode(adapter: Any, task: Any) -> None:
+def test_adapter_at_episode_end_returns_its_last_observation(adapter: Any, task: Any) -> None:
     plain = task.make_environments(2)
     env = adapter.BatchVecEnv(task.make_environments(2))
     env.seed(SEED)
@@ -124,8 +126,8 @@ def test_adapter_hands_over_the_last_observation_of_an_episode(adapter: Any, tas
     def compare_step() -> tuple[Any, list[dict[str, Any]], dict[str, Any]]:
         """Step both, and return the ends, the infos of the adapter, and those of the environments."""
         observations, rewards, _, _, infos = plain.step(actions)
-        adapted, adapted_rewards, is_over, adapted_infos = env.step(actions)
-        assert np.array_equal(adapted, observations)
+        adapted_observations, adapted_rewards, is_over, adapted_infos = env.step(actions)
+        assert np.array_equal(adapted_observations, observations)
         assert np.allclose(adapted_rewards, rewards)
         return is_over, adapted_infos, infos
 
@@ -136,19 +138,19 @@ def test_adapter_hands_over_the_last_observation_of_an_episode(adapter: Any, tas
     is_over, adapted_infos, infos = compare_step()
     assert is_over.all()
     assert infos["time_s"].tolist() == [0.0, 0.0], "the next episodes have begun"
-    time = OBSERVE.index("time_s")
+    time_index = OBSERVE.index("time_s")
     for row, info in enumerate(adapted_infos):
         assert np.array_equal(info["terminal_observation"], infos["final_obs"][row])
-        assert info["terminal_observation"][time] == pytest.approx(SHORT_S)
+        assert info["terminal_observation"][time_index] == pytest.approx(SHORT_S)
         assert info["TimeLimit.truncated"] is True
 
 
-def test_adapter_reports_no_time_limit_if_a_fault_stops_the_robot(adapter: Any) -> None:
+def test_adapter_after_fault_reports_no_time_limit(adapter: Any) -> None:
     arguments = {"scenario": "triplet", "set": {"faults": ["nan:joint_3@0.1"]}}
     env = adapter.BatchVecEnv(SnakeVectorEnv(1, autoreset_mode="SameStep", **arguments))
     env.reset()
     actions = np.zeros((1, *env.action_space.shape), dtype=np.float32)
-    for _ in range(20):  # of 50 ms
+    for _ in range(20):  # steps of 50 ms
         _, _, is_over, infos = env.step(actions)
         if is_over[0]:
             assert infos[0]["TimeLimit.truncated"] is False
@@ -156,14 +158,16 @@ def test_adapter_reports_no_time_limit_if_a_fault_stops_the_robot(adapter: Any) 
     pytest.fail("the fault has not stopped the robot")
 
 
-def test_adapter_needs_environments_that_reset_in_the_same_step(adapter: Any) -> None:
+def test_adapter_of_environments_with_next_step_reset_is_refused(adapter: Any) -> None:
     with pytest.raises(ValueError, match="NextStep"):
         adapter.BatchVecEnv(SnakeVectorEnv(1, scenario="triplet"))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_training_resumes_and_its_policy_drives_the_robot(wave_file: Path, tmp_path: Path) -> None:
+def test_ppo_training_resumes_and_its_policy_drives_the_robot(
+    wave_file: Path, tmp_path: Path
+) -> None:
     for package in ("stable_baselines3", "tensorboard", "onnxscript"):
         pytest.importorskip(package, reason=MISSING)
     out = tmp_path / "ppo"
@@ -181,7 +185,7 @@ def test_training_resumes_and_its_policy_drives_the_robot(wave_file: Path, tmp_p
     assert processor_s == sorted(processor_s)
     assert len(list((tmp_path / "log").rglob("events.out.tfevents.*"))) == 2
 
-    # The same bits in the environment and as a controller of the HAL.
+    # The policy computes the same bits in the environment and as a controller of the HAL.
     policy = out / "policy.onnx"
     env = SnakeEnv("scales", observe=OBSERVE, frame_skip=1, duration=1.0)
     model = PolicyModel(env.description, str(policy))
@@ -210,5 +214,5 @@ def test_exported_policy_computes_the_corrected_wave(wave_file: Path, tmp_path: 
     random = np.random.default_rng(SEED)
     observations = random.normal(size=(20, len(env.observation_names))).astype(np.float32)
     targets_rad = network.CorrectedWave(policy, wave).compute_targets_rad(observations)
-    assert np.allclose([model(one) for one in observations], targets_rad, atol=1e-4)
+    assert np.allclose([model(observation) for observation in observations], targets_rad, atol=1e-4)
     assert not np.allclose(targets_rad, wave.compute_targets(observations), atol=0.1)

@@ -1,4 +1,4 @@
-"""`import snakesim`: runs from a program, with what it gives as a controller, and what comes of them."""
+"""The Python API runs scenarios with functions, classes and files as controllers, and returns their signals."""
 
 import gc
 import importlib.util
@@ -30,24 +30,28 @@ needs_pandas = pytest.mark.skipif(
 )
 
 
-def wave(time_s, joints):
+def compute_wave_rad(time_s, joints):
+    """Return the joint angles of a wave whose amplitude grows in the first second."""
+    amplitude_rad = 0.2 * min(time_s, 1.0)
     return [
-        0.2 * min(time_s, 1.0) * np.sin(3 * time_s - 0.9 * i) for i in range(len(joints.angle_rad))
+        amplitude_rad * np.sin(3 * time_s - 0.9 * joint) for joint in range(len(joints.angle_rad))
     ]
 
 
-class Nod(snakesim.Controller):
+class ConstantAngle(snakesim.Controller):
+    """A controller that bends every joint by the same parameter."""
+
     needs_world = False
 
     class Parameters(snakesim.Parameters, frozen=True):
-        by_rad: float = 0.0
+        angle_rad: float = 0.0
 
     def update(self, observation):
-        angles_rad = [self.parameters.by_rad] * len(self.robot.joints)
+        angles_rad = [self.parameters.angle_rad] * len(self.robot.joints)
         return snakesim.ControllerCommand(snakesim.make_position_setpoints(self.robot, angles_rad))
 
 
-FAILING = """\
+FAILING_CONTROLLER = """\
 import numpy as np
 from snakesim_gnc.control.hold import HoldPose
 
@@ -60,17 +64,18 @@ class Failing(HoldPose):
 
 @pytest.fixture(scope="module")
 def result() -> snakesim.Result:
+    """Return the result of a run of one second."""
     return snakesim.run("triplet", duration=1)
 
 
-def test_a_run_is_that_of_the_command(result: snakesim.Result) -> None:
-    same = simulate(load_scenario("triplet", [parse_set_option("duration_s=1")]).config)
-    assert result.digest == same.summary.command_digest
+def test_run_has_digest_and_metrics_of_the_command(result: snakesim.Result) -> None:
+    expected = simulate(load_scenario("triplet", [parse_set_option("duration_s=1")]).config)
+    assert result.digest == expected.summary.command_digest
     assert result.complete
-    assert result.metrics["path_distance_m"] == same.summary.path_distance_m
+    assert result.metrics["path_distance_m"] == expected.summary.path_distance_m
 
 
-def test_signals_have_names_units_and_time(result: snakesim.Result) -> None:
+def test_result_signals_have_names_units_and_time(result: snakesim.Result) -> None:
     assert result["angle_rad"].shape == (100, 13)
     assert result.time_s.shape == (100,)
     assert np.array_equal(
@@ -84,57 +89,59 @@ def test_signals_have_names_units_and_time(result: snakesim.Result) -> None:
         result["angle_rd"]
 
 
-def test_a_function_is_a_controller() -> (
-    None
-):  # a lambda, too: tests/system/learning/test_environments.py
-    found = snakesim.run("triplet", controller=wave, duration=1)
-    assert found.complete
-    assert found.summary.controller.startswith("program:")
-    assert np.ptp(found["target.joint_5"]) > 0.1
+def test_run_with_function_uses_it_as_controller() -> None:
+    run = snakesim.run("triplet", controller=compute_wave_rad, duration=1)
+    assert run.complete
+    assert run.summary.controller.startswith("program:")
+    assert np.ptp(run["target.joint_5"]) > 0.1
 
 
-def test_a_class_is_a_controller_and_takes_parameters() -> None:
-    found = snakesim.run(
-        "triplet", controller=Nod, duration=1, set={"control.by_rad": np.float64(0.3)}
+def test_run_with_class_uses_it_and_its_parameters() -> None:
+    run = snakesim.run(
+        "triplet", controller=ConstantAngle, duration=1, set={"control.angle_rad": np.float64(0.3)}
     )
-    assert found["target.joint_5"][-1] == 0.3
-    with raises_error(snakesim.ConfigError, code="config/unknown-key", field="control.by_rd"):
-        snakesim.run("triplet", controller=Nod, set={"control.by_rd": 1})
+    assert run["target.joint_5"][-1] == 0.3
+    with raises_error(snakesim.ConfigError, code="config/unknown-key", field="control.angle_rd"):
+        snakesim.run("triplet", controller=ConstantAngle, set={"control.angle_rd": 1})
 
 
-class Growing(Nod):
+class GrowingTelemetry(ConstantAngle):
+    """A controller with a custom telemetry value that grows with time."""
+
     def update(self, observation):
         command = super().update(observation)
         telemetry = snakesim.Telemetry(custom={"amplitude_rad": observation.time_s})
         return snakesim.ControllerCommand(command.setpoints, telemetry)
 
 
-class Boundless(Nod):
+class TooMuchTelemetry(ConstantAngle):
+    """A controller with more custom telemetry values than allowed."""
+
     def update(self, observation):
         command = super().update(observation)
-        telemetry = snakesim.Telemetry(custom={f"value_{i}": 0.0 for i in range(33)})
+        telemetry = snakesim.Telemetry(custom={f"value_{index}": 0.0 for index in range(33)})
         return snakesim.ControllerCommand(command.setpoints, telemetry)
 
 
-def test_custom_telemetry_of_a_controller_is_a_signal() -> None:
-    found = snakesim.run("triplet", controller=Growing, duration=1)
-    amplitude_rad = found["amplitude_rad.controller"]
-    assert found.units["amplitude_rad.controller"] == "rad"
+def test_controller_custom_telemetry_is_a_signal() -> None:
+    run = snakesim.run("triplet", controller=GrowingTelemetry, duration=1)
+    amplitude_rad = run["amplitude_rad.controller"]
+    assert run.units["amplitude_rad.controller"] == "rad"
     assert np.all(np.diff(amplitude_rad[np.isfinite(amplitude_rad)]) >= 0)
-    # Sent 20 times a second.
-    assert amplitude_rad[-1] == pytest.approx(found.time_s[-1] - found.time_s[0], abs=0.06)
+    # Telemetry is sent 20 times a second.
+    assert amplitude_rad[-1] == pytest.approx(run.time_s[-1] - run.time_s[0], abs=0.06)
 
 
-def test_custom_telemetry_beyond_its_bound_is_an_error_of_the_controller() -> None:
+def test_controller_with_too_much_custom_telemetry_fails() -> None:
     with pytest.raises(snakesim.ControllerError, match="custom"):
-        snakesim.run("triplet", controller=Boundless, duration=1)
+        snakesim.run("triplet", controller=TooMuchTelemetry, duration=1)
 
 
-def test_load_returns_the_run_of_a_folder(tmp_path: Path) -> None:
-    ran = snakesim.run("triplet", controller="hold", duration=0.5, out=tmp_path / "run")
+def test_load_of_run_folder_returns_its_result(tmp_path: Path) -> None:
+    run = snakesim.run("triplet", controller="hold", duration=0.5, out=tmp_path / "run")
     loaded = snakesim.load(tmp_path / "run")
-    assert loaded.digest == ran.digest
-    assert np.array_equal(loaded["angle_rad"], ran["angle_rad"])
+    assert loaded.digest == run.digest
+    assert np.array_equal(loaded["angle_rad"], run["angle_rad"])
     with raises_error(snakesim.ConfigError, code="recording/not-a-run"):
         snakesim.load(tmp_path / "nothing")
 
@@ -150,14 +157,14 @@ def test_compute_body_points_w_ends_at_the_head(result: snakesim.Result) -> None
     assert np.allclose(nodes_w[0], result["position_w_m"][0])
 
 
-def test_a_path_and_a_shipped_name_are_controllers_too(tmp_path: Path) -> None:
+def test_run_with_path_or_shipped_name_uses_that_controller(tmp_path: Path) -> None:
     source = "from snakesim_gnc.control.hold import HoldPose\n\n\nclass Mine(HoldPose):\n    pass\n"
     (tmp_path / "mine.py").write_text(source)
-    mine = snakesim.run("triplet", controller=f"{tmp_path}/mine.py:Mine", duration=0.5)
-    assert mine.digest == snakesim.run("triplet", controller="hold", duration=0.5).digest
+    run = snakesim.run("triplet", controller=f"{tmp_path}/mine.py:Mine", duration=0.5)
+    assert run.digest == snakesim.run("triplet", controller="hold", duration=0.5).digest
 
 
-WRONG = [
+INVALID_CALLS = [
     (("triplett",), {}, "config/unknown-name"),
     ((3,), {}, "python/invalid-argument"),
     (("triplet",), {"controller": "hodl"}, "plugin/not-found"),
@@ -169,18 +176,18 @@ WRONG = [
     (("triplet",), {"controller": lambda time_s: 0}, "python/invalid-argument"),
     (("triplet",), {"controller": 5}, "python/invalid-argument"),
     (("triplet",), {"controller": int}, "plugin/not-loadable"),
-    (("triplet",), {"controller": wave, "processes": True}, "python/invalid-argument"),
+    (("triplet",), {"controller": compute_wave_rad, "processes": True}, "python/invalid-argument"),
     (("triplet",), {"set": {"clock_mode": "realtime"}}, "backend/wrong-clock-mode"),
 ]
 
 
-@pytest.mark.parametrize(("given", "more", "code"), WRONG)
-def test_wrong_input_is_answered_at_the_call(given, more, code: str) -> None:
+@pytest.mark.parametrize(("arguments", "options", "code"), INVALID_CALLS)
+def test_run_with_invalid_argument_is_refused(arguments, options, code: str) -> None:
     with raises_error(snakesim.ConfigError, code=code):
-        snakesim.run(*given, **more)
+        snakesim.run(*arguments, **options)
 
 
-def test_simulate_says_what_it_takes() -> None:
+def test_simulate_with_invalid_argument_is_refused() -> None:
     with raises_error(snakesim.ConfigError, code="python/invalid-argument", field="triplet"):
         simulate("triplet")  # pyright: ignore[reportArgumentType]
 
@@ -199,29 +206,31 @@ def solve_singular(time_s, joints):
     ],
     ids=["length", "shape", "type", "in NumPy"],
 )
-def test_a_controller_that_fails_is_an_error_that_names_it(controller, cause: type | None) -> None:
+def test_run_with_failing_controller_names_it_in_the_error(controller, cause: type | None) -> None:
     with raises_error(snakesim.ControllerError, code="controller/failed") as caught:
         snakesim.run("triplet", controller=controller, duration=0.1)
     assert type(caught.value.__cause__) is (type(None) if cause is None else cause)
 
 
-def test_python_controller_failure_in_child_process_is_a_cause(tmp_path: Path) -> None:
-    """As when NumPy was imported first."""
-    (tmp_path / "failing.py").write_text(FAILING)
+def test_python_controller_failure_in_child_process_is_reported(tmp_path: Path) -> None:
+    """Runs happen in a child process if the program has imported NumPy before snakesim."""
+    (tmp_path / "failing.py").write_text(FAILING_CONTROLLER)
     code = "import numpy, snakesim\nsnakesim.run('triplet', controller='./failing.py:Failing', duration=0.1)"
-    done = run_program(
+    completed = run_program(
         [sys.executable, "-c", code], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""}
     )
-    assert "raised LinAlgError: Singular matrix (failing.py line 7)" in done.err.splitlines()[-1]
-    assert "np.linalg.solve(np.zeros((2, 2)), np.ones(2))" in done.err
+    assert (
+        "raised LinAlgError: Singular matrix (failing.py line 7)" in completed.err.splitlines()[-1]
+    )
+    assert "np.linalg.solve(np.zeros((2, 2)), np.ones(2))" in completed.err
 
 
 def test_python_controller_too_slow_for_real_time_is_reported() -> None:
-    def slow(time_s, joints):
+    def compute_slowly(time_s, joints):
         time.sleep(0.1)
         return joints.angle_rad
 
-    run = snakesim.run("triplet", controller=slow, duration=0.03)
+    run = snakesim.run("triplet", controller=compute_slowly, duration=0.03)
     assert run.complete
     assert re.match(
         r"control: update\(\) took \d\d\d ms of 10 ms; 3 of 3 updates", run.summary.too_slow[0]
@@ -229,13 +238,15 @@ def test_python_controller_too_slow_for_real_time_is_reported() -> None:
     assert "update() took" in repr(run)
 
 
-def test_pages_plots_and_films_need_no_folder(result: snakesim.Result, tmp_path: Path) -> None:
+def test_result_without_folder_makes_pages_plots_and_videos(
+    result: snakesim.Result, tmp_path: Path
+) -> None:
     report = result.report(tmp_path / "report.html").read_text()
     assert "Save the effective configuration below as <code>config.json</code>" in report
-    shown = result._repr_html_()
-    assert shown.startswith("<iframe")
-    assert "class=&quot;player card&quot;" in shown
-    assert len(shown) < 500_000
+    notebook_html = result._repr_html_()
+    assert notebook_html.startswith("<iframe")
+    assert "class=&quot;player card&quot;" in notebook_html
+    assert len(notebook_html) < 500_000
     plot = result.plot("angle_rad", "torque_nm.joint_3")
     assert "torque_nm.joint_3, N·m" in plot.save(tmp_path / "plot.html").read_text()
     assert plot._repr_html_().startswith("<iframe")
@@ -243,7 +254,7 @@ def test_pages_plots_and_films_need_no_folder(result: snakesim.Result, tmp_path:
     assert film.read_bytes().startswith(b"GIF8")
 
 
-def test_without_pandas_it_says_what_to_install(
+def test_result_to_pandas_without_pandas_names_the_extra(
     result: snakesim.Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
@@ -252,7 +263,7 @@ def test_without_pandas_it_says_what_to_install(
 
 
 @needs_pandas
-def test_a_data_frame_has_the_columns_and_their_units(result: snakesim.Result) -> None:
+def test_result_to_pandas_has_signals_and_units(result: snakesim.Result) -> None:
     frame = result.to_pandas()
     assert frame.index.name == "time_s"
     assert np.array_equal(frame["angle_rad.joint_3"], result["angle_rad.joint_3"])
@@ -260,35 +271,35 @@ def test_a_data_frame_has_the_columns_and_their_units(result: snakesim.Result) -
 
 
 @pytest.mark.e2e
-def test_in_processes_it_is_the_same_run(result: snakesim.Result, tmp_path: Path) -> None:
-    apart = snakesim.run("triplet", duration=1, processes=True, out=tmp_path / "run")
-    assert apart.complete
-    assert apart.digest == result.digest
+def test_run_in_processes_has_same_digest(result: snakesim.Result, tmp_path: Path) -> None:
+    run = snakesim.run("triplet", duration=1, processes=True, out=tmp_path / "run")
+    assert run.complete
+    assert run.digest == result.digest
     assert (tmp_path / "run" / "report.html").is_file()
 
 
-def test_an_unknown_name_lists_what_there_is() -> None:
+def test_snakesim_module_with_unknown_name_raises_attribute_error() -> None:
     with raises_error(AttributeError, field="snakesim"):
         snakesim.runn  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
     assert {name for name in snakesim.__all__ if getattr(snakesim, name) is None} == set()
 
 
-def test_importing_it_loads_neither_numpy_nor_a_simulator() -> None:
+def test_snakesim_import_loads_neither_numpy_nor_simulator() -> None:
     code = "import sys, snakesim; print(sorted({'numpy', 'mujoco', 'zenoh'} & set(sys.modules)))"
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY
     )
-    assert done.stdout == "[]\n"
+    assert completed.stdout == "[]\n"
 
 
-def test_importing_it_changes_no_environment_variable() -> None:
+def test_snakesim_import_changes_no_environment_variable() -> None:
     code = (
         "import os; before = dict(os.environ); import snakesim; print(before == dict(os.environ))"
     )
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY
     )
-    assert done.stdout == "True\n"
+    assert completed.stdout == "True\n"
 
 
 def test_python_process_computes_like_snakesim_run_after_one_call() -> None:
@@ -298,19 +309,19 @@ def test_python_process_computes_like_snakesim_run_after_one_call() -> None:
         "import os, numpy; print(make_common_arithmetic_env().items() <= os.environ.items(), is_pinned())\n"
         "snakesim.use_common_arithmetic()"
     )
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY
     )
-    assert done.stdout == "True True\n"
+    assert completed.stdout == "True True\n"
 
 
-def test_a_call_that_comes_too_late_is_an_error() -> None:
+def test_use_common_arithmetic_after_numpy_import_fails() -> None:
     code = "import numpy, snakesim\nsnakesim.is_pinned = lambda: False\nsnakesim.use_common_arithmetic()"
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY
     )
-    assert done.returncode == 1
-    assert "before NumPy is imported" in done.stderr
+    assert completed.returncode == 1
+    assert "before NumPy is imported" in completed.stderr
 
 
 FIRST_EXAMPLES = [
@@ -321,32 +332,34 @@ FIRST_EXAMPLES = [
 ]
 
 
-@pytest.mark.parametrize(("page", "name"), FIRST_EXAMPLES, ids=lambda one: one)
-def test_a_first_example_starts_gently_from_the_measured_pose(page: str, name: str) -> None:
+@pytest.mark.parametrize(("page", "name"), FIRST_EXAMPLES, ids=lambda value: value)
+def test_documented_controller_starts_slowly_from_measured_pose(page: str, name: str) -> None:
     blocks = [
         content
         for section in parse_sections(REPOSITORY / "docs" / page)
         for _, content in section.blocks
     ]
-    defined = next(block for block in blocks if f"class {name}" in block or f"def {name}" in block)
+    definition = next(
+        block for block in blocks if f"class {name}" in block or f"def {name}" in block
+    )
     names: dict[str, Any] = {"__name__": "example", "snakesim": snakesim}
-    exec(re.split(r"first = |snakesim.run\(", defined)[0], names)
+    exec(re.split(r"first = |snakesim.run\(", definition)[0], names)
     controller = names[name](0.3) if name == "wave" else names[name]
     run = snakesim.run("triplet", controller=controller, duration=0.2)
     assert np.abs(run["velocity_rad_s"]).max() < 1.0  # rad/s; the robot's limit is 7.5
 
 
-def live_objects() -> Counter[str]:
-    """How many objects of our classes are in memory, by class."""
-    names = [f"{type(one).__module__}.{type(one).__qualname__}" for one in gc.get_objects()]
+def count_objects_by_class() -> Counter[str]:
+    """Return the number of objects in memory for each class of this project."""
+    names = [f"{type(item).__module__}.{type(item).__qualname__}" for item in gc.get_objects()]
     return Counter(name for name in names if name.startswith("snakesim"))
 
 
-def run_on(backend: str) -> None:
+def run_on_backend(backend: str) -> None:
     snakesim.run("triplet", duration=0.05, backend=backend)
 
 
-def run_that_fails() -> None:
+def run_with_failing_controller() -> None:
     with pytest.raises(snakesim.ControllerError):
         snakesim.run("triplet", duration=0.05, controller=lambda time_s, joints: [1 / 0])
 
@@ -361,39 +374,41 @@ def step_an_environment(action: str) -> None:
 @pytest.mark.parametrize(
     "use",
     [
-        *(partial(run_on, backend) for backend in ("sim", "can", "moteus", "dynamixel")),
-        run_that_fails,
+        *(partial(run_on_backend, backend) for backend in ("sim", "can", "moteus", "dynamixel")),
+        run_with_failing_controller,
         *(partial(step_an_environment, action) for action in ("position", "residual:hold")),
     ],
     ids=["sim", "can", "moteus", "dynamixel", "fails", "environment", "residual"],
 )
-def test_no_reference_cycle_keeps_a_run_in_memory(use: Callable[[], None]) -> None:
-    use()  # what is cached for good
+def test_run_leaves_no_objects_in_memory(use: Callable[[], None]) -> None:
+    use()  # The first use fills caches, which stay in memory.
     gc.collect()
     gc.disable()
     try:
-        before = live_objects()
+        counts_before = count_objects_by_class()
         use()
-        # A thread that has been stopped may still be about to end on a busy computer, and holds what it works on.
-        wait_until(lambda: not live_objects() - before, "a run that leaves no object in memory")
+        # On a busy computer a stopped thread may still be ending, and then it keeps its objects in memory.
+        wait_until(
+            lambda: not count_objects_by_class() - counts_before,
+            "a run that leaves no object in memory",
+        )
     finally:
         gc.enable()
 
 
 @pytest.mark.slow
-def test_the_study_in_the_documents_as_printed(tmp_path: Path) -> None:
-    """Run, plot, sweep a gain, take the best, run it on emulated modules, compare."""
+def test_python_page_study_runs_as_printed(tmp_path: Path) -> None:
+    """The study runs, plots, sweeps a gain, runs the best value on emulated modules, and compares."""
     page = REPOSITORY / "docs" / "how-to" / "python.md"
-    study = next(section for section in parse_sections(page) if "study.py" in section.files).files[
-        "study.py"
-    ]
+    sections = parse_sections(page)
+    study = next(section for section in sections if "study.py" in section.files).files["study.py"]
     (tmp_path / "study.py").write_text(study)
-    done = run_program(
+    completed = run_program(
         [sys.executable, "study.py"], tmp_path, {"PYTHONPATH": str(REPOSITORY), "PATH": ""}
     )
-    assert done.code == 0, done.err
+    assert completed.code == 0, completed.err
     assert (tmp_path / "first.html").is_file()
-    assert "incomplete" not in done.out
-    assert "0.5 rad: " in done.out
-    assert "sim -> can" in done.out
-    assert "A moved" in done.out
+    assert "incomplete" not in completed.out
+    assert "0.5 rad: " in completed.out
+    assert "sim -> can" in completed.out
+    assert "A moved" in completed.out
