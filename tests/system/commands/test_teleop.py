@@ -98,7 +98,9 @@ def test_teleop_keys_drive_robot_and_lost_operator_stops_it(tmp_path: Path) -> N
 def lockstep_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningCommand]:
     """Run a moving robot in lockstep, whose processes wait for each other."""
     out = tmp_path_factory.mktemp("lockstep") / "run"
-    with running_snakesim(out, "peg_row", "--duration", "300", "--set", "stall_limit_s=60") as run:
+    # In lockstep, a robot may be many times faster than real time. It must not end before the last test.
+    duration = ("--duration", "3600")
+    with running_snakesim(out, "peg_row", *duration, "--set", "stall_limit_s=60") as run:
         run.wait_for("Locomoting")
         yield run
 
