@@ -28,11 +28,24 @@ RATED_RAD_S = 6.25
 INIT = f"init {NODE} 7 {RATED_NM} {RATED_RAD_S} 800 1050 18000 0"
 BOOTED_US = 100_000
 OUTBOX_FRAMES = 16
+# Frames in an answer begin with their id.
+GYRO_PREFIX = f"{frame_id(Opcode.GYRO, NODE):03X}#"
+JOINT_STATE_PREFIX = f"{frame_id(Opcode.JOINT_STATE, NODE):03X}#"
 
 
-def describe_sensors(speed_mrad_s: int = 0) -> str:
-    """An event with the sensor values of a healthy module at room temperature."""
-    return f"sensors 1 0 {speed_mrad_s} 0 0 24000 0 200 200" + " 0" * 23
+def describe_sensors(
+    *,
+    speed_mrad_s: int = 0,
+    is_valid: bool = True,
+    voltage_mv: int = 24_000,
+    winding_tenths_c: int = 200,
+    is_leaking: bool = False,
+) -> str:
+    """An event with the sensor values of a module. By default it is healthy and at room temperature."""
+    return (
+        f"sensors {int(is_valid)} 0 {speed_mrad_s} 0 0 {voltage_mv} 0 {winding_tenths_c} 200 {int(is_leaking)}"
+        + " 0" * 22
+    )
 
 
 def describe_frame(frame: CanFrame, time_us: int = BOOTED_US) -> str:
@@ -227,6 +240,26 @@ def test_slow_speed_limit_allows_torque_at_rest_and_zero_allows_none(
 
 
 @pytest.mark.parametrize(
+    "sensors",
+    [
+        describe_sensors(is_valid=False),
+        describe_sensors(voltage_mv=17_999),
+        describe_sensors(winding_tenths_c=1050),
+        describe_sensors(is_leaking=True),
+    ],
+    ids=["sensor", "voltage", "heat", "leak"],
+)
+def test_module_with_the_cause_of_a_fault_is_not_armed_for_a_moment(
+    replay: Path, sensors: str
+) -> None:
+    """The cause appears between two polls, so that it is not latched yet when the Command arrives."""
+    events = [sensors, describe_command(CommandAction.ARM), f"poll {BOOTED_US}"]
+    armed, polled = run_booted(replay, events)
+    assert (armed.state, armed.feeds_bridge, armed.frames) == (ModuleState.DISARMED, False, ())
+    assert polled.state == ModuleState.FAULT
+
+
+@pytest.mark.parametrize(
     ("events", "mode"),
     [
         ([describe_command(CommandAction.STOP)], JointMode.VELOCITY),
@@ -270,6 +303,17 @@ def test_imu_is_sent_in_turn_by_the_number_of_syncs_since_the_boot(replay: Path)
         *syncs,
     ]
     answers = run_reference(replay, events)
-    gyro_prefix = f"{frame_id(Opcode.GYRO, NODE):03X}#"
-    has_gyro = [any(frame.startswith(gyro_prefix) for frame in answer.frames) for answer in answers]
+    has_gyro = [any(frame.startswith(GYRO_PREFIX) for frame in answer.frames) for answer in answers]
     assert has_gyro[-6:] == [False, True, False, False, True, False]
+
+
+def test_joint_state_has_the_values_at_its_sync_and_not_those_of_the_last_poll(
+    replay: Path,
+) -> None:
+    events = [describe_sensors(speed_mrad_s=321), describe_frame(make_sync(1, 0))]
+    (answer,) = run_booted(replay, events)
+    states = [frame for frame in answer.frames if frame.startswith(JOINT_STATE_PREFIX)]
+    velocities_mrad_s = [
+        struct.unpack_from("<h", bytes.fromhex(frame.partition("#")[2]), 2)[0] for frame in states
+    ]
+    assert velocities_mrad_s == [321]
