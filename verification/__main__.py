@@ -67,6 +67,7 @@ PARTS = {
             "verification/faults/test_fault_table.py",
             "verification/attack/test_attack_suite.py",
             "verification/fuzz",
+            "verification/mutation/firmware",
         ),
     ),
     "quiet": CampaignPart(
@@ -156,6 +157,16 @@ PARTS = {
             "--files",
             *sorted(TESTS_BY_FILE.keys() - {"lease.py", "lifecycle.py", "stop_ramp.py"}),
         ),
+    ),
+    "firmware": CampaignPart(
+        "planted faults in the C firmware of a joint module (needs a C compiler)",
+        7,
+        ("verification.mutation.firmware",),
+    ),
+    "small-changes": CampaignPart(
+        "small changes of the C firmware of a joint module",
+        5,
+        ("verification.mutation.firmware", "--small-changes", "states.c", "control.c"),
     ),
 }
 

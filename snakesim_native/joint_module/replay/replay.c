@@ -4,7 +4,9 @@
  * page "Build a joint module" of the SnakeSIM documentation. One line of input is one event:
  *
  *     init NODE SERIAL RATED_NM RATED_RAD_S DERATE_TENTHS_C STOP_TENTHS_C MIN_MV TIME_US
+ *     flash INDEX VALUE        before `init`: a parameter that the nonvolatile memory has, other than a new module
  *     sensors VALUE ...        all fields of `jm_sensors`, in their order
+ *     mailbox 0                no frame can be sent from now on, until `mailbox 1`
  *     frame TIME_US ID DATA    id and data in hexadecimal; data `-` is none
  *     poll TIME_US
  *     torque ANGLE_RAD VELOCITY_RAD_S
@@ -20,9 +22,17 @@
 
 enum { LINE_BYTES = 1024, SENSOR_VALUES = 32, WRONG_INPUT = 2 };
 
+/* A parameter in the nonvolatile memory at the next `init`. */
+typedef struct {
+    bool is_set;
+    float value;
+} saved_value;
+
 typedef struct {
     jm_module module;
     jm_sensors sensors;
+    saved_value saved[JM_PARAMETER_COUNT];
+    bool is_mailbox_full;
     uint64_t due_us;
 } session;
 
@@ -46,7 +56,25 @@ static bool read_init(session *s, const char *text)
     config.derate_from_tenths_c = (int16_t)derate_tenths_c;
     config.stop_at_tenths_c = (int16_t)stop_tenths_c;
     jm_parameters flash = jm_make_factory_parameters(config.rated_torque_nm, config.rated_speed_rad_s);
+    for (int index = 1; index < JM_PARAMETER_COUNT; index++) {
+        if (s->saved[index].is_set) {
+            flash.values[index] = s->saved[index].value;
+        }
+    }
+    memset(s->saved, 0, sizeof s->saved);
     jm_init(&s->module, &config, &flash, now_us);
+    return true;
+}
+
+static bool read_flash(session *s, const char *text)
+{
+    unsigned index;
+    float value;
+    if (sscanf(text, "%u %f", &index, &value) != 2 || index == 0 || index >= JM_PARAMETER_COUNT) {
+        return false;
+    }
+    s->saved[index].is_set = true;
+    s->saved[index].value = value;
     return true;
 }
 
@@ -160,7 +188,7 @@ static void print_outputs(session *s)
 {
     jm_module *module = &s->module;
     jm_frame frame;
-    while (jm_pop_frame(module, &frame)) {
+    while (!s->is_mailbox_full && jm_pop_frame(module, &frame)) {
         printf("%03X#", frame.id);
         for (int i = 0; i < frame.length; i++) {
             printf("%02X", frame.data[i]);
@@ -185,8 +213,15 @@ static bool run_event(session *s, char *line)
     if (strcmp(line, "init") == 0) {
         return read_init(s, rest);
     }
+    if (strcmp(line, "flash") == 0) {
+        return read_flash(s, rest);
+    }
     if (strcmp(line, "sensors") == 0) {
         return read_sensors(s, rest);
+    }
+    if (strcmp(line, "mailbox") == 0) {
+        s->is_mailbox_full = strtol(rest, NULL, 10) == 0;
+        return true;
     }
     if (strcmp(line, "torque") == 0) {
         return print_torque(s, rest);

@@ -1,7 +1,6 @@
 """The reference firmware answers as the emulated joint module does, whatever a host sends."""
 
 import random
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -23,6 +22,7 @@ from snakesim_testing.can.firmware_replay import (
     Answer,
     find_difference,
     run_reference,
+    run_torques,
     shrink_difference,
 )
 from snakesim_testing.can.firmware_traffic import NODE, Traffic
@@ -104,8 +104,8 @@ def compute_expected_torque(
     angle_rad: float,
     speed_rad_s: float,
     winding_c: float,
-) -> float:
-    """Return the torque that the specification of SetPoint demands, with the parameters of the test below."""
+) -> tuple[float, bool]:
+    """Return the torque that the specification demands, and whether heat reduces it, for the test below."""
     match mode:
         case JointMode.PASSIVE:
             demand_nm = 0.0
@@ -118,8 +118,11 @@ def compute_expected_torque(
     stall_nm = STEEPEST_ROLL_OFF * RATED_NM
     reduction_nm = stall_nm * speed_rad_s / 5.0
     demand_nm = min(max(demand_nm, -stall_nm - reduction_nm), stall_nm - reduction_nm)
-    limit_nm = min(limit_nm, 3.5, RATED_NM * HEAT.compute_remaining_fraction(winding_c))
-    return min(max(demand_nm, -limit_nm), limit_nm)
+    limit_nm = min(limit_nm, 3.5)
+    commanded_nm = min(max(demand_nm, -limit_nm), limit_nm)
+    hot_limit_nm = RATED_NM * HEAT.compute_remaining_fraction(winding_c)
+    torque_nm = min(max(commanded_nm, -hot_limit_nm), hot_limit_nm)
+    return torque_nm, torque_nm != commanded_nm
 
 
 def test_the_control_law_is_that_of_the_specification(replay: Path) -> None:
@@ -132,7 +135,7 @@ def test_the_control_law_is_that_of_the_specification(replay: Path) -> None:
         ModuleParameter.SPEED_LIMIT: 5.0,
     }
     events: list[str] = []
-    expected_nm: list[float] = []
+    expected: list[tuple[float, bool]] = []
     for _ in range(300):
         mode = choose.choice(list(JointMode))
         target = 0.0 if mode == JointMode.PASSIVE else round(choose.uniform(-3, 3), 3)
@@ -143,18 +146,16 @@ def test_the_control_law_is_that_of_the_specification(replay: Path) -> None:
         sensors = f"sensors 1 0 0 0 0 24000 0 {winding_tenths_c} 200" + " 0" * 23
         events += arm_with(parameters, sensors, make_setpoint(0, mode, target, limit_nm, NODE))
         events.append(f"torque {angle_rad} {speed_rad_s}")
-        expected_nm.append(
+        expected.append(
             compute_expected_torque(
                 mode, target, limit_nm, angle_rad, speed_rad_s, winding_tenths_c / 10
             )
         )
-    completed = subprocess.run(
-        [str(replay)], input="\n".join(events), capture_output=True, text=True, check=True
+    measured = run_torques(replay, events)
+    assert [torque_nm for torque_nm, _ in measured] == pytest.approx(
+        [torque_nm for torque_nm, _ in expected], abs=1e-3
     )
-    torques_nm = [
-        float(line.split()[0]) for line in completed.stdout.splitlines() if "|" not in line
-    ]
-    assert torques_nm == pytest.approx(expected_nm, abs=1e-3)
+    assert [is_derated for _, is_derated in measured] == [is_derated for _, is_derated in expected]
 
 
 def test_a_module_that_is_not_driven_has_no_torque(replay: Path) -> None:
@@ -165,8 +166,4 @@ def test_a_module_that_is_not_driven_has_no_torque(replay: Path) -> None:
         make_setpoint(0, JointMode.POSITION, 1.0, 3.0, NODE),
     )
     events += ["torque 0 0", f"poll {BOOTED_US + 100_000}", "torque 0 0"]
-    completed = subprocess.run(
-        [str(replay)], input="\n".join(events), capture_output=True, text=True, check=True
-    )
-    torques = [line for line in completed.stdout.splitlines() if "|" not in line]
-    assert torques == ["3.000000 0", "0.000000 0"]
+    assert run_torques(replay, events) == [(3.0, False), (0.0, False)]
