@@ -48,11 +48,11 @@ def test_service_of_a_run_ignores_forged_description(
     monkeypatch.setenv(RUN_KEY, new_run_key())
     with (
         running_host(make_run_config()) as run,
-        open_session(run.link) as stranger,
+        open_session(run.link) as other_session,
         open_session(run.link) as own,
     ):
         forged = msgspec.structs.replace(run.host.description, emulated=True, lease_ns=10**9)
-        stranger.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(forged)
+        other_session.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(forged)
         assert HostClient(own, "control").wait_for_description() == run.host.description
         monkeypatch.setenv(RUN_KEY, new_run_key())  # a service of another run, on the wrong network
         with pytest.raises(NotConnectedError):

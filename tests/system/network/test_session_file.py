@@ -41,12 +41,12 @@ def test_session_file_connects_sessions_and_stock_zenoh_at_router(tmp_path: Path
         pass
     with (
         open_router(router),
-        open_session(link) as ours,
-        zenoh.open(zenoh.Config.from_file(path)) as stock,
+        open_session(link) as snakesim_session,
+        zenoh.open(zenoh.Config.from_file(path)) as stock_session,
     ):
-        ours.declare_alive("control")
+        snakesim_session.declare_alive("control")
         wait_until(
-            lambda: list_tokens(stock) == ["worm/alive/control"],
+            lambda: list_tokens(stock_session) == ["worm/alive/control"],
             "the stock session sees the token of SnakeSIM's session",
             20.0,
         )
