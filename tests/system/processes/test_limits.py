@@ -1,4 +1,4 @@
-"""A case that gets nowhere ends: in robot time when it is stuck, in wall time whatever its code does."""
+"""A trial without progress ends: by robot time if the robot is stuck, and by wall time if its code never returns."""
 
 import time
 from pathlib import Path
@@ -13,7 +13,7 @@ from snakesim_operator.features.evaluate.case import (
 )
 from snakesim_operator.features.evaluate.suite import EvaluationSuite, make_cases
 
-ENDLESS = """
+ENDLESS_CODE = """
 from snakesim_gnc.control.hold import HoldPose
 
 
@@ -24,38 +24,38 @@ class Endless(HoldPose):
 """
 
 
-def ran(
+def run_first_trial(
     controller: str, duration_s: float = 4, give_up_s: float = 12.0, limit_s: float = 600.0
 ) -> CaseOutcome:
-    """What comes of the first case."""
+    """Run the first trial of a suite with this controller and these limits."""
     goal = {"kind": "heading", "distance_m": 0.3}
-    always = {"duration_s": duration_s, "mission.goal": goal}
-    suite = EvaluationSuite(scenario="peg_row", set=always, give_up_s=give_up_s, limit_s=limit_s)
+    settings = {"duration_s": duration_s, "mission.goal": goal}
+    suite = EvaluationSuite(scenario="peg_row", set=settings, give_up_s=give_up_s, limit_s=limit_s)
     case = make_cases(suite, "here", [controller], 1, first_field=1)[0]
     return run_case(case.config, compute_code_digest(), case.stall_timeout_s, case.timeout_s)
 
 
 @pytest.mark.slow
-def test_who_comes_no_further_is_given_up() -> None:
-    reported = ran("hold", give_up_s=1.0).numbers
-    assert reported[GAVE_UP_FIELD] is True
-    assert reported["reached_goal"] is False
-    assert isinstance(reported["duration_s"], float)
-    assert 1.0 <= reported["duration_s"] < 2.0
+def test_trial_without_progress_is_given_up() -> None:
+    numbers = run_first_trial("hold", give_up_s=1.0).numbers
+    assert numbers[GAVE_UP_FIELD] is True
+    assert numbers["reached_goal"] is False
+    assert isinstance(numbers["duration_s"], float)
+    assert 1.0 <= numbers["duration_s"] < 2.0
 
 
 @pytest.mark.slow
-def test_who_comes_on_is_not() -> None:
-    reported = ran("path_following", give_up_s=1.0).numbers
-    assert reported[GAVE_UP_FIELD] is False
-    assert reported["reached_goal"] is True
+def test_trial_with_progress_is_not_given_up() -> None:
+    numbers = run_first_trial("path_following", give_up_s=1.0).numbers
+    assert numbers[GAVE_UP_FIELD] is False
+    assert numbers["reached_goal"] is True
 
 
 @pytest.mark.slow
-def test_endless_code_is_stopped_and_the_worker_goes_on(tmp_path: Path) -> None:
-    (tmp_path / "endless.py").write_text(ENDLESS)
-    began = time.monotonic()
-    stopped = ran(f"{tmp_path}/endless.py:Endless", limit_s=3.0)
-    assert stopped.error == "stopped after 3 s of wall time; the suite's `limit_s` allows no more"
-    assert time.monotonic() - began < 30
-    assert ran("hold", duration_s=0.2).error is None
+def test_trial_with_endless_code_is_stopped_and_next_one_runs(tmp_path: Path) -> None:
+    (tmp_path / "endless.py").write_text(ENDLESS_CODE)
+    start_s = time.monotonic()
+    outcome = run_first_trial(f"{tmp_path}/endless.py:Endless", limit_s=3.0)
+    assert outcome.error == "stopped after 3 s of wall time; the suite's `limit_s` allows no more"
+    assert time.monotonic() - start_s < 30
+    assert run_first_trial("hold", duration_s=0.2).error is None
