@@ -1,6 +1,7 @@
-"""Tests in this folder need a real SocketCAN bus, vcan0; they find its name in the fixture `channel`.
+"""Tests in this folder need a real SocketCAN bus, vcan0; the fixture `channel` provides its name.
 
-Where there is none they are skipped, except in CI: a run there that met no bus has not tested what it says.
+They are skipped if there is no bus. In CI a missing bus is an error, because skipped tests would hide that the bus
+was not tested.
 """
 
 import os
@@ -14,15 +15,15 @@ from snakesim_testing.can.interface import assert_succeeded, run_ip
 
 CHANNEL = "vcan0"
 HERE = Path(__file__).parent
-RUN = "python deploy/vm/with_vcan.py -- .venv/bin/python -m pytest tests/system/can"
-NEEDED = ("CI", "SNAKESIM_NEED_VCAN")
+RUN_COMMAND = "python deploy/vm/with_vcan.py -- .venv/bin/python -m pytest tests/system/can"
+REQUIRING_VARIABLES = ("CI", "SNAKESIM_NEED_VCAN")
 
 
-def no_bus_because(channel: str) -> str | None:
-    """Why no raw CAN socket can be bound to the interface, or None if one can."""
+def find_bus_problem(channel: str) -> str | None:
+    """Return why no raw CAN socket can be bound to the interface, or None if one can."""
     try:
-        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as tried:
-            tried.bind((channel,))
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw_socket:
+            raw_socket.bind((channel,))
     except OSError as error:
         return f"no CAN socket on {channel}: {error.strerror}"
     return None
@@ -30,31 +31,32 @@ def no_bus_because(channel: str) -> str | None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(session: pytest.Session, items: list[pytest.Item]) -> None:
-    ours = [item for item in items if HERE in item.path.parents]
-    if not ours:
+    can_tests = [item for item in items if HERE in item.path.parents]
+    if not can_tests:
         return
-    for item in ours:
+    for item in can_tests:
         item.add_marker(pytest.mark.can)
-    reason = no_bus_because(CHANNEL)
+    reason = find_bus_problem(CHANNEL)
     if reason is None:
         return
-    if asked_by := [name for name in NEEDED if os.environ.get(name, "") not in ("", "0", "false")]:
-        raise pytest.UsageError(
-            f"{reason}, and {asked_by[0]} is set: tests/system/can may not be skipped. Run: {RUN}"
-        )
-    for item in ours:
-        item.add_marker(pytest.mark.skip(reason=f"{reason}. Run: {RUN}"))
+    for name in REQUIRING_VARIABLES:
+        if os.environ.get(name, "") not in ("", "0", "false"):
+            raise pytest.UsageError(
+                f"{reason}, and {name} is set: tests/system/can may not be skipped. Run: {RUN_COMMAND}"
+            )
+    for item in can_tests:
+        item.add_marker(pytest.mark.skip(reason=f"{reason}. Run: {RUN_COMMAND}"))
 
 
 @pytest.fixture
 def channel() -> str:
-    """The name of a CAN interface that is up."""
+    """Provide the name of a CAN interface that is up."""
     return CHANNEL
 
 
 @pytest.fixture
 def raw_socket(channel: str) -> Iterator[socket.socket]:
-    """A raw CAN socket on the bus, which gives up waiting after two seconds."""
+    """Provide a raw CAN socket on the bus, with a timeout of two seconds."""
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as opened:
         opened.settimeout(2.0)
         opened.bind((channel,))
@@ -63,7 +65,7 @@ def raw_socket(channel: str) -> Iterator[socket.socket]:
 
 @pytest.fixture
 def spare_channel() -> Iterator[str]:
-    """An interface of the test's own, which it may take down."""
+    """Provide an interface that the test may take down."""
     name = f"vcan{os.getpid() % 100_000}"
     added = run_ip("link", "add", name, "type", "vcan")
     if added.returncode:

@@ -1,4 +1,4 @@
-"""Processes that are killed with SIGKILL while the robot is armed, as a listener on the bus sees it.
+"""Processes are killed with SIGKILL while the robot is armed, and a listener on the bus measures what follows.
 
 Host, control and modules are the processes of `snakesim run` and `snakesim drive emulate can`. The listener has the
 kernel's time of every frame. `pytest -rP tests/system/can/test_killed.py` prints a row for each.
@@ -39,21 +39,22 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 @pytest.fixture
 def robot(tmp_path: Path, channel: str) -> Iterator[RobotOnBus]:
-    with open_robot_on_bus(tmp_path, channel) as made:
-        yield made
+    """Provide the processes of a robot on the bus."""
+    with open_robot_on_bus(tmp_path, channel) as robot:
+        yield robot
 
 
-def killed(process: subprocess.Popen[bytes]) -> int:
-    """SIGKILL; when, by the clock of the listener."""
+def kill_process(process: subprocess.Popen[bytes]) -> int:
+    """Send SIGKILL to a process and return the time of the signal by the clock of the listener, in ns."""
     now_ns = time.time_ns()
     process.kill()
     process.wait()
     return now_ns
 
 
-def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: RobotOnBus) -> None:
+def test_killed_controller_makes_driver_stop_the_modules(robot: RobotOnBus) -> None:
     _, control = robot.arm()
-    killed_ns = killed(control)
+    killed_ns = kill_process(control)
     passive = {ModuleState.DISARMED}
     robot.wait_until(
         lambda: (
@@ -67,14 +68,14 @@ def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: RobotOnBus
         "the fault in the status",
     )
     received = list(robot.listener.receive_frames())
-    last_ms = (max(h.at_ns for h in received if h.opcode == Opcode.SET_POINT) - killed_ns) / 1e6
-    stop = next(h for h in select_stop_commands(received) if h.at_ns > killed_ns)
+    setpoint_times_ns = [frame.at_ns for frame in received if frame.opcode == Opcode.SET_POINT]
+    last_ms = (max(setpoint_times_ns) - killed_ns) / 1e6
+    stop = next(frame for frame in select_stop_commands(received) if frame.at_ns > killed_ns)
     stop_ms = (stop.at_ns - killed_ns) / 1e6
-    rest_ms = max(
-        (h.at_ns - stop.at_ns) / 1e6
-        for h in find_first_reports(received, passive, killed_ns).values()
-    )
-    lease_ms, period_ms = robot.config.lease_ns / 1e6, robot.config.period_ns / 1e6
+    first_reports = find_first_reports(received, passive, killed_ns).values()
+    rest_ms = max((report.at_ns - stop.at_ns) / 1e6 for report in first_reports)
+    lease_ms = robot.config.lease_ns / 1e6
+    period_ms = robot.config.period_ns / 1e6
     assert last_ms <= stop_ms <= lease_ms + 2 * period_ms + LATE_MS
     assert rest_ms <= 100 + period_ms + LATE_MS
     print(
@@ -84,13 +85,13 @@ def test_a_killed_controller_makes_the_driver_stop_the_modules(robot: RobotOnBus
     )
 
 
-def test_a_killed_host_leaves_every_module_to_its_own_watchdog(
+def test_killed_host_leads_to_watchdog_stop_of_every_module(
     robot: RobotOnBus, channel: str
 ) -> None:
     host, _ = robot.arm()
     armed = [ModuleState.ARMED] * JOINT_COUNT
     assert robot.listener.states() == armed, robot.read_log("host")
-    killed_ns = killed(host)
+    killed_ns = kill_process(host)
     period_ms = robot.config.period_ns / 1e6
     fault = {ModuleState.FAULT}
     robot.wait_until(
@@ -110,49 +111,52 @@ def test_a_killed_host_leaves_every_module_to_its_own_watchdog(
     )
     received = robot.listener.received
     stopped = find_first_reports(received, fault, killed_ns)
-    assert all(h.opcode == Opcode.HEARTBEAT for h in stopped.values()), (
-        "told at once, without a Sync"
-    )
-    assert {h.decode()["last_stop"] for h in stopped.values()} == {LastStop.WATCHDOG}
-    assert all(h.decode()["fault_watchdog"] and h.decode()["mode"] == 0 for h in stopped.values())
-    last = {
+    for report in stopped.values():
+        assert report.opcode == Opcode.HEARTBEAT  # a heartbeat needs no Sync of the host
+        values = report.decode()
+        assert values["last_stop"] == LastStop.WATCHDOG
+        assert values["fault_watchdog"]
+        assert values["mode"] == 0
+    last_setpoint_ns = {
         node: max(
-            h.at_ns
-            for h in received
-            if h.opcode == Opcode.SET_POINT and parse_node(h.frame.id) == node
+            frame.at_ns
+            for frame in received
+            if frame.opcode == Opcode.SET_POINT and parse_node(frame.frame.id) == node
         )
         for node in NODES
     }
-    from_host = [
-        h.at_ns for h in received if h.opcode in (Opcode.SET_POINT, Opcode.SYNC, Opcode.COMMAND)
-    ]
-    last_ms = (max(from_host) - killed_ns) / 1e6
-    took_ms = [(stopped[node].at_ns - last[node]) / 1e6 for node in NODES]
-    own_ms = [
-        measure_module_duration_ms(received, node, last[node], stopped[node].at_ns)
+    host_opcodes = (Opcode.SET_POINT, Opcode.SYNC, Opcode.COMMAND)
+    host_frame_times_ns = [frame.at_ns for frame in received if frame.opcode in host_opcodes]
+    last_ms = (max(host_frame_times_ns) - killed_ns) / 1e6
+    # The time from the last setpoint to the stop, by the clock of the kernel and by the clocks of the modules.
+    kernel_ms = [(stopped[node].at_ns - last_setpoint_ns[node]) / 1e6 for node in NODES]
+    module_ms = [
+        measure_module_duration_ms(received, node, last_setpoint_ns[node], stopped[node].at_ns)
         for node in NODES
     ]
     assert last_ms < LATE_MS
-    assert max(took_ms) <= 100 + period_ms + LATE_MS
-    assert max(own_ms) <= 100 + period_ms
-    assert min(own_ms) > 100 - period_ms
+    assert max(kernel_ms) <= 100 + period_ms + LATE_MS
+    assert max(module_ms) <= 100 + period_ms
+    assert min(module_ms) > 100 - period_ms
     assert robot.listener.states() == [ModuleState.FAULT] * JOINT_COUNT
     print(
         f"| host, SIGKILL | last frame {last_ms:.1f} ms after it | all modules FAULT (watchdog), "
-        f"motor off, {max(took_ms):.0f} ms after their last setpoint by the kernel's clock, "
-        f"{min(own_ms):.0f} to {max(own_ms):.0f} ms by their own | watchdog 100 ms |"
+        f"motor off, {max(kernel_ms):.0f} ms after their last setpoint by the kernel's clock, "
+        f"{min(module_ms):.0f} to {max(module_ms):.0f} ms by their own | watchdog 100 ms |"
     )
 
-    # Whoever looks afterwards sees it.
-    scanned = snakesim("drive", "scan", "can", channel, "--duration", "3", cwd=robot.folder)
-    lines = scanned.out.splitlines()
-    assert scanned.code == 0 and lines[0].split() == list(COLUMNS), scanned.out + scanned.err
+    # A later scan of the bus shows the faults.
+    scan = snakesim("drive", "scan", "can", channel, "--duration", "3", cwd=robot.folder)
+    lines = scan.out.splitlines()
+    assert scan.code == 0, scan.out + scan.err
+    assert lines[0].split() == list(COLUMNS), scan.out + scan.err
     rows = [dict(zip(COLUMNS, line.split(), strict=False)) for line in lines[1:]]
-    assert [r["node"] for r in rows] == [str(node) for node in NODES]
-    assert all(
-        (r["emulated"], r["state"], r["faults"]) == ("yes", "fault", "watchdog") for r in rows
-    )
-    assert len({r["serial"] for r in rows}) == JOINT_COUNT
+    assert [row["node"] for row in rows] == [str(node) for node in NODES]
+    for row in rows:
+        assert row["emulated"] == "yes"
+        assert row["state"] == "fault"
+        assert row["faults"] == "watchdog"
+    assert len({row["serial"] for row in rows}) == JOINT_COUNT
     print(
         f"| `snakesim drive scan can {channel}` afterwards | {'; '.join(' '.join(line.split()) for line in lines)} |"
     )

@@ -16,15 +16,15 @@ from snakesim_testing.runs.command import snakesim
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 ROBOT_TIME_S = "10"
-LIMIT_S = 400.0  # an emulated machine is slow
+RUN_TIMEOUT_S = 400.0  # an emulated machine is slow
 
 
 def test_triplet_over_socketcan_equals_virtual_bus_to_the_bit(tmp_path: Path, channel: str) -> None:
-    over_the_bus = (f'backend.channels=["{channel}"]', 'backend.emulators="process"')
+    real_bus_options = (f'backend.channels=["{channel}"]', 'backend.emulators="process"')
     records: dict[str, RunRecord] = {}
-    took_s: dict[str, float] = {}
-    for name, sets in (("virtual", ()), (channel, over_the_bus)):
-        began = time.monotonic()
+    wall_time_s: dict[str, float] = {}
+    for name, options in (("virtual", ()), (channel, real_bus_options)):
+        start_s = time.monotonic()
         arguments = [
             "triplet",
             "--backend",
@@ -35,24 +35,26 @@ def test_triplet_over_socketcan_equals_virtual_bus_to_the_bit(tmp_path: Path, ch
             find_free_endpoint(),
         ]
         arguments += [
-            argument for value in ("stall_limit_s=300", *sets) for argument in ("--set", value)
+            argument for value in ("stall_limit_s=300", *options) for argument in ("--set", value)
         ]
-        ended = snakesim("run", *arguments, "--out", name, cwd=tmp_path, timeout_s=LIMIT_S)
-        took_s[name] = time.monotonic() - began
-        assert ended.code == 0, ended.out + ended.err
+        result = snakesim("run", *arguments, "--out", name, cwd=tmp_path, timeout_s=RUN_TIMEOUT_S)
+        wall_time_s[name] = time.monotonic() - start_s
+        assert result.code == 0, result.out + result.err
         records[name] = RunRecord.load(tmp_path / name)
-    virtual, real = records["virtual"], records[channel]
+    virtual = records["virtual"]
+    real = records[channel]
+    expected_ticks = round(float(ROBOT_TIME_S) * 100)
     assert real.host.command_digest == virtual.host.command_digest
-    assert real.host.armed_ticks == virtual.host.armed_ticks == round(float(ROBOT_TIME_S) * 100)
-    for what in ("angle_rad", "mode", "target", "position_w_m"):
-        assert np.array_equal(getattr(real, what), getattr(virtual, what)), what
-    assert np.isfinite(real.position_w_m).all(), (
-        "the base too: it comes by UDP, as from motion capture"
-    )
+    assert virtual.host.armed_ticks == expected_ticks
+    assert real.host.armed_ticks == expected_ticks
+    for name in ("angle_rad", "mode", "target", "position_w_m"):
+        assert np.array_equal(getattr(real, name), getattr(virtual, name)), name
+    # The pose of the base arrives by UDP, as from motion capture.
+    assert np.isfinite(real.position_w_m).all()
     moved_rad = float(np.abs(real.angle_rad[-1] - real.angle_rad[0]).max())
-    assert moved_rad > 0.01, "and it moved"
+    assert moved_rad > 0.01, "the robot did not move"
     print(
         f"| triplet, {ROBOT_TIME_S} s of robot time | command digest {real.host.command_digest[:16]} on {channel} and "
         f"on the virtual bus | joint moved most: {moved_rad:.3f} rad, all angles equal to the bit "
-        f"| {took_s[channel]:.0f} s on {channel}, {took_s['virtual']:.0f} s on the virtual bus |"
+        f"| {wall_time_s[channel]:.0f} s on {channel}, {wall_time_s['virtual']:.0f} s on the virtual bus |"
     )

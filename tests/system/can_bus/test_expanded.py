@@ -1,4 +1,4 @@
-"""The spelled-out DBC file has every message of every node, and stock cantools reads our logs with it."""
+"""The expanded DBC file has every message of every node, and cantools decodes the driver's logs with it."""
 
 import io
 import subprocess
@@ -16,8 +16,6 @@ from snakesim_can_backend.protocol import commands
 from snakesim_can_backend.protocol.codec import load_database, load_layouts
 from snakesim_can_backend.protocol.definitions import (
     BROADCAST,
-    FIRST_NODE,
-    LAST_NODE,
     NODE_BITS,
     CanFrame,
     CommandAction,
@@ -28,26 +26,25 @@ from snakesim_can_backend.protocol.expanded import list_nodes
 from snakesim_hal.wire.messages import JointMode
 from snakesim_testing.operator.registered_command import run_registered_command
 
-EVERYBODY = list(range(FIRST_NODE, LAST_NODE + 1))
-
 
 @pytest.fixture(scope="module")
-def expanded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The file, as `snakesim drive dbc` writes it."""
+def expanded_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Provide the file that `snakesim drive dbc` writes."""
     path = tmp_path_factory.mktemp("dbc") / "expanded.dbc"
     assert run_registered_command(COMMANDS, ["drive", "dbc", "--out", str(path)]) == 0
     return path
 
 
 @pytest.fixture(scope="module")
-def database(expanded: Path) -> Database:
-    database = cantools.database.load_file(expanded)
+def database(expanded_file: Path) -> Database:
+    """Provide the content of the expanded file."""
+    database = cantools.database.load_file(expanded_file)
     assert isinstance(database, Database)
     return database
 
 
 @pytest.mark.slow
-def test_every_message_of_every_node_is_there_and_no_other(database: Database) -> None:
+def test_expanded_file_has_exactly_the_messages_of_every_node(database: Database) -> None:
     expected = {
         opcode << NODE_BITS | node: layout.name
         if node == BROADCAST
@@ -58,35 +55,37 @@ def test_every_message_of_every_node_is_there_and_no_other(database: Database) -
     assert {message.frame_id: message.name for message in database.messages} == expected
 
 
-def test_signals_are_the_same_for_every_node(database: Database) -> None:
-    source = {message.name: message for message in load_database().messages}
+def test_expanded_file_signals_are_equal_for_every_node(database: Database) -> None:
+    original_messages = {message.name: message for message in load_database().messages}
     for message in database.messages:
-        original = source[message.name.partition("_")[0]]
+        original = original_messages[message.name.partition("_")[0]]
         assert message.length == original.length
         assert message.senders == original.senders
-        assert layout_of(message) == layout_of(original)
+        assert get_signal_layouts(message) == get_signal_layouts(original)
 
 
-def layout_of(message: Message) -> dict[str, tuple[object, ...]]:
-    """Everything that a decoder needs of each signal."""
+def get_signal_layouts(message: Message) -> dict[str, tuple[object, ...]]:
+    """Return, for each signal, everything that a decoder needs."""
     return {
-        s.name: (
-            *(
-                s.start,
-                s.length,
-                s.is_signed,
-                s.conversion.scale,
-                s.conversion.offset,
-                s.conversion.is_float,
-            ),
-            *(s.unit, s.minimum, s.maximum, s.choices, s.multiplexer_ids),
+        signal.name: (
+            signal.start,
+            signal.length,
+            signal.is_signed,
+            signal.conversion.scale,
+            signal.conversion.offset,
+            signal.conversion.is_float,
+            signal.unit,
+            signal.minimum,
+            signal.maximum,
+            signal.choices,
+            signal.multiplexer_ids,
         )
-        for s in message.signals
+        for signal in message.signals
     }
 
 
-def sent() -> list[tuple[CanFrame, str]]:
-    """Frames of every kind, and what stock cantools is to say of them."""
+def make_frames_and_texts() -> list[tuple[CanFrame, str]]:
+    """Make frames of every kind, each with the text into which cantools must decode it."""
     layouts = load_layouts()
     setpoint = layouts[Opcode.SET_POINT].encode(
         5, mode=JointMode.POSITION, count=3, position=-0.5, torque_limit=7.0
@@ -114,11 +113,11 @@ def sent() -> list[tuple[CanFrame, str]]:
 
 
 @pytest.mark.slow
-def test_stock_cantools_decodes_our_log(expanded: Path) -> None:
+def test_expanded_file_lets_cantools_decode_a_log(expanded_file: Path) -> None:
     log = io.StringIO()
     wire = LoggedWire(VirtualWire("expanded-log"), log)
     other = VirtualWire("expanded-log")
-    frames = sent()
+    frames = make_frames_and_texts()
     for i, (frame, _) in enumerate(frames):
         if i % 2:
             wire.send(frame)
@@ -127,8 +126,10 @@ def test_stock_cantools_decodes_our_log(expanded: Path) -> None:
             assert wire.receive() == [frame]
     wire.close()
     other.close()
-    command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(expanded)]
-    done = subprocess.run(command, input=log.getvalue(), capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    for line, (_, words) in zip(done.stdout.splitlines(), frames, strict=True):
-        assert words in line
+    command = [sys.executable, "-m", "cantools", "decode", "--single-line", str(expanded_file)]
+    result = subprocess.run(
+        command, input=log.getvalue(), capture_output=True, text=True, timeout=60
+    )
+    assert result.returncode == 0, result.stderr
+    for line, (_, text) in zip(result.stdout.splitlines(), frames, strict=True):
+        assert text in line

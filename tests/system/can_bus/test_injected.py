@@ -1,6 +1,6 @@
-"""Faults on request through the driver: its emulators get theirs, and a virtual bus fails as a kernel's does.
+"""The driver injects requested faults into its emulated modules, and into a virtual bus, which fails as a real one.
 
-What real interfaces do stands in tests/system/can/test_bus_faults.py; the rows here are the same.
+tests/system/can/test_bus_faults.py injects the same faults into interfaces of the kernel.
 """
 
 from typing import Any
@@ -28,13 +28,14 @@ from snakesim_testing.messages import raises_error
 
 
 def inject(run: DriverLoop, text: str, *, begins: bool = True) -> None:
+    """Begin or end a fault, given as KIND:TARGET."""
     FaultyBackend(run.backend).inject(parse_injection(f"{text}@0"), begins=begins)
 
 
-# --- modules -------------------------------------------------------------------------------------------------
+# --- modules -----------------------------------------------------------------------------------------------------
 
 
-def test_what_a_module_cannot_know_the_host_makes() -> None:
+def test_host_injects_measurement_errors_that_modules_cannot() -> None:
     with open_driver_loop() as run:
         run.run(3)
         faulty = FaultyBackend(run.backend)
@@ -48,7 +49,7 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "text"),
+    ("settings", "fault"),
     [
         (CanSettings(), "diverge:simulator@1"),
         (CanSettings(), "cut:bus_2@1"),
@@ -56,28 +57,32 @@ def test_what_a_module_cannot_know_the_host_makes() -> None:
         (CanSettings(channels=["vcan0"], emulators="process"), "full:bus_1@1"),
     ],
 )
-def test_what_cannot_be_had_is_refused_before_anything_is_opened(
-    settings: CanSettings, text: str
+def test_injection_that_is_not_supported_is_refused_before_opening(
+    settings: CanSettings, fault: str
 ) -> None:
     with raises_error(ConfigError, code=("injection/not-supported", "injection/unknown-target")):
-        CanBackend.check(make_can_config(faults=[text]), settings)
+        CanBackend.check(make_can_config(faults=[fault]), settings)
 
 
 def test_injection_allows_everything_emulators_and_virtual_bus_support() -> None:
-    texts = [f"{kind}:joint_1@1" for kind in (*FAULT_DESCRIPTIONS, "wrong", "nan")]
-    texts += [f"{kind}:bus_1@1" for kind in ("cut", "bus_off", "error_passive", "overflow", "full")]
-    assert CanBackend.check(make_can_config(faults=texts), CanSettings()) == (
+    faults = [f"{kind}:joint_1@1" for kind in (*FAULT_DESCRIPTIONS, "wrong", "nan")]
+    faults += [
+        f"{kind}:bus_1@1" for kind in ("cut", "bus_off", "error_passive", "overflow", "full")
+    ]
+    assert CanBackend.check(make_can_config(faults=faults), CanSettings()) == (
         "lockstep",
         "realtime",
     )
 
 
-# --- the bus -------------------------------------------------------------------------------------------------
+# --- the bus -----------------------------------------------------------------------------------------------------
 
 
-SILENT, WATCHDOG = ["module_silent"] * 4, ["module_watchdog"] * 4
+SILENT = ["module_silent"] * 4
+WATCHDOG = ["module_watchdog"] * 4
 BUS_FAULTS = [
-    # asked for, told after so many periods, then and while it lasts, when it ends, and what is only counted
+    # The injected fault, the period in which it is reported, the faults while it lasts, the faults that follow
+    # when it ends, and the minor errors that are only counted.
     ("cut", 0, ["interface_down"], WATCHDOG, {"interface_up"}),
     ("bus_off", 0, ["bus_off", *SILENT], ["restarted", *WATCHDOG], set()),
     ("full", 2, ["bus_stuck"], WATCHDOG, {"queue_full"}),
@@ -87,51 +92,58 @@ BUS_FAULTS = [
 
 
 @pytest.mark.parametrize(
-    ("kind", "after", "what", "then", "counted"), BUS_FAULTS, ids=[row[0] for row in BUS_FAULTS]
+    ("kind", "delay_ticks", "first_faults", "later_faults", "minor_errors"),
+    BUS_FAULTS,
+    ids=[row[0] for row in BUS_FAULTS],
 )
-def test_a_bus_that_fails_stops_the_joints_and_comes_back(
-    kind: str, after: int, what: list[str], then: list[str], counted: set[str]
+def test_bus_fault_stops_the_joints_and_bus_recovers(
+    kind: str,
+    delay_ticks: int,
+    first_faults: list[str],
+    later_faults: list[str],
+    minor_errors: set[str],
 ) -> None:
     with open_driver_loop() as run:
         arm_and_wave(run)
         inject(run, f"{kind}:bus_1")
         start = run.tick
         run.run(13, run.wave_joints)
-        assert [fault.what for fault in run.faults] == what
-        assert run.faults[0].tick - start == after
+        assert [fault.what for fault in run.faults] == first_faults
+        assert run.faults[0].tick - start == delay_ticks
         assert run.lifecycle == "fault"
         inject(run, f"{kind}:bus_1", begins=False)
         run.run(10)
-        assert [fault.what for fault in run.faults] == what + then
-        assert run.backend.modules.monitor.minor_error_counts.keys() == counted
-        assert run.states() == [ModuleState.FAULT if then else ModuleState.DISARMED] * 4
+        assert [fault.what for fault in run.faults] == first_faults + later_faults
+        assert run.backend.modules.monitor.minor_error_counts.keys() == minor_errors
+        assert run.states() == [ModuleState.FAULT if later_faults else ModuleState.DISARMED] * 4
         reset_and_arm_again(run)
 
 
-def test_one_end_of_a_virtual_bus() -> None:
-    here, there = VirtualWire("wire-faults"), VirtualWire("wire-faults")
+def test_virtual_bus_end_with_fault_reports_it_and_recovers() -> None:
+    near = VirtualWire("wire-faults")
+    far = VirtualWire("wire-faults")
     try:
         frame = CanFrame(0x105, b"1")
-        assert here.send(frame)
-        assert there.receive() == [frame]
-        assert here.errors() == []
-        for kind, taken in (("cut", False), ("bus_off", True), ("full", False)):
-            here.inject(kind, begins=True)
-            assert here.send(frame) is taken
-            assert there.receive() == []
-            there.send(frame)
-            assert here.receive() == ([frame] if kind == "full" else [])
-            here.inject(kind, begins=False)
-            assert here.send(frame)
-            assert there.receive() == [frame]
-        here.inject("overflow", begins=True)
-        there.send(frame)
-        there.send(frame)
-        assert here.receive() == []
-        there.send(frame)
-        assert here.receive() == [frame]
-        said = [(error.kind, error.detail) for error in here.errors()]
-        assert said == [
+        assert near.send(frame)
+        assert far.receive() == [frame]
+        assert near.errors() == []
+        for kind, accepts_frame in (("cut", False), ("bus_off", True), ("full", False)):
+            near.inject(kind, begins=True)
+            assert near.send(frame) is accepts_frame
+            assert far.receive() == []
+            far.send(frame)
+            assert near.receive() == ([frame] if kind == "full" else [])
+            near.inject(kind, begins=False)
+            assert near.send(frame)
+            assert far.receive() == [frame]
+        near.inject("overflow", begins=True)
+        far.send(frame)
+        far.send(frame)
+        assert near.receive() == []
+        far.send(frame)
+        assert near.receive() == [frame]
+        errors = [(error.kind, error.detail) for error in near.errors()]
+        assert errors == [
             ("interface_down", "the interface is down"),
             ("interface_up", "the interface is up again"),
             ("bus_off", "transmit errors 255, receive errors 0"),
@@ -139,23 +151,23 @@ def test_one_end_of_a_virtual_bus() -> None:
             ("queue_full", "the transmit queue is full"),
             ("receive_overflow", "the kernel dropped 2 frames: this process reads too slowly"),
         ]
-        here.inject("cut", begins=True)
-        here.inject("cut", begins=True)
-        assert here.errors() == [BusError("interface_down", "wire-faults", "the interface is down")]
+        near.inject("cut", begins=True)
+        near.inject("cut", begins=True)
+        assert near.errors() == [BusError("interface_down", "wire-faults", "the interface is down")]
     finally:
-        here.close()
-        there.close()
+        near.close()
+        far.close()
 
 
 @pytest.mark.parametrize(
-    "given",
+    "channel_and_fault",
     [
         ("lo0", "full"),
         ("nothere0", "cut"),
         ("can7", "bus_off"),
     ],
 )
-def test_what_cannot_be_done_to_an_interface_is_told(given: Any) -> None:
-    channel, kind = given
+def test_interface_fault_that_is_impossible_is_refused(channel_and_fault: Any) -> None:
+    channel, kind = channel_and_fault
     with raises_error(ConfigError, code=("injection/not-supported", "machine/not-permitted")):
         inject_into_interface(channel, kind, begins=True)

@@ -1,4 +1,4 @@
-"""A bus between programs without CAN in the kernel: who gets which frames, and what one program does to others."""
+"""A local bus connects programs without CAN in the kernel, and a frozen or killed program disturbs no other one."""
 
 import contextlib
 import json
@@ -27,7 +27,7 @@ from snakesim_testing.messages import raises_error
 FRAME = CanFrame(0x123, b"\1\2\3")
 FLOOD_FRAMES = 3 * INBOX_BYTES // RECORD_FORMAT.size
 # Joins the bus and sends a frame. At each line of its input it prints the ids that it has received, and its errors.
-MEMBER = """
+MEMBER_CODE = """
 import json, sys
 from snakesim_can_backend.bus.local_wire import LocalWire
 from snakesim_can_backend.protocol.definitions import CanFrame
@@ -44,12 +44,13 @@ for line in sys.stdin:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    """Provide the path of a bus that does not exist yet."""
     return tmp_path / "bus"
 
 
 @contextlib.contextmanager
 def join(folder: Path, count: int) -> Iterator[list[LocalWire]]:
-    """Several ends of one bus in this process, for CAN FD."""
+    """Open several ends of one bus in this process, for CAN FD."""
     with contextlib.ExitStack() as opened:
         yield [
             opened.enter_context(contextlib.closing(LocalWire(str(folder), fd=True)))
@@ -59,9 +60,9 @@ def join(folder: Path, count: int) -> Iterator[list[LocalWire]]:
 
 @contextlib.contextmanager
 def run_member(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """Another process on the bus."""
+    """Run another process that joins the bus."""
     process = subprocess.Popen(
-        [sys.executable, "-c", MEMBER, str(folder)],
+        [sys.executable, "-c", MEMBER_CODE, str(folder)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -75,20 +76,22 @@ def run_member(folder: Path) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def report(process: subprocess.Popen[str]) -> tuple[list[int], list[list[str]]]:
-    """The ids that another process has received since the last report, and its bus errors: kind and detail."""
-    assert process.stdin is not None and process.stdout is not None
+def request_report(process: subprocess.Popen[str]) -> tuple[list[int], list[list[str]]]:
+    """Return the ids that a process has received since its last report, and its errors as kind and detail."""
+    assert process.stdin is not None
+    assert process.stdout is not None
     process.stdin.write("\n")
     process.stdin.flush()
     ids, errors = json.loads(process.stdout.readline())
     return ids, errors
 
 
-def list_kinds(wire: LocalWire) -> list[str]:
+def list_error_kinds(wire: LocalWire) -> list[str]:
+    """Return the kinds of the errors since the last call."""
     return [error.kind for error in wire.errors()]
 
 
-def test_frames_reach_every_other_end_in_order(folder: Path) -> None:
+def test_local_bus_frames_reach_every_other_end_in_order(folder: Path) -> None:
     frames = [CanFrame(0x8001, bytes(range(64))), CanFrame(0x101, b"")]
     with join(folder, 3) as (first, *others):
         for frame in frames:
@@ -101,7 +104,7 @@ def test_frames_reach_every_other_end_in_order(folder: Path) -> None:
     assert not folder.exists(), "the last program removes the folder"
 
 
-def test_several_writers_reach_one_reader(folder: Path) -> None:
+def test_local_bus_reader_receives_frames_of_several_writers(folder: Path) -> None:
     with join(folder, 4) as (reader, *writers):
         for i in range(100):
             for identifier, wire in enumerate(writers):
@@ -111,7 +114,7 @@ def test_several_writers_reach_one_reader(folder: Path) -> None:
         assert [frame.data[0] for frame in frames if frame.id == identifier] == [*range(100)]
 
 
-def test_a_program_that_joins_late_gets_every_later_frame(folder: Path) -> None:
+def test_local_bus_end_that_joins_late_receives_later_frames(folder: Path) -> None:
     with join(folder, 1) as (first,):
         for _ in range(200):
             first.send(CanFrame(1, b"too early"))
@@ -120,7 +123,7 @@ def test_a_program_that_joins_late_gets_every_later_frame(folder: Path) -> None:
                 assert late.receive() == [FRAME]
 
 
-def test_one_end_of_classic_can_ignores_what_it_cannot_receive(folder: Path) -> None:
+def test_local_bus_end_of_classic_can_ignores_other_frames(folder: Path) -> None:
     with (
         join(folder, 1) as (sender,),
         contextlib.closing(open_wire(f"local:{folder}")) as classic,
@@ -135,7 +138,7 @@ def test_one_end_of_classic_can_ignores_what_it_cannot_receive(folder: Path) -> 
             sender.send(CanFrame(1, bytes(65)))
 
 
-def test_a_frozen_reader_delays_no_other_and_its_lost_frames_are_reported(folder: Path) -> None:
+def test_local_bus_frozen_reader_delays_no_other_one(folder: Path) -> None:
     with join(folder, 2) as (writer, reader), run_member(folder) as frozen:
         reader.receive()
         writer.receive()
@@ -148,47 +151,47 @@ def test_a_frozen_reader_delays_no_other_and_its_lost_frames_are_reported(folder
         received += reader.receive()
         sent_ids = [i % 0x800 for i in range(FLOOD_FRAMES)]
         assert [frame.id for frame in received] == sent_ids, "another reader gets everything"
-        assert list_kinds(reader) == []
-        (at_writer,) = writer.errors()
-        assert at_writer.kind == "queue_full"
+        assert list_error_kinds(reader) == []
+        (error,) = writer.errors()
+        assert error.kind == "queue_full"
         assert writer.errors() == [], "each lost frame is reported once"
 
-        # The frozen program continues: it gets the frames that fitted, whole and in order. The next frame brings the
-        # number of the lost ones.
+        # The frozen program continues: it receives the frames for which there was space, in order. The next frame
+        # contains the number of the lost frames.
         os.kill(frozen.pid, signal.SIGCONT)
-        ids, errors = report(frozen)
+        ids, errors = request_report(frozen)
         lost = FLOOD_FRAMES - len(ids)
         assert ids == sent_ids[: len(ids)]
         assert lost > 0
-        assert at_writer.detail.startswith(f"{lost} frames")
+        assert error.detail.startswith(f"{lost} frames")
         assert errors == []
         writer.send(FRAME)
-        ids, ((kind, detail),) = report(frozen)
+        ids, ((kind, detail),) = request_report(frozen)
         assert ids == [FRAME.id]
         assert kind == "receive_overflow"
         assert detail.startswith(f"{lost} frames")
 
 
-def test_a_killed_program_is_forgotten_and_another_takes_its_place(folder: Path) -> None:
+def test_local_bus_removes_killed_program_and_accepts_another(folder: Path) -> None:
     with join(folder, 1) as (wire,):
-        assert list_kinds(wire) == [], "a program may be the first on the bus"
+        assert list_error_kinds(wire) == [], "a program may be the first on the bus"
         for _ in range(2):
             with run_member(folder) as process:
                 wait([wire], 1.0)
                 assert wire.receive() == [FRAME]
-                assert "interface_down" not in list_kinds(wire)
+                assert "interface_down" not in list_error_kinds(wire)
                 process.send_signal(signal.SIGKILL)
                 process.wait(10)
                 assert len([*folder.iterdir()]) == 2, "it could not clean up"
             assert wire.send(FRAME)
             assert [*folder.iterdir()] == [wire._inbox_path]
-            assert list_kinds(wire) == ["interface_down"]
-            assert list_kinds(wire) == []
+            assert list_error_kinds(wire) == ["interface_down"]
+            assert list_error_kinds(wire) == []
         with join(folder, 1):
-            assert list_kinds(wire) == ["interface_up"]
+            assert list_error_kinds(wire) == ["interface_up"]
 
 
-def test_the_next_program_removes_what_killed_ones_left(folder: Path) -> None:
+def test_local_bus_next_program_removes_files_of_killed_one(folder: Path) -> None:
     with run_member(folder) as process:
         process.send_signal(signal.SIGKILL)
         process.wait(10)
@@ -199,7 +202,7 @@ def test_the_next_program_removes_what_killed_ones_left(folder: Path) -> None:
     assert not folder.exists()
 
 
-def test_the_last_program_removes_the_bus_with_what_killed_ones_left(folder: Path) -> None:
+def test_local_bus_last_program_removes_bus_and_remaining_files(folder: Path) -> None:
     with join(folder, 1) as (wire,), run_member(folder) as process:
         wire.send(FRAME)
         process.send_signal(signal.SIGKILL)
@@ -207,7 +210,7 @@ def test_the_last_program_removes_the_bus_with_what_killed_ones_left(folder: Pat
     assert not folder.exists()
 
 
-def test_bytes_that_are_no_frames_are_skipped(folder: Path) -> None:
+def test_local_bus_skips_bytes_that_are_no_frames(folder: Path) -> None:
     record = RECORD_FORMAT.pack(MAGIC, 0, FRAME.id, len(FRAME.data), FRAME.data)
     too_long = RECORD_FORMAT.pack(MAGIC, 0, 1, 65, b"")
     with join(folder, 1) as (wire,):
@@ -219,8 +222,8 @@ def test_bytes_that_are_no_frames_are_skipped(folder: Path) -> None:
         assert wire.receive() == [FRAME]
 
 
-def test_frames_of_others_are_listed(folder: Path) -> None:
-    """As `snakesim drive scan can` does before it sends anything."""
+def test_local_bus_lists_unknown_frames_of_other_programs(folder: Path) -> None:
+    """`snakesim drive scan can` listens in this way before it sends a frame."""
     with join(folder, 2) as (other, listener):
         heartbeat = CanFrame(0x701, b"\5")
         for frame in (
@@ -238,21 +241,21 @@ def test_frames_of_others_are_listed(folder: Path) -> None:
     ]
 
 
-def test_cut_end_neither_sends_nor_receives_until_the_end_of_the_fault(folder: Path) -> None:
+def test_local_bus_cut_end_neither_sends_nor_receives_during_fault(folder: Path) -> None:
     with join(folder, 2) as (near, far):
         near.inject("cut", begins=True)
         assert not near.send(CanFrame(1, b""))
         far.send(CanFrame(2, b""))
         wait([near], 0.2)
         assert near.receive() == []
-        assert list_kinds(near) == ["interface_down"]
+        assert list_error_kinds(near) == ["interface_down"]
         near.inject("cut", begins=False)
         near.send(CanFrame(3, b""))
         wait([far], 1.0)
         assert far.receive() == [CanFrame(3, b"")]
 
 
-def test_only_this_user_can_join(folder: Path) -> None:
+def test_local_bus_is_accessible_only_to_its_user(folder: Path) -> None:
     with join(folder, 1) as (wire,):
         assert folder.stat().st_mode & 0o777 == 0o700
         assert wire._inbox_path.stat().st_mode & 0o777 == 0o600
@@ -265,7 +268,7 @@ def test_only_this_user_can_join(folder: Path) -> None:
         validate_channel(f"local:{folder}")
 
 
-def test_files_of_others_in_the_folder_are_left_alone(folder: Path) -> None:
+def test_local_bus_keeps_other_files_of_its_folder(folder: Path) -> None:
     folder.mkdir(mode=0o700)
     log = folder / "log.can"
     log.write_text("a log")
@@ -276,7 +279,7 @@ def test_files_of_others_in_the_folder_are_left_alone(folder: Path) -> None:
     assert [*folder.iterdir()] == [log]
 
 
-def test_a_bus_without_a_program_is_refused_with_a_way_out(folder: Path, tmp_path: Path) -> None:
+def test_local_bus_without_program_is_refused_with_advice(folder: Path, tmp_path: Path) -> None:
     channel = f"local:{folder}"
     assert is_emulated(channel)
     validate_channels([channel], is_emulator=True)

@@ -1,4 +1,4 @@
-"""The emulators that a driver starts for itself: what is refused, and a child process from its start to its end."""
+"""A driver starts its own emulators in a child process, checks their settings, and ends the process with the run."""
 
 import json
 import os
@@ -18,10 +18,10 @@ from snakesim_testing.can.driver_loop import make_can_config
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
-RUN = make_can_config()
+RUN_CONFIG = make_can_config()
 VCAN = ["vcan0"]
 
-# --- what is refused ---------------------------------------------------------------------------------------
+# --- refused settings --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -38,7 +38,7 @@ VCAN = ["vcan0"]
         CanSettings(emulators="firmware", faults=["mute:joint_1@1"]),
     ],
 )
-def test_twins_that_cannot_be_are_refused(settings: CanSettings) -> None:
+def test_own_emulators_with_impossible_settings_are_refused(settings: CanSettings) -> None:
     with raises_error(
         ConfigError,
         code=(
@@ -48,109 +48,122 @@ def test_twins_that_cannot_be_are_refused(settings: CanSettings) -> None:
             "injection/unknown-target",
         ),
     ):
-        validate_emulator_settings(RUN, settings)
+        validate_emulator_settings(RUN_CONFIG, settings)
 
 
-# --- the child ---------------------------------------------------------------------------------------------
+# --- the child ---------------------------------------------------------------------------------------------------
 
 
-class Child:
-    """Instead of `snakesim drive emulate can` runs a program that notes how it was started, and does as told."""
+class ReplacedChild:
+    """Replaces `snakesim drive emulate can` by a program that stores how it was started, and then runs given code."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self._noted, self._program = folder / "noted.json", folder / "python"
+        self._start_info_file = folder / "start_info.json"
+        self._program = folder / "python"
         self._patch = monkeypatch
 
-    def does(self, *lines: str) -> None:
-        noting = "{'arguments': sys.argv[1:], 'pid': os.getpid(), 'session': os.getsid(0), 'config': config}"
+    def install(self, *lines: str) -> None:
+        """Use a program with these lines of code as the interpreter of the child process."""
+        start_info = "{'arguments': sys.argv[1:], 'pid': os.getpid(), 'session': os.getsid(0), 'config': config}"
         self._program.write_text(
             f"#!{sys.executable}\n"
             "import json, os, pathlib, signal, sys, time\n"
             "config = json.loads(pathlib.Path(sys.argv[4]).read_text())\n"
-            f"pathlib.Path({str(self._noted)!r}).write_text(json.dumps({noting}))\n"
+            f"pathlib.Path({str(self._start_info_file)!r}).write_text(json.dumps({start_info}))\n"
             + "\n".join(lines)
         )
         self._program.chmod(0o755)
         self._patch.setattr(sys, "executable", str(self._program))
 
-    def noted(self) -> dict[str, Any]:
-        return json.loads(self._noted.read_text())
+    def read_start_info(self) -> dict[str, Any]:
+        """Return arguments, process id, session and configuration of the child."""
+        return json.loads(self._start_info_file.read_text())
 
-    def must_be_gone(self) -> None:
-        """The process, and the configuration that was written for it."""
-        noted = self.noted()
+    def assert_removed(self) -> None:
+        """Check that the process and the file with its configuration do not exist any more."""
+        start_info = self.read_start_info()
         with pytest.raises(ProcessLookupError):
-            os.kill(noted["pid"], 0)
-        assert not Path(noted["arguments"][3]).exists()
+            os.kill(start_info["pid"], 0)
+        assert not Path(start_info["arguments"][3]).exists()
 
 
 @pytest.fixture
-def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Child:
-    return Child(tmp_path, monkeypatch)
+def child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ReplacedChild:
+    """Provide a child process whose program the test selects."""
+    return ReplacedChild(tmp_path, monkeypatch)
 
 
-READY, SERVE = "print('modules ready: 4 on vcan0', flush=True)", "time.sleep(60)"
+READY = "print('modules ready: 4 on vcan0', flush=True)"
+SERVE = "time.sleep(60)"
 ON_VCAN = CanSettings(channels=VCAN, emulators="process", physics_model="inertia")
 
 
-def test_a_child_is_told_everything_and_ends_when_asked(
-    child: Child, capsys: pytest.CaptureFixture[str]
+def test_emulator_process_receives_its_settings_and_ends_on_request(
+    child: ReplacedChild, capsys: pytest.CaptureFixture[str]
 ) -> None:
     end = "signal.signal(signal.SIGTERM, lambda *_: (print('last words', flush=True), sys.exit(0)))"
-    child.does(end, "print('a warning')", READY, SERVE)
+    child.install(end, "print('a warning')", READY, SERVE)
     settings = CanSettings(
         channels=["vcan0", "vcan1"],
         emulators="process",
         physics_model="inertia",
         faults=["mute:joint_1@2"],
     )
-    emulators = EmulatorProcess(RUN, settings, "127.0.0.1:5000", is_stepped=True)
-    noted = child.noted()
-    arguments = noted["arguments"]
+    emulators = EmulatorProcess(RUN_CONFIG, settings, "127.0.0.1:5000", is_stepped=True)
+    start_info = child.read_start_info()
+    arguments = start_info["arguments"]
     assert arguments[:3] == ["-P", "-m", "snakesim_can_backend.emulator.command"]
     assert "--stepped" in arguments
-    assert [arguments[i + 1] for i, word in enumerate(arguments) if word == "--channel"] == [
-        "vcan0",
-        "vcan1",
+    channels = [
+        arguments[index + 1] for index, argument in enumerate(arguments) if argument == "--channel"
     ]
+    assert channels == ["vcan0", "vcan1"]
     assert arguments[arguments.index("--pose") + 1] == "127.0.0.1:5000"
     assert arguments[arguments.index("--parent") + 1] == str(os.getpid())
-    assert noted["session"] == noted["pid"], "Ctrl-C is not for it"
-    assert noted["config"]["backends"]["can"]["physics_model"] == "inertia"
-    assert noted["config"]["backends"]["can"]["faults"] == ["mute:joint_1@2"]
+    assert start_info["session"] == start_info["pid"], "Ctrl-C would end the child"
+    settings_of_child = start_info["config"]["backends"]["can"]
+    assert settings_of_child["physics_model"] == "inertia"
+    assert settings_of_child["faults"] == ["mute:joint_1@2"]
     emulators.stop()
-    child.must_be_gone()
-    said = capsys.readouterr().err
-    assert "a warning" in said
-    assert "last words" in said
+    child.assert_removed()
+    printed = capsys.readouterr().err
+    assert "a warning" in printed
+    assert "last words" in printed
 
 
-def test_a_child_that_will_not_end_is_killed(child: Child, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_emulator_process_that_ignores_sigterm_is_killed(
+    child: ReplacedChild, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(emulator_child, "STOP_TIMEOUT_S", 0.2)
-    child.does("signal.signal(signal.SIGTERM, signal.SIG_IGN)", READY, SERVE)
-    emulators = EmulatorProcess(RUN, ON_VCAN, None, is_stepped=False)
-    began = time.monotonic()
+    child.install("signal.signal(signal.SIGTERM, signal.SIG_IGN)", READY, SERVE)
+    emulators = EmulatorProcess(RUN_CONFIG, ON_VCAN, None, is_stepped=False)
+    start_s = time.monotonic()
     emulators.stop()
-    assert time.monotonic() - began < 5.0
-    child.must_be_gone()
+    assert time.monotonic() - start_s < 5.0
+    child.assert_removed()
 
 
 @pytest.mark.parametrize("ending", ["sys.exit(2)", SERVE])
 def test_emulator_process_that_never_becomes_ready_is_reported_and_removed(
-    ending: str, child: Child, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ending: str,
+    child: ReplacedChild,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(emulator_child, "SERVICE_START_LIMIT_S", 5.0)
-    child.does("print('no such physics_model', flush=True)", ending)
+    child.install("print('no such physics_model', flush=True)", ending)
     with raises_error(BackendError, code="emulator/not-started"):
-        EmulatorProcess(RUN, ON_VCAN, None, is_stepped=False)
-    child.must_be_gone()
+        EmulatorProcess(RUN_CONFIG, ON_VCAN, None, is_stepped=False)
+    child.assert_removed()
     assert "no such physics_model" in capsys.readouterr().err
 
 
-def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixture[str]) -> None:
+def test_emulator_command_without_interface_reports_its_name(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with raises_error(BackendError, code="emulator/not-started"):
         EmulatorProcess(
-            RUN,
+            RUN_CONFIG,
             CanSettings(channels=["vcan77"], emulators="process", physics_model="inertia"),
             None,
             is_stepped=False,
@@ -158,9 +171,9 @@ def test_the_real_command_says_why_it_does_not_start(capsys: pytest.CaptureFixtu
     assert "vcan77" in capsys.readouterr().err
 
 
-def test_emulator_process_exit_is_noticed_without_its_log(child: Child) -> None:
-    child.does(READY, "time.sleep(0.3)", "sys.exit(3)")
-    emulators = EmulatorProcess(RUN, ON_VCAN, None, is_stepped=False)
+def test_emulator_process_exit_is_noticed_without_its_log(child: ReplacedChild) -> None:
+    child.install(READY, "time.sleep(0.3)", "sys.exit(3)")
+    emulators = EmulatorProcess(RUN_CONFIG, ON_VCAN, None, is_stepped=False)
     assert emulators.describe_exit() is None
     emulators._child.output_path.unlink()
     wait_until(emulators.describe_exit, "the end of the child")
@@ -168,25 +181,30 @@ def test_emulator_process_exit_is_noticed_without_its_log(child: Child) -> None:
     emulators.stop()
 
 
-def test_emulator_process_error_is_reported_as_in_a_terminal(child: Child, tmp_path: Path) -> None:
-    heard = tmp_path / "heard"
-    child.does(
-        READY, "for line in sys.stdin:", f"    pathlib.Path({str(heard)!r}).open('a').write(line)"
+def test_emulator_process_receives_faults_as_from_a_terminal(
+    child: ReplacedChild, tmp_path: Path
+) -> None:
+    received = tmp_path / "received"
+    child.install(
+        READY,
+        "for line in sys.stdin:",
+        f"    pathlib.Path({str(received)!r}).open('a').write(line)",
     )
-    emulators = EmulatorProcess(RUN, ON_VCAN, None, is_stepped=False)
-    arguments = child.noted()["arguments"]
+    emulators = EmulatorProcess(RUN_CONFIG, ON_VCAN, None, is_stepped=False)
+    arguments = child.read_start_info()["arguments"]
     assert "--interactive" in arguments
     assert "--stepped" not in arguments
     assert arguments[arguments.index("--pose") + 1] == "none"
     emulators.inject(FaultInjection("mute", "joint_3", 1.0, 2.0), begins=True)
     emulators.inject(FaultInjection("mute", "joint_3", 1.0, 2.0), begins=False)
     wait_until(
-        lambda: heard.exists() and heard.read_text().endswith("off\n"), "the end told to the child"
+        lambda: received.exists() and received.read_text().endswith("off\n"),
+        "the child receives the end of the fault",
     )
-    assert heard.read_text() == "mute joint_3\nmute joint_3 off\n"
+    assert received.read_text() == "mute joint_3\nmute joint_3 off\n"
     emulators.stop()
     with raises_error(BackendError, code="injection/not-supported", field="joint_1"):
-        for _ in range(100):  # until the pipe is known to be broken
+        for _ in range(100):  # the first writes to a broken pipe may raise no error
             emulators.inject(FaultInjection("leak", "joint_1"), begins=True)
 
 
@@ -195,4 +213,4 @@ def test_emulator_process_that_cannot_start_is_a_backend_error(
 ) -> None:
     monkeypatch.setattr(sys, "executable", str(tmp_path / "no python"))
     with raises_error(BackendError, code="emulator/not-started"):
-        EmulatorProcess(RUN, ON_VCAN, None, is_stepped=True)
+        EmulatorProcess(RUN_CONFIG, ON_VCAN, None, is_stepped=True)

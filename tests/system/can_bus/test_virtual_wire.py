@@ -1,4 +1,4 @@
-"""Virtual buses within the process, and how one waits for frames."""
+"""Virtual buses connect two ends within one process, and `wait` returns when a frame may have arrived."""
 
 import math
 import socket
@@ -15,29 +15,30 @@ from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_testing.messages import raises_error
 
 
-class End:
-    """Another end that says when it wants to run again."""
+class EmulatedPeer:
+    """The other end of a bus: it sends a frame when it runs, and returns after which time it must run again."""
 
-    def __init__(self, pause_s: float | None, then_send: VirtualWire | None = None) -> None:
-        self.pause_s, self.then_send = pause_s, then_send
-        self.ran = 0
+    def __init__(self, pause_s: float | None, sending_wire: VirtualWire | None = None) -> None:
+        self.pause_s = pause_s
+        self.sending_wire = sending_wire
+        self.run_count = 0
         self.closed = False
 
     def __call__(self) -> float | None:
-        self.ran += 1
-        if self.then_send is not None:
-            self.then_send.send(CanFrame(0x101, b"\x01"))
+        self.run_count += 1
+        if self.sending_wire is not None:
+            self.sending_wire.send(CanFrame(0x101, b"\x01"))
         return self.pause_s
 
     def inject(self, injection: FaultInjection, *, begins: bool) -> None:
-        raise AssertionError(f"nobody asked for {injection}")
+        raise AssertionError(f"these tests inject no faults, such as {injection}")
 
     def close(self) -> None:
         self.closed = True
 
 
-class OnSocket(VirtualWire):
-    """A bus that is waited for by a socket, as a kernel interface is."""
+class SocketWire(VirtualWire):
+    """A bus that has a socket to wait for, as an interface of the kernel has."""
 
     def __init__(self, source: socket.socket) -> None:
         super().__init__(f"waits-{uuid.uuid4().hex}")
@@ -50,14 +51,15 @@ class OnSocket(VirtualWire):
 @pytest.fixture
 def pair() -> Iterator[tuple[VirtualWire, VirtualWire]]:
     name = f"wire-{uuid.uuid4().hex[:8]}"
-    made = VirtualWire(name), VirtualWire(name)
-    yield made
-    for wire in made:
+    wires = (VirtualWire(name), VirtualWire(name))
+    yield wires
+    for wire in wires:
         wire.close()
 
 
-def took_s(began: float) -> float:
-    return time.monotonic() - began
+def compute_elapsed_s(start_s: float) -> float:
+    """Return the time since `start_s` of the monotonic clock."""
+    return time.monotonic() - start_s
 
 
 def test_virtual_bus_ends_receive_each_other_and_not_themselves(
@@ -73,70 +75,75 @@ def test_virtual_bus_ends_receive_each_other_and_not_themselves(
     assert near.errors() == []
 
 
-def test_a_virtual_bus_says_when_something_may_come(pair: tuple[VirtualWire, VirtualWire]) -> None:
+def test_virtual_bus_idle_returns_time_until_next_frame(
+    pair: tuple[VirtualWire, VirtualWire],
+) -> None:
     near, far = pair
     assert near.idle() == math.inf
-    near.peer = End(0.25)
+    near.peer = EmulatedPeer(0.25)
     assert near.idle() == 0.25
-    near.peer = End(None)
+    near.peer = EmulatedPeer(None)
     assert near.idle() is None
     far.send(CanFrame(1, b""))
     assert near.idle() == 0.0
 
 
-def test_closing_one_end_closes_what_lives_on_the_other() -> None:
-    end = End(None)
+def test_virtual_bus_closed_closes_its_peer() -> None:
+    end = EmulatedPeer(None)
     VirtualWire(f"wire-{uuid.uuid4().hex[:8]}", end).close()
     assert end.closed
 
 
-def test_wait_does_not_sleep_when_a_frame_is_there(pair: tuple[VirtualWire, VirtualWire]) -> None:
+def test_wait_with_arrived_frame_returns_at_once(pair: tuple[VirtualWire, VirtualWire]) -> None:
     near, far = pair
-    near.peer = End(5.0, then_send=far)
-    began = time.monotonic()
+    near.peer = EmulatedPeer(5.0, sending_wire=far)
+    start_s = time.monotonic()
     assert wait([near], 5.0)
-    assert took_s(began) < 1.0
-    assert near.peer.ran == 1
+    assert compute_elapsed_s(start_s) < 1.0
+    assert near.peer.run_count == 1
 
 
-def test_wait_sleeps_as_long_as_nobody_wants_to_run(pair: tuple[VirtualWire, VirtualWire]) -> None:
+def test_wait_returns_when_a_peer_must_run(pair: tuple[VirtualWire, VirtualWire]) -> None:
     near, other = pair
-    near.peer = End(0.05)
-    began = time.monotonic()
+    near.peer = EmulatedPeer(0.05)
+    start_s = time.monotonic()
     assert wait([near, other], 5.0)
-    assert 0.045 < took_s(began) < 1.0
-    near.peer = End(5.0)
-    began = time.monotonic()
-    assert wait([near], 0.05) and 0.045 < took_s(began) < 1.0, "and no longer than asked for"
-    assert wait([near], -1.0), "time that is over is no error"
+    assert 0.045 < compute_elapsed_s(start_s) < 1.0
+    near.peer = EmulatedPeer(5.0)
+    start_s = time.monotonic()
+    assert wait([near], 0.05)
+    assert 0.045 < compute_elapsed_s(start_s) < 1.0, "the wait was longer than its timeout"
+    assert wait([near], -1.0), "a negative timeout is an error"
 
 
-def test_wait_says_when_nothing_can_come(pair: tuple[VirtualWire, VirtualWire]) -> None:
+def test_wait_for_peer_that_never_runs_returns_false_at_once(
+    pair: tuple[VirtualWire, VirtualWire],
+) -> None:
     near, _ = pair
-    near.peer = End(None)
-    began = time.monotonic()
+    near.peer = EmulatedPeer(None)
+    start_s = time.monotonic()
     assert not wait([near], 5.0)
-    assert took_s(began) < 1.0
+    assert compute_elapsed_s(start_s) < 1.0
 
 
 def test_virtual_bus_wait_wakes_for_socket_and_reports_closed_one() -> None:
     near, far = socket.socketpair()
     with far:
-        wire = OnSocket(near)
-        began = time.monotonic()
+        wire = SocketWire(near)
+        start_s = time.monotonic()
         assert wait([wire], 0.05)
-        assert took_s(began) > 0.045
+        assert compute_elapsed_s(start_s) > 0.045
         far.send(b"!")
-        began = time.monotonic()
+        start_s = time.monotonic()
         assert wait([wire], 5.0)
-        assert took_s(began) < 1.0
+        assert compute_elapsed_s(start_s) < 1.0
         near.close()
         with raises_error(BackendError, code="bus/io-failed"):
             wait([wire], 0.0)
         wire.close()
 
 
-def test_virtual_bus_that_is_gone_is_a_backend_error() -> None:
+def test_virtual_bus_that_was_shut_down_raises_backend_error() -> None:
     wire = VirtualWire(f"gone-{uuid.uuid4().hex}")
     wire._bus.shutdown()
     with raises_error(BackendError, code="bus/io-failed"):

@@ -1,4 +1,4 @@
-"""One bus from one end: raw CAN frames and errors as Linux has them, on sockets that every machine has."""
+"""A bus sends and receives raw CAN frames and errors as Linux defines them, on sockets that every machine has."""
 
 import errno
 import math
@@ -26,19 +26,31 @@ from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_testing.messages import raises_error
 
 CAN_ERR_FLAG = 0x20000000  # linux/can.h, linux/can/error.h
-CAN_ERR_TX_TIMEOUT, CAN_ERR_LOSTARB, CAN_ERR_CRTL, CAN_ERR_PROT = 0x001, 0x002, 0x004, 0x008
-CAN_ERR_TRX, CAN_ERR_ACK, CAN_ERR_BUSOFF, CAN_ERR_BUSERROR = 0x010, 0x020, 0x040, 0x080
-CAN_ERR_RESTARTED, CAN_ERR_CNT = 0x100, 0x200
-RX_OVERFLOW, TX_OVERFLOW, RX_WARNING, TX_WARNING = 0x01, 0x02, 0x04, 0x08
-RX_PASSIVE, TX_PASSIVE, ACTIVE = 0x10, 0x20, 0x40
+CAN_ERR_TX_TIMEOUT = 0x001
+CAN_ERR_LOSTARB = 0x002
+CAN_ERR_CRTL = 0x004
+CAN_ERR_PROT = 0x008
+CAN_ERR_TRX = 0x010
+CAN_ERR_ACK = 0x020
+CAN_ERR_BUSOFF = 0x040
+CAN_ERR_BUSERROR = 0x080
+CAN_ERR_RESTARTED = 0x100
+CAN_ERR_CNT = 0x200
+RX_OVERFLOW = 0x01
+TX_OVERFLOW = 0x02
+RX_WARNING = 0x04
+TX_WARNING = 0x08
+RX_PASSIVE = 0x10
+TX_PASSIVE = 0x20
+ACTIVE = 0x40
 
 
-def can_frame(identifier: int, data: bytes) -> bytes:
-    """struct can_frame of linux/can.h: id, length, three bytes of padding, eight bytes of data."""
+def pack_can_frame(identifier: int, data: bytes) -> bytes:
+    """Return `struct can_frame` of linux/can.h: id, length, three bytes of padding, eight bytes of data."""
     return struct.pack("=IB3x8s", identifier, len(data), data)
 
 
-# --- error frames ------------------------------------------------------------------------------------------
+# --- error frames ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -59,33 +71,35 @@ def can_frame(identifier: int, data: bytes) -> bytes:
             TX_PASSIVE | RX_OVERFLOW,
             ["bus_off", "error_passive", "receive_overflow"],
         ),
-        (CAN_ERR_PROT, RX_PASSIVE, ["error_frames"]),  # without the class, the byte means nothing
+        (CAN_ERR_PROT, RX_PASSIVE, ["error_frames"]),  # the byte is undefined without its class
         (CAN_ERR_TX_TIMEOUT, 0, ["error_frames"]),
         (CAN_ERR_LOSTARB, 0, ["error_frames"]),
         (CAN_ERR_TRX | CAN_ERR_BUSERROR | CAN_ERR_CNT, 0, ["error_frames"]),
     ],
 )
-def test_an_error_frame_in_words(classes: int, controller: int, kinds: list[Kind]) -> None:
+def test_error_frame_is_decoded_into_its_kinds(
+    classes: int, controller: int, kinds: list[Kind]
+) -> None:
     data = bytes((0, controller, 0, 0, 0, 0, 130, 7))
     expected = [BusError(kind, "can0", "transmit errors 130, receive errors 7") for kind in kinds]
     assert decode_error_frame(CAN_ERR_FLAG | classes, data, "can0") == expected
 
 
 @given(st.integers(0, 0x1FFFFFFF), st.binary(min_size=8, max_size=8))
-def test_every_error_frame_says_something(classes: int, data: bytes) -> None:
-    found = decode_error_frame(CAN_ERR_FLAG | classes, data, "can0")
-    assert found
-    assert len({error.kind for error in found}) == len(found)
+def test_every_error_frame_is_decoded_into_distinct_kinds(classes: int, data: bytes) -> None:
+    errors = decode_error_frame(CAN_ERR_FLAG | classes, data, "can0")
+    assert errors
+    assert len({error.kind for error in errors}) == len(errors)
 
 
-# --- frames through a socket -------------------------------------------------------------------------------
+# --- frames through a socket -------------------------------------------------------------------------------------
 
 
-class CanLike(socket.socket):
-    """A socket of another driver type that keeps what only CAN sockets take, and whose errors a test may choose."""
+class FakeCanSocket(socket.socket):
+    """A local socket that stores the options of CAN sockets, and raises the errors that a test selects."""
 
     filters = b""
-    fails: OSError | None = None
+    raised_error: OSError | None = None
     bound_to: tuple[str] | None = None
 
     def setsockopt(self, level: int, option: int, value: object, *_more: object) -> None:  # pyright: ignore
@@ -98,82 +112,86 @@ class CanLike(socket.socket):
         self.bound_to = address
 
     def send(self, data: bytes, *_flags: int) -> int:  # pyright: ignore
-        if self.fails is not None:
-            raise self.fails
+        if self.raised_error is not None:
+            raise self.raised_error
         return super().send(data)
 
     def recv_into(self, buffer: bytearray, *_more: int) -> int:  # pyright: ignore
-        if self.fails is not None:
-            raise self.fails
+        if self.raised_error is not None:
+            raise self.raised_error
         return super().recv_into(buffer)
 
 
-class Rig:
-    """A SocketCanWire whose kernel is the other end of a pair of sockets."""
+class WireWithFakeKernel:
+    """A SocketCanWire that is connected to the test instead of the kernel."""
 
     def __init__(
         self, monkeypatch: pytest.MonkeyPatch, only: frozenset[Opcode] | None = None
     ) -> None:
         near, self.kernel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.kernel.settimeout(2.0)
-        self.socket = CanLike(fileno=near.detach())
+        self.socket = FakeCanSocket(fileno=near.detach())
         self.up = True
         self.opened_with: dict[str, object] = {}
 
-        def opened(**how: object) -> SimpleNamespace:
-            """Instead of python-can's bus."""
-            self.opened_with = how
+        def open_fake_bus(**options: object) -> SimpleNamespace:
+            """Replace the bus of python-can."""
+            self.opened_with = options
             return SimpleNamespace(socket=self.socket, shutdown=self.socket.close)
 
-        monkeypatch.setattr(wire_module, "SocketcanBus", opened)
+        monkeypatch.setattr(wire_module, "SocketcanBus", open_fake_bus)
         monkeypatch.setattr(wire_module, "validate_interface", lambda _channel: None)
         monkeypatch.setattr(wire_module, "is_up", lambda _channel: self.up)
         self.wire = SocketCanWire("can7", only)
 
-    def kinds(self) -> list[Kind]:
+    def read_error_kinds(self) -> list[Kind]:
+        """Return the kinds of the errors since the last call."""
         return [error.kind for error in self.wire.errors()]
 
 
 @pytest.fixture
-def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
-    made = Rig(monkeypatch)
-    yield made
-    made.wire.close()
-    made.kernel.close()
+def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[WireWithFakeKernel]:
+    rig = WireWithFakeKernel(monkeypatch)
+    yield rig
+    rig.wire.close()
+    rig.kernel.close()
 
 
 @given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=20))
-def test_drain_takes_everything_in_its_order(frames: list[tuple[int, bytes]]) -> None:
+def test_drain_socket_returns_all_frames_in_order(frames: list[tuple[int, bytes]]) -> None:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with near, far:
         near.setblocking(False)
         errors: list[tuple[int, bytes]] = []
-        taken: list[CanFrame] = []
+        received_frames: list[CanFrame] = []
         for identifier, data in frames:
-            far.send(can_frame(identifier, data))
-        far.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8))))
+            far.send(pack_can_frame(identifier, data))
+        far.send(pack_can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8))))
         drain_socket(
-            near, bytearray(16), taken, lambda identifier, data: errors.append((identifier, data))
+            near,
+            bytearray(16),
+            received_frames,
+            lambda identifier, data: errors.append((identifier, data)),
         )
-        assert taken == [CanFrame(*frame) for frame in frames]
-        assert all(type(frame) is CanFrame for frame in taken)
+        assert received_frames == [CanFrame(*frame) for frame in frames]
+        assert all(type(frame) is CanFrame for frame in received_frames)
         assert errors == [(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(range(8)))]
-        drain_socket(near, bytearray(16), taken, lambda *_: None)
-        assert len(taken) == len(frames)
+        drain_socket(near, bytearray(16), received_frames, lambda *_: None)
+        assert len(received_frames) == len(frames)
 
 
-def test_a_bus_that_babbles_does_not_keep_its_reader() -> None:
-    class Babbling:
+def test_drain_socket_of_endless_frames_returns_a_limited_number() -> None:
+    class EndlessSocket:
         def recv_into(self, buffer: bytearray) -> int:
-            buffer[:] = can_frame(0x101, bytes(8))
+            buffer[:] = pack_can_frame(0x101, bytes(8))
             return 16
 
-    taken: list[CanFrame] = []
-    drain_socket(Babbling(), bytearray(16), taken, lambda *_: None)  # pyright: ignore[reportArgumentType]
-    assert len(taken) == MAX_AT_ONCE
+    received_frames: list[CanFrame] = []
+    drain_socket(EndlessSocket(), bytearray(16), received_frames, lambda *_: None)  # pyright: ignore[reportArgumentType]
+    assert len(received_frames) == MAX_AT_ONCE
 
 
-def test_a_frame_goes_out_as_the_kernel_wants_it(rig: Rig) -> None:
+def test_wire_sends_frame_in_format_of_the_kernel(rig: WireWithFakeKernel) -> None:
     assert rig.wire.send(CanFrame(0x0C5, bytes.fromhex("3178EC581BF4")))
     assert rig.kernel.recv(64) == bytes.fromhex("C5000000 06000000 3178EC581BF40000")
     assert rig.wire.fileno() == rig.socket.fileno()
@@ -181,128 +199,140 @@ def test_a_frame_goes_out_as_the_kernel_wants_it(rig: Rig) -> None:
     assert rig.opened_with == {"channel": "can7", "ignore_rx_error_frames": False}
 
 
-def test_frames_and_errors_come_in(rig: Rig) -> None:
-    rig.kernel.send(can_frame(0x105, b"\x01\x02"))
-    rig.kernel.send(can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(8)))
-    rig.kernel.send(can_frame(0x080, bytes(5)))
+def test_wire_receives_frames_and_errors(rig: WireWithFakeKernel) -> None:
+    rig.kernel.send(pack_can_frame(0x105, b"\x01\x02"))
+    rig.kernel.send(pack_can_frame(CAN_ERR_FLAG | CAN_ERR_BUSOFF, bytes(8)))
+    rig.kernel.send(pack_can_frame(0x080, bytes(5)))
     assert rig.wire.receive() == [CanFrame(0x105, b"\x01\x02"), CanFrame(0x080, bytes(5))]
-    assert rig.kinds() == ["bus_off"]
-    assert rig.kinds() == []
+    assert rig.read_error_kinds() == ["bus_off"]
+    assert rig.read_error_kinds() == []
     assert rig.wire.receive() == []
 
 
-def test_wire_full_queue_is_reported_and_nothing_kept(rig: Rig) -> None:
+def test_wire_full_queue_is_reported_and_nothing_kept(rig: WireWithFakeKernel) -> None:
     sent = 0
     while rig.wire.send(CanFrame(0x101, bytes(8))):
         sent += 1
-    assert rig.kinds() == ["queue_full"]
+    assert rig.read_error_kinds() == ["queue_full"]
     for _ in range(sent):
         rig.kernel.recv(64)
     rig.kernel.settimeout(0.01)
     with pytest.raises(TimeoutError):
         rig.kernel.recv(64)
     assert rig.wire.send(CanFrame(0x102, b""))
-    assert rig.kinds() == []
+    assert rig.read_error_kinds() == []
 
 
-@pytest.mark.parametrize("number", [errno.ENOBUFS, errno.EAGAIN])
-def test_the_kernels_ways_to_say_full(rig: Rig, number: int) -> None:
-    rig.socket.fails = OSError(number, "full")
+@pytest.mark.parametrize("error_number", [errno.ENOBUFS, errno.EAGAIN])
+def test_wire_errors_of_full_queue_are_reported_alike(
+    rig: WireWithFakeKernel, error_number: int
+) -> None:
+    rig.socket.raised_error = OSError(error_number, "full")
     assert not rig.wire.send(CanFrame(0x101, b""))
     assert rig.wire.errors() == [BusError("queue_full", "can7", "the transmit queue is full")]
 
 
 @pytest.mark.parametrize(
-    ("number", "word"), [(errno.ENETDOWN, "down"), (errno.ENODEV, "gone"), (errno.ENXIO, "gone")]
+    ("error_number", "word"),
+    [(errno.ENETDOWN, "down"), (errno.ENODEV, "gone"), (errno.ENXIO, "gone")],
 )
-def test_wire_lost_interface_is_reported_once_per_loss(rig: Rig, number: int, word: str) -> None:
-    rig.socket.fails, rig.up = OSError(number, ""), False
+def test_wire_lost_interface_is_reported_once_per_loss(
+    rig: WireWithFakeKernel, error_number: int, word: str
+) -> None:
+    rig.socket.raised_error = OSError(error_number, "")
+    rig.up = False
     for _ in range(3):
         assert not rig.wire.send(CanFrame(0x101, b""))
         assert rig.wire.receive() == []
     assert rig.wire.errors() == [BusError("interface_down", "can7", f"the interface is {word}")]
-    assert rig.kinds() == []
-    rig.socket.fails, rig.up = None, True
+    assert rig.read_error_kinds() == []
+    rig.socket.raised_error = None
+    rig.up = True
     assert rig.wire.errors() == [BusError("interface_up", "can7", "the interface is up again")]
     assert rig.socket.bound_to == (("can7",) if word == "gone" else None)
-    assert rig.kinds() == []
+    assert rig.read_error_kinds() == []
     assert rig.wire.send(CanFrame(0x101, b""))
 
 
-def test_wire_sent_frame_proves_interface_is_back(rig: Rig) -> None:
-    rig.socket.fails, rig.up = OSError(errno.ENETDOWN, ""), False
+def test_wire_sent_frame_proves_interface_is_back(rig: WireWithFakeKernel) -> None:
+    rig.socket.raised_error = OSError(errno.ENETDOWN, "")
+    rig.up = False
     rig.wire.receive()
-    rig.socket.fails = None
+    rig.socket.raised_error = None
     assert rig.wire.send(CanFrame(0x101, b""))
-    assert rig.kinds() == ["interface_down", "interface_up"]
+    assert rig.read_error_kinds() == ["interface_down", "interface_up"]
 
 
-def test_what_came_before_an_error_is_not_lost(rig: Rig) -> None:
-    rig.kernel.send(can_frame(0x105, b"\x01"))
-    left = [1, 0]
+def test_wire_frames_before_an_error_are_received(rig: WireWithFakeKernel) -> None:
+    rig.kernel.send(pack_can_frame(0x105, b"\x01"))
+    call_count = 0
     receive = rig.socket.recv_into
 
-    def then_down(buffer: bytearray, *_more: int) -> int:
-        if not left.pop(0):
+    def receive_once_then_fail(buffer: bytearray, *_more: int) -> int:
+        nonlocal call_count
+        call_count += 1
+        if call_count == 2:
             raise OSError(errno.ENETDOWN, "down")
         return receive(buffer)
 
-    rig.socket.recv_into, rig.up = then_down, False
+    rig.socket.recv_into = receive_once_then_fail
+    rig.up = False
     assert rig.wire.receive() == [CanFrame(0x105, b"\x01")]
-    assert rig.kinds() == ["interface_down"]
+    assert rig.read_error_kinds() == ["interface_down"]
 
 
-def test_anything_else_ends_the_run(rig: Rig) -> None:
+def test_wire_unknown_error_raises_backend_error(rig: WireWithFakeKernel) -> None:
     rig.kernel.close()
     with raises_error(BackendError, code="bus/io-failed"):
         rig.wire.send(CanFrame(0x101, b""))
 
 
 @pytest.mark.parametrize("only", [None, FROM_HOST])
-def test_the_kernel_filters(
+def test_wire_filters_pass_only_wanted_standard_frames(
     monkeypatch: pytest.MonkeyPatch, only: frozenset[Opcode] | None
 ) -> None:
-    rig = Rig(monkeypatch, only)
+    rig = WireWithFakeKernel(monkeypatch, only)
     pairs = list(struct.iter_unpack("=II", rig.socket.filters))
     rig.wire.close()
     rig.kernel.close()
 
-    def passes(identifier: int) -> bool:
+    def passes_filter(identifier: int) -> bool:
         return any(identifier & mask == wanted & mask for wanted, mask in pairs)
 
     for identifier in range(0x800):
-        assert passes(identifier) is (only is None or identifier >> 6 in only)
-        assert not passes(0x80000000 | identifier) and not passes(0x40000000 | identifier), (
-            "extended, remote"
-        )
-    assert rig.socket.fileno() == -1, "closed"
+        assert passes_filter(identifier) is (only is None or identifier >> 6 in only)
+        extended_identifier = 0x80000000 | identifier
+        remote_identifier = 0x40000000 | identifier
+        assert not passes_filter(extended_identifier)
+        assert not passes_filter(remote_identifier)
+    assert rig.socket.fileno() == -1, "the socket is not closed"
 
 
-def test_dropped_frames_are_told_with_their_number(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
+def test_wire_dropped_frames_are_reported_with_their_number(
+    rig: WireWithFakeKernel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drops = iter([3, 3, 10])
+    drop_counts = iter([3, 3, 10])
 
-    def meminfo(_level: int, option: int, length: int) -> bytes:
+    def get_memory_info(_level: int, option: int, length: int) -> bytes:
         assert option == 55
-        assert length == 36  # SO_MEMINFO, nine numbers of which the last is the drops
-        return struct.pack("=9I", *range(8), next(drops))
+        assert length == 36  # SO_MEMINFO has nine numbers; the last one counts dropped frames
+        return struct.pack("=9I", *range(8), next(drop_counts))
 
-    monkeypatch.setattr(rig.socket, "getsockopt", meminfo)
-    reported = [rig.wire.errors() for _ in range(3)]
-    assert [[t.kind for t in found] for found in reported] == [
-        ["receive_overflow"],
-        [],
-        ["receive_overflow"],
-    ]
-    assert "dropped 3 frames" in reported[0][0].detail
-    assert "dropped 7 frames" in reported[2][0].detail
+    monkeypatch.setattr(rig.socket, "getsockopt", get_memory_info)
+    first_errors, second_errors, third_errors = (rig.wire.errors() for _ in range(3))
+    assert [error.kind for error in first_errors] == ["receive_overflow"]
+    assert second_errors == []
+    assert [error.kind for error in third_errors] == ["receive_overflow"]
+    assert "dropped 3 frames" in first_errors[0].detail
+    assert "dropped 7 frames" in third_errors[0].detail
 
 
-# --- interfaces --------------------------------------------------------------------------------------------
+# --- interfaces --------------------------------------------------------------------------------------------------
 
 
-def test_an_interface_must_be_there_and_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_validate_interface_requires_can_and_interface_that_is_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(wire_module, "_kernel_has_can", lambda: False)
     with raises_error(ConfigError, code="bus/not-available", field="lo"):
         validate_interface("lo")

@@ -1,6 +1,7 @@
 """The tests in this folder compile the reference firmware of joint modules.
 
-Without a C compiler they are skipped, except in CI: a run there that compiled nothing has not tested what it says.
+They are skipped if there is no C compiler. In CI a missing compiler is an error, because skipped tests would hide
+that the firmware was not tested.
 """
 
 import os
@@ -32,7 +33,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", params=["plain", "sanitized"])
 def replay(request: pytest.FixtureRequest) -> Path:
-    """The program that runs the firmware on events; the second time it checks every access to memory."""
+    """Provide the program that runs the firmware on events, without and with checks of every memory access."""
     if request.param == "plain":
         return get_program(JOINT_MODULE_REPLAY)
     return get_sanitized_program(JOINT_MODULE_REPLAY)
@@ -40,11 +41,12 @@ def replay(request: pytest.FixtureRequest) -> Path:
 
 @pytest.fixture(scope="session")
 def sanitized_modules() -> Path:
-    """The program that emulates a robot, which checks every access to memory."""
+    """Provide the program that emulates a robot, with checks of every memory access."""
     return get_sanitized_program(JOINT_MODULES)
 
 
 def get_sanitized_program(program: NativeProgram) -> Path:
+    """Compile a program with sanitizers, or skip the test if the compiler has none."""
     try:
         return get_program(program, SANITIZER_FLAGS)
     except CannotCompileError as error:

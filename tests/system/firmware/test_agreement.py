@@ -42,7 +42,7 @@ def test_emulator_and_reference_agree_on_random_traffic(replay: Path, seed: int)
     assert difference is None, str(shrink_difference(replay, difference))
 
 
-def test_random_traffic_reaches_every_state_and_every_reason_of_a_stop(replay: Path) -> None:
+def test_random_traffic_reaches_every_state_and_stop_reason(replay: Path) -> None:
     answers: list[Answer] = []
     for seed in SEEDS:
         answers += run_reference(replay, Traffic(seed).generate_events(EVENTS_PER_SEED))
@@ -62,26 +62,27 @@ def test_random_traffic_reaches_every_state_and_every_reason_of_a_stop(replay: P
         ("MAX_WRONG_COUNTS", 6),
     ],
 )
-def test_a_difference_is_found_and_shrunk_to_the_events_that_matter(
+def test_find_difference_of_wrong_constant_is_shrunk_to_few_events(
     replay: Path, monkeypatch: pytest.MonkeyPatch, constant: str, wrong_value: float
 ) -> None:
     monkeypatch.setattr(emulated_firmware, constant, wrong_value)
-    found = (
+    differences = (
         find_difference(replay, Traffic(seed).generate_events(EVENTS_PER_SEED))
         for seed in range(20)
     )
-    difference = next(difference for difference in found if difference is not None)
+    difference = next(difference for difference in differences if difference is not None)
     shrunk = shrink_difference(replay, difference)
     assert len(shrunk.events) <= 20, str(shrunk)
     assert not shrunk.emulator.agrees_with(shrunk.reference)
 
 
 def describe_event(frame: CanFrame, time_us: int) -> str:
+    """Return a frame as a line of input of the replay program."""
     return f"frame {time_us} {frame.id:x} {frame.data.hex()}"
 
 
 def arm_with(parameters: dict[ModuleParameter, float], sensors: str, target: CanFrame) -> list[str]:
-    """The events after which a module with some parameters follows a setpoint."""
+    """Return the events after which a module with these parameters follows a setpoint."""
     events = [
         f"init {NODE} 7 {RATED_NM} {RATED_RAD_S} 800 1050 18000 0",
         sensors,
@@ -125,8 +126,8 @@ def compute_expected_torque(
     return torque_nm, torque_nm != commanded_nm
 
 
-def test_the_control_law_is_that_of_the_specification(replay: Path) -> None:
-    choose = random.Random(3)
+def test_reference_firmware_follows_specified_control_law(replay: Path) -> None:
+    rng = random.Random(3)
     parameters = {
         ModuleParameter.STIFFNESS: 20.0,
         ModuleParameter.DAMPING: 1.5,
@@ -137,12 +138,12 @@ def test_the_control_law_is_that_of_the_specification(replay: Path) -> None:
     events: list[str] = []
     expected: list[tuple[float, bool]] = []
     for _ in range(300):
-        mode = choose.choice(list(JointMode))
-        target = 0.0 if mode == JointMode.PASSIVE else round(choose.uniform(-3, 3), 3)
-        limit_nm = choose.choice((0.0, 1.0, 3.0, 20.0))
-        winding_tenths_c = choose.choice((200, 790, 850, 1000, 1049))
-        angle_rad = round(choose.uniform(-3, 3), 3)
-        speed_rad_s = round(choose.uniform(-6, 6), 3)
+        mode = rng.choice(list(JointMode))
+        target = 0.0 if mode == JointMode.PASSIVE else round(rng.uniform(-3, 3), 3)
+        limit_nm = rng.choice((0.0, 1.0, 3.0, 20.0))
+        winding_tenths_c = rng.choice((200, 790, 850, 1000, 1049))
+        angle_rad = round(rng.uniform(-3, 3), 3)
+        speed_rad_s = round(rng.uniform(-6, 6), 3)
         sensors = f"sensors 1 0 0 0 0 24000 0 {winding_tenths_c} 200" + " 0" * 23
         events += arm_with(parameters, sensors, make_setpoint(0, mode, target, limit_nm, NODE))
         events.append(f"torque {angle_rad} {speed_rad_s}")
@@ -158,7 +159,7 @@ def test_the_control_law_is_that_of_the_specification(replay: Path) -> None:
     assert [is_derated for _, is_derated in measured] == [is_derated for _, is_derated in expected]
 
 
-def test_a_module_that_is_not_driven_has_no_torque(replay: Path) -> None:
+def test_reference_firmware_without_setpoints_has_no_torque(replay: Path) -> None:
     sensors = "sensors 1 0 0 0 0 24000 0 200 200" + " 0" * 23
     events = arm_with(
         {ModuleParameter.STIFFNESS: 20.0},

@@ -1,4 +1,4 @@
-"""The program that runs the reference firmware for a whole robot, on its bus and at its command line."""
+"""One program runs the reference firmware of all modules of a robot; the tests use its bus and its command line."""
 
 import contextlib
 import random
@@ -63,7 +63,7 @@ def start_modules(
 def run_modules(
     folder: Path, *arguments: str, program: Path | None = None
 ) -> Iterator[tuple[Path, subprocess.Popen[bytes]]]:
-    """The program and the folder of its bus. At the end it is stopped, and must not have failed."""
+    """Run the program; yield the folder of its bus and the process, and check at the end that it stops normally."""
     process = start_modules(folder, *arguments, program=program)
     try:
         yield folder / "bus", process
@@ -74,18 +74,19 @@ def run_modules(
 
 
 def receive_until(wire: LocalWire, opcode: Opcode, count: int) -> list[CanFrame]:
+    """Receive frames until this number of them has this opcode, and return these."""
     frames: list[CanFrame] = []
 
-    def receive() -> bool:
+    def receive_and_count() -> bool:
         frames.extend(frame for frame in wire.receive() if parse_opcode(frame.id) == opcode)
         return len(frames) >= count
 
-    wait_until(receive, f"{count} frames {opcode.name}")
+    wait_until(receive_and_count, f"{count} frames {opcode.name}")
     return frames
 
 
 def list_answering_nodes(wire: LocalWire) -> list[int]:
-    """The nodes that answer a request for their identity within a moment, once for each answer."""
+    """Return the nodes that answer a request for their identity within 0.2 s, once for each answer."""
     wire.receive()
     wire.send(make_command(CommandAction.IDENTIFY))
     frames: list[CanFrame] = []
@@ -97,32 +98,35 @@ def list_answering_nodes(wire: LocalWire) -> list[int]:
     )
 
 
-def test_every_module_answers_on_its_bus(tmp_path: Path) -> None:
+def test_firmware_program_answers_for_every_module(tmp_path: Path) -> None:
     with run_modules(tmp_path) as (path, _), contextlib.closing(LocalWire(str(path))) as wire:
         receive_until(wire, Opcode.HEARTBEAT, 4)
         assert wire.send(make_command(CommandAction.IDENTIFY))
         identities = receive_until(wire, Opcode.IDENTITY, 4)
     assert [parse_node(frame.id) for frame in identities] == [1, 2, 3, 4]
-    assert len({frame.data[:4] for frame in identities}) == 4, "serial numbers"
+    serial_numbers = {frame.data[:4] for frame in identities}
+    assert len(serial_numbers) == 4
 
 
 def make_garbage(seed: int) -> Iterator[bytes]:
-    """Records of random bytes, most of them with an id that modules read, and some of a wrong size."""
-    choose = random.Random(seed)
+    """Yield records of random bytes, most of them with an id that modules read, and some with a wrong size."""
+    rng = random.Random(seed)
     for _ in range(GARBAGE_RECORDS):
         record = RECORD_FORMAT.pack(
             MAGIC,
-            choose.randrange(100),
-            choose.randrange(0x900),
-            choose.randrange(12),
-            choose.randbytes(64),
+            rng.randrange(100),
+            rng.randrange(0x900),
+            rng.randrange(12),
+            rng.randbytes(64),
         )
-        yield record + choose.randbytes(choose.choice((0, 0, 0, 7)))
-    yield choose.randbytes(4000)
-    yield MAGIC + choose.randbytes(30)
+        yield record + rng.randbytes(rng.choice((0, 0, 0, 7)))
+    yield rng.randbytes(4000)
+    yield MAGIC + rng.randbytes(30)
 
 
-def test_random_bytes_do_it_no_harm(tmp_path: Path, sanitized_modules: Path) -> None:
+def test_firmware_program_that_receives_random_bytes_continues(
+    tmp_path: Path, sanitized_modules: Path
+) -> None:
     with run_modules(tmp_path, program=sanitized_modules) as (path, _):
         for seed in range(5):
             (inbox_path,) = path.iterdir()
@@ -137,16 +141,16 @@ def test_random_bytes_do_it_no_harm(tmp_path: Path, sanitized_modules: Path) -> 
 
 
 @pytest.mark.parametrize("stop_signal", [signal.SIGTERM, signal.SIGKILL])
-def test_the_end_of_the_program_is_reported_once_and_its_restart_too(
+def test_firmware_program_end_and_restart_are_reported_once(
     tmp_path: Path, stop_signal: signal.Signals
 ) -> None:
     path = tmp_path / "bus"
     with contextlib.closing(LocalWire(str(path))) as wire:
-        for at_start in ([], ["interface_up"]):
+        for errors_at_start in ([], ["interface_up"]):
             process = start_modules(tmp_path)
             try:
                 receive_until(wire, Opcode.HEARTBEAT, 4)
-                assert [error.kind for error in wire.errors()] == at_start
+                assert [error.kind for error in wire.errors()] == errors_at_start
             finally:
                 process.send_signal(stop_signal)
                 process.wait(10)
@@ -157,29 +161,31 @@ def test_the_end_of_the_program_is_reported_once_and_its_restart_too(
     assert not path.exists()
 
 
-def test_it_sends_to_several_programs_and_one_that_does_not_read_delays_no_other(
+def test_firmware_program_is_not_delayed_by_slow_reader(
     tmp_path: Path,
 ) -> None:
     """A host fills the inbox of a program that does not read. The modules then send to both."""
     filler = CanFrame(frame_id(Opcode.JOINT_STATE, LAST_NODE), b"")
-    fillers = INBOX_BYTES // RECORD_FORMAT.size + 200
+    filler_count = INBOX_BYTES // RECORD_FORMAT.size + 200
     with (
         run_modules(tmp_path) as (path, process),
         contextlib.closing(LocalWire(str(path))) as host,
-        contextlib.closing(LocalWire(str(path))) as deaf,
+        contextlib.closing(LocalWire(str(path))) as slow_reader,
     ):
         # While they boot, modules answer no request.
         wait_until(lambda: list_answering_nodes(host) == [1, 2, 3, 4], "answers after the boot")
-        for begin in range(0, fillers, BATCH):
-            for _ in range(min(BATCH, fillers - begin)):
+        for begin in range(0, filler_count, BATCH):
+            for _ in range(min(BATCH, filler_count - begin)):
                 host.send(filler)
             host.send(make_command(CommandAction.IDENTIFY))
             receive_until(host, Opcode.IDENTITY, 4)  # the modules have read the batch
         receive_until(host, Opcode.HEARTBEAT, 8)
-        while deaf.receive():
+        while slow_reader.receive():
             pass
-        receive_until(deaf, Opcode.HEARTBEAT, 4)
-        (lost_at_reader,) = [error for error in deaf.errors() if error.kind == "receive_overflow"]
+        receive_until(slow_reader, Opcode.HEARTBEAT, 4)
+        (lost_at_reader,) = [
+            error for error in slow_reader.errors() if error.kind == "receive_overflow"
+        ]
         assert int(lost_at_reader.detail.split()[0]) >= 8
         process.terminate()
         assert process.stdout is not None
@@ -188,14 +194,14 @@ def test_it_sends_to_several_programs_and_one_that_does_not_read_delays_no_other
         assert b"the modules read too slowly" not in output
 
 
-def test_the_program_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
+def test_firmware_program_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
     with run_modules(tmp_path, "--until-input-ends") as (_, process):
         assert process.stdin is not None
         process.stdin.close()
         assert process.wait(10) == 0
 
 
-def test_modules_of_two_programs_with_the_same_ids_are_seen(tmp_path: Path) -> None:
+def test_firmware_programs_with_equal_ids_both_answer(tmp_path: Path) -> None:
     """A bus cannot refuse a second robot. Each of its modules answers, which the driver reports as a duplicate."""
     with run_modules(tmp_path) as (path, _), contextlib.closing(LocalWire(str(path))) as wire:
         second = start_modules(tmp_path)
@@ -209,7 +215,7 @@ def test_modules_of_two_programs_with_the_same_ids_are_seen(tmp_path: Path) -> N
             assert second.wait(10) == 0
 
 
-def test_a_folder_that_other_users_can_enter_is_refused(tmp_path: Path) -> None:
+def test_firmware_program_refuses_folder_of_other_users(tmp_path: Path) -> None:
     folder = tmp_path / "bus"
     folder.mkdir(mode=0o755)
     (tmp_path / "modules.txt").write_text(describe_modules(make_can_config(), CanSettings()))
@@ -223,7 +229,7 @@ def test_a_folder_that_other_users_can_enter_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "joint_1 node 70\n", "joint_1 node 1 speed 3\n", "joint_1 node 1 serial\n"]
 )
-def test_a_wrong_description_is_wrong_input(tmp_path: Path, text: str) -> None:
+def test_firmware_program_refuses_invalid_description(tmp_path: Path, text: str) -> None:
     (tmp_path / "modules.txt").write_text(text)
     command = [
         get_program(JOINT_MODULES),

@@ -1,4 +1,4 @@
-"""The client alone: the feed that finds samples by their tick, and the holder of the lease."""
+"""The parts of a client: the feed that finds samples by their tick, and the commander that holds the lease."""
 
 import threading
 
@@ -22,7 +22,8 @@ from snakesim_testing.messages import raises_error
 
 
 def test_feed_returns_samples_by_tick_and_drops_old_ones() -> None:
-    robot, network = make_description(), LocalNetwork()
+    robot = make_description()
+    network = LocalNetwork()
     feed = SampleFeed(network.create_session().declare_reader(keys.JOINTS, JointState), keys.JOINTS)
     joints = network.create_session().declare_publisher(keys.JOINTS, JointState)
     assert feed.newest() is None
@@ -30,13 +31,15 @@ def test_feed_returns_samples_by_tick_and_drops_old_ones() -> None:
     for tick in range(100):
         joints.put(make_joint_state(robot, 0.1 * tick, tick=tick))
         feed.store_arrived_samples()
-    newest, kept = feed.newest(), feed.get_at_tick(99)
+    newest = feed.newest()
     assert newest is not None
     assert newest.tick == 99
-    assert kept is newest
+    assert feed.get_at_tick(99) is newest
     assert feed.get_at_tick(50) is None
     assert feed.get_at_tick(90) is not None
-    joints.put(make_joint_state(robot, 0.0, tick=90))  # shown again: it came last
+    joints.put(
+        make_joint_state(robot, 0.0, tick=90)
+    )  # published again, so that it is the last one to arrive
     feed.store_arrived_samples()
     newest = feed.newest()
     assert newest is not None
@@ -45,11 +48,12 @@ def test_feed_returns_samples_by_tick_and_drops_old_ones() -> None:
     assert feed.newest() is None
 
 
-def naming(tick: int, joints_tick: int, arm_session: int = 1) -> Clock:
+def make_clock_for_joints(tick: int, joints_tick: int, arm_session: int = 1) -> Clock:
+    """Make a clock message which says that the joint state of this tick refers to `joints_tick`."""
     return make_clock(tick, arm_session=arm_session, newest={keys.JOINTS: joints_tick})
 
 
-def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
+def test_client_waits_for_samples_named_by_clock(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     robot = make_description()
@@ -65,35 +69,39 @@ def test_client_waits_for_samples_of_clock_and_reports_missing_ones(
         ticks = iter(client.iterate_ticks(silence_timeout_s=5.0))
         for tick in (3, 4):
             joints.put(make_joint_state(robot, tick=tick))
-        clocks.put(naming(5, 3))
+        clocks.put(make_clock_for_joints(5, 3))
         assert client.read(feed) is None  # no clock yet
-        assert next(ticks) == naming(5, 3)
-        found = client.read(feed)
-        assert found is not None
-        assert found.tick == 3  # what is named, not what is newest
-        clocks.put(naming(6, 6))
+        assert next(ticks) == make_clock_for_joints(5, 3)
+        joint_state = client.read(feed)
+        assert joint_state is not None
+        assert joint_state.tick == 3  # the sample that the clock names, not the newest one
+        clocks.put(make_clock_for_joints(6, 6))
         next(ticks)
-        late = threading.Timer(0.03, lambda: joints.put(make_joint_state(robot, tick=6)))
-        late.start()
-        found = client.read(feed)
-        assert found is not None
-        assert found.tick == 6
-        clocks.put(naming(7, 7))
+        late_sample = threading.Timer(0.03, lambda: joints.put(make_joint_state(robot, tick=6)))
+        late_sample.start()
+        joint_state = client.read(feed)
+        assert joint_state is not None
+        assert joint_state.tick == 6
+        clocks.put(make_clock_for_joints(7, 7))
         next(ticks)
         # Only now: a busy computer may deliver the late sample above after a shorter time.
         monkeypatch.setattr("snakesim_hal.network.client.MISSING_SAMPLE_TIMEOUT_S", 0.1)
         with raises_error(StalledError, code="network/no-ticks"):
             client.read(feed)
         hal._zenoh.put(keys.CLOCK, b"garbage", encoding="zenoh/bytes")
-        clocks.put(naming(0, 0, arm_session=0))  # the HAL started over
-        again = next(ticks)
-        assert again is not None
-        assert again.tick == 0
+        clocks.put(
+            make_clock_for_joints(0, 0, arm_session=0)
+        )  # as from a HAL host that started again
+        first_clock = next(ticks)
+        assert first_clock is not None
+        assert first_clock.tick == 0
         assert client.read(feed) is None
-        wait_until(lambda: session.rejected == {"unknown_message": 1}, "the garbage counted")
+        wait_until(
+            lambda: session.rejected == {"unknown_message": 1}, "the client counts the garbage"
+        )
 
 
-def test_commander_requests_free_lease_and_releases_passed_one() -> None:
+def test_commander_acquires_free_lease_and_notices_its_loss() -> None:
     with (
         running_host(make_run_config(clock_mode="realtime", services={})) as run,
         open_session(run.link) as session,
@@ -103,10 +111,10 @@ def test_commander_requests_free_lease_and_releases_passed_one() -> None:
         other = LeaseRequest(action="acquire", holder="teleop", priority=200)
         assert run.request(keys.LEASE, other).ok
         ticks = (
-            found for found in client.iterate_ticks(silence_timeout_s=1.0) if found is not None
+            clock for clock in client.iterate_ticks(silence_timeout_s=1.0) if clock is not None
         )
-        held = [commander.ensure_lease(next(ticks)) for _ in range(2)]
-        assert held[0] is False
+        has_lease = [commander.ensure_lease(next(ticks)) for _ in range(2)]
+        assert has_lease[0] is False
         assert commander.lease_refusal is not None
         assert "held by teleop" in commander.lease_refusal
         wait_until(lambda: commander.ensure_lease(next(ticks)), "the end of teleop's lease", 10.0)
@@ -114,5 +122,5 @@ def test_commander_requests_free_lease_and_releases_passed_one() -> None:
         assert run.host.authority.lease.holder == "pilot"
         assert run.request(keys.LEASE, other).ok
         wait_until(
-            lambda: not commander.ensure_lease(next(ticks)), "the lease seen to have passed on"
+            lambda: not commander.ensure_lease(next(ticks)), "the commander sees that it lost"
         )

@@ -1,4 +1,4 @@
-"""Endpoints and namespaces as people mistype them."""
+"""Endpoints and namespaces are checked when they are read: mistyped ones are refused with an example."""
 
 import shutil
 import subprocess
@@ -16,11 +16,11 @@ from snakesim_hal.network.endpoint import (
 )
 from snakesim_testing.messages import raises_error
 
-GOOD = [
+VALID_ENDPOINTS = [
     *("tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/lab-router.example:65535"),
     *("tcp/[::1]:7447", "tcp/[fe80::1]:7#iface=eth0", "unixsock-stream/tmp/robot"),
 ]
-WRONG = [
+INVALID_ENDPOINTS = [
     "banana",
     "",
     "127.0.0.1:7447",
@@ -37,13 +37,13 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize("text", GOOD)
-def test_an_endpoint_is_taken_as_it_is(text: str) -> None:
+@pytest.mark.parametrize("text", VALID_ENDPOINTS)
+def test_check_endpoint_returns_valid_endpoint_unchanged(text: str) -> None:
     assert check_endpoint(text, "--endpoint") == text
 
 
-@pytest.mark.parametrize("text", WRONG)
-def test_a_wrong_endpoint_says_what_a_valid_one_looks_like(text: str) -> None:
+@pytest.mark.parametrize("text", INVALID_ENDPOINTS)
+def test_check_endpoint_invalid_endpoint_is_refused_with_example(text: str) -> None:
     with raises_error(
         ConfigError, code="network/invalid-address", field=("--router", "tcp/127.0.0.1:7447")
     ) as caught:
@@ -65,7 +65,7 @@ def test_a_wrong_endpoint_says_what_a_valid_one_looks_like(text: str) -> None:
         ("udp/robot.lab:7447", True),
     ],
 )
-def test_endpoint_for_other_machines_needs_access_control_or_a_request(
+def test_listening_endpoint_for_other_machines_needs_protection_or_insecure_flag(
     endpoint: str, exposed: bool
 ) -> None:
     require_safe_listening_endpoint(endpoint, "--endpoint", insecure=True)
@@ -77,26 +77,33 @@ def test_endpoint_for_other_machines_needs_access_control_or_a_request(
         require_safe_listening_endpoint(endpoint, "--endpoint")
 
 
-def test_namespaces() -> None:
+def test_check_namespace_refuses_empty_parts_and_special_characters() -> None:
     assert check_namespace("lab/planar13", "--namespace") == "lab/planar13"
     for text in ("", "/", "a/", "/a", "a//b", "**", "a/*", "a b", "a#b", "@x", "a\x1b"):
         with raises_error(ConfigError, code="network/invalid-address"):
             check_namespace(text, "--namespace")
 
 
-# A network namespace of its own, whose loopback interface is down.
-APART = ["unshare", "--net", "--map-root-user"]
-LOOKS = "from snakesim_operator.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
+# `unshare` starts a program in a new network namespace, whose loopback interface is down.
+UNSHARE_COMMAND = ["unshare", "--net", "--map-root-user"]
+CLI_CODE = "from snakesim_operator.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
 
 
-def test_endpoint_on_loopback_that_is_down_is_named(tmp_path: Path) -> None:
+def test_run_without_loopback_names_interface_and_remedy(tmp_path: Path) -> None:
     if (
         shutil.which("unshare") is None
-        or subprocess.run([*APART, "true"], check=False, capture_output=True).returncode
+        or subprocess.run([*UNSHARE_COMMAND, "true"], check=False, capture_output=True).returncode
     ):
-        pytest.skip("no network namespace can be made here")
-    command = [*APART, *make_python_command("-c", LOOKS), "run", "triplet", "--out", "run"]
-    ended = subprocess.run(
+        pytest.skip("this computer does not allow new network namespaces")
+    command = [
+        *UNSHARE_COMMAND,
+        *make_python_command("-c", CLI_CODE),
+        "run",
+        "triplet",
+        "--out",
+        "run",
+    ]
+    result = subprocess.run(
         command,
         cwd=tmp_path,
         env=make_child_environment(),
@@ -105,9 +112,9 @@ def test_endpoint_on_loopback_that_is_down_is_named(tmp_path: Path) -> None:
         timeout=60,
         check=False,
     )
-    assert ended.returncode == 1
-    assert "loopback interface" in ended.stderr
-    assert "ip link set lo up" in ended.stderr
+    assert result.returncode == 1
+    assert "loopback interface" in result.stderr
+    assert "ip link set lo up" in result.stderr
     assert not (tmp_path / "run").exists()
     require_loopback_up("tcp/127.0.0.1:7447")
     # Not on loopback: whether it answers is another question.

@@ -1,4 +1,4 @@
-"""Ports that are chosen now and bound later."""
+"""A free port stays reserved between the moment it is chosen and the moment a program binds it."""
 
 import os
 import socket
@@ -13,19 +13,19 @@ from snakesim_hal.network.free_ports import BLOCK_PORTS, FIRST_PORT, LOOPBACK, f
 from snakesim_testing.messages import raises_error
 
 PROCESSES = 4
-PORTS_EACH = BLOCK_PORTS + 6  # more than one block
-CHOOSE = f"""
+PORTS_EACH = BLOCK_PORTS + 6  # so that each process needs more than one block
+CHOOSE_PORTS_CODE = f"""
 from snakesim_hal.network.free_ports import find_free_port
 print(*[find_free_port() for _ in range({PORTS_EACH})], flush=True)
 input()
 """
 
 
-def test_processes_that_choose_ports_at_the_same_time_get_different_ones() -> None:
-    """All of them choose before any of them has bound a port."""
-    choosing = [
+def test_find_free_port_in_several_processes_returns_different_ports() -> None:
+    """All processes choose before any of them has bound a port."""
+    processes = [
         subprocess.Popen(
-            make_python_command("-c", CHOOSE),
+            make_python_command("-c", CHOOSE_PORTS_CODE),
             env=make_child_environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -35,37 +35,43 @@ def test_processes_that_choose_ports_at_the_same_time_get_different_ones() -> No
     ]
     try:
         chosen: list[int] = []
-        for process in choosing:
+        for process in processes:
             assert process.stdout is not None
             chosen += [int(port) for port in process.stdout.readline().split()]
     finally:
-        for process in choosing:
+        for process in processes:
             process.communicate("\n")
     assert len(set(chosen)) == PROCESSES * PORTS_EACH
-    first_of_kernel = int(free_ports.LOCAL_RANGE.read_text().split()[0])
+    first_ephemeral_port = int(free_ports.LOCAL_RANGE.read_text().split()[0])
     assert min(chosen) >= FIRST_PORT
-    assert max(chosen) < first_of_kernel, "the kernel may give it to any program"
+    assert max(chosen) < first_ephemeral_port, "the kernel may give it to any program"
 
 
 @pytest.mark.parametrize("kind", [socket.SOCK_STREAM, socket.SOCK_DGRAM])
-def test_port_that_another_program_uses_is_left_out(kind: socket.SocketKind) -> None:
-    before = find_free_port()
-    with socket.socket(socket.AF_INET, kind) as taken:
-        taken.bind((LOOPBACK, before + 1))
+def test_find_free_port_skips_port_of_another_program(kind: socket.SocketKind) -> None:
+    chosen_port = find_free_port()
+    next_port = chosen_port + 1
+    with socket.socket(socket.AF_INET, kind) as other_program:
+        other_program.bind((LOOPBACK, next_port))
         if kind == socket.SOCK_STREAM:
-            taken.listen()
-        assert find_free_port() not in (before, before + 1)
+            other_program.listen()
+        assert find_free_port() not in (chosen_port, next_port)
 
 
-def test_forked_process_does_not_get_the_ports_of_its_parent(
+def test_find_free_port_in_forked_process_uses_another_block(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    before = find_free_port()
+    parent_port = find_free_port()
     monkeypatch.setattr(os, "getpid", lambda: 1)
-    assert (find_free_port() - FIRST_PORT) // BLOCK_PORTS != (before - FIRST_PORT) // BLOCK_PORTS
+    child_port = find_free_port()
+    parent_block = (parent_port - FIRST_PORT) // BLOCK_PORTS
+    child_block = (child_port - FIRST_PORT) // BLOCK_PORTS
+    assert child_block != parent_block
 
 
-def test_when_all_ports_are_claimed_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_find_free_port_when_all_are_claimed_raises_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(free_ports, "_ports", iter(()))
     monkeypatch.setattr(free_ports, "_read_first_local_port", lambda: FIRST_PORT)
     with raises_error(NotConnectedError, code="network/port-in-use", field="--endpoint"):

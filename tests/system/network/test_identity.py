@@ -1,4 +1,4 @@
-"""Who is who: host ids, the run key, the private channel, and the list of this computer's robots."""
+"""A process knows which robot it talks to: run key, private channel, and the list of this computer's robots."""
 
 import os
 import signal
@@ -30,91 +30,95 @@ from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
 
-def test_a_description_is_proven_by_the_runs_key_alone() -> None:
-    described, key = make_description(), new_run_key()
-    ours = add_proof(described, key)
-    assert has_valid_proof(ours, key)
-    assert has_valid_proof(described, None)
-    assert not has_valid_proof(described, key)
-    assert not has_valid_proof(ours, new_run_key())
-    assert not has_valid_proof(msgspec.structs.replace(ours, emulated=not ours.emulated), key)
+def test_description_proof_is_valid_for_its_run_key_only() -> None:
+    description = make_description()
+    run_key = new_run_key()
+    proven = add_proof(description, run_key)
+    changed = msgspec.structs.replace(proven, emulated=not proven.emulated)
+    assert has_valid_proof(proven, run_key)
+    assert has_valid_proof(description, None)
+    assert not has_valid_proof(description, run_key)
+    assert not has_valid_proof(proven, new_run_key())
+    assert not has_valid_proof(changed, run_key)
 
 
-def test_identity_service_of_a_run_ignores_forged_description(
+def test_service_of_a_run_ignores_forged_description(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv(RUN_KEY, new_run_key())
     with (
         running_host(make_run_config()) as run,
-        open_session(run.link) as stranger,
+        open_session(run.link) as other_session,
         open_session(run.link) as own,
     ):
         forged = msgspec.structs.replace(run.host.description, emulated=True, lease_ns=10**9)
-        stranger.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(forged)
+        other_session.declare_latched_publisher(keys.DESCRIPTION, RobotDescription).put(forged)
         assert HostClient(own, "control").wait_for_description() == run.host.description
         monkeypatch.setenv(RUN_KEY, new_run_key())  # a service of another run, on the wrong network
         with pytest.raises(NotConnectedError):
             HostClient(own, "control").wait_for_description(timeout_s=0.3)
 
 
-def test_a_run_is_armed_over_its_private_channel() -> None:
-    ours, its = socket_pair()
-    starter = StarterEnd(ours)
+def test_host_arms_on_request_over_private_channel() -> None:
+    starter_socket, host_socket = socket_pair()
+    starter = StarterEnd(starter_socket)
+    config = make_run_config(clock_mode="realtime")
     with (
-        running_host(make_run_config(clock_mode="realtime"), starter_channel=HostEnd(its)) as run,
+        running_host(config, starter_channel=HostEnd(host_socket)) as run,
         running_follower(run.link, SineFollower()),
     ):
 
-        def ready() -> bool:
+        def is_ready_to_arm() -> bool:
             starter.receive()
             return starter.status is not None and starter.status.ready_to_arm
 
-        wait_until(ready, "a status that is ready")
+        wait_until(is_ready_to_arm, "the host is ready to arm")
         robot = starter.description
         assert robot == run.host.description
         assert robot is not None
-        arm = make_arm_request(robot, "the run")
-        starter.send_request(msgspec.structs.replace(arm, host="another"))
+        arm_request = make_arm_request(robot, "the run")
+        starter.send_request(msgspec.structs.replace(arm_request, host="another"))
         wait_until(lambda: starter.receive() or starter.answers, "an answer")
-        refused = starter.answers.pop()
-        assert not refused.ok
-        assert refused.refusal == "wrong_host"
-        starter.send_request(arm)
+        refusal = starter.answers.pop()
+        assert not refusal.ok
+        assert refusal.refusal == "wrong_host"
+
+        starter.send_request(arm_request)
         wait_until(lambda: starter.receive() or starter.answers, "an answer")
         assert starter.answers.pop().ok
         run.wait_for_lifecycle("armed")
         assert run.status.reason.startswith("armed by the run")
-        assert [text.split(": ", 1)[1] for text in run.host.request_log][
-            -1
-        ] == "arm by 'the run', done"
+        _, logged_request = run.host.request_log[-1].split(": ", 1)
+        assert logged_request == "arm by 'the run', done"
     starter.close()
 
 
-def test_a_starter_that_does_not_read_holds_up_nothing() -> None:
-    ours, its = socket_pair()
-    with ours, its:
-        host = HostEnd(its)
+def test_private_channel_whose_starter_does_not_read_blocks_nothing() -> None:
+    starter_socket, host_socket = socket_pair()
+    with starter_socket, host_socket:
+        host = HostEnd(host_socket)
         for _ in range(5000):
             host.send(HostMessage(description=make_description()))
 
 
-def a_robot() -> LocalRobot:
-    where = {"endpoint": "tcp/127.0.0.1:7447", "stop_host": "127.0.0.1", "stop_port": 7447}
-    return LocalRobot(namespace="worm", robot="worm", backend="sim", **where, pid=os.getpid())
+def make_local_robot() -> LocalRobot:
+    """Describe a robot whose host is this process."""
+    address = {"endpoint": "tcp/127.0.0.1:7447", "stop_host": "127.0.0.1", "stop_port": 7447}
+    return LocalRobot(namespace="worm", robot="worm", backend="sim", **address, pid=os.getpid())
 
 
-def test_identity_robots_of_this_computer_are_listed_while_alive(
+def test_local_robots_are_listed_while_registered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert list_local_robots() == []
-    with register_robot(a_robot()) as failure:
+    with register_robot(make_local_robot()) as failure:
         assert failure is None
-        assert list_local_robots() == [a_robot()]
+        assert list_local_robots() == [make_local_robot()]
     assert list_local_robots() == []
 
 
-def test_a_run_that_was_killed_is_not_found_any_more(
+def test_local_robot_whose_process_was_killed_is_not_listed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
@@ -123,7 +127,7 @@ def test_a_run_that_was_killed_is_not_found_any_more(
         from snakesim_hal.network.local_registry import LocalRobot, register_robot
         values = {"namespace": "worm", "robot": "worm", "backend": "sim", "endpoint": "tcp/127.0.0.1:7447"}
         with register_robot(LocalRobot(**values, stop_host="127.0.0.1", stop_port=7447, pid=os.getpid())):
-            print("there", flush=True)
+            print("registered", flush=True)
             time.sleep(60)
     """
     with subprocess.Popen(
@@ -138,18 +142,18 @@ def test_a_run_that_was_killed_is_not_found_any_more(
         assert not list((tmp_path / "snakesim" / "live").iterdir())
 
 
-def test_a_folder_that_cannot_be_written_is_told(
+def test_register_robot_in_unwritable_folder_returns_the_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "snakesim").write_text("a file where the folder belongs")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    with register_robot(a_robot()) as failure:
+    with register_robot(make_local_robot()) as failure:
         assert failure is not None
         assert "--endpoint" in failure
     assert list_local_robots() == []
 
 
-def test_one_robot_is_one_folder_whatever_its_name(
+def test_robot_state_folder_contains_no_path_from_robot_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
@@ -158,14 +162,15 @@ def test_one_robot_is_one_folder_whatever_its_name(
     assert get_robot_state_folder("../../etc", "sim", "").parent == robots
 
 
-def test_identity_runs_started_together_have_separate_endpoints() -> None:
+def test_runs_started_together_reserve_separate_endpoints() -> None:
     from snakesim_operator.run.run_endpoint import reserve_endpoint
 
-    first, its_port = reserve_endpoint(None, None, "worm")
-    second, other_port = reserve_endpoint(None, None, "worm")
-    with its_port, other_port:
+    first, first_port_lock = reserve_endpoint(None, None, "worm")
+    second, second_port_lock = reserve_endpoint(None, None, "worm")
+    with first_port_lock, second_port_lock:
         assert first != second
         with raises_error(NotConnectedError, code="network/port-in-use"):
             reserve_endpoint(first.endpoint, None, "worm")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", int(first.endpoint.rpartition(":")[2])))
+    port = int(first.endpoint.rpartition(":")[2])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as next_program:
+        next_program.bind(("127.0.0.1", port))  # raises an error if the port is still in use

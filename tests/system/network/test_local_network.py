@@ -1,11 +1,11 @@
-"""Sessions within one process do what those on a network do."""
+"""The sessions of one process behave as sessions on a network, and share the messages that they decode."""
 
 import math
 from unittest import mock
 
 from snakesim_hal.base.errors import NotConnectedError
 from snakesim_hal.host.inbox import HostInbox
-from snakesim_hal.network.local_network import LocalNetwork
+from snakesim_hal.network.local_network import LocalNetwork, LocalSession
 from snakesim_hal.network.streams import IncomingQuery
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode
@@ -17,45 +17,52 @@ from snakesim_testing.messages import raises_error
 REQUEST = LeaseRequest(action="acquire", holder="control")
 
 
+def create_sessions(network: LocalNetwork, count: int) -> list[LocalSession]:
+    """Create sessions of one network."""
+    return [network.create_session() for _ in range(count)]
+
+
 def test_local_network_delivers_matching_keys_and_latched_values_later() -> None:
     network = LocalNetwork()
-    one, other = network.create_session(), network.create_session()
-    every, reader = (
-        other.declare_reader(keys.DONE_ALL, TickDone),
-        other.declare_reader(keys.done_key("control"), TickDone),
-    )
-    publisher = one.declare_latched_publisher(keys.done_key("control"), TickDone)
+    sender, receiver = create_sessions(network, 2)
+    reader_of_all = receiver.declare_reader(keys.DONE_ALL, TickDone)
+    reader = receiver.declare_reader(keys.done_key("control"), TickDone)
+    publisher = sender.declare_latched_publisher(keys.done_key("control"), TickDone)
     assert publisher.has_subscriber()
     publisher.put(TickDone(tick=1))
     publisher.put(TickDone(tick=2))
-    one.declare_publisher(keys.done_key("guidance"), TickDone).put(TickDone(tick=3))
+    sender.declare_publisher(keys.done_key("guidance"), TickDone).put(TickDone(tick=3))
     assert [done.tick for done in reader.drain()] == [1, 2]
-    assert [done.tick for done in every.drain()] == [1, 2, 3]
-    assert other.wait_for_latched(keys.done_key("control"), TickDone, 0.0) == TickDone(tick=2)
-    other.close()
+    assert [done.tick for done in reader_of_all.drain()] == [1, 2, 3]
+    assert receiver.wait_for_latched(keys.done_key("control"), TickDone, 0.0) == TickDone(tick=2)
+    receiver.close()
     assert not publisher.has_subscriber()
 
 
-def test_tokens_come_and_go_with_their_session() -> None:
-    network, seen = LocalNetwork(), list[tuple[str, bool]]()
-    one, other = network.create_session(), network.create_session()
-    one.declare_alive("control")
-    other.on_token_change(lambda key, present: seen.append((keys.parse_service(key), present)))
-    one.close()
-    assert seen == [("control", True), ("control", False)]
+def test_local_network_token_disappears_with_its_session() -> None:
+    network = LocalNetwork()
+    service, observer = create_sessions(network, 2)
+    changes: list[tuple[str, bool]] = []
+    service.declare_alive("control")
+    observer.on_token_change(
+        lambda key, present: changes.append((keys.parse_service(key), present))
+    )
+    service.close()
+    assert changes == [("control", True), ("control", False)]
 
 
-def test_who_is_asked_answers_before_the_question_returns() -> None:
-    network, asked = LocalNetwork(), list[IncomingQuery]()
-    host, client = network.create_session(), network.create_session()
-    host.on_query(keys.LEASE, asked.append)
+def test_local_network_query_is_answered_before_it_returns() -> None:
+    network = LocalNetwork()
+    host, client = create_sessions(network, 2)
+    queries: list[IncomingQuery] = []
+    host.on_query(keys.LEASE, queries.append)
     answer = Answer(ok=True, reason="", epoch=7, lifecycle="disarmed", host="a")
 
-    def reply() -> None:
-        for question in asked:
-            question.reply(answer)
+    def reply_to_queries() -> None:
+        for query in queries:
+            query.reply(answer)
 
-    network.run_responders = reply
+    network.run_responders = reply_to_queries
     assert client.send_request(keys.LEASE, REQUEST, host="a").epoch == 7
     with raises_error(NotConnectedError, code="network/no-answer"):
         client.send_request(keys.LEASE, REQUEST, timeout_s=0.01, host="b")
@@ -63,53 +70,38 @@ def test_who_is_asked_answers_before_the_question_returns() -> None:
         client.send_request(keys.ESTOP, REQUEST)
 
 
-def test_readers_of_one_process_share_the_message_that_the_first_has_decoded() -> None:
-    network = LocalNetwork()
-    sender, one, other = (
-        network.create_session(),
-        network.create_session(),
-        network.create_session(),
-    )
-    readers = [
-        session.declare_reader(keys.done_key("control"), TickDone) for session in (one, other)
-    ]
-    sent = TickDone(tick=4)
-    sender.declare_publisher(keys.done_key("control"), TickDone).put(sent)
-    (first,), (second,) = (reader.drain() for reader in readers)
-    assert first is second
-    assert first == sent
-    assert first is not sent  # the sender's own message is encoded, and never handed to a reader
-
-
-def test_readers_of_one_process_share_the_message_that_the_check_of_the_sender_has_decoded() -> (
-    None
-):
-    network = LocalNetwork()
-    sender, one, other = (
-        network.create_session(),
-        network.create_session(),
-        network.create_session(),
-    )
+def test_local_readers_share_message_decoded_by_first_reader() -> None:
+    sender, first, second = create_sessions(LocalNetwork(), 3)
     key = keys.done_key("control")
-    readers = [
-        one.declare_reader(key, TickDone),
-        other.declare_reader(key, TickDone),
-        other.declare_reader(key, Answer),
-    ]
+    first_reader = first.declare_reader(key, TickDone)
+    second_reader = second.declare_reader(key, TickDone)
+    sent = TickDone(tick=4)
+    sender.declare_publisher(key, TickDone).put(sent)
+    (first_message,) = first_reader.drain()
+    (second_message,) = second_reader.drain()
+    assert first_message is second_message
+    assert first_message == sent
+    assert first_message is not sent  # the sender's own object never reaches a reader
+
+
+def test_local_readers_share_message_decoded_by_check_of_sender() -> None:
+    sender, first, second = create_sessions(LocalNetwork(), 3)
+    key = keys.done_key("control")
+    first_reader = first.declare_reader(key, TickDone)
+    second_reader = second.declare_reader(key, TickDone)
+    reader_of_wrong_type = second.declare_reader(key, Answer)
     encoded = encode_checked(key, TickDone(tick=4))
     sender.declare_publisher(key, TickDone).put(TickDone(tick=4), encoded)
-    first, second, of_wrong_type = (reader.drain() for reader in readers)
-    assert first[0] is encoded.decoded
-    assert second[0] is encoded.decoded
-    assert of_wrong_type == []
-    assert other.rejected == {"unknown_message": 1}
+    assert first_reader.drain()[0] is encoded.decoded
+    assert second_reader.drain()[0] is encoded.decoded
+    assert reader_of_wrong_type.drain() == []
+    assert second.rejected == {"unknown_message": 1}
 
 
-def test_reader_decodes_the_bytes_of_a_message_that_a_fault_has_changed() -> None:
-    network = LocalNetwork()
-    sender, reading = network.create_session(), network.create_session()
+def test_local_reader_decodes_message_that_a_fault_changed() -> None:
+    sender, receiver = create_sessions(LocalNetwork(), 2)
     key = keys.done_key("control")
-    reader = reading.declare_reader(key, TickDone)
+    reader = receiver.declare_reader(key, TickDone)
     publisher = sender.declare_publisher(key, TickDone)
     sender.reroute(key, lambda _payload: sender.send(key, encode(TickDone(tick=5))))
     publisher.put(TickDone(tick=4), encode_checked(key, TickDone(tick=4)))
@@ -119,41 +111,31 @@ def test_reader_decodes_the_bytes_of_a_message_that_a_fault_has_changed() -> Non
     assert reader.drain() == [TickDone(tick=6)]
 
 
-def test_each_reader_checks_what_no_reader_could_decode() -> None:
-    network = LocalNetwork()
-    sender, one, other = (
-        network.create_session(),
-        network.create_session(),
-        network.create_session(),
-    )
+def test_local_readers_of_malformed_message_each_reject_it() -> None:
+    sender, first, second = create_sessions(LocalNetwork(), 3)
     key = keys.done_key("control")
     readers = [
-        one.declare_reader(key, TickDone),
-        other.declare_reader(key, TickDone),
-        other.declare_reader(key, Answer),
+        first.declare_reader(key, TickDone),
+        second.declare_reader(key, TickDone),
+        second.declare_reader(key, Answer),
     ]
     publisher = sender.declare_publisher(key, TickDone)
     publisher.send(encode(TickDone(tick=-4)))
     assert [reader.drain() for reader in readers] == [[], [], []]
-    assert one.rejected == {"malformed": 1}
-    assert other.rejected == {"malformed": 1, "unknown_message": 1}
+    assert first.rejected == {"malformed": 1}
+    assert second.rejected == {"malformed": 1, "unknown_message": 1}
 
 
-def test_host_shares_no_command_with_the_readers_of_its_process() -> None:
-    network = LocalNetwork()
-    sender, reading, host = (
-        network.create_session(),
-        network.create_session(),
-        network.create_session(),
-    )
-    reader = reading.declare_reader(keys.JOINT_COMMAND, JointCommand)
+def test_local_host_shares_no_command_object_with_readers() -> None:
+    sender, observer, host = create_sessions(LocalNetwork(), 3)
+    reader = observer.declare_reader(keys.JOINT_COMMAND, JointCommand)
     receiver = mock.Mock()
     inbox = HostInbox(host, receiver, [], lambda _query, _answer: None)
     command = make_joint_command(make_description(), 0.1)
     encoded = encode_checked(keys.JOINT_COMMAND, command)
     sender.declare_publisher(keys.JOINT_COMMAND, JointCommand).put(command, encoded)
-    (read,) = reader.drain()
-    read.target[0] = 3.0  # as a careless service might
+    (read_command,) = reader.drain()
+    read_command.target[0] = 3.0  # as a careless service might do
     inbox.handle_queued(math.inf)
-    received = receiver.on_command.call_args.args[0]
-    assert set(received.target) == {0.1}
+    received_command = receiver.on_command.call_args.args[0]
+    assert set(received_command.target) == {0.1}

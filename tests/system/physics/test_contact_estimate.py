@@ -1,11 +1,10 @@
-"""The contact estimate against the simulator's truth, on runs that push off pegs.
+"""Compares the contact estimate with the true contacts of the simulator, in runs that push off pegs.
 
-True contacts of one side within 8 cm are one push, because the estimate cannot tell them apart.
+True contacts on one side within 8 cm count as one push, because the estimate cannot distinguish them.
 """
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,139 +20,193 @@ from snakesim_hal.wire.messages import Imu, Pose, RobotDescription
 from snakesim_sim_backend.backend import SimBackend
 from snakesim_sim_backend.state.truth import TrueState
 
-NEAR_M, MIN_FORCE_N = 0.08, 2.0
-FROM_TICK, EVERY = 30, 2
-Push = tuple[float, int, float]  # place along the body in m, side (1: left), force in N
+SAME_PUSH_M = 0.08  # the estimate cannot distinguish contacts that are closer together
+MIN_FORCE_N = 2.0  # weaker pushes are not counted
+FIRST_TICK = 30  # the snake starts to push before it
+TICKS_PER_SAMPLE = 2
+
+
+@dataclass(frozen=True, order=True)
+class Push:
+    """A force on one side of the body."""
+
+    position_m: float  # along the body, from the tail end
+    side: int  # 1: left, -1: right
+    force_n: float
 
 
 @dataclass
-class Score:
-    """Errors over a run, for true pushes of at least MIN_FORCE_N."""
+class EstimateErrors:
+    """The errors of the estimates in a run, for true pushes of at least MIN_FORCE_N."""
 
-    # Error / true force; 1 where nothing was found.
-    share: list[float] = field(default_factory=list[float])
-    place_m: list[float] = field(default_factory=list[float])  # of those found
-    ghosts: int = 0  # found, at least MIN_FORCE_N, and nothing there
+    # |estimated - true force| / true force; 1 if the estimate missed the push.
+    force_error_ratios: list[float] = field(default_factory=list[float])
+    position_errors_m: list[float] = field(default_factory=list[float])  # of the detected pushes
+    false_detections: int = 0  # estimated pushes of at least MIN_FORCE_N without a true push
 
-    def add(self, true: list[Push], felt: list[Push]) -> None:
-        """One tick."""
-        left = list(felt)
-        for place, side, force in true:
-            mine = [push for push in left if push[1] == side and abs(push[0] - place) < NEAR_M]
-            left = [push for push in left if push not in mine]
-            if force < MIN_FORCE_N:
+    def add_sample(self, true_pushes: list[Push], estimated_pushes: list[Push]) -> None:
+        """Add the errors of the estimates of one tick."""
+        unmatched = list(estimated_pushes)
+        for true_push in true_pushes:
+            matching = [push for push in unmatched if _is_same_push(push, true_push)]
+            unmatched = [push for push in unmatched if push not in matching]
+            if true_push.force_n < MIN_FORCE_N:
                 continue
-            found = sum(push[2] for push in mine)
-            self.share.append(abs(found - force) / force)
-            if mine:
-                self.place_m.append(abs(sum(push[0] * push[2] for push in mine) / found - place))
-        self.ghosts += sum(push[2] >= MIN_FORCE_N for push in left)
+            force_n = sum(push.force_n for push in matching)
+            self.force_error_ratios.append(abs(force_n - true_push.force_n) / true_push.force_n)
+            if matching:
+                moment_nm = sum(push.position_m * push.force_n for push in matching)
+                self.position_errors_m.append(abs(moment_nm / force_n - true_push.position_m))
+        self.false_detections += sum(push.force_n >= MIN_FORCE_N for push in unmatched)
 
 
-def score(scenario: str, *settings: str, with_pose: bool = True) -> Score:
-    """Of the estimates in a run of a scenario. settings: KEY=VALUE, or -KEY to leave it out."""
-    result, (robot, seen) = Score(), watched(scenario, *settings)
-    nothing = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
-    for samples, true in seen:
-        imu, pose, reported = (
-            samples.by_key.get(keys.IMU, nothing),
-            samples.by_key.get(keys.POSE),
-            samples.joints,
-        )
+def _is_same_push(push: Push, other: Push) -> bool:
+    return push.side == other.side and abs(push.position_m - other.position_m) < SAME_PUSH_M
+
+
+def measure_estimate_errors(
+    scenario: str, *settings: str, with_pose: bool = True
+) -> EstimateErrors:
+    """Run a scenario and compare the contact estimate with the true contacts.
+
+    Args:
+        scenario: name of a shipped scenario.
+        settings: KEY=VALUE to set a key, or -KEY to remove it.
+        with_pose: whether the estimate may use the pose of the robot.
+    """
+    errors = EstimateErrors()
+    robot, samples_and_pushes = run_and_record_pushes(scenario, *settings)
+    no_imu = Imu(tick=0, timestamp_ns=0, link=[], angular_velocity_rad_s=[], acceleration_m_s2=[])
+    for samples, true_pushes in samples_and_pushes:
+        imu = samples.by_key.get(keys.IMU, no_imu)
+        pose = samples.by_key.get(keys.POSE)
+        joints = samples.joints
         assert isinstance(imu, Imu)
         assert isinstance(pose, Pose | None)
-        felt = estimate_pushes(
+        estimated = estimate_pushes(
             robot,
-            reported.angle_rad,
-            reported.velocity_rad_s,
-            reported.torque_nm,
+            joints.angle_rad,
+            joints.velocity_rad_s,
+            joints.torque_nm,
             imu,
             pose if with_pose else None,
         )
-        result.add(true, pushes(robot, felt))
-    return result
+        errors.add_sample(true_pushes, convert_estimated_pushes(robot, estimated))
+    return errors
 
 
 @lru_cache(maxsize=1)
-def watched(
+def run_and_record_pushes(
     scenario: str, *settings: str
 ) -> tuple[RobotDescription, list[tuple[Samples, list[Push]]]]:
-    """A run's robot, and its samples with what was true; the last run is kept, to be judged in another way."""
-    sets = (
+    """Return the robot of a run, and its samples with the true pushes.
+
+    The last run is cached, because two tests evaluate it in different ways.
+    """
+    overrides = (
         KeyOverride(text[1:], None, text) if text.startswith("-") else parse_set_option(text)
         for text in settings
     )
-    config = load_scenario(scenario, [parse_set_option("duration_s=3"), *sets]).config
-    seen: list[tuple[Samples, list[Push]]] = []
+    config = load_scenario(scenario, [parse_set_option("duration_s=3"), *overrides]).config
+    samples_and_pushes: list[tuple[Samples, list[Push]]] = []
 
-    class Watched(SimBackend):
-        """The backend, with a look at what is true."""
+    class PushRecordingBackend(SimBackend):
+        """A simulator that records the true pushes of its samples."""
 
         def sample(self, tick: int, timestamp_ns: int) -> Samples:
             samples = super().sample(tick, timestamp_ns)
-            if tick >= FROM_TICK and tick % EVERY == 0:
-                seen.append((samples, true_pushes(self.describe(), self.true_state())))
+            if tick >= FIRST_TICK and tick % TICKS_PER_SAMPLE == 0:
+                true_pushes = compute_true_pushes(self.describe(), self.true_state())
+                samples_and_pushes.append((samples, true_pushes))
             return samples
 
-    with register_plugin_temporarily(BACKENDS, "sim", Watched), InProcessRun(config) as run:
+    with (
+        register_plugin_temporarily(BACKENDS, "sim", PushRecordingBackend),
+        InProcessRun(config) as run,
+    ):
         for _ in run.iterate_ticks():
             pass
-        return run.host.description, seen
+        return run.host.description, samples_and_pushes
 
 
-def pushes(robot: RobotDescription, felt: list[EstimatedPush]) -> list[Push]:
-    """Where along the body."""
-    starts = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
+def convert_estimated_pushes(robot: RobotDescription, estimated: list[EstimatedPush]) -> list[Push]:
+    """Convert pushes that are relative to links into positions along the body."""
+    link_starts_m = np.append(0.0, np.cumsum([link.length_m for link in robot.links]))
     return [
-        (starts[c.link] + c.distance_from_rear_joint_m, -int(np.sign(c.normal_l[1])), c.force_n)
-        for c in felt
+        Push(
+            float(link_starts_m[push.link] + push.distance_from_rear_joint_m),
+            -int(np.sign(push.normal_l[1])),
+            push.force_n,
+        )
+        for push in estimated
     ]
 
 
-def true_pushes(robot: RobotDescription, truth: TrueState) -> list[Push]:
-    """The simulator's contacts, tail to head."""
-    lengths = [link.length_m for link in robot.links]
-    starts = np.append(0.0, np.cumsum(lengths))
-    base = rotation_from_quaternion(truth.base_orientation_wxyz)
+def compute_true_pushes(robot: RobotDescription, truth: TrueState) -> list[Push]:
+    """Return the contacts of the simulator from tail to head; neighbors on one side are merged."""
+    lengths_m = [link.length_m for link in robot.links]
+    link_starts_m = np.append(0.0, np.cumsum(lengths_m))
+    base_rotation = rotation_from_quaternion(truth.base_orientation_wxyz)
     axes = [joint.axis for joint in robot.joints]
     rear_w, frames = compute_link_frames(
-        truth.base_position_w, base, truth.angles_rad, axes, lengths
+        truth.base_position_w, base_rotation, truth.angles_rad, axes, lengths_m
     )
-    found: list[Push] = []
+    pushes: list[Push] = []
     for contact in truth.contacts:
-        force_n = float(np.linalg.norm(contact.force_w))
-        along, across = (frames[contact.link].T @ (contact.position_w - rear_w[contact.link]))[:2]
-        found.append((float(starts[contact.link] + along), 1 if across > 0 else -1, force_n))
-    return together(found)
+        position_l = frames[contact.link].T @ (contact.position_w - rear_w[contact.link])
+        along_m, across_m = position_l[:2]
+        pushes.append(
+            Push(
+                float(link_starts_m[contact.link] + along_m),
+                1 if across_m > 0 else -1,
+                float(np.linalg.norm(contact.force_w)),
+            )
+        )
+    return merge_neighbors(pushes)
 
 
-def together(found: list[Push]) -> list[Push]:
-    """Neighbors on one side are added up."""
-    merged: list[Any] = []
-    for place, side, force in sorted(found):
-        same = [push for push in merged if push[1] == side and place - push[0] < NEAR_M]
-        if same and force + same[-1][2] > 0:
-            total = same[-1][2] + force
-            same[-1][0], same[-1][2] = (same[-1][0] * same[-1][2] + place * force) / total, total
+def merge_neighbors(pushes: list[Push]) -> list[Push]:
+    """Merge pushes of one side that are close together into one push at their center of force."""
+    merged: list[Push] = []
+    for push in sorted(pushes):
+        neighbors = [
+            index
+            for index, other in enumerate(merged)
+            if other.side == push.side and push.position_m - other.position_m < SAME_PUSH_M
+        ]
+        if neighbors and push.force_n + merged[neighbors[-1]].force_n > 0:
+            other = merged[neighbors[-1]]
+            force_n = other.force_n + push.force_n
+            moment_nm = other.position_m * other.force_n + push.position_m * push.force_n
+            merged[neighbors[-1]] = Push(moment_nm / force_n, push.side, force_n)
         else:
-            merged.append([place, side, force])
-    return [(place, side, force) for place, side, force in merged]
+            merged.append(push)
+    return merged
 
 
 @pytest.mark.parametrize("with_pose", [True, False])
 @pytest.mark.parametrize("scenario", ["triplet", "peg_row"])
-def test_the_median_error_of_a_push_is_below_15_percent(scenario: str, with_pose: bool) -> None:
-    found = score(scenario, with_pose=with_pose)
-    assert len(found.share) > 100
-    assert np.median(found.share) < 0.15
-    assert len(found.place_m) > 0.95 * len(found.share)  # so few are missed
-    assert found.ghosts < 0.1 * len(found.share)
-    assert np.median(found.place_m) < 0.04
+def test_contact_estimate_median_force_error_is_below_15_percent(
+    scenario: str, with_pose: bool
+) -> None:
+    errors = measure_estimate_errors(scenario, with_pose=with_pose)
+    push_count = len(errors.force_error_ratios)
+    detected_count = len(errors.position_errors_m)
+    assert push_count > 100
+    assert np.median(errors.force_error_ratios) < 0.15
+    assert detected_count > 0.95 * push_count
+    assert errors.false_detections < 0.1 * push_count
+    assert np.median(errors.position_errors_m) < 0.04
 
 
 @pytest.mark.slow
-def test_without_imus_three_of_four_pushes_are_still_found() -> None:
-    found = score("triplet", "-robot.sensors.imu", "-robot.sensors.contacts", with_pose=False)
-    assert len(found.place_m) > 0.75 * len(found.share) > 75
-    assert np.median(found.share) < 0.4
-    assert np.median(found.place_m) < 0.05
+def test_contact_estimate_without_imus_detects_three_of_four_pushes() -> None:
+    errors = measure_estimate_errors(
+        "triplet", "-robot.sensors.imu", "-robot.sensors.contacts", with_pose=False
+    )
+    push_count = len(errors.force_error_ratios)
+    detected_count = len(errors.position_errors_m)
+    assert push_count > 100
+    assert detected_count > 0.75 * push_count
+    assert np.median(errors.force_error_ratios) < 0.4
+    assert np.median(errors.position_errors_m) < 0.05

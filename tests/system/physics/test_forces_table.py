@@ -1,4 +1,4 @@
-"""The forces that `benchmarks.forces` counts, against what the robot's own sensor says of the same run."""
+"""Compares the forces that `benchmarks.forces` measures with the robot's contact sensor in the same run."""
 
 import numpy as np
 import pytest
@@ -9,26 +9,27 @@ from snakesim_testing.runs.desired_and_measured_forces import (
     run_and_measure_forces,
 )
 
+SENSOR_PERIOD_S = 0.05
+
 
 def test_step_forces_average_to_contact_sensor_samples():
     result, forces = run_and_measure_forces("triplet", "obstacle_aided", duration=2.0)
-    steps = round(0.05 / STEP_S)
-    at_end = [float(force[-steps:].mean()) for force in forces.values()]
+    steps_per_sample = round(SENSOR_PERIOD_S / STEP_S)
+    final_forces_n = [float(force_n[-steps_per_sample:].mean()) for force_n in forces.values()]
     assert len(forces) >= 3
-    assert max(at_end) > 1.0
-    # That is of one link.
-    assert max(at_end) == pytest.approx(result.record.contact_peak_n[-1], rel=0.5)
+    assert max(final_forces_n) > 1.0
+    # The sensor measures the force on one link.
+    assert max(final_forces_n) == pytest.approx(result.record.contact_peak_n[-1], rel=0.5)
     impulses_ns = STEP_S * np.sum(list(forces.values()), axis=1)
-    assert impulses_ns.sum() > 10.0  # more than 4 N of drag for two seconds, across the way
+    # The ground's drag is about 4 N for two seconds, and contacts also push across the direction of travel.
+    assert impulses_ns.sum() > 10.0
 
 
-def test_shares_of_the_causes_make_up_all_of_the_difference():
-    cells = [
-        cell.strip()
-        for cell in measure_difference_causes("triplet", "obstacle_aided", duration=2.0).split("|")[
-            1:-1
-        ]
-    ]
-    assert sum(int(cell.rstrip("%")) for cell in cells[4:8]) == pytest.approx(100, abs=2)
-    # Asked for: more than the ground's drag, for contacts push across the way.
-    assert float(cells[2]) > 4.0
+def test_difference_causes_add_up_to_100_percent():
+    table_row = measure_difference_causes("triplet", "obstacle_aided", duration=2.0)
+    cells = [cell.strip() for cell in table_row.split("|")[1:-1]]
+    desired_force_n = float(cells[2])
+    cause_percentages = [int(cell.rstrip("%")) for cell in cells[4:8]]
+    assert sum(cause_percentages) == pytest.approx(100, abs=2)
+    # More than the ground's drag of about 4 N, because contacts also push across the direction of travel.
+    assert desired_force_n > 4.0

@@ -1,4 +1,4 @@
-"""The gaits of the literature in the simulator, each on a scene where it works."""
+"""Each gait of the literature moves the robot in the simulator, on a scene that suits the gait."""
 
 import numpy as np
 import pytest
@@ -11,15 +11,18 @@ from snakesim_operator.run.in_process import simulate
 ON_PEGS = ("control.wavelength=0.31", "control.winding_angle_rad=0.45")  # the wave of the row
 
 
-def run_gait(gait: str, scenario: str, seconds: float, *sets: str) -> tuple[RunRecord, RunSummary]:
-    texts = (f"controller={gait}", f"duration_s={seconds}", *sets)
-    done = simulate(load_scenario(scenario, [parse_set_option(text) for text in texts]).config)
-    assert done.summary.ended == "complete"
-    return done.record, done.summary
+def run_gait(
+    gait: str, scenario: str, seconds: float, *options: str
+) -> tuple[RunRecord, RunSummary]:
+    """Run a gait to the end. The options are as `--set` takes them."""
+    texts = (f"controller={gait}", f"duration_s={seconds}", *options)
+    result = simulate(load_scenario(scenario, [parse_set_option(text) for text in texts]).config)
+    assert result.summary.ended == "complete"
+    return result.record, result.summary
 
 
 def find_displacement_m(record: RunRecord) -> tuple[float, float]:
-    """Return how far the middle of the body moved along x, in which it lies at first, and along y."""
+    """Return how far the center of the body moved along x, its initial direction, and along y."""
     rows = np.flatnonzero(record.has_pose)[[0, -1]]
     first, last = (record.find_body_points_w(int(row)) for row in rows)
     assert first is not None
@@ -55,7 +58,7 @@ def test_gait_moves_forward(
         for row in (("serpenoid", -1.0), ("cpg", 1.0), ("cpg", -1.0))
     ],
 )
-def test_directional_control_turns_the_body_towards_its_goal(gait: str, side: float) -> None:
+def test_directional_control_turns_body_towards_its_goal(gait: str, side: float) -> None:
     goal = (
         "mission.goal.kind=heading",
         f"mission.goal.heading_rad={side * 0.8}",
@@ -71,21 +74,21 @@ def test_directional_control_turns_the_body_towards_its_goal(gait: str, side: fl
 @pytest.mark.parametrize(
     ("height", "side"), [(0.015, 1.0), pytest.param(-0.015, -1.0, marks=pytest.mark.slow)]
 )
-def test_sidewinding_by_a_helix_travels_to_the_requested_side(height: float, side: float) -> None:
+def test_backbone_sidewinding_moves_to_the_requested_side(height: float, side: float) -> None:
     record, _ = run_gait("backbone_sidewinding", "mamba_flat", 4, f"control.half_height={height}")
     forward_m, sideways_m = find_displacement_m(record)
     assert side * sideways_m > 0.6
     assert abs(forward_m) < 0.6 * abs(sideways_m)
 
 
-def test_rolling_by_an_arc_travels_sideways() -> None:
+def test_backbone_rolling_moves_sideways() -> None:
     record, _ = run_gait("backbone_rolling", "mamba_flat", 4)
     forward_m, sideways_m = find_displacement_m(record)
     assert abs(sideways_m) > 0.25
     assert abs(forward_m) < 0.3 * abs(sideways_m)
 
 
-def test_concertina_advances_in_a_corridor_by_cycles() -> None:
+def test_concertina_in_corridor_advances_and_braces_between_walls() -> None:
     record, summary = run_gait("concertina", "corridor", 8.5)
     forward_m, _ = find_displacement_m(record)
     assert forward_m > 0.12
@@ -94,7 +97,7 @@ def test_concertina_advances_in_a_corridor_by_cycles() -> None:
 
 
 @pytest.mark.slow
-def test_concertina_without_walls_stays_behind_itself_in_a_corridor() -> None:
+def test_concertina_without_walls_advances_less_than_in_corridor() -> None:
     free, _ = run_gait("concertina", "corridor", 8.5, "scene.wall=[]")
     braced, _ = run_gait("concertina", "corridor", 8.5)
     free_m, _ = find_displacement_m(free)
@@ -102,14 +105,14 @@ def test_concertina_without_walls_stays_behind_itself_in_a_corridor() -> None:
     assert braced_m > 1.5 * free_m
 
 
-def test_rectilinear_motion_advances_by_the_shortening_of_the_body() -> None:
+def test_rectilinear_motion_moves_body_forward() -> None:
     record, _ = run_gait("rectilinear", "mamba_flat", 5)
     forward_m, _ = find_displacement_m(record)
     assert forward_m > 0.06
 
 
-def test_lifting_the_bends_turns_the_direction_of_travel_round() -> None:
-    """On ground with isotropic friction the same wave moves a body backward that rests on all of its length."""
+def test_sinus_lifting_reverses_the_direction_of_travel() -> None:
+    """On isotropic friction, the same wave moves the body backward if all of the body rests on the ground."""
     lifted, _ = run_gait("sinus_lifting", "mamba_flat", 5)
     resting, _ = run_gait("sinus_lifting", "mamba_flat", 5, "control.lift_slope_rad=0")
     lifted_m, sideways_m = find_displacement_m(lifted)
@@ -120,7 +123,7 @@ def test_lifting_the_bends_turns_the_direction_of_travel_round() -> None:
 
 
 @pytest.mark.parametrize("gait", ["backbone_sidewinding", "rectilinear"])
-def test_a_planar_robot_stays_and_the_report_has_the_reason(gait: str) -> None:
+def test_gait_on_planar_robot_does_not_move_and_reports_reason(gait: str) -> None:
     record, summary = run_gait(gait, "peg_row", 1)
     forward_m, sideways_m = find_displacement_m(record)
     assert np.hypot(forward_m, sideways_m) < 0.01

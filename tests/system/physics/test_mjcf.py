@@ -1,4 +1,4 @@
-"""Another MuJoCo program loads an exported model, and MuJoCo's engine applies the laws there."""
+"""A program that imports only MuJoCo loads an exported model, and applies the friction laws of the simulator."""
 
 import json
 import subprocess
@@ -13,11 +13,11 @@ from snakesim_sim_backend.model.mjcf import export_mjcf
 from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.sim.simulator_rig import make_config
 
-MU = 0.3
+GROUND_FRICTION = 0.3
 SPEED_M_S = 0.5
 SLIDE_S = 0.1
 
-# It knows MuJoCo alone.
+# This program imports MuJoCo, and nothing of SnakeSIM.
 PROGRAM = """
 import json, sys
 import mujoco
@@ -35,14 +35,14 @@ print(json.dumps(result))
 
 @pytest.fixture
 def library() -> Path:
-    """Return the compiled laws."""
+    """Provide the path of the compiled friction laws."""
     loaded = load_shared_library(LAWS_LIBRARY)
     if loaded.path is None:
         pytest.skip(loaded.problem)
     return loaded.path
 
 
-def test_a_snake_slides_to_a_stop_in_a_program_that_knows_mujoco_alone(
+def test_exported_model_in_plain_mujoco_is_slowed_by_dry_friction(
     tmp_path: Path, library: Path
 ) -> None:
     obstacle = {
@@ -51,31 +51,35 @@ def test_a_snake_slides_to_a_stop_in_a_program_that_knows_mujoco_alone(
         "size_m": [0.1, 0.1, 0.2],
         "stiffness_n_per_m": 300.0,
     }
-    config = make_config(scene={"ground": {"friction": MU}, "box": [obstacle]})
+    config = make_config(scene={"ground": {"friction": GROUND_FRICTION}, "box": [obstacle]})
     file = tmp_path / "snake.xml"
     file.write_text(export_mjcf(config, SimSettings()))
     assert "snakesim.dry_friction" in file.read_text()
     assert "snakesim.yielding" in file.read_text()
 
     command = [sys.executable, "-c", PROGRAM, str(file), str(library), str(SPEED_M_S), str(SLIDE_S)]
-    finished = subprocess.run(
+    process = subprocess.run(
         command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
     )
-    result = json.loads(finished.stdout)
+    result = json.loads(process.stdout)
     assert not [name for name in result["modules"] if name.startswith("snakesim")]
     assert result["height"] == pytest.approx(config.robot.module.radius_m, abs=1e-3), (
-        "the ground does not carry it"
+        "the ground does not carry the body"
     )
-    lost_m_s = SPEED_M_S - result["speed"]
-    assert lost_m_s == pytest.approx(MU * result["gravity"] * SLIDE_S, rel=0.05)
+    speed_loss_m_s = SPEED_M_S - result["speed"]
+    assert speed_loss_m_s == pytest.approx(GROUND_FRICTION * result["gravity"] * SLIDE_S, rel=0.05)
 
 
-def test_a_model_without_the_library_is_refused_by_name(tmp_path: Path, library: Path) -> None:
+def test_exported_model_without_library_is_refused_by_plugin_name(
+    tmp_path: Path, library: Path
+) -> None:
     assert library.is_file()
     file = tmp_path / "snake.xml"
-    file.write_text(export_mjcf(make_config(scene={"ground": {"friction": MU}}), SimSettings()))
+    file.write_text(
+        export_mjcf(make_config(scene={"ground": {"friction": GROUND_FRICTION}}), SimSettings())
+    )
     program = f"import mujoco; mujoco.MjModel.from_xml_path({str(file)!r})"
-    finished = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
     )
-    assert "snakesim.dry_friction" in finished.stderr
+    assert "snakesim.dry_friction" in process.stderr

@@ -1,4 +1,4 @@
-"""Snakes that swim: a shipped gait advances, and waves drift as an integrator without MuJoCo computes."""
+"""Snakes swim: a shipped gait advances, and waves drift as an integrator without MuJoCo computes."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from snakesim_testing.sim.swimming import WATER, swim_wave, swim_without_mujoco
 from snakesim_testing.sim.waves import JointWave
 
 TOLERANCE_MM_S = 3.0
-SLOW = JointWave(0.3, 0.7, 4.0)
+SLOW_WAVE = JointWave(0.3, 0.7, 4.0)
 
 
 @pytest.mark.parametrize(
@@ -18,9 +18,9 @@ SLOW = JointWave(0.3, 0.7, 4.0)
 )
 def test_undulation_swims_forward_at_its_depth(controller: str, min_forward_m: float) -> None:
     texts = (f"controller={controller}", "duration_s=4")
-    done = simulate(load_scenario("swimming", [parse_set_option(text) for text in texts]).config)
-    assert done.summary.ended == "complete"
-    record = done.record
+    result = simulate(load_scenario("swimming", [parse_set_option(text) for text in texts]).config)
+    assert result.summary.ended == "complete"
+    record = result.record
     rows = np.flatnonzero(record.has_pose)[[0, -1]]
     first, last = (record.find_body_points_w(int(row)) for row in rows)
     assert first is not None
@@ -32,11 +32,12 @@ def test_undulation_swims_forward_at_its_depth(controller: str, min_forward_m: f
 
 
 @pytest.mark.parametrize(
-    "wave", [SLOW, pytest.param(SLOW.reversed, marks=pytest.mark.slow)], ids=["wave", "its reverse"]
+    "wave",
+    [SLOW_WAVE, pytest.param(SLOW_WAVE.reversed, marks=pytest.mark.slow)],
+    ids=["wave", "its reverse"],
 )
-def test_wave_in_water_drifts_as_the_momentum_balance_says(wave: JointWave) -> None:
+def test_wave_in_water_drifts_as_momentum_balance_computes(wave: JointWave) -> None:
     drift_mm_s = swim_wave(wave, WATER).drift_mm_s
     assert abs(drift_mm_s) > 150.0
-    assert drift_mm_s == pytest.approx(
-        swim_without_mujoco(wave, WATER, 0.002).drift_mm_s, abs=TOLERANCE_MM_S
-    )
+    expected_mm_s = swim_without_mujoco(wave, WATER, 0.002).drift_mm_s
+    assert drift_mm_s == pytest.approx(expected_mm_s, abs=TOLERANCE_MM_S)

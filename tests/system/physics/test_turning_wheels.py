@@ -1,4 +1,4 @@
-"""Wheels with separate limits: rolling does not reduce the friction of the tires sideways."""
+"""Wheels with separate friction limits keep the sideways friction of their tires while they roll."""
 
 import numpy as np
 import pytest
@@ -10,50 +10,53 @@ from snakesim_testing.sim.waves import JointWave, integrate_momentum_balance, si
 
 ROLLING_FRICTION = 0.01
 TIRE_FRICTION = 0.6
-SECTION = {
+WHEELS = {
     "radius_m": 0.03,
     "bearing_radius_m": 0.003,
     "bearing_friction": 0.1,
     "tire_friction": TIRE_FRICTION,
 }
-TURNING = {"wheels": {**SECTION, "separate_limits": True}}
+SEPARATE_LIMITS = {"wheels": {**WHEELS, "separate_limits": True}}
 COEFFICIENTS = DirectionalFriction(ROLLING_FRICTION, ROLLING_FRICTION, TIRE_FRICTION)
-SLOW = JointWave(0.3, 0.7, 4.0)
+SLOW_WAVE = JointWave(0.3, 0.7, 4.0)
 
 
-def test_wheels_that_roll_and_slip_have_the_whole_friction_sideways() -> None:
-    glider = GlidingSnake("flat ground", TURNING)
+def test_wheels_that_roll_and_slip_keep_full_sideways_friction() -> None:
+    glider = GlidingSnake("flat ground", SEPARATE_LIMITS)
     force_n = glider.drag(np.array([0.5, 0.1]), 0.4)
     assert np.abs(force_n) / (glider.mass_kg * G) == pytest.approx(
         (ROLLING_FRICTION, TIRE_FRICTION), rel=0.01
     )
-    slipping = GlidingSnake("flat ground", {"wheels": SECTION})
-    force_n = slipping.drag(np.array([0.5, 0.1]), 0.4)
-    assert abs(force_n[1]) / (slipping.mass_kg * G) < 0.2  # by the law of scales
+    # With a common limit, as scales have it, rolling reduces the sideways friction.
+    common_limit = GlidingSnake("flat ground", {"wheels": WHEELS})
+    force_n = common_limit.drag(np.array([0.5, 0.1]), 0.4)
+    assert abs(force_n[1]) / (common_limit.mass_kg * G) < 0.2
 
 
 @pytest.mark.parametrize("surface", ["flat ground", "level hills", "step", "top of an obstacle"])
-def test_wheels_roll_easily_and_hold_sideways(surface: str) -> None:
-    glider = GlidingSnake(surface, TURNING)
+def test_wheels_roll_easily_and_slip_sideways_above_tire_friction(surface: str) -> None:
+    glider = GlidingSnake(surface, SEPARATE_LIMITS)
     force_n = glider.drag(np.array([0.5, 0.0]), 0.4)
     assert np.linalg.norm(force_n) / (glider.mass_kg * G) == pytest.approx(
         ROLLING_FRICTION, rel=0.02
     )
-    held = GlidingSnake(surface, TURNING)
-    held.push(np.array([0.0, 0.95 * TIRE_FRICTION]))
-    held.go(0.5)
-    before = held.position_w
-    held.go(0.5)
-    assert held.position_w == pytest.approx(before, abs=2e-4)
-    held.push(np.array([0.0, 1.1 * TIRE_FRICTION]))
-    held.go(0.5)
-    assert (held.position_w - before)[1] > 1e-3
+    pushed = GlidingSnake(surface, SEPARATE_LIMITS)
+    pushed.push(np.array([0.0, 0.95 * TIRE_FRICTION]))
+    pushed.go(0.5)
+    position_w = pushed.position_w
+    pushed.go(0.5)
+    assert pushed.position_w == pytest.approx(position_w, abs=2e-4)
+    pushed.push(np.array([0.0, 1.1 * TIRE_FRICTION]))
+    pushed.go(0.5)
+    assert (pushed.position_w - position_w)[1] > 1e-3
 
 
 @pytest.mark.parametrize(
-    "wave", [SLOW, pytest.param(SLOW.reversed, marks=pytest.mark.slow)], ids=["wave", "its reverse"]
+    "wave",
+    [SLOW_WAVE, pytest.param(SLOW_WAVE.reversed, marks=pytest.mark.slow)],
+    ids=["wave", "its reverse"],
 )
-def test_wave_drifts_as_the_momentum_balance_says(wave: JointWave) -> None:
-    drift_mm_s = simulate_wave(wave, {"friction": 0.19}, TURNING).drift_mm_s
+def test_wave_on_wheels_drifts_as_momentum_balance_computes(wave: JointWave) -> None:
+    drift_mm_s = simulate_wave(wave, {"friction": 0.19}, SEPARATE_LIMITS).drift_mm_s
     expected_mm_s = integrate_momentum_balance(wave, COEFFICIENTS, separate_limits=True).drift_mm_s
     assert drift_mm_s == pytest.approx(expected_mm_s, rel=0.01)

@@ -1,4 +1,4 @@
-"""Which processor code a process computes with, and what is said where it is another."""
+"""A process selects the common processor code of NumPy and BLAS, and names results of other code."""
 
 import json
 import os
@@ -12,126 +12,129 @@ import pytest
 
 from snakesim_hal.base import arithmetic
 
-INTEL = "processor : 0\nflags\t\t: fpu sse2 fma avx2 avx512f\n"
+AVX512_CPUINFO = "processor : 0\nflags\t\t: fpu sse2 fma avx2 avx512f\n"
 
 
 @pytest.fixture
-def computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """What the kernel says of another processor."""
+def cpuinfo_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Provide the file in which a test describes another processor, as the kernel would do."""
     monkeypatch.setattr(arithmetic, "CPUINFO", tmp_path / "cpuinfo")
     arithmetic.make_common_arithmetic_env.cache_clear()
     yield tmp_path / "cpuinfo"
     arithmetic.make_common_arithmetic_env.cache_clear()
 
 
-@pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that driver_type")
-def test_a_wide_processor_computes_as_a_usual_one(computer: Path) -> None:
-    computer.write_text(INTEL)
-    wanted = arithmetic.make_common_arithmetic_env()
-    assert wanted["OPENBLAS_CORETYPE"] == "Haswell"
-    assert "X86_V4" in wanted["NPY_DISABLE_CPU_FEATURES"]
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="needs a processor of that kind")
+def test_arithmetic_of_avx512_processor_is_that_of_a_common_one(cpuinfo_file: Path) -> None:
+    cpuinfo_file.write_text(AVX512_CPUINFO)
+    environment = arithmetic.make_common_arithmetic_env()
+    assert environment["OPENBLAS_CORETYPE"] == "Haswell"
+    assert "X86_V4" in environment["NPY_DISABLE_CPU_FEATURES"]
 
 
-@pytest.mark.skipif(os.uname().machine != "x86_64", reason="about processors of that driver_type")
-def test_what_was_set_before_has_no_effect(computer: Path) -> None:
-    computer.write_text(INTEL.replace(" avx512f", ""))
-    wanted = arithmetic.make_common_arithmetic_env()
-    assert wanted["NPY_DISABLE_CPU_FEATURES"] == wanted["NPY_ENABLE_CPU_FEATURES"] == ""
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="needs a processor of that kind")
+def test_arithmetic_environment_overrides_earlier_numpy_settings(cpuinfo_file: Path) -> None:
+    cpuinfo_file.write_text(AVX512_CPUINFO.replace(" avx512f", ""))
+    environment = arithmetic.make_common_arithmetic_env()
+    assert environment["NPY_DISABLE_CPU_FEATURES"] == ""
+    assert environment["NPY_ENABLE_CPU_FEATURES"] == ""
 
 
 @pytest.mark.parametrize("flags", ["flags : fpu sse2\n", "Features : fp asimd\n", "", None])
-def test_arithmetic_of_unknown_processor_is_not_pinned(computer: Path, flags: str | None) -> None:
-    """Code for AVX2 would crash there."""
+def test_arithmetic_of_unknown_processor_is_not_pinned(
+    cpuinfo_file: Path, flags: str | None
+) -> None:
+    """Code for AVX2 would crash on such a processor."""
     if flags is not None:
-        computer.write_text(flags)
+        cpuinfo_file.write_text(flags)
     assert arithmetic.make_common_arithmetic_env() == {}
     assert arithmetic.is_pinned()
 
 
-def measured_with(code: str, **more: str) -> dict[str, str]:
-    show = (
+def measure_arithmetic_after(code: str, **variables: str) -> dict[str, str]:
+    """Measure the arithmetic of a new process that runs this code, with these environment variables."""
+    program = (
         "import json; from snakesim_hal.base import arithmetic; {}; "
         "print(json.dumps(arithmetic.measure_arithmetic()))"
     )
-    unset = {
+    environment = {
         name: value
         for name, value in os.environ.items()
         if name not in arithmetic.make_common_arithmetic_env()
     }
-    done = subprocess.run(
-        [sys.executable, "-c", show.format(code)],
-        env={**unset, **more},
+    result = subprocess.run(
+        [sys.executable, "-c", program.format(code)],
+        env={**environment, **variables},
         capture_output=True,
         check=True,
     )
-    return json.loads(done.stdout)
+    return json.loads(result.stdout)
 
 
-def test_what_a_process_computes_with_is_measured() -> None:
+def test_measure_arithmetic_detects_code_selected_before_numpy_import() -> None:
     if not arithmetic.make_common_arithmetic_env():
-        pytest.skip("this processor has no AVX2 and FMA, so nothing can be chosen")
+        pytest.skip("this processor has no AVX2 and FMA, so that no other code can be selected")
     old = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3"}
-    assert arithmetic.find_differing_parts(measured_with("pass", **old)) == ["BLAS", "NumPy"]
-    assert (
-        measured_with("arithmetic.pin_common_arithmetic()", **old)
-        == arithmetic.measure_arithmetic()
-    )
-    assert measured_with(
-        "import numpy; arithmetic.pin_common_arithmetic()", **old
-    ) == measured_with("pass", **old)
+    old_arithmetic = measure_arithmetic_after("pass", **old)
+    assert arithmetic.find_differing_parts(old_arithmetic) == ["BLAS", "NumPy"]
+    pin_first = "arithmetic.pin_common_arithmetic()"
+    assert measure_arithmetic_after(pin_first, **old) == arithmetic.measure_arithmetic()
+    pin_too_late = "import numpy; arithmetic.pin_common_arithmetic()"
+    assert measure_arithmetic_after(pin_too_late, **old) == old_arithmetic
 
 
 def test_arithmetic_digest_of_other_kernels_is_marked_as_local() -> None:
     other = {**arithmetic.COMMON, "BLAS": "00000000", "C library": "00000000"}
     assert arithmetic.find_differing_parts(other) == ["BLAS", "C library"]
-    said = arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts(other))
-    otherwise = "round otherwise than on most computers with NumPy 2.2 to 2.4"
-    assert said == f"0123456789abcdef, its own: BLAS and C library {otherwise}"
-    assert (
-        arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts({}))
-        == "0123456789abcdef"
+    text = arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts(other))
+    remark = "round otherwise than on most computers with NumPy 2.2 to 2.4"
+    assert text == f"0123456789abcdef, its own: BLAS and C library {remark}"
+    common_text = arithmetic.format_digest(
+        "0123456789abcdef01", arithmetic.find_differing_parts({})
     )
+    assert common_text == "0123456789abcdef"
 
 
 def test_arithmetic_difference_of_newer_wheel_names_the_wheel() -> None:
-    of_2_5 = {**arithmetic.COMMON, "BLAS": "3f7c15b6"}
-    assert arithmetic.find_differing_parts(of_2_5) == ["BLAS of NumPy 2.5"]
-    said = arithmetic.format_digest("0123456789abcdef01", arithmetic.find_differing_parts(of_2_5))
-    assert said.startswith(
+    numpy_2_5 = {**arithmetic.COMMON, "BLAS": "3f7c15b6"}
+    differing_parts = arithmetic.find_differing_parts(numpy_2_5)
+    assert differing_parts == ["BLAS of NumPy 2.5"]
+    text = arithmetic.format_digest("0123456789abcdef01", differing_parts)
+    assert text.startswith(
         "0123456789abcdef, as on most computers with the BLAS of NumPy 2.5, which rounds otherwise"
     )
 
 
 @pytest.mark.parametrize(
-    ("version", "first", "last"),
+    ("version", "first_name", "last_name"),
     [
         ("2.2.6", "AVX512F", "AVX512_KNM"),
         ("2.3.5", "AVX512F", "AVX512_SPR"),
         ("2.5.1", "X86_V4", "AVX512_SPR"),
     ],
 )
-def test_numpy_is_given_only_names_that_its_version_knows(
-    computer: Path,
+def test_arithmetic_disables_only_features_known_to_numpy_version(
+    cpuinfo_file: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     version: str,
-    first: str,
-    last: str,
+    first_name: str,
+    last_name: str,
 ) -> None:
     (tmp_path / "version.py").write_text(f'\nversion = "{version}"\n')
     monkeypatch.setattr(
         "importlib.util.find_spec",
         lambda _: ModuleSpec("numpy", None, origin=f"{tmp_path}/__init__.py"),
     )
-    computer.write_text(INTEL)
+    cpuinfo_file.write_text(AVX512_CPUINFO)
     names = arithmetic.make_common_arithmetic_env()["NPY_DISABLE_CPU_FEATURES"].split()
-    assert names[0] == first
-    assert names[-1] == last
+    assert names[0] == first_name
+    assert names[-1] == last_name
 
 
-def test_numpy_can_be_imported_where_warnings_are_errors() -> None:
+def test_import_of_snakesim_and_numpy_causes_no_warning() -> None:
     code = "import snakesim; import numpy"
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
+    assert result.returncode == 0, result.stderr

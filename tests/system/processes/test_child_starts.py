@@ -1,4 +1,4 @@
-"""Every place in the source that starts a process, and that no child of ours takes modules from the working folder."""
+"""The source code starts every process in a safe way, so that no child imports modules from the working folder."""
 
 import ast
 import os
@@ -22,7 +22,7 @@ FOLDERS = (
 )
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
-STARTS = {
+START_FUNCTIONS = {
     *(f"subprocess.{name}" for name in ("Popen", "run", "call", "check_call", "check_output")),
     *(
         f"os.{name}"
@@ -41,7 +41,8 @@ STARTS = {
     "ProcessPoolExecutor",
     "LocalCluster",
 }
-OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
+# Files that start programs without our Python code, or that explain why their start is safe.
+OTHER_PROGRAMS = {
     "benchmarks/checkouts.py": "git",
     "benchmarks/paths/ways.py": "openssl",
     "benchmarks/peers/__main__.py": "rospy, dora and apt, each with an interpreter of its own",
@@ -60,62 +61,69 @@ OTHER_PROGRAMS = {  # that start no Python of ours, or where the file says why
     "snakesim_native/compile.py": "the C compiler",
     "snakesim_hal/base/process.py": "the same program again, with its own options",
 }
-# Copies of a process, which import nothing.
+# Files that fork a process, which imports nothing.
 FORKS = {"snakesim_operator/run/processes/guarded_process.py"}
 
 
-def dotted(node: ast.expr) -> str:
-    """A name as it is written: `subprocess.run`; empty for anything else."""
+def get_dotted_name(node: ast.expr) -> str:
+    """Return a name as it is written, such as `subprocess.run`, or an empty text for any other expression."""
     if isinstance(node, ast.Attribute):
-        return f"{dotted(node.value)}.{node.attr}"
+        return f"{get_dotted_name(node.value)}.{node.attr}"
     return node.id if isinstance(node, ast.Name) else ""
 
 
-def starts_in(path: Path) -> Iterator[tuple[ast.Call, ast.AST]]:
-    """Each call that starts a process, with the function or file around it."""
+def find_process_starts(path: Path) -> Iterator[tuple[ast.Call, ast.AST]]:
+    """Yield each call that starts a process, with the function or file that contains it."""
     text = path.read_text(encoding="utf-8")
-    if not any(name.rpartition(".")[2] in text for name in STARTS):
-        return  # parsing all files takes seconds
+    if not any(name.rpartition(".")[2] in text for name in START_FUNCTIONS):
+        return  # the file is not parsed, because parsing all files takes seconds
     tree = ast.parse(text)
     calls = [
         node
         for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and dotted(node.func) in STARTS
+        if isinstance(node, ast.Call) and get_dotted_name(node.func) in START_FUNCTIONS
     ]
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     for call in calls:
-        around = [one for one in functions if one.lineno <= call.lineno <= (one.end_lineno or 0)]
-        yield call, around[-1] if around else tree
+        containing = [
+            function
+            for function in functions
+            if function.lineno <= call.lineno <= (function.end_lineno or 0)
+        ]
+        yield call, containing[-1] if containing else tree
 
 
-def is_protected(call: ast.Call, around: ast.AST) -> bool:
-    """Whether command line and environment come from the two functions that make them."""
-    called = {dotted(node.func) for node in ast.walk(around) if isinstance(node, ast.Call)}
+def is_safe_start(call: ast.Call, container: ast.AST) -> bool:
+    """Return whether command line and environment come from the two functions that make them."""
+    called = {
+        get_dotted_name(node.func) for node in ast.walk(container) if isinstance(node, ast.Call)
+    }
     has_environment = any(keyword.arg == "env" for keyword in call.keywords)
     return has_environment and {"make_python_command", "make_child_environment"} <= called
 
 
-def test_child_processes_all_start_with_prepared_command_and_environment() -> None:
-    found = {path: list(starts_in(path)) for path in FILES}
-    assert sum(map(len, found.values())) > 15, "the search finds nothing any more"
-    unprotected = {
-        f"{path.relative_to(ROOT)}:{call.lineno}"
-        for path, calls in found.items()
-        if path.relative_to(ROOT).as_posix() not in OTHER_PROGRAMS.keys() | FORKS
-        for call, around in calls
-        if not is_protected(call, around)
+def test_child_processes_start_with_prepared_command_and_environment() -> None:
+    starts_by_file = {
+        path.relative_to(ROOT).as_posix(): list(find_process_starts(path)) for path in FILES
     }
-    assert not unprotected, (
-        "start it with make_python_command() and make_child_environment(), or add it to the table above"
+    assert sum(map(len, starts_by_file.values())) > 15, "the search finds nothing any more"
+    exceptions = OTHER_PROGRAMS.keys() | FORKS
+    unsafe_starts = {
+        f"{file}:{call.lineno}"
+        for file, starts in starts_by_file.items()
+        if file not in exceptions
+        for call, container in starts
+        if not is_safe_start(call, container)
+    }
+    assert not unsafe_starts, (
+        "use make_python_command() and make_child_environment(), or add the file to the table above"
     )
-    listed = OTHER_PROGRAMS.keys() | FORKS
-    assert listed <= {
-        path.relative_to(ROOT).as_posix() for path, calls in found.items() if calls
-    }, "no longer needed"
+    files_with_starts = {file for file, starts in starts_by_file.items() if starts}
+    assert exceptions <= files_with_starts, "the table above names a file that starts no process"
 
 
-def test_nothing_else_makes_a_command_line_of_this_interpreter() -> None:
-    # Zig, a compiler.
+def test_command_lines_of_this_interpreter_are_made_in_one_place() -> None:
+    # The command of the C compiler Zig also starts with this interpreter.
     allowed = {"snakesim_hal/base/process.py", "deploy/bootstrap.py", "snakesim_native/compile.py"}
     for path in FILES:
         text = path.read_text(encoding="utf-8")
@@ -123,27 +131,32 @@ def test_nothing_else_makes_a_command_line_of_this_interpreter() -> None:
             continue
         tree = ast.parse(text)
         sequences = [node for node in ast.walk(tree) if isinstance(node, ast.List | ast.Tuple)]
-        assert not [
-            node.lineno for node in sequences if "sys.executable" in map(dotted, node.elts)
-        ], path
+        command_line_numbers = [
+            node.lineno for node in sequences if "sys.executable" in map(get_dotted_name, node.elts)
+        ]
+        assert not command_line_numbers, path
 
 
 @pytest.mark.parametrize("search_path", ["", os.pathsep])
-@pytest.mark.parametrize("words", [("-c",), ("-m", "snakesim_operator")])
-def test_a_file_in_the_working_folder_replaces_no_module(
-    words: tuple[str, ...], search_path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("arguments", [("-c",), ("-m", "snakesim_operator")])
+def test_child_process_imports_no_module_from_working_folder(
+    arguments: tuple[str, ...], search_path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", search_path)
     for name in ("random", "queue", "can", "calendar", "resource"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit(77)")
-    again = "import subprocess, sys; sys.exit(subprocess.call([sys.executable, '-c', 'import random, calendar']))"
-    if words == ("-c",):
-        command = make_python_command("-c", f"import random, queue, calendar; {again}")
-        variables = make_child_environment()
-    else:
-        command = [sys.executable, *words, "--version"]  # as a user may type it
-        variables = dict(os.environ)
-    ended = subprocess.run(
-        command, cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=60
+    start_grandchild = (
+        "import subprocess, sys; "
+        "sys.exit(subprocess.call([sys.executable, '-c', 'import random, calendar']))"
     )
-    assert ended.returncode == 0, ended.stderr
+    if arguments == ("-c",):
+        code = f"import random, queue, calendar; {start_grandchild}"
+        command = make_python_command("-c", code)
+        environment = make_child_environment()
+    else:
+        command = [sys.executable, *arguments, "--version"]  # as a user may type it
+        environment = dict(os.environ)
+    result = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert result.returncode == 0, result.stderr

@@ -1,4 +1,4 @@
-"""Processes of a run, from the outside."""
+"""The supervisor starts and stops the processes of a run, also while they start or if they ignore a signal."""
 
 import signal
 import socket
@@ -20,7 +20,7 @@ from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
-DEAF = """
+IGNORE_SIGTERM_CODE = """
 import signal, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 print("ready", flush=True)
@@ -28,8 +28,8 @@ time.sleep(60)
 """
 
 
-def recorder_arguments(out: Path) -> list[str]:
-    """The command line of a recorder whose network is never opened."""
+def make_recorder_arguments(out: Path) -> list[str]:
+    """Make the command line of a recorder whose network is never opened."""
     endpoint = find_free_endpoint()
     return [
         "snakesim_operator.recording.recorder_process",
@@ -41,30 +41,30 @@ def recorder_arguments(out: Path) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("after_s", [0.0, 0.02, 0.1])
-def test_an_interrupt_while_a_child_starts_leaves_no_traceback(after_s: float) -> None:
-    said = bytearray()
+@pytest.mark.parametrize("delay_s", [0.0, 0.02, 0.1])
+def test_child_interrupted_while_it_starts_prints_no_traceback(delay_s: float) -> None:
+    printed = bytearray()
     child = start_child(
-        "control", ["snakesim_hal.programs.service_program", "control", "--help"], said.extend
+        "control", ["snakesim_hal.programs.service_program", "control", "--help"], printed.extend
     )
-    time.sleep(after_s)
+    time.sleep(delay_s)
     child.process.send_signal(signal.SIGINT)
     assert child.process.wait(30) == 0, child.output.last_lines()
     assert child.output.last_lines()
-    assert b"Traceback" not in said
+    assert b"Traceback" not in printed
 
 
 def test_recorder_that_waits_for_a_network_ends_at_once(tmp_path: Path) -> None:
     """The network of a run that ends at once is gone before a slow recorder has started."""
-    recorder = start_child("recorder", recorder_arguments(tmp_path), lambda _output: None)
-    time.sleep(3.0)  # it has started, and waits; if the computer is slow, it still starts
+    recorder = start_child("recorder", make_recorder_arguments(tmp_path), lambda _output: None)
+    time.sleep(3.0)  # now it waits for the network; on a slow computer it still starts
     stop_children([recorder])
     assert recorder.process.returncode == -signal.SIGTERM
     assert not recorder.was_killed
-    assert not (tmp_path / RECORDING_FILENAME).exists(), "a file that nobody has closed"
+    assert not (tmp_path / RECORDING_FILENAME).exists(), "the recorder created a recording"
 
 
-def test_recording_that_is_stopped_before_there_is_a_network_says_so(tmp_path: Path) -> None:
+def test_record_to_file_stopped_before_network_opens_raises_error(tmp_path: Path) -> None:
     with raises_error(NotConnectedError, code="network/nothing-listens"):
         record_to_file(
             ConnectionSettings(find_free_endpoint(), "worm"),
@@ -74,12 +74,12 @@ def test_recording_that_is_stopped_before_there_is_a_network_says_so(tmp_path: P
     assert not (tmp_path / RECORDING_FILENAME).exists()
 
 
-def test_child_that_is_ended_while_it_starts_is_reported_as_such(tmp_path: Path) -> None:
+def test_child_ended_while_it_starts_is_reported(tmp_path: Path) -> None:
     printed: list[str] = []
     files = RunFiles(tmp_path, printed.append)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stop_port:
         supervisor = RunSupervisor(files, RunEnding(), printed.append, stop_port)
-        supervisor.start("recorder", recorder_arguments(tmp_path), vital=False)
+        supervisor.start("recorder", make_recorder_arguments(tmp_path), vital=False)
         supervisor.end_all_processes()
     files.close()
     assert supervisor.losses_by_process == {
@@ -93,11 +93,13 @@ def test_child_that_is_ended_while_it_starts_is_reported_as_such(tmp_path: Path)
 def test_child_that_does_not_end_is_killed_and_described(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "deaf.py").write_text(DEAF)
+    (tmp_path / "ignore_sigterm.py").write_text(IGNORE_SIGTERM_CODE)
     monkeypatch.setattr(children, "STOP_TIMEOUT_S", 0.2)
-    said = bytearray()
-    child = start_child("control", ["deaf"], said.extend, extra_env={"PYTHONPATH": str(tmp_path)})
-    wait_until(lambda: b"ready" in said, "a child that ignores SIGTERM")
+    printed = bytearray()
+    child = start_child(
+        "control", ["ignore_sigterm"], printed.extend, extra_env={"PYTHONPATH": str(tmp_path)}
+    )
+    wait_until(lambda: b"ready" in printed, "the child ignores SIGTERM")
     stop_children([child])
     assert (
         child.describe_exit()

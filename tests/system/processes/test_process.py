@@ -1,4 +1,4 @@
-"""Measures for real time: taken where the system allows them, and otherwise named."""
+"""Real-time settings of a process are applied where the system allows them, and reported where it refuses them."""
 
 import os
 import subprocess
@@ -6,36 +6,43 @@ import sys
 
 import pytest
 
-LOCK = "import resource; resource.setrlimit(resource.RLIMIT_MEMLOCK, ({0}, {0})); "
-PRINT = "from snakesim_hal.base.process import {0}; print({0}({1}))"
+# Format strings of code: the first one limits locked memory in bytes, the second one prints the result of a function.
+LIMIT_MEMORY_CODE = "import resource; resource.setrlimit(resource.RLIMIT_MEMLOCK, ({0}, {0})); "
+PRINT_RESULT_CODE = "from snakesim_hal.base.process import {0}; print({0}({1}))"
 
 
 def run_python(code: str, *, drop: str = "") -> str:
-    """What a process of its own prints; drop: a capability that it must not have (an ordinary user's has none)."""
-    bounded = (
-        ["setpriv", f"--bounding-set=-{drop}", f"--inh-caps=-{drop}"]
-        if drop and os.geteuid() == 0
-        else []
-    )
-    done = subprocess.run(
-        [*bounded, sys.executable, "-c", code],
+    """Run code in a new process and return what it prints.
+
+    Args:
+        code: the Python code.
+        drop: a capability that the process must not have. The process of an ordinary user has none anyway.
+    """
+    prefix: list[str] = []
+    if drop and os.geteuid() == 0:
+        prefix = ["setpriv", f"--bounding-set=-{drop}", f"--inh-caps=-{drop}"]
+    result = subprocess.run(
+        [*prefix, sys.executable, "-c", code],
         capture_output=True,
         text=True,
         timeout=30,
         check=False,
     )
-    return (done.stdout + done.stderr).strip()
+    return (result.stdout + result.stderr).strip()
 
 
-def test_memory_is_not_locked_under_a_limit() -> None:
-    words = run_python(LOCK.format(1 << 20) + PRINT.format("lock_memory", ""), drop="ipc_lock")
-    assert "the limit is 1024 KiB" in words
-    assert "ulimit -l" in words
+def test_lock_memory_under_limit_reports_the_limit() -> None:
+    printed = run_python(
+        LIMIT_MEMORY_CODE.format(1 << 20) + PRINT_RESULT_CODE.format("lock_memory", ""),
+        drop="ipc_lock",
+    )
+    assert "the limit is 1024 KiB" in printed
+    assert "ulimit -l" in printed
 
 
-def test_memory_is_locked_where_that_is_allowed() -> None:
+def test_lock_memory_where_allowed_locks_memory() -> None:
     code = (
-        PRINT.format("lock_memory", "")
+        PRINT_RESULT_CODE.format("lock_memory", "")
         + "; print(open('/proc/self/status').read().split('VmLck:')[1].split()[0])"
     )
     verdict, *locked = run_python(code).splitlines()
@@ -44,19 +51,20 @@ def test_memory_is_locked_where_that_is_allowed() -> None:
     assert int(locked[0]) > 1000
 
 
-def test_what_is_refused_is_returned_and_printed() -> None:
+def test_enter_realtime_returns_and_prints_refused_settings() -> None:
     code = "from snakesim_hal.base.process import enter_realtime; r = enter_realtime(20); print(len(r), r)"
-    words = run_python(LOCK.format(1 << 20) + code, drop="ipc_lock,-sys_nice")
-    assert words.startswith("2 [") and words.count("no real-time priority") == 2, words
+    printed = run_python(LIMIT_MEMORY_CODE.format(1 << 20) + code, drop="ipc_lock,-sys_nice")
+    assert printed.startswith("2 ["), printed
+    assert printed.count("no real-time priority") == 2, printed
 
 
-def test_the_clock_is_not_stepped_without_permission() -> None:
-    words = run_python(PRINT.format("step_wall_clock", "0.0"), drop="sys_time")
-    assert "CAP_SYS_TIME" in words
-    assert "RefusedError" in words
+def test_step_wall_clock_without_capability_is_refused() -> None:
+    printed = run_python(PRINT_RESULT_CODE.format("step_wall_clock", "0.0"), drop="sys_time")
+    assert "CAP_SYS_TIME" in printed
+    assert "RefusedError" in printed
 
 
-def test_a_thread_that_never_pauses_gives_up_its_priority() -> None:
+def test_realtime_thread_that_never_pauses_drops_its_priority() -> None:
     code = """
 import os, time
 from snakesim_hal.base.process import drop_priority_after, set_realtime_priority
@@ -74,22 +82,21 @@ print(os.sched_getscheduler(0) == os.SCHED_FIFO)
 compute(0.5)
 print(os.sched_getscheduler(0) == os.SCHED_OTHER)
 """
-    words = run_python(code)
-    if "refused" in words:
+    printed = run_python(code)
+    if "refused" in printed:
         pytest.skip("real-time priority is refused here")
-    assert words.startswith("True\nTrue\n"), words
-    assert "priority dropped after computing for 50 ms without a pause" in words
+    assert printed.startswith("True\nTrue\n"), printed
+    assert "priority dropped after computing for 50 ms without a pause" in printed
 
 
-def test_a_closed_terminal_is_a_stop_but_under_nohup() -> None:
-    code = PRINT.format("list_stop_signals", "")
-    in_a_terminal = ["env", "--default-signal=HUP"]  # these tests may run under nohup
-    words, under_nohup = (
-        subprocess.run(
-            [*prefix, sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout
-        for prefix in (in_a_terminal, ["nohup"])
+def test_closed_terminal_is_a_stop_signal_except_under_nohup() -> None:
+    code = PRINT_RESULT_CODE.format("list_stop_signals", "")
+    command = [sys.executable, "-c", code]
+    as_in_terminal = ["env", "--default-signal=HUP"]  # these tests may run under nohup
+    in_terminal = subprocess.run(
+        [*as_in_terminal, *command], capture_output=True, text=True, check=True
     )
-    assert "SIGHUP" in words
-    assert "SIGTERM" in under_nohup
-    assert "SIGHUP" not in under_nohup
+    under_nohup = subprocess.run(["nohup", *command], capture_output=True, text=True, check=True)
+    assert "SIGHUP" in in_terminal.stdout
+    assert "SIGTERM" in under_nohup.stdout
+    assert "SIGHUP" not in under_nohup.stdout

@@ -1,4 +1,4 @@
-"""A plugin's file may import its neighbors, and they replace nothing."""
+"""The file of a plugin may import modules of its folder, and these replace no other module."""
 
 import subprocess
 from pathlib import Path
@@ -7,35 +7,37 @@ import pytest
 
 from snakesim_hal.base.process import make_child_environment, make_python_command
 
-FILE = """
+PLUGIN_CODE = """
 import random
 import helpers
 import parts.arm
 
 class Wave:
     random = random.__file__
-    helped = helpers.GAIN, parts.arm.NAME
+    imported_values = helpers.GAIN, parts.arm.NAME
 
     def later(self):
         import at_work
         return at_work.__file__
 """
-LOADS = """
+LOAD_PLUGIN_CODE = """
 import pathlib, sys
 from snakesim_hal.model.plugins import load_plugin
 wave = load_plugin("snakesim.controllers", f"{sys.argv[1]}/wave.py:Wave")
-assert wave.helped == (2, "arm") and pathlib.Path(wave().later()).stem == "at_work"
+assert wave.imported_values == (2, "arm")
+assert pathlib.Path(wave().later()).stem == "at_work"
 assert not wave.random.startswith(sys.argv[1]), wave.random
 try:
-    import optional  # as a library does with what it can do without
+    import optional  # as a library imports an optional dependency
 except ModuleNotFoundError:
-    print("as it must be")
+    print("optional is not found")
 """
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "wave.py").write_text(FILE)
+    """Provide a folder with a plugin, modules that it imports, and two modules that must never be imported."""
+    (tmp_path / "wave.py").write_text(PLUGIN_CODE)
     (tmp_path / "helpers.py").write_text("import constants\nGAIN = constants.GAIN")
     (tmp_path / "constants.py").write_text("GAIN = 2")
     (tmp_path / "at_work.py").write_text("")
@@ -47,9 +49,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_plugin_file_imports_neighbors_and_only_what_it_names(folder: Path) -> None:
-    command = make_python_command("-c", LOADS, str(folder))
-    ended = subprocess.run(
+def test_plugin_file_imports_modules_of_its_folder_without_replacing_others(folder: Path) -> None:
+    command = make_python_command("-c", LOAD_PLUGIN_CODE, str(folder))
+    result = subprocess.run(
         command,
         env=make_child_environment(),
         cwd=folder,
@@ -58,4 +60,5 @@ def test_plugin_file_imports_neighbors_and_only_what_it_names(folder: Path) -> N
         timeout=60,
         check=False,
     )
-    assert (ended.returncode, ended.stdout) == (0, "as it must be\n"), ended.stderr
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == "optional is not found\n"

@@ -1,4 +1,4 @@
-"""A step that does not return is interrupted, and no later one is."""
+"""A watchdog interrupts a step that does not return, and never a later step."""
 
 import subprocess
 import sys
@@ -15,53 +15,55 @@ from snakesim_hal.base.step_limit import (
 )
 
 
-def endless() -> None:
+def run_endlessly() -> None:
+    """Compute forever, and ignore ordinary exceptions."""
     while True:
         try:
             while True:
                 pass
-        except Exception:  # noqa: BLE001 - as a controller may have it
+        except Exception:  # noqa: BLE001 - as in a careless controller
             pass
 
 
-def test_an_endless_step_is_interrupted_and_its_place_is_known() -> None:
-    with closing(StepWatchdog(0.1)) as limit:
-        with pytest.raises(StepTooLongError) as caught, limit:
-            endless()
+def test_step_watchdog_interrupts_endless_step_and_names_its_line() -> None:
+    with closing(StepWatchdog(0.1)) as watchdog:
+        with pytest.raises(StepTooLongError) as caught, watchdog:
+            run_endlessly()
         assert describe_interrupted_line(caught.value).startswith(
-            "endless() (test_step_limit.py line "
+            "run_endlessly() (test_step_limit.py line "
         )
-        with limit:
+        with watchdog:
             pass
-        time.sleep(0.4)  # between steps nothing is raised
+        time.sleep(0.4)  # the watchdog raises no error between steps
 
 
-def test_a_hurry_ends_the_present_step_long_before_its_limit() -> None:
-    with closing(StepWatchdog(600.0)) as limit, pytest.raises(StepTooLongError), limit:
-        limit.request_shutdown(0.1)
-        endless()
-    assert limit.is_shutting_down
+def test_step_watchdog_at_shutdown_ends_step_before_its_limit() -> None:
+    with closing(StepWatchdog(600.0)) as watchdog, pytest.raises(StepTooLongError), watchdog:
+        watchdog.request_shutdown(0.1)
+        run_endlessly()
+    assert watchdog.is_shutting_down
 
 
-def test_an_error_that_was_not_raised_yet_is_taken_back() -> None:
-    with closing(StepWatchdog(0.0)) as limit:
+def test_step_watchdog_raises_no_late_error_after_the_step() -> None:
+    with closing(StepWatchdog(0.0)) as watchdog:
         for _ in range(20):
             try:
-                with limit:
-                    time.sleep(0.03)  # compiled code, at whose end the error may be due
+                with watchdog:
+                    time.sleep(0.03)  # the error may be due at the end of compiled code
             except StepTooLongError:
                 pass
         time.sleep(0.3)
 
 
-def test_another_process_can_see_when_a_step_began() -> None:
+def test_shared_step_times_contain_start_and_deadline_during_step() -> None:
     step_times = SharedStepTimes()
-    with closing(StepWatchdog(60.0, step_times)) as limit:
+    with closing(StepWatchdog(60.0, step_times)) as watchdog:
         assert step_times.read_step_times() is None
-        with limit:
-            step_s = step_times.read_step_times()
-            assert step_s is not None
-            assert step_s[1] - step_s[0] == pytest.approx(60.0)
+        with watchdog:
+            step = step_times.read_step_times()
+            assert step is not None
+            start_s, deadline_s = step
+            assert deadline_s - start_s == pytest.approx(60.0)
         assert step_times.read_step_times() is None
 
 
@@ -94,12 +96,12 @@ print(read_count > 0, wrong_count)
 """
 
 
-def test_step_times_read_while_steps_change_are_never_mixed_up() -> None:
-    completed = subprocess.run(
+def test_shared_step_times_read_during_changes_belong_together() -> None:
+    result = subprocess.run(
         [sys.executable, "-c", READ_WHILE_STEPS_CHANGE],
         capture_output=True,
         text=True,
         timeout=60,
         check=True,
     )
-    assert completed.stdout == "True 0\n"
+    assert result.stdout == "True 0\n"

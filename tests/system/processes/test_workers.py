@@ -1,4 +1,4 @@
-"""Threads that serve others go on after an error that nobody expected, and say so."""
+"""Threads that serve requests continue after an unexpected error, and report it."""
 
 import socket
 import threading
@@ -19,107 +19,110 @@ from snakesim_testing.harness.wait import wait_until
 LOOPBACK = "127.0.0.1"
 
 
-class BrokenError(RuntimeError):
-    """What nobody expected."""
+class UnexpectedError(RuntimeError):
+    """An error that the code of the threads does not expect."""
 
 
 def test_worker_restarts_after_error_and_reports_it_once(capfd: pytest.CaptureFixture[str]) -> None:
-    attempts, dropped = list[int](), list[Exception]()
+    attempts = 0
+    errors: list[Exception] = []
 
-    def work() -> None:
-        attempts.append(1)
-        if len(attempts) < 3:
-            raise BrokenError("no file is left")
+    def fail_twice() -> None:
+        nonlocal attempts
+        attempts += 1
+        if attempts < 3:
+            raise UnexpectedError("no file is left")
 
-    start_restarting_thread("bellows", work, on_error=dropped.append).join(10.0)
-    assert len(attempts) == 3
-    assert len(dropped) == 2
-    assert (
-        capfd.readouterr().err.count(
-            "bellows: unexpected error, going on: BrokenError: no file is left"
-        )
-        == 1
-    )
+    start_restarting_thread("worker", fail_twice, on_error=errors.append).join(10.0)
+    assert attempts == 3
+    assert len(errors) == 2
+    message = "worker: unexpected error, going on: UnexpectedError: no file is left"
+    assert capfd.readouterr().err.count(message) == 1
 
 
-def test_a_worker_that_is_over_does_not_begin_again() -> None:
-    over, attempts = threading.Event(), list[int]()
+def test_worker_that_should_stop_does_not_restart_after_error() -> None:
+    should_stop = threading.Event()
+    attempts = 0
 
-    def work() -> None:
-        attempts.append(1)
-        over.set()
-        raise BrokenError
+    def stop_and_fail() -> None:
+        nonlocal attempts
+        attempts += 1
+        should_stop.set()
+        raise UnexpectedError
 
-    start_restarting_thread("bellows", work, should_stop=over.is_set).join(10.0)
-    assert attempts == [1]
+    start_restarting_thread("worker", stop_and_fail, should_stop=should_stop.is_set).join(10.0)
+    assert attempts == 1
 
 
-def test_a_job_that_raises_costs_nothing_but_its_own_result() -> None:
-    worker = BackgroundThread("hammer")
+def test_background_thread_continues_after_a_job_raises() -> None:
+    worker = BackgroundThread("worker")
 
     def fail() -> None:
-        raise BrokenError("no file is left")
+        raise UnexpectedError("no file is left")
 
-    with pytest.raises(BrokenError):
+    with pytest.raises(UnexpectedError):
         worker.submit(fail).result(5.0)
     assert worker.submit(lambda: 7).result(5.0) == 7
     worker.close()
 
 
-def stop_port_serves() -> bool:
-    asked: list[str] = []
+def request_stop_after_error() -> bool:
+    """Return whether a stop port answers although its handler raises an error for the first request."""
+    requesters: list[str] = []
 
-    def take(who: str, reply: Reply) -> None:
-        asked.append(who)
-        if len(asked) == 1:
-            raise BrokenError("no file is left")
+    def on_stop_request(requester: str, reply: Reply) -> None:
+        requesters.append(requester)
+        if len(requesters) == 1:
+            raise UnexpectedError("no file is left")
         reply("done")
 
-    with open_stop_port(LOOPBACK, 0) as opened:
-        start_stop_server(opened, "worm", take)
-        return request_stop(LOOPBACK, opened.getsockname()[1], "anna", 5.0) is not None
+    with open_stop_port(LOOPBACK, 0) as server_socket:
+        start_stop_server(server_socket, "worm", on_stop_request)
+        port = server_socket.getsockname()[1]
+        return request_stop(LOOPBACK, port, "anna", 5.0) is not None
 
 
-def stop_is_latched(folder: Path) -> bool:
-    latch, told = EstopLatch(folder), SimpleQueue[str | None]()
+def latch_estop_after_error(folder: Path) -> bool:
+    """Return whether a second emergency stop is stored although the callback of the first one raises an error."""
+    latch = EstopLatch(folder)
+    failures = SimpleQueue[str | None]()
 
     def fail(_failure: str | None) -> None:
-        raise BrokenError("the network is closed")
+        raise UnexpectedError("the network is closed")
 
     latch.engage("anna", 1, fail)
-    latch.engage("berta", 2, told.put)
-    return told.get(timeout=5.0) is None
+    latch.engage("berta", 2, failures.put)
+    return failures.get(timeout=5.0) is None
 
 
-def private_channel_serves() -> bool:
+def send_request_after_invalid_message() -> bool:
+    """Return whether a host receives a request over its private channel after an invalid message."""
     starter, host = socket_pair()
-    taken = threading.Event()
+    received = threading.Event()
 
-    def take(_request: LifecycleRequest, _reply: Callable[[Answer], None]) -> None:
-        taken.set()
+    def on_request(_request: LifecycleRequest, _reply: Callable[[Answer], None]) -> None:
+        received.set()
 
     with starter, host:
-        HostEnd(host).start_serving(take)
+        HostEnd(host).start_serving(on_request)
         starter.send(b"\xc1 no message")
-        starter.send(_encoded(LifecycleRequest(action="disarm")))
-        served = taken.wait(5.0)
+        starter.send(msgspec.msgpack.encode(LifecycleRequest(action="disarm")))
+        was_received = received.wait(5.0)
         host.shutdown(socket.SHUT_RDWR)
-    return served
+    return was_received
 
 
-def _encoded(request: LifecycleRequest) -> bytes:
-    return msgspec.msgpack.encode(request)
+def test_threads_that_stop_a_robot_serve_after_an_error(tmp_path: Path) -> None:
+    assert request_stop_after_error()
+    assert latch_estop_after_error(tmp_path)
+    assert send_request_after_invalid_message()
 
 
-def test_what_stops_a_robot_is_served_after_an_error(tmp_path: Path) -> None:
-    assert stop_port_serves()
-    assert stop_is_latched(tmp_path)
-    assert private_channel_serves()
-
-
-def test_a_jobs_thread_is_there_before_it_is_needed() -> None:
-    worker = BackgroundThread("hammer")
+def test_background_thread_starts_before_its_first_job() -> None:
+    worker = BackgroundThread("worker-of-the-test")
     wait_until(
-        lambda: any(thread.name == "hammer" for thread in threading.enumerate()), "the thread", 5.0
+        lambda: any(thread.name == "worker-of-the-test" for thread in threading.enumerate()),
+        "the thread",
+        5.0,
     )
     worker.close()

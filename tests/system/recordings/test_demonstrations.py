@@ -1,4 +1,4 @@
-"""Demonstrations by teleoperation, recorded episode by episode, as a data set that `lerobot` itself loads."""
+"""Demonstrations by teleoperation are recorded as episodes, and exported as a dataset that `lerobot` loads."""
 
 import json
 import subprocess
@@ -21,9 +21,10 @@ from snakesim_testing.runs.teleop_terminal import UP, running_teleop
 
 pytestmark = pytest.mark.e2e
 RUN = ("clutter", "--clock-mode", "realtime", "--duration", "600", "--stay", "--set", "rate_hz=50")
-THEIRS = REPOSITORY / "build" / "lerobot"  # an environment of its own: lerobot brings PyTorch, 6 GB
+LEROBOT_VENV = REPOSITORY / "build" / "lerobot"  # a separate environment: PyTorch takes 6 GB
+MIN_EPISODE_BYTES = 150_000
 LEROBOT = "lerobot==0.4.4"
-LOADED = """
+LOAD_DATASET_CODE = """
 import json, torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -42,8 +43,8 @@ print(json.dumps({
 """
 
 
-class Recording:
-    """`snakesim record --episodes`, at its keyboard."""
+class EpisodeRecorder:
+    """A process `snakesim record --episodes` whose keyboard the test controls."""
 
     def __init__(self, run: RunningCommand, cwd: Path) -> None:
         command = (
@@ -65,13 +66,14 @@ class Recording:
             stderr=subprocess.STDOUT,
         )
         self.printed = ""
-        threading.Thread(target=self._listen, daemon=True).start()
+        threading.Thread(target=self._collect_output, daemon=True).start()
 
-    def _listen(self) -> None:
+    def _collect_output(self) -> None:
         for line in self.process.stdout or ():
             self.printed += line
 
     def type(self, line: str, answer: str) -> None:
+        """Type a line and wait until the process prints the answer."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{line}\n")
         self.process.stdin.flush()
@@ -80,71 +82,79 @@ class Recording:
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes of four: one was dropped, and of one nobody said what became of it."""
+    """Record four episodes and keep two: one is dropped, and one is not labelled before the recorder ends."""
     home = tmp_path_factory.mktemp("demos")
     with running_armed_snakesim(home / "run", *RUN) as run:
-        _demonstrate(run, home)
+        record_demonstrations(run, home)
     return home
 
 
-def _demonstrate(run: RunningCommand, home: Path) -> None:
-    at = Recording(run, home)
+def record_demonstrations(run: RunningCommand, home: Path) -> None:
+    """Steer the robot forward and record three labelled episodes and an unlabelled one."""
+    recorder = EpisodeRecorder(run, home)
     with running_teleop(run, home) as terminal:
         wait_until(
-            lambda: "Enter begins an episode" in at.printed, "the recorder at the robot", 20.0
+            lambda: "Enter begins an episode" in recorder.printed, "the recorder connects", 20.0
         )
         terminal.type(UP + UP)
-        for number, word, became in (
+        for number, letter, outcome in (
             (0, "s", "succeeded"),
             (1, "f", "failed"),
             (2, "d", "dropped"),
         ):
             name = f"episode-{number:03d}.mcap"
-            at.type("", f"{name}: recording")
+            recorder.type("", f"{name}: recording")
             file = home / "demos" / name
             wait_until(
-                lambda file=file: file.is_file() and file.stat().st_size > 150_000,
-                "something in it",
+                lambda file=file: file.is_file() and file.stat().st_size > MIN_EPISODE_BYTES,
+                "the episode contains messages",
                 20.0,
             )
-            before = at.printed
-            at.type("", f"{before}{name}: ")
+            printed_before = recorder.printed
+            recorder.type("", f"{printed_before}{name}: ")
             if number == 0:
-                at.type("x", "'x': s if it succeeded")
-            at.type(word, f"{name}: {became}")
-        before = at.printed
-        at.type("", f"{before}episode-002.mcap: recording")
-        at.type("q", "2 episodes;")
-        assert at.process.wait(10) == 0
+                recorder.type("x", "'x': s if it succeeded")
+            recorder.type(letter, f"{name}: {outcome}")
+        printed_before = recorder.printed
+        recorder.type("", f"{printed_before}episode-002.mcap: recording")
+        recorder.type("q", "2 episodes;")
+        assert recorder.process.wait(10) == 0
 
 
 @pytest.mark.slow
-def test_episodes_keep_what_was_said_of_them(demos: Path) -> None:
-    labels = [
-        json.loads(line) for line in (demos / "demos" / "episodes.jsonl").read_text().splitlines()
-    ]
-    assert [(one["file"], one["success"]) for one in labels] == [
+def test_episodes_store_their_label_and_task(demos: Path) -> None:
+    lines = (demos / "demos" / "episodes.jsonl").read_text().splitlines()
+    labels = [json.loads(line) for line in lines]
+    assert [(label["file"], label["success"]) for label in labels] == [
         ("episode-000.mcap", True),
         ("episode-001.mcap", False),
     ]
-    assert {one["task"] for one in labels} == {"through the field"}
+    assert {label["task"] for label in labels} == {"through the field"}
     assert {path.name for path in (demos / "demos").iterdir()} == {
         "episodes.jsonl",
-        *(one["file"] for one in labels),
+        *(label["file"] for label in labels),
     }
     info = snakesim("recording", "info", "demos/episode-000.mcap", cwd=demos)
-    assert "operator/intent" in info.out and "sensor/depth/head" in info.out, info.printed
+    assert "operator/intent" in info.out, info.printed
+    assert "sensor/depth/head" in info.out, info.printed
 
 
 @pytest.mark.slow
-def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path) -> None:
+def test_demonstrations_exported_with_images_form_a_dataset(demos: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
-    given = ("recording", "export", str(demos / "demos"), "--format", "lerobot", "--images")
-    refused = snakesim(*given, "--fps", "7", "--out", "no", cwd=tmp_path)
+    export_command = (
+        "recording",
+        "export",
+        str(demos / "demos"),
+        "--format",
+        "lerobot",
+        "--images",
+    )
+    refused = snakesim(*export_command, "--fps", "7", "--out", "no", cwd=tmp_path)
     assert refused.code == 2
     assert "--fps 7: of a robot at 50 Hz give one of 1, 2, 5, 10" in refused.err
-    ended = snakesim(*given, "--fps", "10", "--out", "set", cwd=tmp_path)
-    assert "2 episodes" in ended.out, ended.printed
+    exported = snakesim(*export_command, "--fps", "10", "--out", "set", cwd=tmp_path)
+    assert "2 episodes" in exported.out, exported.printed
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
     assert info["fps"] == 10
     assert info["total_episodes"] == 2
@@ -167,17 +177,17 @@ def test_demonstrations_make_a_dataset_with_pictures(demos: Path, tmp_path: Path
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @needs_uv
-def test_lerobot_itself_loads_the_dataset(demos: Path, tmp_path: Path) -> None:
-    """Installs it, once, into build/lerobot."""
-    python = THEIRS / "bin" / "python"
+def test_exported_dataset_is_loaded_by_lerobot(demos: Path, tmp_path: Path) -> None:
+    """The test installs lerobot into build/lerobot if it is not there."""
+    python = LEROBOT_VENV / "bin" / "python"
     for command in (
-        ["venv", "--allow-existing", str(THEIRS)],
+        ["venv", "--allow-existing", str(LEROBOT_VENV)],
         ["pip", "install", "--python", str(python), LEROBOT],
     ):
-        made = subprocess.run([UV, *command], capture_output=True, text=True, check=False)
-        if made.returncode:
-            pytest.skip(f"{LEROBOT} cannot be installed here: {made.stderr[-300:]}")
-    given = (
+        installation = subprocess.run([UV, *command], capture_output=True, text=True, check=False)
+        if installation.returncode:
+            pytest.skip(f"{LEROBOT} cannot be installed here: {installation.stderr[-300:]}")
+    export_command = (
         "recording",
         "export",
         str(demos / "demos"),
@@ -189,18 +199,18 @@ def test_lerobot_itself_loads_the_dataset(demos: Path, tmp_path: Path) -> None:
         "--out",
         "set",
     )
-    assert "2 episodes" in snakesim(*given, cwd=tmp_path).out
+    assert "2 episodes" in snakesim(*export_command, cwd=tmp_path).out
     offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf"), "PATH": "/usr/bin:/bin"}
-    loaded = run_program([python, "-c", LOADED], tmp_path, offline, 600.0)
-    assert loaded.code == 0, loaded.err[-3000:]
-    seen = json.loads(loaded.out.splitlines()[-1])
-    assert seen["episodes"] == 2
-    assert seen["fps"] == 10
-    assert seen["task"] == "through the field"
-    assert seen["image"] == [3, 120, 160]
-    assert 0 < seen["brightest"] <= 1
-    assert seen["mean"] == [3, 1, 1]
-    assert seen["done"]
-    assert seen["success"] == [False, False]
-    assert seen["around"] == [[2, 26], [2, 3, 120, 160]]
-    assert seen["batch"] == [4, 3, 120, 160]
+    program = run_program([python, "-c", LOAD_DATASET_CODE], tmp_path, offline, 600.0)
+    assert program.code == 0, program.err[-3000:]
+    dataset = json.loads(program.out.splitlines()[-1])
+    assert dataset["episodes"] == 2
+    assert dataset["fps"] == 10
+    assert dataset["task"] == "through the field"
+    assert dataset["image"] == [3, 120, 160]
+    assert 0 < dataset["brightest"] <= 1
+    assert dataset["mean"] == [3, 1, 1]
+    assert dataset["done"]
+    assert dataset["success"] == [False, False]
+    assert dataset["around"] == [[2, 26], [2, 3, 120, 160]]
+    assert dataset["batch"] == [4, 3, 120, 160]

@@ -1,4 +1,4 @@
-"""An export that does not fit on the disk is named, and leaves no half file; an earlier file stays as it was."""
+"""An export that does not fit on the disk is named and leaves no partial file; an earlier file stays unchanged."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,14 +11,14 @@ from snakesim_testing.harness.file_size import limited_file_size
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
-FITS_BYTES = 2000  # less than any of these exports takes
+MAX_FILE_BYTES = 2000  # less than any of these exports needs
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("full") / "run"
-    ended, _ = run_to_summary(out, "triplet", "--duration", "0.5")
-    assert ended.code == 0, ended.err
+    result, _ = run_to_summary(out, "triplet", "--duration", "0.5")
+    assert result.code == 0, result.err
     return out
 
 
@@ -36,20 +36,21 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["recording", "video", "--width", "64", "--height", "48", "--fps", "10"], "film.mp4"),
         (["recording", "report"], "report.html"),
     ],
-    ids=lambda one: one if isinstance(one, str) else "",
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_export_on_full_disk_is_named_and_leaves_nothing(
     run: Path, tmp_path: Path, command: list[str], name: str
 ) -> None:
     out = tmp_path / name
-    with limited_file_size(FITS_BYTES):
-        ended = snakesim(*command[:2], str(run), *command[2:], "--out", str(out), cwd=tmp_path)
-    assert ended.code == 2 and f"{out}: cannot be written: " in ended.err, ended.out + ended.err
+    with limited_file_size(MAX_FILE_BYTES):
+        result = snakesim(*command[:2], str(run), *command[2:], "--out", str(out), cwd=tmp_path)
+    assert result.code == 2 and f"{out}: cannot be written: " in result.err, result.out + result.err
     assert list(tmp_path.iterdir()) == []
 
 
 def write_learning_curve(folder: Path) -> None:
-    # Imported here: it takes a second, and each worker imports this file.
+    """Write the learning curve of a search."""
+    # The import takes a second, and each test worker imports this file.
     from snakesim.training.curve import write_curve
     from snakesim.training.search import SearchGeneration
 
@@ -64,12 +65,12 @@ def write_learning_curve(folder: Path) -> None:
     ],
     ids=["curve", "tables"],
 )
-def test_what_searches_and_evaluations_leave_is_whole_or_as_before(
+def test_table_on_full_disk_is_named_and_keeps_earlier_file(
     tmp_path: Path, write: Callable[[Path], object], name: str
 ) -> None:
     (tmp_path / name).write_text("an earlier one")
     with (
-        limited_file_size(FITS_BYTES),
+        limited_file_size(MAX_FILE_BYTES),
         raises_error(ConfigError, code="file/not-writable", field=name),
     ):
         write(tmp_path)

@@ -1,4 +1,4 @@
-"""Parameters of the controller, changed while it runs: recorded with time and author, and changed in a replay too."""
+"""Parameter changes of a running controller are recorded with time and requester, and repeated in a replay."""
 
 from pathlib import Path
 
@@ -17,79 +17,83 @@ from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.robot_commands.parameters import RobotParameter, parse_parameters
 from snakesim_testing.runs.in_process_command import snakesim
 
-CHANGED_AT = 30  # turns
+CHANGE_TICK = 30
 
 
 @pytest.fixture(scope="module")
-def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording in which ada changed two gains."""
+def tuned_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Provide a recording in which ada changed two gains."""
     path = tmp_path_factory.mktemp("tuned") / RECORDING_FILENAME
     config = load_scenario("peg_row", [parse_set_option("duration_s=0.6")]).config
     with InProcessRun(config) as run:
-        session, recording = run.network.create_session(), RecordingWriter(path)
-        for row in keys.SPACE:
-            session.on_latched_arrival(row.key, recording.write_arrival)
+        session = run.network.create_session()
+        recording = RecordingWriter(path)
+        for entry in keys.SPACE:
+            session.on_latched_arrival(entry.key, recording.write_arrival)
         request = ParametersRequest(
             requester="ada",
             controller=config.controller,
             parameters='{"propulsion_n": 20, "damping_nm_s_per_rad": 0.9}',
         )
-        for turn, _ in enumerate(run.iterate_ticks()):
-            if turn == CHANGED_AT:
+        for tick, _ in enumerate(run.iterate_ticks()):
+            if tick == CHANGE_TICK:
                 session.send_query(keys.PARAMETERS, request)
         recording.close({})
     return path
 
 
-def test_a_replay_changes_them_in_the_same_tick(tuned: Path, tmp_path: Path) -> None:
-    replayed = snakesim("replay", str(tuned), "--control", cwd=tmp_path)
-    assert replayed.code == 0 and replayed.out == "60 commands, the same to the bit\n", (
-        replayed.out + replayed.err
-    )
+def test_replay_changes_parameters_in_the_same_tick(tuned_recording: Path, tmp_path: Path) -> None:
+    replayed = snakesim("replay", str(tuned_recording), "--control", cwd=tmp_path)
+    assert replayed.code == 0, replayed.err
+    assert replayed.out == "60 commands, the same to the bit\n"
 
 
-def test_the_recording_names_who_set_what_and_when(tuned: Path, tmp_path: Path) -> None:
-    said = snakesim("recording", "info", str(tuned), cwd=tmp_path).out
-    row = next(line for line in said.splitlines() if line.startswith("  set "))
-    assert row.endswith(
+def test_recording_info_names_requester_and_changed_parameters(
+    tuned_recording: Path, tmp_path: Path
+) -> None:
+    info = snakesim("recording", "info", str(tuned_recording), cwd=tmp_path).out
+    change_line = next(line for line in info.splitlines() if line.startswith("  set "))
+    assert change_line.endswith(
         " s by ada: control.propulsion_n: 35.0 -> 20.0, control.damping_nm_s_per_rad: 0.5 -> 0.9"
     )
 
 
-def test_what_is_set_for_the_replay_stays(tuned: Path, tmp_path: Path) -> None:
-    given = ["--set", "control.propulsion_n=20", "--set", "control.damping_nm_s_per_rad=0.9"]
-    replayed = snakesim("replay", str(tuned), "--control", *given, cwd=tmp_path)
+def test_replay_with_set_option_uses_it_before_recorded_change(
+    tuned_recording: Path, tmp_path: Path
+) -> None:
+    options = ["--set", "control.propulsion_n=20", "--set", "control.damping_nm_s_per_rad=0.9"]
+    replayed = snakesim("replay", str(tuned_recording), "--control", *options, cwd=tmp_path)
     assert "commands differ, the first answers tick " in replayed.out
-    first = int(replayed.out.split("answers tick ")[1].split()[0])
-    assert first < CHANGED_AT, "differs before the change, and not after it alone"
+    first_different_tick = int(replayed.out.split("answers tick ")[1].split()[0])
+    assert first_different_tick < CHANGE_TICK, "the commands differ only after the recorded change"
 
 
-MUST_BE_SET = {"policy": {"model": "a.onnx"}}
+REQUIRED_PARAMETERS = {"policy": {"model": "a.onnx"}}
+UNITLESS_PARAMETERS = ("push_scale", "model", "slides")
 
 
 @pytest.mark.parametrize("name", list_installed_plugins(CONTROLLERS))
-def test_every_shipped_parameter_says_what_it_is(name: str) -> None:
+def test_shipped_parameter_has_description_range_and_unit(name: str) -> None:
     parameters_type = load_controller(name).Parameters
-    in_force = ControlParameters(
+    values = parameters_type(**REQUIRED_PARAMETERS.get(name, {}))
+    published = ControlParameters(
         tick=0,
         timestamp_ns=0,
         controller=name,
-        parameters=msgspec.json.encode(parameters_type(**MUST_BE_SET.get(name, {}))).decode(),
+        parameters=msgspec.json.encode(values).decode(),
         schema=msgspec.json.encode(make_schema(parameters_type)).decode(),
     )
-    found = parse_parameters(in_force)
-    assert len(found) == len(msgspec.structs.fields(parameters_type))
-    for one in found:
-        needs_unit = not isinstance(one.value, bool) and one.name not in (
-            "push_scale",
-            "model",
-            "slides",
-        )
-        assert one.description and one.range_text, one
-        assert one.unit or not needs_unit, one
+    parameters = parse_parameters(published)
+    assert len(parameters) == len(msgspec.structs.fields(parameters_type))
+    for parameter in parameters:
+        assert parameter.description, parameter
+        assert parameter.range_text, parameter
+        is_boolean = isinstance(parameter.value, bool)
+        needs_unit = not is_boolean and parameter.name not in UNITLESS_PARAMETERS
+        assert parameter.unit or not needs_unit, parameter
 
 
-def test_ranges_are_told_in_words() -> None:
+def test_parameter_range_is_described_as_text() -> None:
     assert RobotParameter("a", 1.0, "s", minimum=0.0, maximum=5.0).range_text == ">= 0, <= 5"
     assert RobotParameter("a", 1.0, "s", minimum=0.0, excludes_minimum=True).range_text == "> 0"
     assert RobotParameter("a", "x", choices=("x", "y")).range_text == "x or y"

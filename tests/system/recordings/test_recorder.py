@@ -1,4 +1,4 @@
-"""The recorder as a process: beside a run and as part of it, killed, and what is played from its file."""
+"""The recorder process as a part of a run and beside it: it may be killed, and its file can be played back."""
 
 import json
 import os
@@ -29,7 +29,7 @@ from snakesim_testing.runs.command import run_in_background, running_armed_snake
 pytestmark = pytest.mark.e2e
 
 TRUSTED = "https://app.foxglove.dev"
-LONG = [
+RUN_OF_7_S = [
     "triplet",
     "--controller",
     "hold",
@@ -42,82 +42,83 @@ LONG = [
 ]
 
 
-def sighted_live(address: str, origin: str | None = None) -> list[str]:
-    """The frames that a viewer of Foxglove's is told of. origin: of the page that it is, if it is one."""
-    of = None if origin is None else Origin(origin)
+def read_foxglove_frames(address: str, origin: str | None = None) -> list[str]:
+    """Connect as a Foxglove viewer and return the names of the coordinate frames that it receives.
+
+    Args:
+        address: WebSocket address of the recorder.
+        origin: origin of the web page that contains the viewer; None for a program.
+    """
+    origin_header = None if origin is None else Origin(origin)
     with connect(
-        address, origin=of, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None
+        address, origin=origin_header, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None
     ) as viewer:
-        frames: dict[str, str] | None = None
-        while frames is None:
-            reported = viewer.recv(10.0)
-            if isinstance(reported, str) and (message := json.loads(reported))["op"] == "advertise":
-                frames = next(
-                    (row for row in message["channels"] if row["topic"] == "/planar13/tf"), None
+        channel: dict[str, str] | None = None
+        while channel is None:
+            reply = viewer.recv(10.0)
+            if isinstance(reply, str) and (message := json.loads(reply))["op"] == "advertise":
+                channel = next(
+                    (entry for entry in message["channels"] if entry["topic"] == "/planar13/tf"),
+                    None,
                 )
-        assert frames["encoding"] == frames["schemaEncoding"] == "protobuf"
-        viewer.send(
-            json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": frames["id"]}]})
-        )
-        while isinstance(reported := viewer.recv(10.0), str):
+        assert channel["encoding"] == "protobuf"
+        assert channel["schemaEncoding"] == "protobuf"
+        subscription = {"id": 1, "channelId": channel["id"]}
+        viewer.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
+        while isinstance(reply := viewer.recv(10.0), str):
             pass
-        operation, _, time_ns = struct.unpack("<BIQ", reported[:13])
+        operation, _, robot_time_ns = struct.unpack("<BIQ", reply[:13])
         assert operation == 1
-        assert 0 < time_ns < 60e9  # robot time
-        return [
-            frame.child_frame_id for frame in FrameTransforms.FromString(reported[13:]).transforms
-        ]
+        assert 0 < robot_time_ns < 60e9
+        transforms = FrameTransforms.FromString(reply[13:]).transforms
+        return [frame.child_frame_id for frame in transforms]
 
 
 @pytest.mark.slow
 def test_recorder_loss_does_not_end_run_and_another_records(tmp_path: Path) -> None:
-    with running_armed_snakesim(tmp_path / "run", *LONG) as run:
+    with running_armed_snakesim(tmp_path / "run", *RUN_OF_7_S) as run:
         time.sleep(1.0)
         os.kill(run.part("recorder"), signal.SIGKILL)
-        typed = ("record", "--endpoint", run.endpoint, "--out", "beside.mcap")
+        arguments = ("record", "--endpoint", run.endpoint, "--out", "second.mcap")
         with run_in_background(
-            tmp_path, *typed, "--foxglove", "0", "--foxglove-origin", TRUSTED
-        ) as beside:
-            assert beside.stdout is not None
-            address = (
-                next(line for line in beside.stdout if "Foxglove" in line)
-                .rpartition(" ")[2]
-                .strip()
-            )
-            file = tmp_path / "beside.mcap"
+            tmp_path, *arguments, "--foxglove", "0", "--foxglove-origin", TRUSTED
+        ) as second_recorder:
+            assert second_recorder.stdout is not None
+            address_line = next(line for line in second_recorder.stdout if "Foxglove" in line)
+            address = address_line.rpartition(" ")[2].strip()
+            file = tmp_path / "second.mcap"
             wait_until(
                 lambda: file.exists() and file.stat().st_size > 10_000,
                 "the first second of the recording",
             )
-            links = sighted_live(address)
-            assert (
-                sighted_live(address, address.replace("ws", "http"))
-                == sighted_live(address, TRUSTED)
-                == links
-            )
-            for theirs in ("http://evil.example", "null", "file://", "http://localhost:8080"):
+            links = read_foxglove_frames(address)
+            own_origin = address.replace("ws", "http")
+            assert read_foxglove_frames(address, own_origin) == links
+            assert read_foxglove_frames(address, TRUSTED) == links
+            for origin in ("http://evil.example", "null", "file://", "http://localhost:8080"):
                 with pytest.raises(InvalidStatus, match="403"):
-                    sighted_live(address, theirs)
+                    read_foxglove_frames(address, origin)
             time.sleep(1.0)
-            beside.send_signal(signal.SIGINT)
-            said = beside.stdout.read()
-            assert "messages in" in said
-            assert beside.wait(20) == 0
-            assert said.count("refused a viewer") == 4 and "http://evil.example" in said, said
+            second_recorder.send_signal(signal.SIGINT)
+            printed = second_recorder.stdout.read()
+            assert "messages in" in printed
+            assert second_recorder.wait(20) == 0
+            assert printed.count("refused a viewer") == 4, printed
+            assert "http://evil.example" in printed
         assert links == [f"link_{i}" for i in range(14)]
-        assert run.end() == 3, run.printed()  # complete, but the record is incomplete
+        assert run.end() == 3, run.printed()  # the run is complete, but its record is incomplete
     assert run.printed().count("warning:") == 1
     assert "recorder was ended by SIGKILL" in run.printed()
-    kept = list(RecordingReader(tmp_path / "run" / RECORDING_FILENAME).read_messages([keys.JOINTS]))
-    assert len(kept) > 10
-    alone = RunRecord.load(tmp_path / "beside.mcap")
-    assert alone.config.name == "triplet"
-    assert len(alone.time_s) > 40
-    assert command.snakesim("recording", "report", "beside.mcap", cwd=tmp_path).code == 0
+    recording = RecordingReader(tmp_path / "run" / RECORDING_FILENAME)
+    assert len(list(recording.read_messages([keys.JOINTS]))) > 10
+    second_record = RunRecord.load(tmp_path / "second.mcap")
+    assert second_record.config.name == "triplet"
+    assert len(second_record.time_s) > 40
+    assert command.snakesim("recording", "report", "second.mcap", cwd=tmp_path).code == 0
 
 
-def test_a_recording_is_played_with_its_timing(tmp_path: Path) -> None:
-    ended = command.snakesim(
+def test_played_recording_keeps_its_timing_at_half_rate(tmp_path: Path) -> None:
+    result = command.snakesim(
         "run",
         "triplet",
         "--in-process",
@@ -128,30 +129,33 @@ def test_a_recording_is_played_with_its_timing(tmp_path: Path) -> None:
         "bare",
         cwd=tmp_path,
     )
-    assert ended.code == 0
+    assert result.code == 0
     assert not (tmp_path / "bare" / RECORDING_FILENAME).exists()
     command.snakesim(
         "run", "triplet", "--in-process", "--duration", "1", "--out", "run", cwd=tmp_path
     )
-    endpoint, said = find_free_endpoint(), list[str]()
-    how = {"endpoint": endpoint, "namespace": "again", "rate": 0.5, "step": False}
+    endpoint = find_free_endpoint()
+    printed: list[str] = []
     player = threading.Thread(
         target=play_recording,
-        args=(tmp_path / "run" / RECORDING_FILENAME, iter(()), said.append),
-        kwargs=how,
+        args=(tmp_path / "run" / RECORDING_FILENAME, iter(()), printed.append),
+        kwargs={"endpoint": endpoint, "namespace": "again", "rate": 0.5, "step": False},
     )
     player.start()
-    wait_until(lambda: bool(said), "the player")
+    wait_until(lambda: bool(printed), "the player starts")
     with open_session(ConnectionSettings(endpoint, "again"), 5.0) as session:
-        robots = session.declare_latched_reader(keys.DESCRIPTION, RobotDescription)
-        clocks, began = session.declare_reader(keys.CLOCK, Clock), time.monotonic()
-        found = list[Clock]()
-        wait_until(
-            lambda: bool(found.extend(clocks.drain())) or bool(found and found[-1].tick == 99),
-            "the last tick",
-        )
-        assert time.monotonic() - began > 1.0
-        assert len(found) > 50
-        assert robots.drain()[-1].robot == "planar13"
+        descriptions = session.declare_latched_reader(keys.DESCRIPTION, RobotDescription)
+        clock_reader = session.declare_reader(keys.CLOCK, Clock)
+        start_s = time.monotonic()
+        clocks: list[Clock] = []
+
+        def has_received_last_tick() -> bool:
+            clocks.extend(clock_reader.drain())
+            return bool(clocks) and clocks[-1].tick == 99
+
+        wait_until(has_received_last_tick, "the last tick")
+        assert time.monotonic() - start_s > 1.0
+        assert len(clocks) > 50
+        assert descriptions.drain()[-1].robot == "planar13"
     player.join(10)
-    assert "messages played" in said[-1]
+    assert "messages played" in printed[-1]

@@ -1,4 +1,4 @@
-"""A recording: what is in it is what was on the wire, whatever became of its recorder or its disk."""
+"""A recording contains what was on the wire, even if its recorder was killed or its disk is full or slow."""
 
 import contextlib
 import os
@@ -50,7 +50,8 @@ class Whisker(CustomSample, frozen=True, kw_only=True):
     bend_rad: Annotated[float, bounded(-2.0, 2.0, "rad")]
 
 
-def done(tick: int, service: str = "control") -> ReceivedSample:
+def make_done_sample(tick: int, service: str = "control") -> ReceivedSample:
+    """Make the sample in which a service reports that it has answered a tick."""
     return ReceivedSample(
         keys.done_key(service),
         encode(TickDone(tick=tick)),
@@ -59,7 +60,7 @@ def done(tick: int, service: str = "control") -> ReceivedSample:
     )
 
 
-def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
+def test_recording_stores_messages_bytewise_with_robot_time(tmp_path: Path) -> None:
     recording = RecordingWriter(tmp_path / "a.mcap")
     intent = ReceivedSample(
         keys.INTENT,
@@ -67,24 +68,34 @@ def test_messages_are_kept_to_the_byte_in_robot_time(tmp_path: Path) -> None:
         format_encoding(LocomotionIntent),
         time.monotonic_ns(),
     )
-    negative = msgspec.structs.replace(done(0), payload=msgspec.msgpack.encode({"tick": -1}))
-    sent = [make_clock_sample(7), done(8), done(2_000_000), intent, done(6, "guidance"), negative]
+    negative = msgspec.structs.replace(
+        make_done_sample(0), payload=msgspec.msgpack.encode({"tick": -1})
+    )
+    sent = [
+        make_clock_sample(7),
+        make_done_sample(8),
+        make_done_sample(2_000_000),
+        intent,
+        make_done_sample(6, "guidance"),
+        negative,
+    ]
     for arrival in sent:
         recording.write_arrival(arrival)
     recording.close({"dropped": {}})
-    found = list((reader := RecordingReader(tmp_path / "a.mcap")).read_messages())
-    assert [(one.key, one.payload, one.encoding) for one in found] == [
-        (a.key, a.payload, a.encoding) for a in sent
+    reader = RecordingReader(tmp_path / "a.mcap")
+    stored = list(reader.read_messages())
+    assert [(message.key, message.payload, message.encoding) for message in stored] == [
+        (sample.key, sample.payload, sample.encoding) for sample in sent
     ]
-    # A tick that cannot be true, or none: the time of the newest clock.
-    assert [one.robot_time_ns // PERIOD_NS for one in found] == [7, 8, 7, 7, 6, 7]
-    assert all(abs(one.wall_time_ns - time.time_ns()) < 60e9 for one in found)
+    # A message with an impossible tick or without a tick gets the time of the newest clock.
+    assert [message.robot_time_ns // PERIOD_NS for message in stored] == [7, 8, 7, 7, 6, 7]
+    assert all(abs(message.wall_time_ns - time.time_ns()) < 60e9 for message in stored)
     assert reader.is_complete
     assert reader.metadata == {"dropped": {}}
     assert not reader.missing
 
 
-def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
+def test_recording_is_read_by_mcap_library_with_schemas(tmp_path: Path) -> None:
     recording = RecordingWriter(tmp_path / "a.mcap")
     for tick in range(50):
         recording.write_arrival(make_clock_sample(tick))
@@ -93,20 +104,23 @@ def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
     recording.close({"version": "1"})
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
-        found = list(reader.iter_messages())
-        late = [
+        messages = list(reader.iter_messages())
+        times_from_tick_25_ns = [
             message.log_time for *_, message in reader.iter_messages(starting_at=25 * PERIOD_NS)
         ]
-        summary, about = reader.get_summary(), list(reader.iter_metadata())
+        summary = reader.get_summary()
+        metadata = list(reader.iter_metadata())
     assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_count == 50
     assert len(summary.chunk_indexes) == 3
-    assert late == [tick * PERIOD_NS for tick in range(25, 50)]
+    assert times_from_tick_25_ns == [tick * PERIOD_NS for tick in range(25, 50)]
     assert summary.statistics.message_start_time == 0
     assert summary.statistics.message_end_time == 49 * PERIOD_NS
-    assert [(one.name, one.metadata) for one in about] == [("snakesim", {"version": '"1"'})]
-    schema, channel, message = found[-1]
+    assert [(entry.name, entry.metadata) for entry in metadata] == [
+        ("snakesim", {"version": '"1"'})
+    ]
+    schema, channel, message = messages[-1]
     assert schema is not None
     assert schema.name == "snakesim.Clock"
     assert schema.encoding == "jsonschema"
@@ -115,7 +129,7 @@ def test_the_stock_reader_gets_schemas_and_messages(tmp_path: Path) -> None:
     assert message.log_time == 49 * PERIOD_NS
 
 
-KILLED = """
+RECORD_ENDLESSLY_CODE = """
 import os, sys, time
 from pathlib import Path
 from snakesim_operator.recording.writer import RecordingWriter
@@ -131,34 +145,33 @@ for tick in range(10**9):
 """
 
 
-def test_a_killed_recorder_lacks_at_most_a_second(tmp_path: Path) -> None:
+def test_recording_of_killed_recorder_misses_at_most_a_second(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     process = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", RECORD_ENDLESSLY_CODE, str(path)], stdout=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
-    ticks: list[tuple[float, int]] = []
-    while not ticks or ticks[-1][0] - ticks[0][0] < 1.2:
-        at, tick = process.stdout.readline().split()
-        ticks.append((float(at), int(tick)))
+    times_and_ticks: list[tuple[float, int]] = []
+    while not times_and_ticks or times_and_ticks[-1][0] - times_and_ticks[0][0] < 1.2:
+        time_s, tick = process.stdout.readline().split()
+        times_and_ticks.append((float(time_s), int(tick)))
     os.kill(process.pid, signal.SIGKILL)
     process.wait(10)
     process.stdout.close()
     reader = RecordingReader(path)
-    kept = len(list(reader.read_messages()))
-    a_second_before = [tick for at, tick in ticks if at < ticks[-1][0] - 1.0]
-    assert kept > a_second_before[-1]
+    message_count = len(list(reader.read_messages()))
+    last_time_s, _ = times_and_ticks[-1]
+    ticks_a_second_before = [tick for time_s, tick in times_and_ticks if time_s < last_time_s - 1.0]
+    assert message_count > ticks_a_second_before[-1]
     assert not reader.is_complete
     assert "its end: it breaks off" in reader.missing[0]
-    with (
-        path.open("rb") as file,
-        contextlib.suppress(Exception),
-    ):  # the stock reader, as far as it goes
-        stock = [
+    # The mcap library may raise an error at the end of the file.
+    with path.open("rb") as file, contextlib.suppress(Exception):
+        library_times_ns = [
             message.log_time
             for _, _, message in make_reader(file).iter_messages(log_time_order=False)
         ]
-        assert len(stock) == kept
+        assert len(library_times_ns) == message_count
 
 
 def test_recording_on_full_disk_ends_readable(tmp_path: Path) -> None:
@@ -171,47 +184,45 @@ def test_recording_on_full_disk_ends_readable(tmp_path: Path) -> None:
         recording.close({})
     assert "File too large" in recording.failure
     reader = RecordingReader(tmp_path / "a.mcap")
-    ticks = [one.robot_time_ns // PERIOD_NS for one in reader.read_messages()]
+    ticks = [message.robot_time_ns // PERIOD_NS for message in reader.read_messages()]
     assert len(ticks) > 200
     assert ticks == list(range(len(ticks)))
     assert not reader.losses.damage_count
     assert not reader.is_complete
 
 
-def test_a_flood_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_message_tap_flooded_is_bounded_and_counts_dropped_messages(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(tap_module, "MAX_QUEUED_BYTES", 1000)
     network = LocalNetwork()
-    tap, publisher = (
-        MessageTap(network.create_session()),
-        network.create_session().declare_publisher(keys.done_key("control"), TickDone),
-    )
+    tap = MessageTap(network.create_session())
+    publisher = network.create_session().declare_publisher(keys.done_key("control"), TickDone)
     for tick in range(2000):
         publisher.put(TickDone(tick=tick))
-    kept = tap.take_arrivals()
-    assert sum(len(arrival.payload) for arrival in kept) <= 1000
-    assert len(kept) + tap.dropped_count_by_key[keys.done_key("control")] == 2000
+    arrivals = tap.take_arrivals()
+    assert sum(len(arrival.payload) for arrival in arrivals) <= 1000
+    assert len(arrivals) + tap.dropped_count_by_key[keys.done_key("control")] == 2000
     publisher.put(TickDone(tick=1))
     assert len(tap.take_arrivals()) == 1
 
 
-def test_recording_in_lockstep_waits_for_slow_disk_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_message_tap_in_lockstep_waits_once_for_slow_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tap_module, "MAX_QUEUED_BYTES", 100)
     monkeypatch.setattr(tap_module, "DISK_TIMEOUT_S", 2.0)
     network = LocalNetwork()
-    tap, publisher = (
-        MessageTap(network.create_session()),
-        network.create_session().declare_publisher(keys.done_key("control"), TickDone),
-    )
+    tap = MessageTap(network.create_session())
+    publisher = network.create_session().declare_publisher(keys.done_key("control"), TickDone)
     tap.is_lossless = True
-    began = time.monotonic()
+    start_s = time.monotonic()
     for tick in range(200):
         publisher.put(TickDone(tick=tick))
-    assert 2.0 <= time.monotonic() - began < 4.0  # it waits for the disk once
+    assert 2.0 <= time.monotonic() - start_s < 4.0  # the tap waits once for the disk
     assert tap.dropped_count_by_key.total() + len(tap.take_arrivals()) == 200
 
 
-def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> None:
-    """What is damaged: tests/system/recordings/test_damaged_recordings.py."""
+def test_recover_recording_of_unreadable_file_leaves_no_copy(tmp_path: Path) -> None:
+    """Damaged recordings that can be copied: tests/system/recordings/test_damaged_recordings.py."""
     (tmp_path / "bad.mcap").write_bytes(b"no recording at all")
     with raises_error(ConfigError, code="recording/not-readable", field="bad.mcap"):
         recover_recording(tmp_path / "bad.mcap", tmp_path / "copy.mcap")
@@ -219,11 +230,13 @@ def test_a_copy_that_cannot_be_made_leaves_no_file_behind(tmp_path: Path) -> Non
 
 
 def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
-    endpoint, told = find_free_endpoint(), threading.Event()
-    link, path = ConnectionSettings(endpoint, "planar13"), tmp_path / "a.mcap"
+    endpoint = find_free_endpoint()
+    link = ConnectionSettings(endpoint, "planar13")
+    path = tmp_path / "a.mcap"
+    stop_requested = threading.Event()
     recorder = threading.Thread(
         target=lambda: record_to_file(
-            link, path, lambda: not told.is_set(), wait_for_host_exit=True
+            link, path, lambda: not stop_requested.is_set(), wait_for_host_exit=True
         )
     )
     with open_session(ConnectionSettings(endpoint, "planar13", listen=True)) as host:
@@ -232,42 +245,42 @@ def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
         recorder.start()
         wait_until(
             lambda: clocks.has_subscriber() and host.list_tokens(keys.alive_key("recorder")),
-            "the recorder",
+            "the recorder connects",
         )
         for tick in range(40):
             host.send(keys.CLOCK, make_clock_sample(tick).payload)
             if tick == 20:
-                told.set()
-                time.sleep(0.2)  # many of its turns
+                stop_requested.set()
+                time.sleep(0.2)  # many cycles of the recorder
     recorder.join()
-    assert [one.payload for one in RecordingReader(path).read_messages([keys.CLOCK])] == [
-        make_clock_sample(t).payload for t in range(40)
-    ]
+    payloads = [message.payload for message in RecordingReader(path).read_messages([keys.CLOCK])]
+    assert payloads == [make_clock_sample(tick).payload for tick in range(40)]
 
 
 def test_recording_sample_before_description_keeps_its_schema(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    own = keys.custom_key("left")
-    early = ReceivedSample(
-        own, msgspec.msgpack.encode({"tick": 3}), "application/msgpack;snakesim.CustomSample/1", 0
+    custom_key = keys.custom_key("left")
+    early_sample = ReceivedSample(
+        custom_key,
+        msgspec.msgpack.encode({"tick": 3}),
+        "application/msgpack;snakesim.CustomSample/1",
+        0,
     )
+    later_sample = msgspec.structs.replace(early_sample, monotonic_ns=1)
     schema = make_message_schema(Whisker, "test")
-    described = encode(msgspec.structs.replace(make_description(), custom={own: schema}))
-    robot = ReceivedSample(keys.DESCRIPTION, described, format_encoding(RobotDescription), 0)
+    description = msgspec.structs.replace(make_description(), custom={custom_key: schema})
+    description_sample = ReceivedSample(
+        keys.DESCRIPTION, encode(description), format_encoding(RobotDescription), 0
+    )
     recording = RecordingWriter(path)
-    for arrival in (
-        early,
-        make_clock_sample(4),
-        robot,
-        msgspec.structs.replace(early, monotonic_ns=1),
-    ):
-        recording.write_arrival(arrival)
+    for sample in (early_sample, make_clock_sample(4), description_sample, later_sample):
+        recording.write_arrival(sample)
     recording.close({})
     with path.open("rb") as file:
         schemas = {
             schema.name
-            for schema, channel, _ in make_reader(file).iter_messages(topics=[own])
+            for schema, _, _ in make_reader(file).iter_messages(topics=[custom_key])
             if schema
         }
     assert schemas == {"snakesim.custom.Whisker"}
-    assert recording.counts[own] == 2
+    assert recording.counts[custom_key] == 2

@@ -1,4 +1,4 @@
-"""The recording of a run: the record that is made of it alone, and what `snakesim recording info` tells of it."""
+"""The record of a run is read from its recording alone, described by `recording info`, and exported."""
 
 import csv
 import json
@@ -30,23 +30,28 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_recording_alone_has_the_record_of_the_black_box(run: Path) -> None:
-    whole, alone = RunRecord.load(run), RunRecord.load(run / RECORDING_FILENAME)
-    arrays = {name: value for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
+def test_recordings_alone_contain_the_record_of_the_black_box(run: Path) -> None:
+    with_black_box = RunRecord.load(run)
+    recording_alone = RunRecord.load(run / RECORDING_FILENAME)
+    arrays = {
+        name: value for name, value in vars(with_black_box).items() if isinstance(value, np.ndarray)
+    }
     assert len(arrays) > 8
-    assert len(whole.time_s) == 200
+    assert len(with_black_box.time_s) == 200
     for name, value in arrays.items():
-        assert np.array_equal(value, getattr(alone, name), equal_nan=True), name
-    assert alone.host.command_digest == whole.host.command_digest
-    assert alone.config == whole.config
-    assert alone.control_states == whole.control_states
-    assert alone.worlds == whole.worlds
-    assert alone.trajectories == whole.trajectories
-    assert alone.missing == whole.missing == []
+        assert np.array_equal(value, getattr(recording_alone, name), equal_nan=True), name
+    assert recording_alone.host.command_digest == with_black_box.host.command_digest
+    assert recording_alone.config == with_black_box.config
+    assert recording_alone.control_states == with_black_box.control_states
+    assert recording_alone.worlds == with_black_box.worlds
+    assert recording_alone.trajectories == with_black_box.trajectories
+    assert recording_alone.missing == []
+    assert with_black_box.missing == []
 
 
 def test_recordings_without_black_box_keep_numbers_of_host(run: Path, tmp_path: Path) -> None:
-    content, host = (run / RECORDING_FILENAME).read_bytes(), RunRecord.load(run).host
+    content = (run / RECORDING_FILENAME).read_bytes()
+    host = RunRecord.load(run).host
     (tmp_path / RECORDING_FILENAME).write_bytes(content[: len(content) * 2 // 3])
     record = RunRecord.load(tmp_path, host)
     assert 0 < len(record.time_s) < 200
@@ -65,19 +70,19 @@ def test_recordings_report_ticks_that_never_reached_the_recorder(run: Path, tmp_
                 ReceivedSample(message.key, message.payload, message.encoding, message.wall_time_ns)
             )
     recording.close({})
-    # Nothing in the file itself tells.
+    # The recording itself does not show that ticks are missing.
     assert RunRecord.load(tmp_path / RECORDING_FILENAME).missing == []
-    ended = snakesim("recording", "report", ".", cwd=tmp_path)
-    said = "recording: 99 of 200 ticks did not reach the recorder; the last that came is of "
-    assert (
-        ended.code == 3 and said in ended.err and said in (tmp_path / "report.html").read_text()
-    ), ended.err
+    result = snakesim("recording", "report", ".", cwd=tmp_path)
+    sentence = "recording: 99 of 200 ticks did not reach the recorder; the last that came is of "
+    assert result.code == 3, result.err
+    assert sentence in result.err
+    assert sentence in (tmp_path / "report.html").read_text()
 
 
-def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path) -> None:
-    ended = snakesim("recording", "info", str(run), "--json", cwd=tmp_path)
-    info = json.loads(ended.out)
-    assert ended.code == 0
+def test_recordings_info_lists_contents_and_missing_parts(run: Path, tmp_path: Path) -> None:
+    result = snakesim("recording", "info", str(run), "--json", cwd=tmp_path)
+    info = json.loads(result.out)
+    assert result.code == 0
     assert info["finished"]
     assert info["duration_s"] == pytest.approx(2.0)
     assert info["robot"] == "planar13_camera"
@@ -87,19 +92,19 @@ def test_info_tells_what_is_in_it_and_what_is_missing(run: Path, tmp_path: Path)
     assert info["keys"]["sensor/joints"]["rate_hz"] == pytest.approx(100.0)
     assert "sensor/depth/head" in info["keys"]
     content = (run / RECORDING_FILENAME).read_bytes()
-    (tmp_path / "torn.mcap").write_bytes(content[: len(content) * 2 // 3])
-    result = snakesim("recording", "info", "torn.mcap", cwd=tmp_path)
+    (tmp_path / "truncated.mcap").write_bytes(content[: len(content) * 2 // 3])
+    result = snakesim("recording", "info", "truncated.mcap", cwd=tmp_path)
     assert result.code == 3
     assert "missing: its end: it breaks off at " in result.out
 
 
-def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
+def test_recordings_export_contains_the_record(run: Path, tmp_path: Path) -> None:
     record = RunRecord.load(run)
     for form in ("npz", "csv", "mcap"):
-        ended = snakesim(
+        result = snakesim(
             "recording", "export", str(run), "--format", form, "--out", f"a.{form}", cwd=tmp_path
         )
-        assert ended.code == 0, ended.err
+        assert result.code == 0, result.err
     with np.load(tmp_path / "a.npz") as arrays:
         assert np.array_equal(arrays["angle_rad"], record.angle_rad)
         assert arrays["joints"][0] == "joint_1"
@@ -108,17 +113,17 @@ def test_what_is_exported_is_the_record(run: Path, tmp_path: Path) -> None:
     assert [float(row["target.joint_3"]) for row in rows] == record.target[:, 2].tolist()
     assert [float(row["position_w_m.y"]) for row in rows] == record.position_w_m[:, 1].tolist()
     assert np.array_equal(RunRecord.load(tmp_path / "a.mcap").angle_rad, record.angle_rad)
-    again = snakesim(
+    repeated = snakesim(
         "recording", "export", str(run), "--format", "csv", "--out", "a.csv", cwd=tmp_path
     )
-    assert again.code == 2
-    assert "there is such a file already" in again.err
+    assert repeated.code == 2
+    assert "there is such a file already" in repeated.err
 
 
-def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
+def test_recordings_of_several_runs_are_exported_as_dataset(run: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     record = RunRecord.load(run)
-    ended = snakesim(
+    result = snakesim(
         "recording",
         "export",
         str(run),
@@ -129,44 +134,45 @@ def test_several_runs_make_a_dataset(run: Path, tmp_path: Path) -> None:
         "set",
         cwd=tmp_path,
     )
-    assert ended.code == 0 and "2 episodes, 400 frames" in ended.out, ended.err
+    assert result.code == 0, result.err
+    assert "2 episodes, 400 frames" in result.out
     info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
-    wanted = {"codebase_version": "v3.0", "fps": 100, "total_frames": 400, "total_episodes": 2}
-    assert info.items() >= wanted.items(), info
-    n = 200
-    episode, second = parquet.read_table(
+    expected = {"codebase_version": "v3.0", "fps": 100, "total_frames": 400, "total_episodes": 2}
+    assert info.items() >= expected.items(), info
+    frames_each = 200
+    first, second = parquet.read_table(
         tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
     ).to_pylist()
-    assert [episode[f"dataset_{end}_index"] for end in ("from", "to")] == [0, n]
-    assert second["dataset_from_index"] == n
+    assert first["dataset_from_index"] == 0
+    assert first["dataset_to_index"] == frames_each
+    assert second["dataset_from_index"] == frames_each
     assert second["tasks"] == ["clutter"]
-    assert second["length"] == n
-    assert second["stats/index/min"] == [n]
-    at = {"chunk_index": second["data/chunk_index"], "file_index": second["data/file_index"]}
-    rows = parquet.read_table(tmp_path / "set" / info["data_path"].format(**at)).to_pydict()
-    assert sorted(rows) == sorted(info["features"])
-    assert rows["index"] == list(range(n, 2 * n))
-    state, names = (
-        np.array(rows["observation.state"]),
-        info["features"]["observation.state"]["names"],
+    assert second["length"] == frames_each
+    assert second["stats/index/min"] == [frames_each]
+    data_path = info["data_path"].format(
+        chunk_index=second["data/chunk_index"], file_index=second["data/file_index"]
     )
-    assert info["features"]["observation.state"]["shape"] == [state.shape[1]]
-    assert np.allclose(
-        state[:, names.index("angle_rad.joint_5")], record.angle_rad[:, 4], atol=1e-6
-    )
-    assert rows["timestamp"][1] == pytest.approx(0.01)
+    frames = parquet.read_table(tmp_path / "set" / data_path).to_pydict()
+    assert sorted(frames) == sorted(info["features"])
+    assert frames["index"] == list(range(frames_each, 2 * frames_each))
+    state = np.array(frames["observation.state"])
+    state_feature = info["features"]["observation.state"]
+    assert state_feature["shape"] == [state.shape[1]]
+    column = state_feature["names"].index("angle_rad.joint_5")
+    assert np.allclose(state[:, column], record.angle_rad[:, 4], atol=1e-6)
+    assert frames["timestamp"][1] == pytest.approx(0.01)
     stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
     assert sorted(stats) == sorted(info["features"])
     assert stats["action"]["count"] == [400]
     assert np.allclose(stats["observation.state"]["q50"], np.median(state, axis=0), atol=1e-5)
-    # Pandas reads the names as the index.
+    # pandas uses the task names as the index of the table.
     tasks = parquet.read_table(tmp_path / "set/meta/tasks.parquet")
     assert tasks.to_pydict() == {"task_index": [0], "__index_level_0__": ["clutter"]}
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
 
 
 @pytest.mark.parametrize("command", ["info", "report"])
-def test_what_is_no_recording_is_named(tmp_path: Path, command: str) -> None:
+def test_recordings_command_names_file_that_is_no_recording(tmp_path: Path, command: str) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     assert (
         "notes.txt is not a recording"
@@ -175,8 +181,8 @@ def test_what_is_no_recording_is_named(tmp_path: Path, command: str) -> None:
     assert "gone" in snakesim("recording", command, "gone", cwd=tmp_path).err
 
 
-def test_a_stock_reader_gets_our_messages_by_their_fields(run: Path) -> None:
-    """Beside Foxglove's, each by its own decoder."""
+def test_recordings_are_decoded_by_mcap_library_with_field_names(run: Path) -> None:
+    """The recording also contains messages for Foxglove; each type has its own decoder."""
     with (run / RECORDING_FILENAME).open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory(), ProtobufDecoder()])
         decoded = [
@@ -188,9 +194,9 @@ def test_a_stock_reader_gets_our_messages_by_their_fields(run: Path) -> None:
 
 
 def test_recordings_with_later_message_version_are_decoded_as_stored() -> None:
-    later = DecoderFactory().decoder_for(
+    decode = DecoderFactory().decoder_for(
         "msgpack", Schema(id=1, name="snakesim.Whisker", encoding="jsonschema", data=b"{}")
     )
-    assert later is not None
-    assert later(msgspec.msgpack.encode({"bend_rad": 0.1})) == {"bend_rad": 0.1}
+    assert decode is not None
+    assert decode(msgspec.msgpack.encode({"bend_rad": 0.1})) == {"bend_rad": 0.1}
     assert DecoderFactory().decoder_for("msgpack", None) is None

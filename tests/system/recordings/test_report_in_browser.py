@@ -1,4 +1,4 @@
-"""A report in a real browser: its scripts run without an error, and every chart is drawn."""
+"""A report is opened in a real browser: its scripts run without an error, and every chart is drawn."""
 
 from pathlib import Path
 
@@ -12,8 +12,8 @@ from snakesim_testing.operator.triplet_report import (
     simulate_triplet,
 )
 
-DRAWN = "document.querySelectorAll('.chart .main-svg .xaxislayer-above').length"
-OVERFLOW_PX = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+COUNT_DRAWN_CHARTS = "document.querySelectorAll('.chart .main-svg .xaxislayer-above').length"
+MEASURE_OVERFLOW_PX = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def record() -> RunRecord:
 
 @pytest.mark.skipif(CHROMIUM is None, reason=BROWSER_MISSING)
 @pytest.mark.parametrize("width", [1400, 400])
-def test_every_chart_of_a_report_is_drawn_without_errors(
+def test_report_in_browser_draws_every_chart_without_errors(
     record: RunRecord, tmp_path: Path, width: int
 ) -> None:
     reader: ReportReader = render_and_check_report(record)
@@ -33,5 +33,5 @@ def test_every_chart_of_a_report_is_drawn_without_errors(
         tab = browser.open_page(page.as_uri(), width)
         tab.wait_until_loaded()
         assert tab.errors == []
-        assert tab.evaluate(DRAWN) == len(reader.charts) > 3
-        assert tab.evaluate(OVERFLOW_PX) == 0
+        assert tab.evaluate(COUNT_DRAWN_CHARTS) == len(reader.charts) > 3
+        assert tab.evaluate(MEASURE_OVERFLOW_PX) == 0

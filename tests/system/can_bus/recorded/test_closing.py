@@ -1,4 +1,4 @@
-"""The whole driver: how it ends, its poses and its log."""
+"""The complete driver disables its modules when it is closed, publishes poses, and logs its bus."""
 
 import socket
 from pathlib import Path
@@ -28,10 +28,10 @@ from snakesim_testing.can.recording_bus import (
 )
 from snakesim_testing.messages import raises_error
 
-# --- closing -----------------------------------------------------------------------------------------------
+# --- closing -----------------------------------------------------------------------------------------------------
 
 
-def test_closing_disarms_and_twice_is_harmless() -> None:
+def test_closing_disarms_modules_and_may_be_repeated() -> None:
     with open_driver_loop() as run:
         run.arm()
         module = find_module(run, 3)
@@ -39,10 +39,9 @@ def test_closing_disarms_and_twice_is_harmless() -> None:
         run.backend.close()
         assert describe_host_frames(wire.sent)[-1] == "disarm"
         assert wire.close_count == 1
-        assert module.state == DISARMED and module.last_stop == LastStop.DISARM, (
-            "and they have heard it"
-        )
-        sent = len(wire.sent)
+        assert module.state == DISARMED
+        assert module.last_stop == LastStop.DISARM
+        sent_count = len(wire.sent)
         run.backend.close()
         assert wire.close_count == 1
         for call in (lambda: run.backend.sample(99, 0), run.backend.advance):
@@ -50,10 +49,10 @@ def test_closing_disarms_and_twice_is_harmless() -> None:
                 call()
         run.backend.enact(run.hold_angles(run.samples[-1]), "armed")
         assert run.backend.faults() == []
-        assert len(wire.sent) == sent
+        assert len(wire.sent) == sent_count
 
 
-def test_closing_goes_on_when_a_bus_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_with_broken_bus_closes_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
     with open_driver_loop(
         make_can_config(robot__sensors__pose__rate_hz=100.0), pose_listen="127.0.0.1:0"
     ) as run:
@@ -61,22 +60,22 @@ def test_closing_goes_on_when_a_bus_is_broken(monkeypatch: pytest.MonkeyPatch) -
         assert mocap is not None
         host, _, port = mocap.address.rpartition(":")
 
-        def broken(_frame: CanFrame) -> bool:
+        def raise_send_error(_frame: CanFrame) -> bool:
             raise BackendError("the bus is broken")
 
-        def gone() -> None:
+        def raise_shutdown_error() -> None:
             raise can.CanOperationError("the bus is gone")
 
-        WIRES[0].should_refuse = broken
+        WIRES[0].should_refuse = raise_send_error
         with monkeypatch.context() as patched:
-            patched.setattr(WIRES[0]._bus, "shutdown", gone)
+            patched.setattr(WIRES[0]._bus, "shutdown", raise_shutdown_error)
             run.backend.close()
         assert WIRES[0].close_count == 1
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-            free.bind((host, int(port)))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as next_program:
+            next_program.bind((host, int(port)))  # raises an error if the port is still in use
 
 
-def test_poses_need_a_delay_that_somebody_has_stated() -> None:
+def test_check_requires_delay_of_the_pose_in_robot_file() -> None:
     with raises_error(ConfigError, code="config/missing-key"):
         CanBackend.check(make_can_config(), CanSettings(pose_listen="127.0.0.1:0"))
     CanBackend.check(
@@ -86,45 +85,45 @@ def test_poses_need_a_delay_that_somebody_has_stated() -> None:
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.03])
 def test_closing_pose_of_emulators_has_age_of_robot_file(delay_s: float) -> None:
-    """To the bit, in lockstep; and the description says so."""
+    """In lockstep the age is exact, and the description contains it."""
     with open_driver_loop(
         make_can_config(robot__sensors__pose__delay_s=delay_s), physics_model="mujoco"
     ) as run:
-        (sensor,) = [s for s in run.backend.describe().sensors if s.key == keys.POSE]
-        assert sensor.delay_s == delay_s
+        sensors = run.backend.describe().sensors
+        (pose_sensor,) = [sensor for sensor in sensors if sensor.key == keys.POSE]
+        assert pose_sensor.delay_s == delay_s
         run.run(20)
-        late = [
-            (s.joints.timestamp_ns, pose.timestamp_ns)
-            for s in run.samples
-            if isinstance(pose := s.by_key.get(keys.POSE), Pose)
+        ages_ns = [
+            samples.joints.timestamp_ns - pose.timestamp_ns
+            for samples in run.samples
+            if isinstance(pose := samples.by_key.get(keys.POSE), Pose)
         ]
-        assert {now_ns - captured_ns for now_ns, captured_ns in late} == {round(delay_s * 1e9)}
-        assert len(late) == 20 - round(delay_s / 0.01)
+        assert set(ages_ns) == {round(delay_s * 1e9)}
+        assert len(ages_ns) == 20 - round(delay_s / 0.01)
 
 
 def test_closing_reports_errors_even_when_stop_cannot_be_sent() -> None:
-    """The cause is not lost to the error of the bus."""
+    """The error of the bus does not hide the fault that caused the stop."""
     with open_driver_loop() as run:
         arm_and_wave(run)
         find_module(run, 2).health.leak = True
         wire = WIRES[0]
 
-        def breaks(frame: CanFrame) -> bool:
+        def raise_error_for_stop(frame: CanFrame) -> bool:
             if is_action(frame, CommandAction.STOP):
                 raise BackendError("the bus is broken")
             return False
 
-        wire.should_refuse = breaks
-        with raises_error(
-            BackendError, code="backend/failed"
-        ):  # by the next tick, which tries again
+        wire.should_refuse = raise_error_for_stop
+        # The next tick sends the stop again and fails.
+        with raises_error(BackendError, code="backend/failed"):
             run.run(3, run.wave_joints)
-        reported = {fault.what: fault.cause for fault in run.faults}
-        assert "leak" in reported["module_leak"]
-        assert reported["stop_not_sent"] == "the bus is broken"
+        causes = {fault.what: fault.cause for fault in run.faults}
+        assert "leak" in causes["module_leak"]
+        assert causes["stop_not_sent"] == "the bus is broken"
 
 
-def test_the_log_holds_everything_that_went_over_the_bus(tmp_path: Path) -> None:
+def test_closing_leaves_log_of_all_frames_of_the_bus(tmp_path: Path) -> None:
     path = tmp_path / "bus.log"
     with open_driver_loop(log=str(path)) as run:
         backend = run.backend
@@ -135,11 +134,11 @@ def test_the_log_holds_everything_that_went_over_the_bus(tmp_path: Path) -> None
         assert backend.faults() == []
     lines = [line.split() for line in path.read_text().splitlines()]
     assert [line[2] for line in lines] == [
-        f"{f.id:03X}#{f.data.hex().upper()}" for f in WIRES[0].all_frames
+        f"{frame.id:03X}#{frame.data.hex().upper()}" for frame in WIRES[0].all_frames
     ]
     assert {line[1] for line in lines} == {WIRES[0].channel}
     opcodes = {int(line[2][:3], 16) >> 6 for line in lines}
     assert opcodes > {*FROM_HOST} - {Opcode.EMERGENCY}
     assert Opcode.JOINT_STATE in opcodes
-    last = [line[2] for line in lines if int(line[2][:3], 16) >> 6 in FROM_HOST][-1]
-    assert last.startswith("040#02"), "which is disarm"
+    host_frames = [line[2] for line in lines if int(line[2][:3], 16) >> 6 in FROM_HOST]
+    assert host_frames[-1].startswith("040#02"), "the last command is not disarm"

@@ -1,4 +1,4 @@
-"""The whole driver on virtual buses with emulated joint modules: opening it, and a period."""
+"""The complete driver opens virtual buses with emulated joint modules, and sends the frames of a period."""
 
 from collections.abc import Callable
 from typing import Any
@@ -44,28 +44,21 @@ from snakesim_testing.can.recording_bus import (
 )
 from snakesim_testing.messages import raises_error
 
-# --- opening -----------------------------------------------------------------------------------------------
+# --- opening -----------------------------------------------------------------------------------------------------
 
 
-def test_bring_up_enables_nothing() -> None:
+def test_opening_disarms_modules_first_and_enables_none() -> None:
     with open_driver_loop() as run:
         sent = WIRES[0].sent
-        assert {parse_opcode(frame.id) for frame in sent} == {
-            Opcode.COMMAND,
-            Opcode.PARAMETER_REQUEST,
-            Opcode.SYNC,
-        }
-        assert all(
-            is_action(f, CommandAction.IDENTIFY, CommandAction.DISARM)
-            for f in sent
-            if parse_opcode(f.id) == Opcode.COMMAND
-        )
-        disarm = next(i for i, frame in enumerate(sent) if is_action(frame, CommandAction.DISARM))
-        written = next(
-            i for i, frame in enumerate(sent) if parse_opcode(frame.id) == Opcode.PARAMETER_REQUEST
-        )
-        assert disarm < written
-        assert parse_node(sent[disarm].id) == BROADCAST
+        opcodes = [parse_opcode(frame.id) for frame in sent]
+        assert set(opcodes) == {Opcode.COMMAND, Opcode.PARAMETER_REQUEST, Opcode.SYNC}
+        for frame, opcode in zip(sent, opcodes, strict=True):
+            if opcode == Opcode.COMMAND:
+                assert is_action(frame, CommandAction.IDENTIFY, CommandAction.DISARM)
+        are_disarm = [is_action(frame, CommandAction.DISARM) for frame in sent]
+        first_disarm = are_disarm.index(True)
+        assert first_disarm < opcodes.index(Opcode.PARAMETER_REQUEST)
+        assert parse_node(sent[first_disarm].id) == BROADCAST
         assert run.states() == [DISARMED] * JOINT_COUNT
         assert not any(is_setpoint(frame) for frame in run_in_lifecycle_state(run, "disarmed", 30))
         assert run.faults == []
@@ -75,14 +68,14 @@ def test_bring_up_enables_nothing() -> None:
 def test_opening_silent_module_is_reported_and_everything_closed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    class Deaf(RecordingWire):
+    class WireWithSilentJoint2(RecordingWire):
         def __init__(self, channel: str, peer: VirtualPeer | None = None) -> None:
             super().__init__(channel, peer)
             self.should_ignore = lambda frame: (
                 parse_opcode(frame.id) == Opcode.JOINT_STATE and parse_node(frame.id) == 2
             )
 
-    monkeypatch.setattr(modules, "VirtualWire", Deaf)
+    monkeypatch.setattr(modules, "VirtualWire", WireWithSilentJoint2)
     with raises_error(BackendError, code="drive/silent", field="joint_2"), open_driver_loop():
         pass
     (wire,) = WIRES
@@ -91,27 +84,27 @@ def test_opening_silent_module_is_reported_and_everything_closed(
     assert not any(map(is_setpoint, wire.sent))
 
 
-def found_as(
+def change_emulated_module(
     monkeypatch: pytest.MonkeyPatch, node: int, change: Callable[[ModuleFirmware], None]
 ) -> None:
-    """When a driver opens its bus, one of the emulators is not as new."""
+    """Change one of the emulated modules before the driver opens its bus."""
 
-    def emulators(*given: Any, **more: Any) -> InProcessEmulators:
-        end = make_in_process_emulators(*given, **more)
-        change(end.server.chain.slots[node - 1].module)
-        return end
+    def start_changed_emulators(*arguments: Any, **options: Any) -> InProcessEmulators:
+        emulators = make_in_process_emulators(*arguments, **options)
+        change(emulators.server.chain.slots[node - 1].module)
+        return emulators
 
-    monkeypatch.setattr(modules, "start_in_process_emulators", emulators)
+    monkeypatch.setattr(modules, "start_in_process_emulators", start_changed_emulators)
 
 
-def left_behind(module: ModuleFirmware, kind: str) -> None:
-    """What a module is like whose driver was killed, or worse."""
+def set_state_after_killed_driver(module: ModuleFirmware, kind: str) -> None:
+    """Bring a module into the state in which a killed driver, or an additional fault, leaves it."""
     if kind == "emergency":
         module.receive(make_emergency(), 0.0)
         return
     module.receive(make_command(CommandAction.ARM), 0.0)
     module._fail(ModuleFault.STREAM if kind == "stream" else ModuleFault.WATCHDOG, 0.0)
-    if kind == "leak":  # after the watchdog had stopped it, water came, and went
+    if kind == "leak":  # a leak after the stop by the watchdog, which has ended
         module.health.leak = True
         module.poll(0.0)
         module.health.leak = False
@@ -127,25 +120,28 @@ def left_behind(module: ModuleFirmware, kind: str) -> None:
         ("emergency", EMERGENCY),
     ],
 )
-def test_what_a_killed_driver_left_is_cleared_and_nothing_else(
+def test_opening_resets_only_faults_of_a_killed_driver(
     kind: str, state: ModuleState, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found_as(monkeypatch, 2, lambda module: left_behind(module, kind))
+    change_emulated_module(
+        monkeypatch, 2, lambda module: set_state_after_killed_driver(module, kind)
+    )
     with open_driver_loop() as run:
         run_in_lifecycle_state(run, "disarmed", 2)
         assert run.states() == [DISARMED, state, DISARMED, DISARMED]
         assert describe_host_frames(WIRES[0].sent).count("clear 2") == (state == DISARMED)
-        found = [
-            fault
-            for _ in range(3)
-            for fault in (run_in_lifecycle_state(run, "disarmed"), *run.faults)[1:]
-        ]
-        assert {fault.joint for fault in found} == (set() if state == DISARMED else {"joint_2"})
+        faulty_joints: set[str | None] = set()
+        for _ in range(3):
+            run_in_lifecycle_state(run, "disarmed")
+            faulty_joints.update(fault.joint for fault in run.faults)
+        assert faulty_joints == (set() if state == DISARMED else {"joint_2"})
 
 
-def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    weak = {ModuleParameter.RATED_TORQUE: 1.0}
-    found_as(monkeypatch, 3, lambda module: module.parameters.values.update(weak))
+def test_opening_refuses_module_with_too_little_torque(monkeypatch: pytest.MonkeyPatch) -> None:
+    weak_parameters = {ModuleParameter.RATED_TORQUE: 1.0}
+    change_emulated_module(
+        monkeypatch, 3, lambda module: module.parameters.values.update(weak_parameters)
+    )
     with (
         raises_error(BackendError, code="drive/unsupported-setting", field="joint_3"),
         open_driver_loop(),
@@ -153,14 +149,14 @@ def test_a_module_that_is_too_weak_is_refused(monkeypatch: pytest.MonkeyPatch) -
         pass
 
 
-def test_paces_and_what_is_checked_before_anything_is_opened(
+def test_check_returns_clock_modes_and_validates_settings_before_opening(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert CanBackend.check(make_can_config(), CanSettings()) == ("lockstep", "realtime")
     with raises_error(ConfigError, code="bus/not-available", field="nocan7"):
         CanBackend.check(make_can_config(), CanSettings(channels=["nocan7"]))
-    asked: list[str] = []
-    monkeypatch.setattr("snakesim_can_backend.bus.adapter.validate_interface", asked.append)
+    validated: list[str] = []
+    monkeypatch.setattr("snakesim_can_backend.bus.adapter.validate_interface", validated.append)
     assert CanBackend.check(make_can_config(), CanSettings(channels=["can0", "can1"])) == (
         "realtime",
     )
@@ -170,7 +166,7 @@ def test_paces_and_what_is_checked_before_anything_is_opened(
         "lockstep",
         "realtime",
     )
-    assert asked == ["can0", "can1", "vcan0"]
+    assert validated == ["can0", "can1", "vcan0"]
     with raises_error(ConfigError, code="bus/not-virtual"):
         CanBackend.check(make_can_config(), CanSettings(emulators="none"))
     with raises_error(ConfigError, code="drive/unsupported-setting"):
@@ -195,12 +191,12 @@ def test_opening_waits_for_answers_as_long_as_fullest_bus() -> None:
     assert compute_response_timeout_s(triplet, two) == pytest.approx(1.25 * 15 * 135e-6 + 0.002)
 
 
-# --- a period ----------------------------------------------------------------------------------------------
+# --- a period ----------------------------------------------------------------------------------------------------
 
 
 def test_opened_command_acts_one_period_after_its_state() -> None:
-    change_at = 15
-    speeds = []
+    change_tick = 15
+    speeds_rad_s = []
     for torque_nm in (0.0, 1.0):
         with open_driver_loop() as run:
             run.setpoints = SafeSetpoints(
@@ -208,18 +204,21 @@ def test_opened_command_acts_one_period_after_its_state() -> None:
             )
             run.arm()
 
-            def wish(tick: int, torque_nm: float = torque_nm) -> SafeSetpoints:
+            def set_torque_at_change(tick: int, torque_nm: float = torque_nm) -> SafeSetpoints:
                 return SafeSetpoints(
                     [JointMode.TORQUE] * JOINT_COUNT,
-                    [torque_nm * (tick == change_at)] * JOINT_COUNT,
+                    [torque_nm * (tick == change_tick)] * JOINT_COUNT,
                     [4.0] * JOINT_COUNT,
                 )
 
-            run.run(change_at + 5 - run.tick, wish)
-            speeds.append(np.array([samples.joints.velocity_rad_s for samples in run.samples]))
-    moved = (np.abs(speeds[1] - speeds[0]) > 1e-9).any(axis=1)
-    assert not moved[: change_at + 2].any(), "it waits for the next Sync"
-    assert moved[change_at + 2 :].all(), "and acts from then on"
+            run.run(change_tick + 5 - run.tick, set_torque_at_change)
+            speeds_rad_s.append(
+                np.array([samples.joints.velocity_rad_s for samples in run.samples])
+            )
+    moved = (np.abs(speeds_rad_s[1] - speeds_rad_s[0]) > 1e-9).any(axis=1)
+    # The command waits for the next Sync, and acts from then on.
+    assert not moved[: change_tick + 2].any()
+    assert moved[change_tick + 2 :].all()
 
 
 def test_opened_period_has_one_sync_and_one_setpoint_per_module() -> None:
@@ -232,11 +231,11 @@ def test_opened_period_has_one_sync_and_one_setpoint_per_module() -> None:
                 *[Opcode.SET_POINT] * JOINT_COUNT,
             ]
             assert [parse_node(frame.id) for frame in sent[1:]] == [1, 2, 3, 4]
-        counts = [
-            decode_signals(f)["count"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC
+        syncs = [
+            decode_signals(frame)
+            for frame in WIRES[0].sent
+            if parse_opcode(frame.id) == Opcode.SYNC
         ]
-        assert counts == [i % 256 for i in range(len(counts))]
-        times = [
-            decode_signals(f)["time"] for f in WIRES[0].sent if parse_opcode(f.id) == Opcode.SYNC
-        ]
-        assert np.diff(times[-20:]).tolist() == [10_000] * 19
+        assert [sync["count"] for sync in syncs] == [i % 256 for i in range(len(syncs))]
+        times_us = [sync["time"] for sync in syncs]
+        assert np.diff(times_us[-20:]).tolist() == [10_000] * 19

@@ -1,4 +1,4 @@
-"""The whole driver: who gets setpoints, and what is said again until everybody has heard."""
+"""The complete driver sends setpoints only to an armed robot, and repeats commands until all modules confirm."""
 
 from itertools import pairwise
 
@@ -32,11 +32,11 @@ from snakesim_testing.can.recording_bus import (
     run_in_lifecycle_state,
 )
 
-# --- who may move ------------------------------------------------------------------------------------------
+# --- armed and disarmed robots -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("lifecycle", "said", "state", "cleared"),
+    ("lifecycle", "first_command", "state", "reset_command"),
     [
         ("disarmed", ["disarm"], DISARMED, []),
         ("fault", ["stop"], DISARMED, ["clear"]),
@@ -44,7 +44,10 @@ from snakesim_testing.can.recording_bus import (
     ],
 )
 def test_setpoints_are_sent_only_to_armed_robot_until_a_stop(
-    lifecycle: LifecycleState, said: list[str], state: ModuleState, cleared: list[str]
+    lifecycle: LifecycleState,
+    first_command: list[str],
+    state: ModuleState,
+    reset_command: list[str],
 ) -> None:
     with open_driver_loop() as run:
         run.arm()
@@ -52,18 +55,19 @@ def test_setpoints_are_sent_only_to_armed_robot_until_a_stop(
         assert max(run.true_speed_rad_s) > 0.3
         sent = run_in_lifecycle_state(run, lifecycle, 40)
         assert not any(map(is_setpoint, sent))
-        assert describe_host_frames(sent)[:1] == said and len(describe_host_frames(sent)) <= 3, (
-            "a word, and not all the time"
-        )
+        commands = describe_host_frames(sent)
+        assert commands[:1] == first_command
+        assert len(commands) <= 3, "the command is repeated all the time"
         assert run.states() == [state] * JOINT_COUNT
         assert run.true_speed_rad_s[-1] < 0.05
-        assert describe_host_frames(run_in_lifecycle_state(run, "disarmed"))[:1] == cleared
+        sent = run_in_lifecycle_state(run, "disarmed")
+        assert describe_host_frames(sent)[:1] == reset_command
         reset_and_arm_again(run)
         assert run.faults == []
 
 
 @pytest.mark.parametrize("latched", ["estop", "fault"])
-def test_clearing_and_arming_between_two_ticks_works(latched: LifecycleState) -> None:
+def test_reset_and_arming_between_two_ticks_arms_the_robot(latched: LifecycleState) -> None:
     with open_driver_loop() as run:
         run.arm()
         run_in_lifecycle_state(run, latched, 25)
@@ -100,9 +104,9 @@ def test_module_that_disarmed_itself_is_not_armed_again_automatically() -> None:
         run_in_lifecycle_state(run, "armed", 3)
         assert run.states() == [ARMED] * JOINT_COUNT
         find_module(run, 2).receive(make_command(CommandAction.DISARM), 0.0)
-        before = len(WIRES[0].sent)
+        sent_before = len(WIRES[0].sent)
         run.run(5)
-        assert describe_host_frames(WIRES[0].sent[before:]) == ["stop"]
+        assert describe_host_frames(WIRES[0].sent[sent_before:]) == ["stop"]
         assert find_module(run, 2).state == DISARMED
         assert [(fault.what, fault.joint) for fault in run.faults] == [
             ("module_not_armed", "joint_2")
@@ -124,37 +128,47 @@ def test_lost_emergency_frame_is_repeated_until_all_modules_confirm() -> None:
         assert describe_host_frames(run_in_lifecycle_state(run, "estop", 10)) == []
 
 
-# --- frames that the bus does not take ---------------------------------------------------------------------
+# --- frames that the bus refuses ---------------------------------------------------------------------------------
 
 
 def test_setpoint_rejected_by_bus_is_replaced_and_never_sent_late() -> None:
     with open_driver_loop() as run:
         run.arm()
         start = run.tick
-        refused = (start + 4, start + 5, start + 9)
+        refused_ticks = (start + 4, start + 5, start + 9)
         WIRES[0].should_refuse = lambda frame: (
-            is_setpoint(frame) and parse_node(frame.id) == 2 and run.tick in refused
+            is_setpoint(frame) and parse_node(frame.id) == 2 and run.tick in refused_ticks
         )
-        by_tick: dict[int, list[dict[str, float]]] = {}
+        setpoints_by_tick: dict[int, list[dict[str, float]]] = {}
         for _ in range(30):
             tick = run.tick
-            before = len(WIRES[0].sent)
+            sent_before = len(WIRES[0].sent)
             run.run(
                 1,
                 lambda tick: SafeSetpoints(
                     [JointMode.POSITION] * 4, [0.001 * (tick - start)] * 4, [4.0] * 4
                 ),
             )
-            mine = [f for f in WIRES[0].sent[before:] if is_setpoint(f) and parse_node(f.id) == 2]
-            by_tick[tick] = [decode_signals(frame) for frame in mine]
-        assert [tick for tick, frames in by_tick.items() if not frames] == list(refused)
-        assert all(len(frames) == 1 for tick, frames in by_tick.items() if tick not in refused)
-        sent = {tick: frames[0] for tick, frames in by_tick.items() if frames}
-        assert all(
-            f["position"] == pytest.approx(0.001 * (tick - start)) for tick, f in sent.items()
-        ), "the newest"
-        counts = [int(frame["count"]) for frame in sent.values()]
-        assert all((b - a) % 16 == 1 for a, b in pairwise(counts)), "a count is of what was sent"
+            setpoints_by_tick[tick] = [
+                decode_signals(frame)
+                for frame in WIRES[0].sent[sent_before:]
+                if is_setpoint(frame) and parse_node(frame.id) == 2
+            ]
+        ticks_without_setpoint = [
+            tick for tick, setpoints in setpoints_by_tick.items() if not setpoints
+        ]
+        assert ticks_without_setpoint == list(refused_ticks)
+        counts: list[int] = []
+        for tick, setpoints in setpoints_by_tick.items():
+            if tick in refused_ticks:
+                continue
+            (setpoint,) = setpoints
+            assert setpoint["position"] == pytest.approx(0.001 * (tick - start)), (
+                "the setpoint is not the newest one"
+            )
+            counts.append(int(setpoint["count"]))
+        # The setpoints that the bus refused are not counted.
+        assert all((b - a) % 16 == 1 for a, b in pairwise(counts))
         assert run.faults == []
         assert run.states() == [ARMED] * JOINT_COUNT
 
@@ -164,13 +178,12 @@ def test_bus_without_sync_is_reported_even_when_disarmed() -> None:
         run.run(2)
         WIRES[0].should_refuse = lambda frame: parse_opcode(frame.id) == Opcode.SYNC
         run.run(8)
-        assert [fault.what for fault in run.faults] == ["bus_stuck"], (
-            "and no module is blamed for it"
-        )
+        # No module is reported as silent.
+        assert [fault.what for fault in run.faults] == ["bus_stuck"]
         assert run.samples[-1].joints.valid == [False] * JOINT_COUNT
 
 
-# --- modules that restart ----------------------------------------------------------------------------------
+# --- modules that restart ----------------------------------------------------------------------------------------
 
 
 def test_restarted_module_is_not_armed_before_its_parameters_are_set() -> None:
@@ -187,7 +200,7 @@ def test_restarted_module_is_not_armed_before_its_parameters_are_set() -> None:
         assert module.parameters.values[ModuleParameter.STIFFNESS] == 0.0
         assert "module_restarted" in [fault.what for fault in run.faults]
         assert run.lifecycle == "fault"
-        run_in_lifecycle_state(run, "armed", 8)  # cleared and armed between two ticks
+        run_in_lifecycle_state(run, "armed", 8)  # the robot is reset and armed between two ticks
         assert run.states() == [ARMED] * JOINT_COUNT
         assert module.parameters.values[ModuleParameter.STIFFNESS] == 40.0
 
