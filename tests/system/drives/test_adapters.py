@@ -1,6 +1,6 @@
-"""A bus through python-can: two processes over UDP multicast, on the loopback of a machine of its own.
+"""A bus of python-can connects two processes by UDP multicast, on the loopback of a separate network namespace.
 
-Emulated drives come before other processes: real ones do not wait for a computer's tests.
+Emulated drives have priority over other processes, because real ones do not wait for a busy computer.
 """
 
 import json
@@ -22,63 +22,71 @@ pytestmark = [
 ]
 pytest.importorskip("msgpack", reason="python-can's UDP bus needs it")
 
-CHANNEL, POSE = "udp_multicast:239.74.163.2", "127.0.0.1:7450"
-LISTENING = ("--set", f'backend.pose_listen="{POSE}"')
+CHANNEL = "udp_multicast:239.74.163.2"
+POSE_ADDRESS = "127.0.0.1:7450"
+LISTEN_TO_POSE = ("--set", f'backend.pose_listen="{POSE_ADDRESS}"')
 SNAKESIM = str(Path(sys.executable).with_name("snakesim"))
 
 
 @pytest.fixture
 def machine() -> Iterator[NamespaceMachine]:
+    """Provide a network namespace whose loopback interface supports multicast."""
     with ExitStack() as stack:
-        one = NamespaceMachine(stack)
-        one.run("ip", "link", "set", "lo", "multicast", "on")
-        one.run("ip", "route", "add", "239.0.0.0/8", "dev", "lo")
-        yield one
+        machine = NamespaceMachine(stack)
+        machine.run("ip", "link", "set", "lo", "multicast", "on")
+        machine.run("ip", "route", "add", "239.0.0.0/8", "dev", "lo")
+        yield machine
 
 
 @contextmanager
-def drives(machine: NamespaceMachine, folder: Path, ready: str, *command: str) -> Iterator[None]:
-    """Emulated drives of another program on the bus."""
-    log, typed = (
-        folder / "drives.log",
-        ("drive", "emulate", command[0], "triplet", "--channel", CHANNEL, *command[1:]),
-    )
-    process = machine.start(SNAKESIM, *typed, log=log, hurried=True)
+def running_emulated_drives(
+    machine: NamespaceMachine, folder: Path, drive_name: str, driver_type: str, *options: str
+) -> Iterator[None]:
+    """Emulate drives on the bus in another process. It prints `drive_name` when they are ready."""
+    log = folder / "drives.log"
+    arguments = ("drive", "emulate", driver_type, "triplet", "--channel", CHANNEL, *options)
+    process = machine.start(SNAKESIM, *arguments, log=log, hurried=True)
     try:
-        wait_until(lambda: f"{ready} ready: 13" in log.read_text(), f"the {ready}")
+        wait_until(
+            lambda: f"{drive_name} ready: 13" in log.read_text(), f"the {drive_name} are ready"
+        )
         yield
     finally:
         process.terminate()
         process.wait(10)
 
 
-def run(machine: NamespaceMachine, folder: Path, *arguments: str, backend: str = "can") -> str:
-    where = ("--set", f'backend.channels=["{CHANNEL}"]', "--out", str(folder / "run"))
-    robot = ("triplet", "--backend", backend, "--set", "rate_hz=50", *where)
-    return machine.run(SNAKESIM, "run", *robot, *arguments, check=False, cwd=folder)
+def run_triplet(
+    machine: NamespaceMachine, folder: Path, *arguments: str, backend: str = "can"
+) -> str:
+    """Run the case study on the bus, and return the output."""
+    bus = ("--set", f'backend.channels=["{CHANNEL}"]', "--out", str(folder / "run"))
+    robot = ("triplet", "--backend", backend, "--set", "rate_hz=50")
+    return machine.run(SNAKESIM, "run", *robot, *bus, *arguments, check=False, cwd=folder)
 
 
-def completes(
+def run_in_realtime_to_end(
     machine: NamespaceMachine, folder: Path, *arguments: str, backend: str = "can"
 ) -> None:
-    """A run in real time to its end."""
-    said = run(machine, folder, *LISTENING, "--clock-mode", "realtime", *arguments, backend=backend)
-    assert "(exit code 0)" in said, said
+    """Run the case study in real time, and check that it completes."""
+    options = (*LISTEN_TO_POSE, "--clock-mode", "realtime", *arguments)
+    output = run_triplet(machine, folder, *options, backend=backend)
+    assert "(exit code 0)" in output, output
 
 
 @pytest.mark.quiet
-def test_external_modules_are_detected_and_driven_in_real_time(
+def test_external_modules_are_detected_and_driven_in_realtime(
     machine: NamespaceMachine, tmp_path: Path
 ) -> None:
-    with drives(machine, tmp_path, "modules", "can"):
-        found = machine.run(SNAKESIM, "drive", "scan", "can", CHANNEL)
-        assert found.count(CHANNEL) == 13, found
-        completes(machine, tmp_path, "--controller", "hold", "--duration", "2")
+    with running_emulated_drives(machine, tmp_path, "modules", "can"):
+        scan = machine.run(SNAKESIM, "drive", "scan", "can", CHANNEL)
+        assert scan.count(CHANNEL) == 13, scan
+        run_in_realtime_to_end(machine, tmp_path, "--controller", "hold", "--duration", "2")
 
 
 @pytest.mark.quiet
 @pytest.mark.parametrize(
-    ("driver_type", "command", "of"),
+    ("driver_type", "command", "drive_name"),
     [
         pytest.param("odrive", "odrive", "axes", marks=pytest.mark.slow),
         ("moteus", "moteus", "controllers"),
@@ -86,18 +94,22 @@ def test_external_modules_are_detected_and_driven_in_real_time(
     ],
 )
 def test_external_drives_are_driven_as_mounted_in_robot_file(
-    machine: NamespaceMachine, tmp_path: Path, driver_type: str, command: str, of: str
+    machine: NamespaceMachine, tmp_path: Path, driver_type: str, command: str, drive_name: str
 ) -> None:
-    """ODrives and CiA 402 drives on classic CAN; moteus on CAN FD, with ids of 29 bits."""
-    built = ("robot.joints.joint_2.sign=-1", "robot.joints.joint_5.zero_rad=0.4")
+    """ODrives and CiA 402 drives use classic CAN; moteus uses CAN FD, with ids of 29 bits."""
+    mounting = ("robot.joints.joint_2.sign=-1", "robot.joints.joint_5.zero_rad=0.4")
     gains = (
         ("backend.kp_nm_per_turn=1000", "backend.kd_nm_s_per_turn=100")
         if driver_type == "moteus"
         else ()
     )
-    sets = [word for text in (*built, *gains) for word in ("--set", text)]
-    with drives(machine, tmp_path, of, command, "--pose", POSE, *sets):
-        completes(machine, tmp_path, "--duration", "4", *sets, backend=driver_type)
+    options: list[str] = []
+    for key in (*mounting, *gains):
+        options += ["--set", key]
+    with running_emulated_drives(
+        machine, tmp_path, drive_name, command, "--pose", POSE_ADDRESS, *options
+    ):
+        run_in_realtime_to_end(machine, tmp_path, "--duration", "4", *options, backend=driver_type)
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["path_distance_m"] > 0.1
 
 
@@ -105,26 +117,27 @@ def test_external_drives_are_driven_as_mounted_in_robot_file(
 def test_external_modules_stop_when_controller_holds_the_interpreter(
     machine: NamespaceMachine, tmp_path: Path
 ) -> None:
-    """Beside the driver compiled code without end stops the host: what is left is the modules' own watchdog."""
+    """Endless compiled code in the host's process stops the host, so that only the modules' watchdogs remain."""
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "holds the interpreter"))
-    with drives(machine, tmp_path, "modules", "can"):
-        beside = ("--set", "services.control.process=host", *LISTENING)
-        bad = (
+    with running_emulated_drives(machine, tmp_path, "modules", "can"):
+        control_in_host = ("--set", "services.control.process=host", *LISTEN_TO_POSE)
+        arguments = (
             "--controller",
             "./bad.py:Controller",
             "--clock-mode",
             "realtime",
             "--duration",
             "60",
-            *beside,
+            *control_in_host,
         )
-        said = run(machine, tmp_path, *bad)
-        assert "(exit code 1)" in said, said
-        found = machine.run(SNAKESIM, "drive", "scan", "can", CHANNEL)
-        assert found.count("watchdog") == 13 and " armed" not in found, said + found
+        output = run_triplet(machine, tmp_path, *arguments)
+        assert "(exit code 1)" in output, output
+        scan = machine.run(SNAKESIM, "drive", "scan", "can", CHANNEL)
+        assert scan.count("watchdog") == 13, output + scan
+        assert " armed" not in scan, output + scan
 
 
-TWO_GROUPS = """
+TWO_GROUPS_CODE = """
 import time
 from snakesim_can_backend.bus.adapter import open_wire
 from snakesim_can_backend.protocol.definitions import CanFrame
@@ -137,16 +150,18 @@ for wire in wires:
 """
 
 
-def test_channels_of_udp_multicast_are_buses_of_their_own(machine: NamespaceMachine) -> None:
-    """They share a port: without an option of its socket each of them gets the frames of all groups."""
-    assert "received: [0, 1, 0]" in machine.run(sys.executable, "-c", TWO_GROUPS)
+def test_udp_multicast_channels_of_different_groups_are_separate_buses(
+    machine: NamespaceMachine,
+) -> None:
+    """The groups share a port. Without an option of the socket, each channel would receive the frames of all groups."""
+    assert "received: [0, 1, 0]" in machine.run(sys.executable, "-c", TWO_GROUPS_CODE)
 
 
 @pytest.mark.slow
-def test_its_own_modules_move_in_lockstep_as_on_any_bus(
+def test_run_with_own_emulated_modules_on_udp_multicast_moves(
     machine: NamespaceMachine, tmp_path: Path
 ) -> None:
-    said = run(
+    output = run_triplet(
         machine,
         tmp_path,
         "--clock-mode",
@@ -156,5 +171,5 @@ def test_its_own_modules_move_in_lockstep_as_on_any_bus(
         "--set",
         'backend.emulators="process"',
     )
-    assert "(exit code 0)" in said, said
+    assert "(exit code 0)" in output, output
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["path_distance_m"] > 0.02

@@ -1,4 +1,7 @@
-"""A robot of two driver types on two buses: in turn, and each bus in a thread of its own. Drives are emulated."""
+"""A robot of two driver types has two buses, which are served one after the other or each in its own thread.
+
+All drives are emulated.
+"""
 
 import threading
 import time
@@ -17,288 +20,324 @@ from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 
-AXES, SERVOS = [0, 1], [2, 3]  # joints
-HEAD = (
-    {"driver": "odrive"},
-    {"joint_3": {"driver": "dynamixel"}, "joint_4": {"driver": "dynamixel"}},
-)
-LONG_S = 1.0  # a watchdog that a busy computer does not reach
-SHORT_S = 0.2
+AXES = [0, 1]  # indices of the joints with ODrive axes
+SERVOS = [2, 3]  # indices of the joints with Dynamixel servos
+BODY_DRIVE = {"driver": "odrive"}
+HEAD_JOINTS = {"joint_3": {"driver": "dynamixel"}, "joint_4": {"driver": "dynamixel"}}
+LONG_WATCHDOG_S = 1.0  # does not expire on a busy computer
+SHORT_WATCHDOG_S = 0.2
 
 
-class Robot(DriveRig):
-    """Drives of one driver type, by default ODrive axes, and two servos at the head."""
+class MixedRobot(DriveRig):
+    """Two drives of one driver type, by default ODrive axes, and two servos at the head."""
 
     def __init__(
         self, clock_mode: ClockMode = "lockstep", body: str = "odrive", **driver_types: Any
     ) -> None:
-        fixed = {
+        backends = {
             name: {"bring_up_limit_s": 2.0} | driver_types.get(name, {})
             for name in (body, "dynamixel")
         }
         config = make_run_config(
             backend="mixed",
             robot__chain__modules=4,
-            robot__drive=HEAD[0] | {"driver": body},
-            robot__joints=HEAD[1],
+            robot__drive=BODY_DRIVE | {"driver": body},
+            robot__joints=HEAD_JOINTS,
             rate_hz=100,
             clock_mode=clock_mode,
-            backends=fixed,
+            backends=backends,
         )
         super().__init__(config, MixedBackend(config, MixedSettings(physics_model="inertia")))
-        self.axes, self.servos = drives_of(self.backend, 0), drives_of(self.backend, 1)
+        self.axes = drives_of(self.backend, 0)
+        self.servos = drives_of(self.backend, 1)
 
-    def ages_ms(self, joints: list[int]) -> list[float]:
+    def get_ages_ms(self, joints: list[int]) -> list[float]:
+        """Return the ages of the published joint states."""
         assert self.joints is not None
         return [self.joints.age_ns[i] * 1e-6 for i in joints]
 
-    def angles(self, joints: list[int]) -> list[float]:
+    def get_angles_rad(self, joints: list[int]) -> list[float]:
+        """Return the published joint angles."""
         assert self.joints is not None
         return [self.joints.angle_rad[i] for i in joints]
 
-    def axes_follow(self) -> set[bool]:
+    def get_axis_enable_states(self) -> set[bool]:
+        """Return whether axes are enabled: a set of one value if all have the same state."""
         return {axis.state == AxisState.CLOSED_LOOP for axis in self.axes._emulator.axes}
 
-    def servos_follow(self) -> set[bool]:
+    def get_servo_enable_states(self) -> set[bool]:
+        """Return whether servos are enabled: a set of one value if all have the same state."""
         return {servo.is_torque_on for servo in self.servos._emulator.servos}
 
-    def enabled(self) -> list[bool]:
-        """Of every drive, in truth."""
+    def assert_all_drives(self, *, enabled: bool) -> None:
+        """Check that all drives are enabled, or that all are disabled."""
+        assert self.get_axis_enable_states() == {enabled}
+        assert self.get_servo_enable_states() == {enabled}
+
+    def has_all_drives(self, *, enabled: bool) -> bool:
+        """Return whether all drives are enabled, or all are disabled."""
+        return self.get_axis_enable_states() == self.get_servo_enable_states() == {enabled}
+
+    def list_enabled(self) -> list[bool]:
+        """Return the true state of every drive: whether it is enabled."""
         return DrivesOfAnyType(self.backend).list_enabled()
 
     def arm(self) -> None:
-        """Until every drive is on, and the driver has no clear left to carry out: a busy computer makes faults."""
+        """Arm until every drive is enabled and the driver resets no more faults, which a busy computer causes."""
 
         def is_armed() -> bool:
             if self.run(1, "armed"):
                 self.run(1, "disarmed")
                 time.sleep(0.05)
                 return False
-            return all(self.enabled()) and self.backend._remaining_grace_cycles <= 0
+            return all(self.list_enabled()) and self.backend._remaining_grace_cycles <= 0
 
-        wait_until(is_armed, "arms", 20.0)
+        wait_until(is_armed, "the robot is armed", 20.0)
+
+    def run_until_enabled(self, is_enabled: Callable[[], bool]) -> None:
+        """Run armed ticks until the drives are enabled."""
+
+        def run_and_check() -> bool:
+            self.run(1, "armed")
+            return is_enabled()
+
+        wait_until(run_and_check, "the drives are enabled")
 
     def freeze_driver(self, seconds: float) -> None:
-        """The driver's threads can do nothing for so long; its drives' time passes."""
+        """Stop the driver's threads for this time, while the time of its drives passes."""
         DrivesOfAnyType(self.backend).freeze_driver(seconds, time.sleep)
 
 
-Opens = Callable[..., Robot]
+OpenRobot = Callable[..., MixedRobot]
 
 
 @pytest.fixture
-def opened() -> Iterator[Opens]:
-    """Opens robots, and closes them in the end."""
-    robots: list[Robot] = []
+def open_robot() -> Iterator[OpenRobot]:
+    """Provide a function that opens robots; close them after the test."""
+    robots: list[MixedRobot] = []
 
-    def open_one(*given: Any, **driver_types: Any) -> Robot:
-        robots.append(Robot(*given, **driver_types))
+    def open_mixed_robot(*arguments: Any, **driver_types: Any) -> MixedRobot:
+        robots.append(MixedRobot(*arguments, **driver_types))
         return robots[-1]
 
-    yield open_one
+    yield open_mixed_robot
     for robot in robots:
         robot.backend.close()
 
 
-def test_mixed_drive_families_move_as_one_robot(opened: Opens) -> None:
-    robot = opened()
-    described = robot.backend.describe()
-    assert [joint.serial[:4] for joint in described.joints] == ["3855", "3855", "", ""]
-    assert described.emulated
-    assert [joint.supports_mode(JointMode.VELOCITY) for joint in described.joints] == [True] * 4, (
-        "as its file says; a run narrows it"
-    )
+def test_mixed_driver_types_move_as_one_robot(open_robot: OpenRobot) -> None:
+    robot = open_robot()
+    description = robot.backend.describe()
+    assert [joint.serial[:4] for joint in description.joints] == ["3855", "3855", "", ""]
+    assert description.emulated
+    # The description has the modes of the robot file; only a run removes those that a drive does not have.
+    for joint in description.joints:
+        assert joint.supports_mode(JointMode.VELOCITY)
     assert robot.run(30, "disarmed") == []
     assert robot.run(40, "armed") == []
-    assert robot.angles([*AXES, *SERVOS]) == pytest.approx([0.1] * 4, abs=0.02)
-    assert robot.axes_follow() == robot.servos_follow() == {True}
+    assert robot.get_angles_rad([*AXES, *SERVOS]) == pytest.approx([0.1] * 4, abs=0.02)
+    robot.assert_all_drives(enabled=True)
     robot.run(5, "estop")
-    assert robot.axes_follow() == robot.servos_follow() == {False}
+    robot.assert_all_drives(enabled=False)
 
 
-def test_bus_failed_reading_keeps_last_value_and_other_buses(opened: Opens) -> None:
-    robot = opened()
+def test_bus_failed_reading_keeps_last_value_and_other_buses(open_robot: OpenRobot) -> None:
+    robot = open_robot()
     robot.run(20, "armed")
-    before = robot.angles(SERVOS)
+    last_angles_rad = robot.get_angles_rad(SERVOS)
     robot.go_wrong("cut:bus_2@0-9")
     robot.target = -0.1
-    found = robot.run(4, "armed")
-    assert robot.angles(SERVOS) == before
-    assert robot.ages_ms(SERVOS) == [40.0, 40.0]
-    assert robot.ages_ms(AXES) == [0.0, 0.0]
-    assert [fault.what for fault in found] == ["interface_down", "drive_silent", "drive_silent"]
-    assert [fault.joint for fault in found[1:]] == ["joint_3", "joint_4"], "named as in the robot"
+    faults = robot.run(4, "armed")
+    assert robot.get_angles_rad(SERVOS) == last_angles_rad
+    assert robot.get_ages_ms(SERVOS) == [40.0, 40.0]
+    assert robot.get_ages_ms(AXES) == [0.0, 0.0]
+    assert [fault.what for fault in faults] == ["interface_down", "drive_silent", "drive_silent"]
+    assert [fault.joint for fault in faults[1:]] == ["joint_3", "joint_4"]
     assert robot.joints is not None
     assert robot.joints.valid == [True] * 4
     robot.run(4, "fault")
     assert robot.joints.valid == [True, True, False, False]
-    assert robot.angles(SERVOS) == before
+    assert robot.get_angles_rad(SERVOS) == last_angles_rad
 
 
-def test_bus_drive_fault_is_injected_and_reported_by_joint_number(opened: Opens) -> None:
-    robot = opened()
+def test_bus_drive_fault_is_injected_and_reported_by_joint_number(open_robot: OpenRobot) -> None:
+    robot = open_robot()
     robot.run(20, "armed")
     robot.go_wrong("overheat:joint_4@0-9")
-    assert [(fault.what, fault.joint) for fault in robot.run(20, "armed")] == [
-        ("drive_fault", "joint_4")
-    ]
+    (fault,) = robot.run(20, "armed")
+    assert fault.what == "drive_fault"
+    assert fault.joint == "joint_4"
     with raises_error(ConfigError, code="injection/unknown-target", field="bus_3"):
         robot.go_wrong("cut:bus_3@0")
 
 
-def test_bus_at_half_rate_is_polled_every_second_tick(opened: Opens) -> None:
-    robot = opened(dynamixel={"decimation": 2})
-    assert robot.backend.describe().sensors[0].delay_s == 0.01, (
-        "so old may a joint state be by itself"
-    )
-    ages: list[list[float]] = []
+def test_bus_at_half_rate_is_polled_every_second_tick(open_robot: OpenRobot) -> None:
+    robot = open_robot(dynamixel={"decimation": 2})
+    max_age_s = robot.backend.describe().sensors[0].delay_s
+    assert max_age_s == 0.01
+    ages_ms: list[list[float]] = []
     for _ in range(6):
         assert robot.run(1, "armed") == []
-        ages.append([*robot.ages_ms([0]), *robot.ages_ms([2])])
-    assert ages == [[0.0, 0.0], [0.0, 10.0]] * 3
+        ages_ms.append([*robot.get_ages_ms([0]), *robot.get_ages_ms([2])])
+    assert ages_ms == [[0.0, 0.0], [0.0, 10.0]] * 3
     assert robot.run(1, "armed") == []
+    # The servos are disabled also in a tick in which their bus is not polled.
     assert robot.run(1, "disarmed") == []
-    assert robot.axes_follow() == robot.servos_follow() == {False}, (
-        "in a tick in which the servos' turn is not"
-    )
+    robot.assert_all_drives(enabled=False)
 
 
-class Held:
-    """A reading of servos blocks while `go` is not set."""
+class BlockableServoReads:
+    """Blocks the bus of the servos in its next read until it may continue."""
 
-    def __init__(self, robot: Robot) -> None:
-        self.there, self.go = threading.Event(), threading.Event()
-        self.go.set()
+    def __init__(self, robot: MixedRobot) -> None:
+        self.is_blocked = threading.Event()
+        self.may_continue = threading.Event()
+        self.may_continue.set()
         read = robot.servos.read
 
         def wait_and_read() -> None:
-            if not self.go.is_set():
-                self.there.set()
-                self.go.wait()
+            if not self.may_continue.is_set():
+                self.is_blocked.set()
+                self.may_continue.wait()
             read()
 
         robot.servos.read = wait_and_read
 
 
-def test_bus_that_blocks_ages_alone_while_others_stop(opened: Opens) -> None:
-    robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
-    held = Held(robot)
+def test_bus_that_blocks_ages_alone_while_others_stop(open_robot: OpenRobot) -> None:
+    robot = open_robot(
+        "realtime",
+        odrive={"watchdog_s": LONG_WATCHDOG_S},
+        dynamixel={"watchdog_s": LONG_WATCHDOG_S},
+    )
+    reads = BlockableServoReads(robot)
     for _ in range(10):
         robot.run(1, "armed")
         time.sleep(0.005)
-    held.go.clear()
+    reads.may_continue.clear()
     robot.run(2, "armed")
-    assert held.there.wait(10.0)
-    robot.run(1, "armed")  # takes what was read before
-    before, ages = robot.angles(SERVOS), [max(robot.ages_ms(SERVOS))]
+    assert reads.is_blocked.wait(10.0)
+    robot.run(1, "armed")  # publishes the last values that were read
+    last_angles_rad = robot.get_angles_rad(SERVOS)
+    ages_ms = [max(robot.get_ages_ms(SERVOS))]
     for _ in range(15):
         robot.run(1, "armed")
-        ages.append(min(robot.ages_ms(SERVOS)))
+        ages_ms.append(min(robot.get_ages_ms(SERVOS)))
         time.sleep(0.01)
-    assert ages == sorted(ages) and ages[-1] >= 140, "its age grows with each tick"
-    assert max(robot.ages_ms(AXES)) < ages[-1], "the other bus is read"
-    assert robot.angles(SERVOS) == before
+    assert ages_ms == sorted(ages_ms), "the age of the servos' state does not grow with each tick"
+    assert ages_ms[-1] >= 140
+    assert max(robot.get_ages_ms(AXES)) < ages_ms[-1], "the other bus is not read"
+    assert robot.get_angles_rad(SERVOS) == last_angles_rad
     assert robot.joints is not None
     assert robot.joints.valid[2:] == [False, False]
     robot.run(1, "disarmed")
-    wait_until(lambda: robot.axes_follow() == {False}, "axes that are let go", 10.0)
-    assert robot.servos_follow() == {True}, "nobody can reach them: their own watchdog stops them"
-    held.go.set()
-    wait_until(lambda: robot.servos_follow() == {False}, "servos that are let go", 10.0)
+    wait_until(lambda: robot.get_axis_enable_states() == {False}, "the axes are disabled", 10.0)
+    # The driver cannot reach the servos. Without this test's long watchdog, it would disable them.
+    assert robot.get_servo_enable_states() == {True}
+    reads.may_continue.set()
+    wait_until(lambda: robot.get_servo_enable_states() == {False}, "the servos are disabled", 10.0)
     wait_until(
-        lambda: robot.run(1, "disarmed") == [] and max(robot.ages_ms(SERVOS)) < ages[-1],
-        "news",
+        lambda: robot.run(1, "disarmed") == [] and max(robot.get_ages_ms(SERVOS)) < ages_ms[-1],
+        "a newer state of the servos",
         10.0,
     )
 
 
-def test_bus_with_slow_readings_does_not_delay_ticks(opened: Opens) -> None:
-    robot = opened("realtime")
-    read, readings = robot.servos.read, [0]
+def test_bus_with_slow_readings_does_not_delay_ticks(open_robot: OpenRobot) -> None:
+    robot = open_robot("realtime")
+    read = robot.servos.read
+    read_count = 0
 
-    def counted() -> None:
-        readings[0] += 1
+    def count_and_read() -> None:
+        nonlocal read_count
+        read_count += 1
         read()
 
-    robot.servos.read = counted
+    robot.servos.read = count_and_read
     robot.go_wrong("slow:bus_2@0=0.02")
-    began = robot.tick
-    while readings[0] <= 5:
+    first_tick = robot.tick
+    while read_count <= 5:
         assert robot.run(1, "disarmed") == []
         assert robot.tick < 100_000
-    assert robot.tick - began > 3 * readings[0], (
-        "if ticks waited for it, they would be as many as its readings"
-    )
+    # If ticks waited for the bus, there would be one tick for each read.
+    assert robot.tick - first_tick > 3 * read_count
     robot.go_wrong("slow:bus_2@0=0.02", begins=False)
-    assert readings[0] > 5
-    assert max(robot.ages_ms(SERVOS)) > 0
+    assert read_count > 5
+    assert max(robot.get_ages_ms(SERVOS)) > 0
 
 
-def test_bus_without_fresh_setpoints_disables_drives_within_the_lease(opened: Opens) -> None:
-    robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
-    wait_until(
-        lambda: (
-            (robot.run(1, "armed") and False)
-            or robot.axes_follow() == robot.servos_follow() == {True}
-        ),
-        "arms",
+def test_bus_without_fresh_setpoints_disables_drives_within_the_lease(
+    open_robot: OpenRobot,
+) -> None:
+    robot = open_robot(
+        "realtime",
+        odrive={"watchdog_s": LONG_WATCHDOG_S},
+        dynamixel={"watchdog_s": LONG_WATCHDOG_S},
     )
-    wait_until(lambda: robot.axes_follow() == robot.servos_follow() == {False}, "both", 10.0)
-    assert not any(axis.errors for axis in robot.axes._emulator.axes), "not by their watchdogs"
-    found = robot.run(1, "armed")
+    robot.run_until_enabled(lambda: robot.has_all_drives(enabled=True))
+    wait_until(lambda: robot.has_all_drives(enabled=False), "all drives are disabled", 10.0)
+    assert not any(axis.errors for axis in robot.axes._emulator.axes), "a watchdog disabled them"
+    faults = robot.run(1, "armed")
 
-    def both_are_reported() -> bool:
-        found.extend(robot.run(1, "fault"))
-        return len(found) >= 2
+    def are_both_buses_reported() -> bool:
+        faults.extend(robot.run(1, "fault"))
+        return len(faults) >= 2
 
-    wait_until(both_are_reported, "a fault of each bus", 10.0)
-    assert {fault.what for fault in found} == {"no_setpoints"}
-    assert "one lease" in found[0].cause
-    assert robot.axes_follow() == robot.servos_follow() == {False}, (
-        "setpoints of an armed robot enabled them again"
-    )
+    wait_until(are_both_buses_reported, "a fault of each bus", 10.0)
+    assert {fault.what for fault in faults} == {"no_setpoints"}
+    assert "one lease" in faults[0].cause
+    # The setpoints of the armed tick above have not enabled the drives again.
+    robot.assert_all_drives(enabled=False)
 
 
 @pytest.mark.parametrize("body", ["odrive", "moteus"])
-def test_drives_that_stop_while_driver_is_frozen_stay_off(opened: Opens, body: str) -> None:
-    """Without a look at them the bus would let its drives go, which clears what their watchdogs have latched."""
-    robot = opened(
-        "realtime", body, **{body: {"watchdog_s": SHORT_S}, "dynamixel": {"watchdog_s": SHORT_S}}
+def test_drives_that_stop_while_driver_is_frozen_stay_off(open_robot: OpenRobot, body: str) -> None:
+    """The bus reads its drives before it disables them, because disabling clears the fault of a watchdog."""
+    robot = open_robot(
+        "realtime",
+        body,
+        **{body: {"watchdog_s": SHORT_WATCHDOG_S}, "dynamixel": {"watchdog_s": SHORT_WATCHDOG_S}},
     )
     robot.arm()
-    robot.freeze_driver(3 * SHORT_S)
-    assert robot.enabled() == [False] * 4
-    robot.damps, named = True, set[str | None]()
+    robot.freeze_driver(3 * SHORT_WATCHDOG_S)
+    assert robot.list_enabled() == [False] * 4
+    robot.damps = True
+    joints_with_fault: set[str | None] = set()
 
-    def all_are_named() -> bool:
-        found = robot.run(1, "fault")
-        assert robot.enabled() == [False] * 4
-        named.update(
+    def has_every_joint_a_fault() -> bool:
+        faults = robot.run(1, "fault")
+        assert robot.list_enabled() == [False] * 4
+        joints_with_fault.update(
             fault.joint
-            for fault in found
+            for fault in faults
             if fault.what == "drive_fault" and "watchdog" in fault.cause
         )
-        return named == {f"joint_{i + 1}" for i in range(4)}
+        return joints_with_fault == {f"joint_{i + 1}" for i in range(4)}
 
-    wait_until(all_are_named, "a fault of every drive", 10.0)
-    wait_until(
-        lambda: (robot.run(1, "disarmed") and False) or not robot.backend._driven_joints,
-        "cleared",
-        10.0,
-    )
+    wait_until(has_every_joint_a_fault, "a fault of every drive", 10.0)
+
+    def has_no_driven_joint() -> bool:
+        robot.run(1, "disarmed")
+        return not robot.backend._driven_joints
+
+    wait_until(has_no_driven_joint, "the driver drives no joint", 10.0)
     robot.arm()
 
 
-def test_bus_thread_error_ends_run_and_disables_all_drives(opened: Opens) -> None:
-    robot = opened("realtime", odrive={"watchdog_s": LONG_S}, dynamixel={"watchdog_s": LONG_S})
-    wait_until(lambda: (robot.run(1, "armed") and False) or robot.servos_follow() == {True}, "arms")
+def test_bus_thread_error_ends_run_and_disables_all_drives(open_robot: OpenRobot) -> None:
+    robot = open_robot(
+        "realtime",
+        odrive={"watchdog_s": LONG_WATCHDOG_S},
+        dynamixel={"watchdog_s": LONG_WATCHDOG_S},
+    )
+    robot.run_until_enabled(lambda: robot.get_servo_enable_states() == {True})
     robot.axes.wire._bus.shutdown()
     with raises_error(BackendError, code="bus/io-failed"):
-        wait_until(lambda: robot.run(1, "armed") and False, "the error", 10.0)
+        wait_until(lambda: robot.run(1, "armed") and False, "the error of the bus", 10.0)
     with pytest.raises(BackendError):
         robot.run(1, "armed")
     robot.backend.close()
-    assert robot.servos_follow() == {False}
+    assert robot.get_servo_enable_states() == {False}
 
 
 @pytest.mark.parametrize(
@@ -316,11 +355,15 @@ def test_bus_thread_error_ends_run_and_disables_all_drives(opened: Opens) -> Non
         {"robot__joints": {"joint_3": {"driver": "dynamixel", "id": 253}}},
     ],
 )
-def test_mixed_robot_errors_name_joint_family_and_section(changes: dict[str, Any]) -> None:
-    fixed: dict[str, Any] = {"robot__drive": HEAD[0], "robot__joints": HEAD[1]}
-    config = make_run_config(
-        **{"backend": "mixed", "robot__chain__modules": 4, "rate_hz": 100, **fixed, **changes}
-    )
+def test_mixed_robot_errors_name_joint_type_and_section(changes: dict[str, Any]) -> None:
+    valid: dict[str, Any] = {
+        "backend": "mixed",
+        "robot__chain__modules": 4,
+        "rate_hz": 100,
+        "robot__drive": BODY_DRIVE,
+        "robot__joints": HEAD_JOINTS,
+    }
+    config = make_run_config(**{**valid, **changes})
     with raises_error(
         ConfigError,
         code=(
@@ -335,8 +378,8 @@ def test_mixed_robot_errors_name_joint_family_and_section(changes: dict[str, Any
         MixedBackend.check(config, MixedSettings())
 
 
-def test_ids_are_those_of_a_family_on_a_port() -> None:
+def test_mixed_robot_may_use_an_id_once_per_driver_type() -> None:
     config = make_run_config(
-        robot__drive=HEAD[0], robot__joints={"joint_3": {"driver": "dynamixel", "id": 1}}
+        robot__drive=BODY_DRIVE, robot__joints={"joint_3": {"driver": "dynamixel", "id": 1}}
     )
     assert [joint.id for joint in config.robot.joint_table][:3] == [1, 2, 1]

@@ -1,4 +1,4 @@
-"""Feetech servos of another program: they have no watchdog, and hold when their host is killed."""
+"""Feetech servos, emulated by another program, have no watchdog and hold their angle if their host is killed."""
 
 import os
 import re
@@ -23,22 +23,21 @@ from snakesim_testing.runs.servo_row import write_servo_row
 
 pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
 
-UNGUARDED = "no joint has a watchdog: it holds its last angle if the host dies"
+NO_WATCHDOG_WARNING = "no joint has a watchdog: it holds its last angle if the host dies"
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Where everything runs, with servos on `./servos`."""
+    """Provide the folder of all programs, with emulated servos on `./servos`."""
     folder = tmp_path_factory.mktemp("servos")
     write_servo_row(folder, "feetech", "servos")
-    first = (
-        REAL_TIME_PRIORITY if os.geteuid() == 0 else ()
-    )  # real servos do not wait for a busy computer
+    # Real servos do not wait for a busy computer.
+    priority = REAL_TIME_PRIORITY if os.geteuid() == 0 else ()
     printed = folder / "servos.log"
     with printed.open("wb") as file:
         servos = subprocess.Popen(
             [
-                *first,
+                *priority,
                 *SNAKESIM_COMMAND,
                 "drive",
                 "emulate",
@@ -53,22 +52,23 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
             stderr=file,
         )
     try:
-        wait_until(lambda: "servos ready: 4" in printed.read_text(), "the servos")
+        wait_until(lambda: "servos ready: 4" in printed.read_text(), "the servos are ready")
         yield folder
     finally:
         servos.terminate()
         servos.wait(10)
-    assert not (folder / "servos").is_symlink(), "its name is taken away"
+    assert not (folder / "servos").is_symlink(), "the channel still exists"
 
 
 def scan_torques(folder: Path) -> list[str]:
     """Return whether the torque of each servo is on, as the scan prints it."""
-    found = snakesim("drive", "scan", "feetech", "servos", "--baud", "1000000", cwd=folder)
-    assert found.code == 0 and found.out.count("STS3215 (777)") == 4, found.printed
-    return re.findall(r" rad +(on|off) ", found.out)
+    scan = snakesim("drive", "scan", "feetech", "servos", "--baud", "1000000", cwd=folder)
+    assert scan.code == 0, scan.printed
+    assert scan.out.count("STS3215 (777)") == 4, scan.printed
+    return re.findall(r" rad +(on|off) ", scan.out)
 
 
-def run(folder: Path, *arguments: str) -> CompletedRun:
+def run_scenario(folder: Path, *arguments: str) -> CompletedRun:
     """Run the scenario, which holds its pose."""
     return snakesim(
         "run",
@@ -82,28 +82,31 @@ def run(folder: Path, *arguments: str) -> CompletedRun:
     )
 
 
-def test_external_servos_are_detected_and_driven_and_off_afterwards(folder: Path) -> None:
+def test_feetech_servos_are_detected_driven_and_disabled_afterwards(folder: Path) -> None:
     assert scan_torques(folder) == ["off"] * 4
-    ended = run(folder, "--duration", "2")
-    assert ended.code == 0, ended.printed
-    assert UNGUARDED in ended.printed
+    result = run_scenario(folder, "--duration", "2")
+    assert result.code == 0, result.printed
+    assert NO_WATCHDOG_WARNING in result.printed
     assert scan_torques(folder) == ["off"] * 4
 
 
-def test_servos_hold_while_host_is_frozen_and_are_off_once_it_resumes(folder: Path) -> None:
+def test_feetech_servos_hold_while_host_is_frozen(folder: Path) -> None:
     """The host's process gets SIGSTOP for 1.5 s, three times its longest pause."""
-    ended = run(
+    result = run_scenario(
         folder, "--fault", "freeze:host@0.5-2", "--duration", "5", "--out", str(folder / "frozen")
     )
     record = RunRecord.load(folder / "frozen").host
-    assert record.armed_ticks > 5, "it was armed when it was frozen"
-    assert ended.code == 1 and record.lifecycle == "fault", ended.printed
-    alone = {fault.joint for fault in record.faults if "held its last angle" in fault.cause}
-    assert len(alone) == 4, record.faults
+    assert record.armed_ticks > 5, "the robot was not armed before the freeze"
+    assert result.code == 1, result.printed
+    assert record.lifecycle == "fault", result.printed
+    holding_joints = {
+        fault.joint for fault in record.faults if "held its last angle" in fault.cause
+    }
+    assert len(holding_joints) == 4, record.faults
     assert scan_torques(folder) == ["off"] * 4
 
 
-def test_servos_keep_their_torque_when_host_is_killed_and_the_next_start_switches_it_off(
+def test_feetech_servos_of_killed_host_hold_until_next_start(
     folder: Path,
 ) -> None:
     endpoint = find_free_endpoint()
@@ -132,13 +135,14 @@ def test_servos_keep_their_torque_when_host_is_killed_and_the_next_start_switche
             60.0,
         )
         status = snakesim("status", *network, cwd=folder)
-        assert UNGUARDED in status.out, status.printed
+        assert NO_WATCHDOG_WARNING in status.out, status.printed
         host.send_signal(signal.SIGKILL)
         host.wait(10)
-        assert scan_torques(folder) == ["on"] * 4, "this is what a missing watchdog means"
+        # Nothing disables servos without a watchdog.
+        assert scan_torques(folder) == ["on"] * 4
     finally:
         for program in programs:
             program.terminate()
             program.wait(10)
-    assert run(folder, "--duration", "1").code == 0
+    assert run_scenario(folder, "--duration", "1").code == 0
     assert scan_torques(folder) == ["off"] * 4

@@ -1,4 +1,4 @@
-"""`snakesim drive qualify` with a person, who reads its questions in a terminal and acts on the drive."""
+"""`snakesim drive qualify` asks a person, who answers in a terminal and acts on the drive."""
 
 import time
 from pathlib import Path
@@ -36,16 +36,18 @@ TITLES = {step.key: step.title for step in STEPS}
 
 
 def get_verdicts(record: Record) -> dict[str, str]:
+    """Return the verdict of each step."""
     return {step.key: step.verdict for step in record.steps}
 
 
 def skip_all_but(*kept: str) -> dict[str, Answer]:
+    """Return answers that skip all steps except these."""
     return {title: skip_step for key, title in TITLES.items() if key not in kept}
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_person_confirms_every_step_of_a_drive(tmp_path: Path):
+def test_qualification_by_person_confirms_every_step(tmp_path: Path):
     with (
         emulated_drive_on_bench(tmp_path, "odrive") as bench,
         running_qualification(tmp_path, bench) as terminal,
@@ -58,7 +60,7 @@ def test_person_confirms_every_step_of_a_drive(tmp_path: Path):
 
 
 @pytest.mark.timeout(300)
-def test_interrupted_qualification_continues_and_asks_what_is_unknown_again(tmp_path: Path):
+def test_interrupted_qualification_by_person_continues_with_unknown_steps(tmp_path: Path):
     with emulated_drive_on_bench(tmp_path, "odrive") as bench:
         with running_qualification(tmp_path, bench) as terminal:
             answer_until(terminal, "Block the shaft: hold", {TITLES["limits"]: skip_step})
@@ -67,16 +69,17 @@ def test_interrupted_qualification_continues_and_asks_what_is_unknown_again(tmp_
             assert terminal.end() == 130
             bench.assert_stays_off()
             assert "continues with this step" in terminal.printed
-        before = get_verdicts(terminal.read_progress())
+        progress_verdicts = get_verdicts(terminal.read_progress())
         confirmed = dict.fromkeys(STEP_KEYS[:4], "confirmed")
-        assert before == {**confirmed, "limits": "unknown"}
+        assert progress_verdicts == {**confirmed, "limits": "unknown"}
         with running_qualification(tmp_path, bench) as terminal:
             answer_until(terminal, "", skip_all_but("limits", "torque", "supply", "estop_key"))
             assert terminal.end() == 1, terminal.printed
             assert terminal.printed.count("done before") == 3
     record = read_record(terminal.folder / RECORD)
-    carried_out = dict.fromkeys((*STEP_KEYS[:5], "supply", "estop_key"), "confirmed")
-    assert get_verdicts(record) == {**dict.fromkeys(STEP_KEYS, "unknown"), **carried_out}
+    all_unknown = dict.fromkeys(STEP_KEYS, "unknown")
+    answered = dict.fromkeys((*STEP_KEYS[:5], "supply", "estop_key"), "confirmed")
+    assert get_verdicts(record) == {**all_unknown, **answered}
     assert [step.key for step in record.steps] == STEP_KEYS
     assert {step.caused_by for step in record.steps} == {"operator"}
     assert len(record.confirmations) == 3
@@ -86,7 +89,7 @@ def test_interrupted_qualification_continues_and_asks_what_is_unknown_again(tmp_
 
 
 @pytest.mark.timeout(300)
-def test_no_is_refuted_and_not_known_or_skipped_is_unknown(tmp_path: Path):
+def test_qualification_answer_no_is_refuted_and_skipped_is_unknown(tmp_path: Path):
     answers: dict[str, Answer] = {
         **skip_all_but("identity", "motion", "unplug"),
         SHAFT_TURNED: lambda _terminal, _question: "n\n",
@@ -99,8 +102,8 @@ def test_no_is_refuted_and_not_known_or_skipped_is_unknown(tmp_path: Path):
         answer_until(terminal, "", answers)
         assert terminal.end() == 1, terminal.printed
     record = read_record(terminal.folder / RECORD)
-    expected = dict.fromkeys(STEP_KEYS, "unknown")
-    assert get_verdicts(record) == {**expected, "identity": "confirmed", "motion": "refuted"}
+    all_unknown = dict.fromkeys(STEP_KEYS, "unknown")
+    assert get_verdicts(record) == {**all_unknown, "identity": "confirmed", "motion": "refuted"}
     assert record.verdict == "refuted"
     claims = {claim.id: claim.verdict for claim in record.claims}
     assert claims["si-units"] == "refuted"
@@ -112,7 +115,7 @@ def test_no_is_refuted_and_not_known_or_skipped_is_unknown(tmp_path: Path):
     assert not skipped.checks
 
 
-def test_nothing_starts_until_the_person_confirms_that_it_is_safe(tmp_path: Path):
+def test_qualification_starts_only_after_person_confirms_safety(tmp_path: Path):
     with emulated_drive_on_bench(tmp_path, "odrive") as bench:
         for confirmation in ("n\n", ENTER):
             with running_qualification(tmp_path, bench) as terminal:
@@ -124,7 +127,7 @@ def test_nothing_starts_until_the_person_confirms_that_it_is_safe(tmp_path: Path
         assert not any(state.is_enabled for state in bench.drive.read_log())
 
 
-def test_closed_terminal_in_the_middle_of_a_motion_stops_the_motor(tmp_path: Path):
+def test_qualification_whose_terminal_is_closed_stops_the_motor(tmp_path: Path):
     with emulated_drive_on_bench(tmp_path, "odrive") as bench:
         with running_qualification(tmp_path, bench) as terminal:
             answer_until(terminal, READY, {})
@@ -141,7 +144,7 @@ def test_closed_terminal_in_the_middle_of_a_motion_stops_the_motor(tmp_path: Pat
         assert list(get_verdicts(terminal.read_progress())) == STEP_KEYS[:2]
 
 
-def test_end_of_input_stops_the_motor_and_keys_typed_early_answer_nothing(tmp_path: Path):
+def test_qualification_ignores_early_keys_and_stops_at_end_of_input(tmp_path: Path):
     with emulated_drive_on_bench(tmp_path, "odrive") as bench:
         with running_qualification(tmp_path, bench) as terminal:
             answer_until(terminal, READY, {})

@@ -1,4 +1,4 @@
-"""Drives that home for some seconds, in real time and with real processes."""
+"""Drives that need some seconds to home delay arming, in real time and with real processes."""
 
 from pathlib import Path
 
@@ -7,13 +7,13 @@ from snakesim_testing.harness.command import RunningCommand, running_snakesim
 from snakesim_testing.harness.wait import wait_until
 
 BACKEND = f"{homing_drives.__file__}:HomingBackend"
-IN_REAL_TIME = ("--clock-mode", "realtime", "--duration", "0.5")
+REALTIME_OPTIONS = ("--clock-mode", "realtime", "--duration", "0.5")
 
 
-def test_status_names_the_start_up_step_until_the_robot_is_armed(tmp_path: Path) -> None:
-    homing = ("--set", "backend.homing_s=20", "--set", "backend.watchdog_s=0.5")
+def test_status_of_homing_drives_names_start_up_step(tmp_path: Path) -> None:
+    homing_options = ("--set", "backend.homing_s=20", "--set", "backend.watchdog_s=0.5")
     with running_snakesim(
-        tmp_path / "run", "triplet", "--backend", BACKEND, *homing, *IN_REAL_TIME
+        tmp_path / "run", "triplet", "--backend", BACKEND, *homing_options, *REALTIME_OPTIONS
     ) as run:
         answer = wait_until(lambda: find_step(run), "status names the step")
         assert "joint_1 (drive 1): homing, " in answer

@@ -1,4 +1,4 @@
-"""Wrong files and flags: one clear error, exit code 2, nothing started, nothing left."""
+"""Invalid files and options cause one clear error and exit code 2; no process starts, and no file remains."""
 
 import os
 import shlex
@@ -16,17 +16,19 @@ SCENARIO = Path("snakesim_hal/shipped/scenarios/triplet.toml").resolve()
 
 TABLE = tomllib.loads(Path(__file__).with_name("refusals.toml").read_text())
 RUN = ("run", "--out", "run")
-WRONG: dict[str, list[str]] = {
-    **{name: [*RUN, "triplet", "--set", flag] for name, flag in TABLE["set"].items()},
-    **{name: [*RUN, *typed.split()] for name, typed in TABLE["arguments"].items()},
-    **{name: shlex.split(typed) for name, typed in TABLE["commands"].items()},
+INVALID_COMMANDS: dict[str, list[str]] = {
+    **{name: [*RUN, "triplet", "--set", option] for name, option in TABLE["set"].items()},
+    **{name: [*RUN, *arguments.split()] for name, arguments in TABLE["arguments"].items()},
+    **{name: shlex.split(command) for name, command in TABLE["commands"].items()},
     "50,000 parts": [*RUN, "triplet", "--set", ".".join("a" * 50_000) + "=1"],
 }
-HAS_A_LIST = ("too much for the bus", "typo: key")  # in its answer: a line a sum, and a line a key
+# The errors of these cases have several lines: one for each part of a sum, or for each valid key.
+CASES_WITH_A_LIST = ("too much for the bus", "typo: key")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Provide a folder with the invalid files that the commands name."""
     tmp_path = tmp_path_factory.mktemp("wrong")
     scenario = SCENARIO.read_text()
     (tmp_path / "broken.toml").write_text("robot = \n")
@@ -63,20 +65,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def list_files(folder: Path) -> set[Path]:
-    """Return what is in a folder, without the bytecode of a controller file that was read."""
+    """Return the files in a folder, except the bytecode of a controller file that was read."""
     return {path for path in folder.iterdir() if path.name != "__pycache__"}
 
 
-@pytest.mark.parametrize("wrong", WRONG)
-def test_one_clear_error_and_nothing_started(
-    folder: Path, wrong: str, messages: StoredMessages
+@pytest.mark.parametrize("case", INVALID_COMMANDS)
+def test_command_with_invalid_input_prints_one_error_and_starts_nothing(
+    folder: Path, case: str, messages: StoredMessages
 ) -> None:
-    before = list_files(folder)
-    ended = snakesim(*WRONG[wrong], cwd=folder)
-    assert ended.code == 2, ended.out + ended.err
-    assert ended.out == ""
-    assert ended.err.startswith("snakesim")
-    assert "Traceback" not in ended.err
-    assert ended.err.count("\n") == 1 or wrong in HAS_A_LIST, ended.err
-    messages.check(ended.err.rstrip("\n"))
-    assert list_files(folder) == before
+    files_before = list_files(folder)
+    result = snakesim(*INVALID_COMMANDS[case], cwd=folder)
+    assert result.code == 2, result.out + result.err
+    assert result.out == ""
+    assert result.err.startswith("snakesim")
+    assert "Traceback" not in result.err
+    assert result.err.count("\n") == 1 or case in CASES_WITH_A_LIST, result.err
+    messages.check(result.err.rstrip("\n"))
+    assert list_files(folder) == files_before

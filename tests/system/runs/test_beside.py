@@ -1,4 +1,4 @@
-"""Control beside the driver: the same commands as from a process of its own, and what a bad controller can do there."""
+"""Control in the host's process sends the same commands as in its own process; a bad controller stops its robot."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ from snakesim_testing.runs.command import run_to_summary, running_snakesim
 
 pytestmark = pytest.mark.e2e
 
-BESIDE = ("--set", "services.control.process=host")
-# 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
+CONTROL_IN_HOST = ("--set", "services.control.process=host")
+# 50 Hz has the longest lease, 100 ms: a busy test machine may pause a process for 50 ms.
 REALTIME = (
     "triplet",
     "--clock-mode",
@@ -21,51 +21,49 @@ REALTIME = (
     "rate_hz=50",
     "--duration",
     "60",
-    *BESIDE,
+    *CONTROL_IN_HOST,
 )
 
 
 @pytest.mark.slow
-def test_it_drives_the_motors_alike(tmp_path: Path) -> None:
-    """As in a process of its own, and as in the one of all: test_in_process.py."""
+def test_control_in_host_process_sends_the_same_commands(tmp_path: Path) -> None:
     arguments = ("triplet", "--duration", "2", "--clock-mode", "lockstep")
-    _, apart = command.run_to_summary(tmp_path / "apart", *arguments)
-    ended, beside = run_to_summary(tmp_path / "beside", *arguments, *BESIDE)
-    assert ended.code == 0
-    assert beside.command_digest == apart.command_digest
+    _, in_process = command.run_to_summary(tmp_path / "apart", *arguments)
+    result, in_host = run_to_summary(tmp_path / "beside", *arguments, *CONTROL_IN_HOST)
+    assert result.code == 0
+    assert in_host.command_digest == in_process.command_digest
 
 
-@pytest.mark.slow  # tests/unit/gnc/control/service/test_guarded.py, and a stop while it hangs below
+@pytest.mark.slow  # quicker tests: tests/unit/gnc/control/service/test_guarded.py
 @pytest.mark.parametrize(
-    ("backend", "deed", "words"),
+    ("backend", "failure", "message"),
     [
         pytest.param("sim", "raises", "update() raised ZeroDivisionError", marks=pytest.mark.slow),
-        pytest.param(
-            "can", "hangs", "lease of control expired", marks=pytest.mark.slow
-        ),  # below, with --stay
+        pytest.param("can", "hangs", "lease of control expired", marks=pytest.mark.slow),
         pytest.param("sim", "spins", "lease of control expired", marks=pytest.mark.slow),
         ("can", "dies", "host ended with exit code 0"),
     ],
 )
-def test_a_bad_controller_stops_its_robot(
-    tmp_path: Path, backend: str, deed: str, words: str
+def test_control_in_host_with_failing_controller_ends_run(
+    tmp_path: Path, backend: str, failure: str, message: str
 ) -> None:
-    (tmp_path / "bad.py").write_text(BAD.replace("%s", deed))
-    given = (*REALTIME, "--controller", "./bad.py:Controller", "--backend", backend)
-    ended, summary = run_to_summary(tmp_path / "out", *given)
-    assert ended.code == 1 and words in ended.out + summary.ended and summary.duration_s < 60, (
-        ended.out
-    )
+    (tmp_path / "bad.py").write_text(BAD.replace("%s", failure))
+    arguments = (*REALTIME, "--controller", "./bad.py:Controller", "--backend", backend)
+    result, summary = run_to_summary(tmp_path / "out", *arguments)
+    assert result.code == 1, result.out
+    assert message in result.out + summary.ended, result.out
+    assert summary.duration_s < 60, result.out
 
 
-def test_a_stop_is_answered_while_it_hangs(tmp_path: Path) -> None:
+def test_host_obeys_estop_while_its_controller_hangs(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "hangs"))
     with running_snakesim(
         tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay"
     ) as run:
         run.wait_for("lease of control expired")
         stopped = command.run_command_for_robot(run, "estop")
-        assert stopped.code == 0 and "planar13: stopped" in stopped.out, stopped.out + stopped.err
+        assert stopped.code == 0, stopped.out + stopped.err
+        assert "planar13: stopped" in stopped.out
         assert "estop" in command.run_command_for_robot(run, "status", "--json").out
 
 
@@ -77,8 +75,8 @@ def test_failed_service_is_restarted_and_waits_for_arming(tmp_path: Path) -> Non
     ) as run:
         run.wait_for("fault: ")
 
-        def armed() -> bool:
-            asked = (("robot", "reset"), ("robot", "arm", "planar13", "sim"))
-            return [command.run_command_for_robot(run, *one).code for one in asked][-1] == 0
+        def reset_and_arm() -> bool:
+            command.run_command_for_robot(run, "robot", "reset")
+            return command.run_command_for_robot(run, "robot", "arm", "planar13", "sim").code == 0
 
-        wait_until(armed, "a robot that is armed again")
+        wait_until(reset_and_arm, "the robot is armed again")

@@ -1,4 +1,4 @@
-"""What joints can do and measure: what needs no more runs. Who says that it needs more is refused: refusals.toml."""
+"""Controllers run on drives with few modes and measurements if they need no others (refusals: refusals.toml)."""
 
 from snakesim_gnc.control.hold import HoldPose
 from snakesim_gnc.control.service.guarded import GuardedController
@@ -11,15 +11,15 @@ from snakesim_operator.run.in_process import simulate
 from snakesim_testing.hal.small_robots import make_joint_state
 from snakesim_testing.messages import raises_error
 
-SERVOS = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
+POSITION_SERVOS = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
 
 
 def test_position_servos_without_measurements_run_undemanding_controllers() -> None:
-    sets = ("controller=lateral_undulation", "duration_s=2", *SERVOS)
-    result = simulate(load_scenario("peg_row", [parse_set_option(text) for text in sets]).config)
+    options = ("controller=lateral_undulation", "duration_s=2", *POSITION_SERVOS)
+    result = simulate(load_scenario("peg_row", [parse_set_option(text) for text in options]).config)
     assert result.summary.ended == "complete"
     assert (result.summary.path_distance_m or 0.0) > 0.1
-    assert not result.record.torque_nm.any(), "what is not measured is not told"
+    assert not result.record.torque_nm.any(), "a torque that is not measured is reported"
     assert set(result.record.mode.flat) <= {JointMode.PASSIVE, JointMode.POSITION}
 
 
@@ -30,7 +30,7 @@ def test_controller_without_declared_needs_is_named_at_first_command() -> None:
             command.setpoints.mode[1] = JointMode.TORQUE
             return command
 
-    config = load_scenario("triplet", [parse_set_option(text) for text in SERVOS]).config
+    config = load_scenario("triplet", [parse_set_option(text) for text in POSITION_SERVOS]).config
     robot = describe_robot(
         config.robot, backend="sim", period_ns=10**7, lease_ns=10**8, config_hash="0"
     )

@@ -1,4 +1,4 @@
-"""What happens when a part dies, a person presses Ctrl-C, or the supervisor itself is killed."""
+"""A controller that dies, answers wrongly or is too slow stops the robot, and the run names it as the cause."""
 
 import os
 import re
@@ -22,50 +22,53 @@ from snakesim_testing.runs.command import (
 
 pytestmark = pytest.mark.e2e
 
-LONG = ["triplet", "--controller", "hold", "--duration", "600"]
+LONG_RUN = ["triplet", "--controller", "hold", "--duration", "600"]
 
 
 @pytest.mark.parametrize(
     "clock_mode", [pytest.param("lockstep", marks=pytest.mark.slow), "realtime"]
 )
-def test_killed_controller_leads_to_safe_joints_and_failed_run(
+def test_killed_controller_leads_to_damped_joints_and_failed_run(
     tmp_path: Path, clock_mode: str
 ) -> None:
-    with running_armed_snakesim(tmp_path / "run", *LONG, "--clock-mode", clock_mode) as run:
+    with running_armed_snakesim(tmp_path / "run", *LONG_RUN, "--clock-mode", clock_mode) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
             statuses = session.declare_reader(keys.STATUS, RobotStatus)
             wait_until(lambda: bool(statuses.drain()), "a status")
             os.kill(run.part("control"), signal.SIGKILL)
             wait_until(
-                lambda: any("lease of control expired" in one.reason for one in statuses.drain()),
-                "the reason",
+                lambda: any(
+                    "lease of control expired" in status.reason for status in statuses.drain()
+                ),
+                "the reason in the status",
             )
         assert run.end() == 1
-    # A busy computer may see any of them first.
+    # On a busy computer either fault may be the first.
     faults = {fault.what: fault for fault in read_summary(run.out).faults}
     assert set(faults) == {"service_lost", "lease_expired"}
-    lost, expired = faults["service_lost"], faults["lease_expired"]
+    lost = faults["service_lost"]
+    expired = faults["lease_expired"]
     record = RunRecord.load(tmp_path / "run")
     lease_ticks = round(record.description.lease_ns / record.config.period_ns)
     assert expired.tick - lost.tick <= lease_ticks + 2
     last_commanded = int(np.flatnonzero((record.mode == JointMode.POSITION).any(axis=1))[-1])
-    after = record.mode[last_commanded + 1 :]
-    assert len(after) > 50
-    assert (after == JointMode.VELOCITY).all()
-    assert (record.target[last_commanded + 1 :] == 0).all()  # damped
-    told_later = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
-    assert told_later.code == 1
-    assert "lease of control expired" in told_later.out
+    modes_after = record.mode[last_commanded + 1 :]
+    targets_after = record.target[last_commanded + 1 :]
+    assert len(modes_after) > 50
+    # The joints are damped.
+    assert (modes_after == JointMode.VELOCITY).all()
+    assert (targets_after == 0).all()
+    status = snakesim("status", "--endpoint", run.endpoint, cwd=tmp_path)
+    assert status.code == 1
+    assert "lease of control expired" in status.out
 
 
 @pytest.mark.slow  # tests/unit/gnc/control/service/test_guarded.py has each wrong answer
 @pytest.mark.parametrize(
     "clock_mode", ["realtime", pytest.param("lockstep", marks=pytest.mark.slow)]
 )
-def test_a_controller_that_answers_wrongly_is_named_at_once(
-    tmp_path: Path, clock_mode: str
-) -> None:
-    """`tests/unit/gnc/control/service/test_guarded.py` has the other wrong answers."""
+def test_controller_with_invalid_command_is_named_at_once(tmp_path: Path, clock_mode: str) -> None:
+    """Other invalid commands: tests/unit/gnc/control/service/test_guarded.py."""
     (tmp_path / "wave.py").write_text(
         "from snakesim_hal.controller import ControllerCommand, RequestedSetpoints\n"
         "from snakesim_gnc.control.hold import HoldPose\n"
@@ -78,26 +81,26 @@ def test_a_controller_that_answers_wrongly_is_named_at_once(
         "        return ControllerCommand(RequestedSetpoints([JointMode.POSITION] * len(angles), angles, [7.0] * 13))\n"
     )
     flags = ["--controller", "./wave.py:Wave", "--clock-mode", clock_mode, "--duration", "60"]
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
-    said = (
+    result, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    message = (
         "controller ./wave.py:Wave (class Wave): RequestedSetpoints.mode has 12 values, must have 13: one a joint, "
         "joint_1 to joint_13"
     )
-    assert ended.code == 1
-    assert summary.duration_s < 5.0  # not after the time that a stalled service is given
-    assert summary.ended.startswith(f"control ended with exit code 1: {said}")
-    assert f"fault: control ended with exit code 1: {said}" in ended.out
+    assert result.code == 1
+    assert summary.duration_s < 5.0  # the run does not wait as long as for a stalled service
+    assert summary.ended.startswith(f"control ended with exit code 1: {message}")
+    assert f"fault: control ended with exit code 1: {message}" in result.out
     assert summary.last_reason is not None
-    assert summary.last_reason.startswith(said)
+    assert summary.last_reason.startswith(message)
     assert (
         (tmp_path / "run" / "control.log")
         .read_text()
         .splitlines()[-1]
-        .startswith(f"snakesim control: {said}")
+        .startswith(f"snakesim control: {message}")
     )
 
 
-@pytest.mark.slow  # tests/system/host/test_control_service.py has what control reports of it
+@pytest.mark.slow  # a quicker test: tests/system/host/test_control_service.py
 def test_slow_controller_is_named_as_cause_of_stop(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(
         "import time\n\n"
@@ -108,8 +111,8 @@ def test_slow_controller_is_named_as_cause_of_stop(tmp_path: Path) -> None:
         "        return super().update(observation)\n"
     )
     flags = ["--controller", "./slow.py:Slow", "--clock-mode", "realtime", "--duration", "10"]
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
-    assert ended.code == 1
+    result, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert result.code == 1
     assert re.match(
         r"control: update\(\) took \d\d\d ms of 10 ms; lease of control expired", summary.ended
     )

@@ -1,4 +1,4 @@
-"""Faults on request in runs of one process, planned with a flag. Those that are refused are in refusals.toml."""
+"""Faults that are planned with `--fault` occur in runs of one process (faults that are refused: refusals.toml)."""
 
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from snakesim_hal.wire.messages import JointMode
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_testing.runs.in_process_command import run_to_summary, snakesim
 
-MAY_LOSE_ONE = "robot.safety.max_isolated_joints=1"
+MAX_ONE_ISOLATED_JOINT = "robot.safety.max_isolated_joints=1"
 slow = partial(pytest.param, marks=pytest.mark.slow)
 
 
@@ -43,16 +43,17 @@ slow = partial(pytest.param, marks=pytest.mark.slow)
 def test_planned_fault_occurs_at_its_tick_and_ends_run(
     tmp_path: Path, backend: str, fault: str, what: str
 ) -> None:
-    robot = ("--set", "robot=planar13_mixed") if backend == "mixed" else ()
-    ended, summary = run_to_summary(
-        tmp_path / "run", "triplet", "--backend", backend, *robot, "--fault", fault
+    robot_option = ("--set", "robot=planar13_mixed") if backend == "mixed" else ()
+    result, summary = run_to_summary(
+        tmp_path / "run", "triplet", "--backend", backend, *robot_option, "--fault", fault
     )
     record = RunRecord.load(tmp_path / "run").host
-    by = 112 if what == "drive_fault" else 104  # a heartbeat of 10 Hz later
-    assert ended.code == 1
+    # A drive reports its own fault in its heartbeat of 10 Hz.
+    last_tick = 112 if what == "drive_fault" else 104
+    assert result.code == 1
     assert summary.faults[0].what == what
     assert record.injected[0].startswith(f"tick 100: {fault} ")
-    assert 100 <= record.faults[0].tick <= by
+    assert 100 <= record.faults[0].tick <= last_tick
     assert record.lifecycle == "fault"
 
 
@@ -68,23 +69,27 @@ def test_isolated_joint_is_passive_while_run_continues(tmp_path: Path, backend: 
         "--duration",
         "1.5",
         "--set",
-        MAY_LOSE_ONE,
+        MAX_ONE_ISOLATED_JOINT,
     ]
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
-    assert ended.code == 0 and summary.ended == "complete" and summary.duration_s == 1.5, ended.out
+    result, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert result.code == 0, result.out
+    assert summary.ended == "complete", result.out
+    assert summary.duration_s == 1.5, result.out
     assert summary.isolated == ["joint_5"]
     assert summary.faults[0].joint == "joint_5"
-    assert "isolated              joint_5: failed, and passive since" in ended.out
-    left = RunRecord.load(tmp_path / "run")
-    modes, limits = left.mode, left.torque_limit_nm
-    before, after = slice(50, 95), slice(106, 150)
-    assert (modes[before, 4] == JointMode.POSITION).all()
-    assert (modes[after, 4] == JointMode.PASSIVE).all()
-    assert (limits[after, 4] == 0.0).all()
-    assert (np.delete(modes, 4, axis=1)[after] != JointMode.PASSIVE).all()
+    assert "isolated              joint_5: failed, and passive since" in result.out
+    record = RunRecord.load(tmp_path / "run")
+    joint_5 = 4  # its index
+    ticks_before = slice(50, 95)
+    ticks_after = slice(106, 150)
+    assert (record.mode[ticks_before, joint_5] == JointMode.POSITION).all()
+    assert (record.mode[ticks_after, joint_5] == JointMode.PASSIVE).all()
+    assert (record.torque_limit_nm[ticks_after, joint_5] == 0.0).all()
+    modes_of_others = np.delete(record.mode, joint_5, axis=1)
+    assert (modes_of_others[ticks_after] != JointMode.PASSIVE).all()
 
 
-def test_the_list_is_there_without_a_robot(tmp_path: Path) -> None:
-    ended = snakesim("fault", "list", cwd=tmp_path)
-    assert ended.code == 0
-    assert "undervoltage" in ended.out
+def test_fault_list_is_printed_without_a_robot(tmp_path: Path) -> None:
+    result = snakesim("fault", "list", cwd=tmp_path)
+    assert result.code == 0
+    assert "undervoltage" in result.out

@@ -1,4 +1,4 @@
-"""Faults on request in runs of real processes: planned with a flag, asked for with the command, and refused."""
+"""Faults are injected into runs of real processes: planned with an option, requested by a command, or refused."""
 
 from pathlib import Path
 
@@ -13,22 +13,22 @@ from snakesim_testing.runs.in_process_command import run_command_for_robot
 pytestmark = pytest.mark.e2e
 
 
-@pytest.mark.slow  # rows of the fault table
+@pytest.mark.slow  # the fault table measures these faults, too
 @pytest.mark.parametrize(
     ("backend", "clock_mode"),
     [pytest.param("can", "lockstep", marks=pytest.mark.slow), ("sim", "realtime")],
 )
-def test_a_fault_that_is_no_danger_disturbs_nothing(
+def test_harmless_faults_do_not_disturb_the_run(
     tmp_path: Path, backend: str, clock_mode: str
 ) -> None:
-    """Messages that come twice are what networks do; a simulator that takes its time is no reason to stop."""
+    """A network may deliver messages twice, and a slow simulator is no reason to stop."""
     faults = [
         "duplicate:actuator/joints@0.5-1.5",
         "duplicate:sensor/joints@0.5-1.5",
         "slow:simulator@1-1.2=0.5",
     ]
-    flags = [word for fault in faults for word in ("--fault", fault)]
-    ended, _ = run_to_summary(
+    fault_options = [argument for fault in faults for argument in ("--fault", fault)]
+    result, _ = run_to_summary(
         tmp_path / "run",
         "triplet",
         "--backend",
@@ -37,13 +37,16 @@ def test_a_fault_that_is_no_danger_disturbs_nothing(
         "2",
         "--clock-mode",
         clock_mode,
-        *flags,
+        *fault_options,
     )
     record = RunRecord.load(tmp_path / "run").host
-    assert ended.code == 0
+    assert result.code == 0
     assert record.armed_ticks == 200
     replayed = record.rejected_commands["replayed"]
-    assert replayed == 100 if clock_mode == "lockstep" else 90 <= replayed <= 110
+    if clock_mode == "lockstep":
+        assert replayed == 100
+    else:
+        assert 90 <= replayed <= 110
     assert [text.partition(": ")[2] for text in record.injected] == [
         "duplicate:sensor/joints@0.5-1.5=1 begins",
         "slow:simulator@1-1.2=0.5 begins",
@@ -53,7 +56,7 @@ def test_a_fault_that_is_no_danger_disturbs_nothing(
 
 
 @pytest.mark.parametrize("backend", ["can", pytest.param("sim", marks=pytest.mark.slow)])
-def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> None:
+def test_fault_requested_by_command_is_injected_or_refused(tmp_path: Path, backend: str) -> None:
     arguments = [
         "triplet",
         "--controller",
@@ -66,12 +69,8 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
         backend,
     ]
     with running_armed_snakesim(tmp_path / "run", *arguments) as run:
-        result = run_command_for_robot(
-            run,
-            "fault",
-            "inject",
-            *(("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")),
-        )
+        unsupported = ("leak", "joint_3") if backend == "sim" else ("diverge", "simulator")
+        result = run_command_for_robot(run, "fault", "inject", *unsupported)
         assert result.code == 1
         assert f"backend '{backend}' cannot do" in result.err
         result = run_command_for_robot(run, "fault", "inject", "mute", "joint_99")
@@ -80,42 +79,40 @@ def test_a_fault_is_asked_for_with_a_command(tmp_path: Path, backend: str) -> No
         result = run_command_for_robot(
             run, "fault", "inject", "drop", "guidance/world", "--amount", "0.2", "--duration", "0.5"
         )
-        assert result.code == 0 and result.out.startswith(
-            "drop of guidance/world has begun, at "
-        ), result.err
+        assert result.code == 0, result.err
+        assert result.out.startswith("drop of guidance/world has begun, at ")
         result = run_command_for_robot(
             run, "fault", "inject", "mute", "joint_3", "--duration", "30"
         )
-        assert result.code == 0 and result.out.startswith("mute of joint_3 has begun, at "), (
-            result.err
-        )
+        assert result.code == 0, result.err
+        assert result.out.startswith("mute of joint_3 has begun, at ")
         assert run.end() == 1
     record = RunRecord.load(tmp_path / "run").host
     assert record.faults[0].joint in (None, "joint_3")
     assert "joint_3" in record.faults[0].cause
     assert "mute:joint_3@" in record.injected[0]
-    said = (tmp_path / "run" / "guidance.log").read_text()
-    assert "drop:guidance/world@" in said
-    assert "begins" in said
+    guidance_log = (tmp_path / "run" / "guidance.log").read_text()
+    assert "drop:guidance/world@" in guidance_log
+    assert "begins" in guidance_log
 
 
-@pytest.mark.slow  # a row of the fault table
-def test_a_busy_interpreter_loses_the_lease_although_it_is_alive(tmp_path: Path) -> None:
+@pytest.mark.slow  # the fault table measures this fault, too
+def test_control_with_busy_interpreter_loses_its_lease(tmp_path: Path) -> None:
     flags = ["--clock-mode", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
-    ended, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
-    assert ended.code == 1
+    result, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
+    assert result.code == 1
     assert [fault.what for fault in summary.faults] == ["lease_expired"]
     assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
 
 
 @pytest.mark.slow  # the attack on it is in verification/attack
-def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> None:
-    """A backend that does not say that it is emulated counts as real."""
+def test_faults_are_refused_if_backend_may_move_real_motors(tmp_path: Path) -> None:
+    """A backend that does not declare itself emulated counts as real."""
     (tmp_path / "bench.py").write_text(
         "import sys\nfrom pathlib import Path\n\nimport msgspec\n"
         "from snakesim_gnc.control.hold import HoldPose\n"
         "from snakesim_sim_backend.backend import SimBackend\n\n"
-        "def tell(part):\n"
+        "def write_loaded_modules(part):\n"
         "    loaded = [name for name in sys.modules if name.startswith('snakesim_hal.faults.')]\n"
         "    loaded = [name for name in loaded if name != 'snakesim_hal.faults.allowed']\n"
         f"    Path({str(tmp_path)!r}, part).write_text(' '.join(loaded))\n\n"
@@ -124,26 +121,27 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         "        return msgspec.structs.replace(super().describe(), emulated=False)\n"
         "    def advance(self):\n"
         "        super().advance()\n"
-        "        tell('host')\n\n"
-        "class Telling(HoldPose):\n"
+        "        write_loaded_modules('host')\n\n"
+        "class ReportingHold(HoldPose):\n"
         "    def update(self, observation):\n"
-        "        tell('control')\n"
+        "        write_loaded_modules('control')\n"
         "        return super().update(observation)\n"
     )
-    arguments = ["triplet", "--backend", "./bench.py:Bench", "--controller", "./bench.py:Telling"]
+    arguments = ["triplet", "--backend", "./bench.py:Bench"]
+    arguments += ["--controller", "./bench.py:ReportingHold"]
     arguments += ["--clock-mode", "realtime", "--unchecked"]
-    loaded = [tmp_path / part for part in ("host", "control")]
+    loaded_modules_files = [tmp_path / part for part in ("host", "control")]
     with running_armed_snakesim(tmp_path / "run", *arguments, "--duration", "600") as run:
-        for words in (("mute", "joint_3"), ("hang", "control")):
-            result = run_command_for_robot(run, "fault", "inject", *words)
+        for fault in (("mute", "joint_3"), ("hang", "control")):
+            result = run_command_for_robot(run, "fault", "inject", *fault)
             assert result.code == 1
             assert "fault injection is not allowed: something real moves here" in result.err
         run.process.terminate()
         run.end()
-    assert [file.read_text() for file in loaded] == ["", ""], (
-        "no process has the code that carries them out"
+    assert [file.read_text() for file in loaded_modules_files] == ["", ""], (
+        "a process has loaded the code that injects faults"
     )
-    allowed = (
+    allow_options = (
         "--set",
         "allow_fault_injection=true",
         "--duration",
@@ -151,9 +149,10 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         "--out",
         str(tmp_path / "allowed"),
     )
-    snakesim("run", *arguments, *allowed, "--endpoint", find_free_endpoint(), cwd=tmp_path)
-    assert all("snakesim_hal.faults.injector" in file.read_text() for file in loaded)
-    ended = snakesim(
+    snakesim("run", *arguments, *allow_options, "--endpoint", find_free_endpoint(), cwd=tmp_path)
+    for file in loaded_modules_files:
+        assert "snakesim_hal.faults.injector" in file.read_text()
+    result = snakesim(
         "run",
         *arguments,
         "--fault",
@@ -162,6 +161,6 @@ def test_where_something_real_moves_faults_are_not_allowed(tmp_path: Path) -> No
         str(tmp_path / "other"),
         cwd=tmp_path,
     )
-    assert ended.code == 1
-    assert "`faults` are planned, and something real moves here" in ended.out
+    assert result.code == 1
+    assert "`faults` are planned, and something real moves here" in result.out
     wait_until(lambda: not list((tmp_path / "other").glob("host.json")), "no record of it")

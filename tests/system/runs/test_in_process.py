@@ -1,4 +1,4 @@
-"""What `simulate` and `snakesim run --in-process` leave. What they refuse is in refusals.toml."""
+"""`simulate` and `snakesim run --in-process` write the files of a run, and end safely (refusals: refusals.toml)."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ from snakesim_testing.harness.command import SNAKESIM_COMMAND, make_environment
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.in_process_command import snakesim
 
-LEFT = {
+RUN_FILES = {
     BLACK_BOX,
     CONFIG_FILENAME,
     DESCRIPTION,
@@ -31,43 +31,42 @@ LEFT = {
 }
 
 
-def test_the_command_leaves_the_folder_of_a_run(tmp_path: Path) -> None:
+def test_in_process_command_writes_the_files_of_a_run(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    ended = snakesim(
+    result = snakesim(
         "run", "triplet", "--in-process", "--duration", "1", "--out", str(out), cwd=tmp_path
     )
-    assert ended.code == 0, ended.out + ended.err
-    assert {path.name for path in out.iterdir()} == LEFT | {LOG_FILE}
-    assert "in one process" in ended.out
-    assert str(out / REPORT_FILENAME) in ended.out
-    assert not ended.err
+    assert result.code == 0, result.out + result.err
+    assert {path.name for path in out.iterdir()} == RUN_FILES | {LOG_FILE}
+    assert "in one process" in result.out
+    assert str(out / REPORT_FILENAME) in result.out
+    assert not result.err
 
 
 @pytest.mark.parametrize("backend", ["odrive", "dynamixel", "feetech"])
-def test_robot_of_emulated_drives_arms_in_one_process_also_without_torque_sensors(
+def test_in_process_robot_of_emulated_drives_arms_without_torque_sensors(
     backend: str,
 ) -> None:
     """Feetech servos do not measure their torque, although the robot file lists it."""
-    sets = [
+    options = [
         f"backend={backend}",
         f"backends.{backend}.physics_model=inertia",
         "controller=hold",
         "robot.chain.modules=3",
         "duration_s=0.3",
     ]
-    config = load_scenario("joint_check", [parse_set_option(text) for text in sets]).config
+    config = load_scenario("joint_check", [parse_set_option(text) for text in options]).config
     with InProcessRun(config) as run:
         for _ in run.iterate_ticks():
             pass
         assert run.host.authority.arm_session, run.host.build_status().reason
         measures_torque = ["torque" in joint.measures for joint in run.host.description.joints]
     assert measures_torque == [backend != "feetech"] * 3
-    assert [
-        "torque" in joint.drive.measures for joint in run.config.robot.joint_table
-    ] == measures_torque
+    configured = ["torque" in joint.drive.measures for joint in run.config.robot.joint_table]
+    assert configured == measures_torque
 
 
-FAILING = """
+FAILING_CODE = """
 from snakesim_gnc.control.hold import HoldPose
 
 
@@ -80,7 +79,7 @@ class Failing(HoldPose):
 
 
 def test_in_process_controller_error_ends_in_safe_stop(tmp_path: Path) -> None:
-    (tmp_path / "failing.py").write_text(FAILING)
+    (tmp_path / "failing.py").write_text(FAILING_CODE)
     result = simulate(
         load_scenario(
             "triplet", [KeyOverride("controller", f"{tmp_path}/failing.py:Failing", "the test")]
@@ -92,7 +91,7 @@ def test_in_process_controller_error_ends_in_safe_stop(tmp_path: Path) -> None:
     assert result.record.host.lifecycle == "fault"
 
 
-ENDLESS = """
+ENDLESS_CODE = """
 import os
 import os
 import signal
@@ -127,7 +126,7 @@ def test_in_process_controller_that_hangs_ends_in_safe_stop(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("snakesim_hal.programs.single_process.TURN_TIMEOUT_S", 2.0)
-    (tmp_path / "endless.py").write_text(ENDLESS)
+    (tmp_path / "endless.py").write_text(ENDLESS_CODE)
     changes = [
         KeyOverride("controller", "./endless.py:Endless", "the test"),
         parse_set_option("start_limit_s=1"),
@@ -144,11 +143,11 @@ def test_in_process_controller_that_hangs_ends_in_safe_stop(
 @pytest.mark.parametrize(
     "controller", ["Endless", pytest.param("Compiled", marks=pytest.mark.slow)]
 )
-def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(
+def test_in_process_run_with_hanging_controller_ends_on_ctrl_c(
     controller: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "endless.py").write_text(ENDLESS)
-    typed = [
+    (tmp_path / "endless.py").write_text(ENDLESS_CODE)
+    arguments = [
         *SNAKESIM_COMMAND,
         "run",
         "triplet",
@@ -159,7 +158,7 @@ def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(
         "run",
     ]
     with subprocess.Popen(
-        typed,
+        arguments,
         cwd=tmp_path,
         env=make_environment(tmp_path),
         stdout=subprocess.PIPE,
@@ -168,24 +167,24 @@ def test_the_first_ctrl_c_ends_it_whatever_its_controller_does(
     ) as process:
         try:
             wait_until((tmp_path / "begun").exists, "a tick that does not end", 60)
-            began = time.monotonic()
+            start_s = time.monotonic()
             process.send_signal(signal.SIGINT)
-            said = process.communicate(timeout=60)[0]
+            printed, _ = process.communicate(timeout=60)
         finally:
             process.kill()
-    assert process.returncode == 130, said
-    assert time.monotonic() - began < 30
+    assert process.returncode == 130, printed
+    assert time.monotonic() - start_s < 30
     if controller == "Endless":
-        assert "The run ended early: interrupted." in said
+        assert "The run ended early: interrupted." in printed
         assert (tmp_path / "run" / REPORT_FILENAME).is_file()
     else:
         assert (
             "had not returned 3 s after it received the signal to stop; its process was killed"
-            in said
+            in printed
         )
 
 
-def test_ctrl_c_after_the_last_tick_costs_no_report(
+def test_in_process_ctrl_c_after_last_tick_keeps_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def conclude_interrupted(*arguments: Any) -> int:

@@ -1,4 +1,4 @@
-"""The main job, with real processes: it runs, it moves, and it repeats itself, however busy the machine is."""
+"""`snakesim run` with real processes completes in every clock mode, and names a computer that is too slow."""
 
 import os
 import re
@@ -21,11 +21,11 @@ from snakesim_testing.runs.command import (
 pytestmark = pytest.mark.e2e
 
 
-def test_triplet_moves_forward_and_hands_over_backward(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(
+def test_run_of_triplet_moves_forward_with_backward_handovers(tmp_path: Path) -> None:
+    result, summary = run_to_summary(
         tmp_path / "run", "triplet", "--duration", "10", "--clock-mode", "lockstep"
     )
-    assert ended.code == 0, ended.out + ended.err
+    assert result.code == 0, result.out + result.err
     assert summary.path_distance_m is not None
     assert summary.path_distance_m >= 0.5
     joints = [int(name.removeprefix("joint_")) for name in summary.propulsion_joints or []]
@@ -38,19 +38,21 @@ def test_triplet_moves_forward_and_hands_over_backward(tmp_path: Path) -> None:
     assert summary.backend == "sim"
     assert summary.config["scene"]["name"] == "triplet"
     assert (tmp_path / "run" / REPORT_FILENAME).stat().st_size > 20_000
-    assert str(tmp_path / "run" / REPORT_FILENAME) in ended.out
+    assert str(tmp_path / "run" / REPORT_FILENAME) in result.out
 
 
 @contextmanager
-def starved(pid: int) -> Iterator[None]:
-    """A process gets next to nothing of one processor: others need that, and go first."""
+def starving_process(pid: int) -> Iterator[None]:
+    """Give a process almost no processor time: four busy processes with priority share its core."""
     core = max(os.sched_getaffinity(0))
-    spin = f"import os; os.sched_setaffinity(0, {{{core}}})\nwhile True: pass"
-    # Each in a session of its own: where a session has one share, all in one would leave enough to a quiet computer.
+    busy_code = f"import os; os.sched_setaffinity(0, {{{core}}})\nwhile True: pass"
+    # Each has its own session. If the kernel gives every session one share of the processor, a common session
+    # would leave enough time to the process.
     load = [
-        subprocess.Popen([sys.executable, "-c", spin], start_new_session=True) for _ in range(4)
+        subprocess.Popen([sys.executable, "-c", busy_code], start_new_session=True)
+        for _ in range(4)
     ]
-    # Its session has a share of its own, where the kernel is made so.
+    # The session of the process also has a share, if the kernel supports automatic groups.
     group = Path(f"/proc/{pid}/autogroup")
     if group.exists():
         group.write_text("19")
@@ -65,8 +67,8 @@ def starved(pid: int) -> Iterator[None]:
             process.wait()
 
 
-@pytest.mark.slow  # it takes a core from every other test
-def test_slow_computer_is_named_before_expired_lease(tmp_path: Path) -> None:
+@pytest.mark.slow  # the test takes a core from every other test
+def test_run_on_slow_computer_names_it_before_expired_lease(tmp_path: Path) -> None:
     arguments = [
         "triplet",
         "--controller",
@@ -78,7 +80,10 @@ def test_slow_computer_is_named_before_expired_lease(tmp_path: Path) -> None:
         "--set",
         "rate_hz=50",
     ]
-    with running_armed_snakesim(tmp_path / "run", *arguments) as run, starved(run.part("control")):
+    with (
+        running_armed_snakesim(tmp_path / "run", *arguments) as run,
+        starving_process(run.part("control")),
+    ):
         assert run.end() == 1, run.printed()
     ended = read_summary(tmp_path / "run").ended
     assert re.match(rf"{TOO_SLOW}(control|host) waited for a processor for \d+ of \d+ ms", ended), (
@@ -90,9 +95,9 @@ def test_slow_computer_is_named_before_expired_lease(tmp_path: Path) -> None:
 
 @pytest.mark.quiet
 @pytest.mark.parametrize("clock_mode", ["realtime", "free"])
-def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
-    """In these clock modes a lease is one of the wall clock."""
-    # 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
+def test_run_in_realtime_and_free_mode_completes(tmp_path: Path, clock_mode: str) -> None:
+    """In these clock modes a lease expires by the wall clock."""
+    # 50 Hz has the longest lease, 100 ms: a busy test machine may pause a process for 50 ms.
     arguments = [
         "triplet",
         "--controller",
@@ -107,9 +112,10 @@ def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
     # The host waits for nothing, so a recorder that joins late misses ticks.
     if clock_mode == "free":
         arguments.append("--no-record")
-    ended, summary = run_to_summary(tmp_path / "run", *arguments)
+    result, summary = run_to_summary(tmp_path / "run", *arguments)
     assert summary.clock_mode == clock_mode
-    assert ended.code == 0 and summary.ticks == 100, ended.out + ended.err
+    assert result.code == 0, result.out + result.err
+    assert summary.ticks == 100, result.out + result.err
     if clock_mode == "realtime":
         assert summary.overruns or summary.real_time_factor == pytest.approx(1.0, abs=0.05)
         assert summary.state_to_command_us["p50"] is not None
@@ -119,8 +125,8 @@ def test_other_paces_complete(tmp_path: Path, clock_mode: str) -> None:
 
 
 @pytest.mark.slow  # in one process: test_advance.py
-def test_a_run_in_processes_may_end_with_its_mission(tmp_path: Path) -> None:
-    short = [
+def test_run_until_goal_ends_with_its_mission(tmp_path: Path) -> None:
+    arguments = [
         "--until-goal",
         "--set",
         "mission.goal.distance_m=0.4",
@@ -129,8 +135,8 @@ def test_a_run_in_processes_may_end_with_its_mission(tmp_path: Path) -> None:
         "--clock-mode",
         "lockstep",
     ]
-    ended, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *short)
-    assert ended.code == 0, ended.out + ended.err
+    result, summary = run_to_summary(tmp_path / "run", "surveyed_clutter", *arguments)
+    assert result.code == 0, result.out + result.err
     assert summary.ended == "complete"
     assert 1.0 < summary.duration_s < 7.0
     assert "on request by snakesim run, at the goal" in (tmp_path / "run" / "host.json").read_text()

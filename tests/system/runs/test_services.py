@@ -1,4 +1,4 @@
-"""Services of one's own, in a file: named by path as controllers are, in processes and in one."""
+"""A user's service in a file is named by its path, as controllers are, and runs in every process layout."""
 
 import re
 import subprocess
@@ -26,10 +26,10 @@ from snakesim_testing.runs.documents import REPOSITORY, parse_sections
 pytestmark = pytest.mark.e2e
 
 PAGE = REPOSITORY / "docs" / "how-to" / "write-a-service.md"
-SERVICE = next(
+SERVICE_CODE = next(
     section.files["mocap.py"] for section in parse_sections(PAGE) if "mocap.py" in section.files
 )
-MORE = """
+OTHER_CLASSES_CODE = """
 
 class Another(MotionCapture):
     name = "another"
@@ -46,29 +46,33 @@ class Empty(Service):
 from pathlib import Path
 (Path(__file__).parent / "ran").touch()
 """
-NAMED = "services.sensor.plugin=./lab/mocap.py:MotionCapture"
+SERVICE_OPTION = "services.sensor.plugin=./lab/mocap.py:MotionCapture"
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A robot without a pose sensor, and a service that has one."""
+    """Provide a folder with a robot that has no pose sensor, and a service that publishes the pose."""
     robot = (SHIPPED_FILES_DIR / "robots" / "planar13.toml").read_text()
-    bare = "\n[".join(part for part in robot.split("\n[") if not part.startswith("sensors.pose]"))
-    (tmp_path / "bare.toml").write_text(bare)
+    (tmp_path / "bare.toml").write_text(remove_section(robot, "sensors.pose"))
     (tmp_path / "lab").mkdir()
-    (tmp_path / "lab" / "mocap.py").write_text(SERVICE + MORE)
+    (tmp_path / "lab" / "mocap.py").write_text(SERVICE_CODE + OTHER_CLASSES_CODE)
     return tmp_path
 
 
-SHORT = ["triplet", "--duration", "0.5", "--set", "robot=./bare.toml"]
+def remove_section(toml: str, name: str) -> str:
+    """Return a TOML text without one of its sections."""
+    return "\n[".join(part for part in toml.split("\n[") if not part.startswith(f"{name}]"))
 
 
-def digest_of(
+SHORT_RUN = ["triplet", "--duration", "0.5", "--set", "robot=./bare.toml"]
+
+
+def run_and_return_digest(
     home: Path, out: str, run: Callable[..., tuple[CompletedRun, RunSummary]]
 ) -> str | None:
-    """Of a run in which guidance knows the pose from the service alone."""
-    ended, summary = run(home / out, *SHORT, "--set", NAMED)
-    assert ended.code == 0, ended.out + ended.err
+    """Run with the pose of the service alone, and return the command digest."""
+    result, summary = run(home / out, *SHORT_RUN, "--set", SERVICE_OPTION)
+    assert result.code == 0, result.out + result.err
     recorded = read_recording(home / out / RECORDING_FILENAME, (keys.POSE, keys.WORLD))
     assert set(range(50)) <= recorded.messages_by_tick[keys.POSE].keys()
     assert recorded.streams[keys.WORLD]
@@ -76,12 +80,13 @@ def digest_of(
 
 
 def test_file_service_publishes_pose_in_all_process_layouts(home: Path) -> None:
-    assert digest_of(home, "many", run_to_summary) == digest_of(
-        home, "one", in_process.run_to_summary
-    )
+    digest = run_and_return_digest(home, "many", run_to_summary)
+    digest_in_process = run_and_return_digest(home, "one", in_process.run_to_summary)
+    assert digest == digest_in_process
 
 
-WRONG = {
+# For each case: the named class, and parts of the refusal.
+REFUSED_CLASSES = {
     "no such class": (
         "MotionCaptuer",
         "no 'MotionCaptuer', as in",
@@ -93,31 +98,30 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("wrong", WRONG)
-def test_a_file_without_that_service_is_refused_before_anything_starts(
-    home: Path, wrong: str
-) -> None:
-    name, *words = WRONG[wrong]
-    code = f"services.sensor.plugin=./lab/mocap.py:{name}"
-    ended = in_process.snakesim("run", *SHORT, "--set", code, "--out", "run", cwd=home)
-    assert ended.code == 2
+@pytest.mark.parametrize("case", REFUSED_CLASSES)
+def test_file_service_of_wrong_class_is_refused_before_the_start(home: Path, case: str) -> None:
+    class_name, *expected_parts = REFUSED_CLASSES[case]
+    option = f"services.sensor.plugin=./lab/mocap.py:{class_name}"
+    result = in_process.snakesim("run", *SHORT_RUN, "--set", option, "--out", "run", cwd=home)
+    assert result.code == 2
     assert not (home / "run").exists()
-    assert all(word in ended.err for word in ("./lab/mocap.py", *words)), ended.err
+    for part in ("./lab/mocap.py", *expected_parts):
+        assert part in result.err
 
 
-def test_showing_a_configuration_runs_none_of_its_services(home: Path) -> None:
-    shown = in_process.snakesim("config", "triplet", "--set", NAMED, cwd=home)
-    assert shown.code == 0
+def test_config_command_runs_no_code_of_file_service(home: Path) -> None:
+    result = in_process.snakesim("config", "triplet", "--set", SERVICE_OPTION, cwd=home)
+    assert result.code == 0
     assert not (home / "lab" / "ran").exists()
     assert (
         "services.sensor: not checked, because that would run ./lab/mocap.py:MotionCapture"
-        in shown.out
+        in result.out
     )
 
 
 @pytest.mark.slow
 def test_file_service_starts_alone_by_path_or_name(home: Path) -> None:
-    """It waits for a host, of which there is none, and says under which name."""
+    """The service prints its name while it waits for a host, which the test does not start."""
     for name in ("./lab/mocap.py:MotionCapture", "sensor"):
         command = [
             *SNAKESIM_COMMAND,
@@ -126,7 +130,7 @@ def test_file_service_starts_alone_by_path_or_name(home: Path) -> None:
             name,
             "triplet",
             "--set",
-            NAMED,
+            SERVICE_OPTION,
             "--endpoint",
             find_free_endpoint(),
         ]
@@ -134,12 +138,13 @@ def test_file_service_starts_alone_by_path_or_name(home: Path) -> None:
             command, cwd=home, env=make_environment(home), stderr=subprocess.PIPE, text=True
         ) as service:
             assert service.stderr is not None
-            said = service.stderr.readline()
+            printed = service.stderr.readline()
             service.terminate()
-        assert said.startswith("sensor: waiting for the network")
+        assert printed.startswith("sensor: waiting for the network")
 
 
-MALFORMED = {
+# For each case: a field of the pose that the service publishes, and the error.
+MALFORMED_FIELDS = {
     "number": (
         "position_w=(0.0, float('nan'), 0.0)",
         "Pose.position_w[1] is nan, must be `float` >= -",
@@ -153,20 +158,21 @@ MALFORMED = {
         "(0.5, 0.0, 0.0, 0.0) of norm 0.5, must be a rotation",
     ),
 }
-LOST = """
+# The field replaces `{}`.
+LOST_CODE = """
 
 class Lost(MotionCapture):
     def outputs(self, clock):
-        said = super().outputs(clock)
-        if said is None or clock.lifecycle != "armed":
-            return said
-        return [(key, msgspec.structs.replace(pose, {})) for key, pose in said]
+        outputs = super().outputs(clock)
+        if outputs is None or clock.lifecycle != "armed":
+            return outputs
+        return [(key, msgspec.structs.replace(pose, {})) for key, pose in outputs]
 """
 
 
 @pytest.mark.slow  # the decoders' errors: tests/unit/hal/wire
 @pytest.mark.parametrize(
-    ("clock_mode", "wrong"),
+    ("clock_mode", "case"),
     [
         ("lockstep", "array"),
         ("one", "number"),
@@ -176,41 +182,52 @@ class Lost(MotionCapture):
         ),
     ],
 )
-def test_malformed_message_is_named_in_log_and_run(home: Path, clock_mode: str, wrong: str) -> None:
-    field, words = MALFORMED[wrong]
-    lost = LOST.replace("{}", field)
-    (home / "lab" / "lost.py").write_text(f"import msgspec\nimport numpy as np\n{SERVICE}{lost}")
-    code = [*SHORT, "--duration", "60", "--set", "services.sensor.plugin=./lab/lost.py:Lost"]
+def test_file_service_with_malformed_message_is_named_in_log(
+    home: Path, clock_mode: str, case: str
+) -> None:
+    """The clock mode `one` means a run in one process."""
+    field, error = MALFORMED_FIELDS[case]
+    service_code = LOST_CODE.replace("{}", field)
+    (home / "lab" / "lost.py").write_text(
+        f"import msgspec\nimport numpy as np\n{SERVICE_CODE}{service_code}"
+    )
+    arguments = [
+        *SHORT_RUN,
+        "--duration",
+        "60",
+        "--set",
+        "services.sensor.plugin=./lab/lost.py:Lost",
+    ]
     if clock_mode == "one":
-        ended, summary = in_process.run_to_summary(home / "run", *code)
+        result, summary = in_process.run_to_summary(home / "run", *arguments)
         log = (home / "run" / LOG_FILE).read_text()
     else:
-        ended, summary = run_to_summary(home / "run", *code, "--clock-mode", clock_mode)
+        result, summary = run_to_summary(home / "run", *arguments, "--clock-mode", clock_mode)
         log = (home / "run" / "sensor.log").read_text()
-    assert ended.code == 1
-    assert summary.duration_s < 5.0  # it ends at once
-    said = re.compile(
+    assert result.code == 1
+    assert summary.duration_s < 5.0  # the run ends at once
+    message = re.compile(
         r"service ./lab/lost.py:Lost \(class Lost\): sensor/pose of tick \d+ cannot be published: .*"
-        + re.escape(words)
+        + re.escape(error)
     )
-    assert all(said.search(text) for text in (log, summary.ended, ended.out)), (
-        f"{log}\n{summary.ended}\n{ended.out}"
-    )
+    assert message.search(log), log
+    assert message.search(summary.ended), summary.ended
+    assert message.search(result.out), result.out
 
 
 @pytest.mark.slow
-def test_a_service_that_raises_ends_the_run_with_its_name(home: Path) -> None:
-    lost = LOST.replace("{}", "position_w=1 / 0")
-    (home / "lab" / "lost.py").write_text(f"import msgspec\n{SERVICE}{lost}")
-    code = [*SHORT, "--set", "services.sensor.plugin=./lab/lost.py:Lost"]
-    ended, summary = in_process.run_to_summary(home / "run", *code)
-    said = "(class Lost): outputs() raised ZeroDivisionError: division by zero (lost.py line "
-    assert ended.code == 1
-    assert said in summary.ended
-    assert said in (home / "run" / LOG_FILE).read_text()
+def test_file_service_that_raises_ends_run_with_its_name(home: Path) -> None:
+    service_code = LOST_CODE.replace("{}", "position_w=1 / 0")
+    (home / "lab" / "lost.py").write_text(f"import msgspec\n{SERVICE_CODE}{service_code}")
+    arguments = [*SHORT_RUN, "--set", "services.sensor.plugin=./lab/lost.py:Lost"]
+    result, summary = in_process.run_to_summary(home / "run", *arguments)
+    message = "(class Lost): outputs() raised ZeroDivisionError: division by zero (lost.py line "
+    assert result.code == 1
+    assert message in summary.ended
+    assert message in (home / "run" / LOG_FILE).read_text()
 
 
-SILENT = """
+SILENT_CODE = """
 
 class Silent(MotionCapture):
     def outputs(self, clock):
@@ -220,28 +237,32 @@ class Silent(MotionCapture):
 
 @pytest.mark.slow
 def test_run_names_missing_stream_and_stops_after_stated_time(home: Path) -> None:
-    (home / "lab" / "silent.py").write_text(SERVICE + SILENT)
-    flags = [
-        *SHORT,
+    (home / "lab" / "silent.py").write_text(SERVICE_CODE + SILENT_CODE)
+    arguments = [
+        *SHORT_RUN,
         "--set",
         "services.sensor.plugin=./lab/silent.py:Silent",
         "--set",
         "start_limit_s=3",
     ]
-    ended, summary = run_to_summary(home / "run", *flags)
-    why = "waiting for guidance, which has no sensor/pose yet (mission.localization=dead_reckoning does without"
-    given_up = "not ready to arm within 3 s"
-    for said in (summary.ended, ended.out):
-        assert f"{given_up} (start_limit_s) with every service there: " in said and why in said, (
-            ended.out
-        )
-    assert ended.code == 1
+    result, summary = run_to_summary(home / "run", *arguments)
+    reason = (
+        "waiting for guidance, which has no sensor/pose yet "
+        "(mission.localization=dead_reckoning does without"
+    )
+    timeout = "not ready to arm within 3 s"
+    for text in (summary.ended, result.out):
+        assert f"{timeout} (start_limit_s) with every service there: " in text, result.out
+        assert reason in text, result.out
+    assert result.code == 1
     assert summary.duration_s == 0.0
-    alone = in_process.snakesim("run", *flags, "--in-process", "--out", "one", cwd=home)
-    assert alone.code != 0 and given_up in alone.err and why in alone.err, alone
+    one_process = in_process.snakesim("run", *arguments, "--in-process", "--out", "one", cwd=home)
+    assert one_process.code != 0, one_process
+    assert timeout in one_process.err, one_process
+    assert reason in one_process.err, one_process
 
 
-FROZEN = """
+FROZEN_CODE = """
 
 class Frozen(MotionCapture):
     def outputs(self, clock):
@@ -251,21 +272,18 @@ class Frozen(MotionCapture):
 """
 
 
-def test_control_holds_while_service_repeats_an_old_pose(home: Path) -> None:
-    (home / "lab" / "frozen.py").write_text("import msgspec\n" + SERVICE + FROZEN)
-    code = ["--set", "services.sensor.plugin=./lab/frozen.py:Frozen", "--duration", "1"]
-    ended, summary = in_process.run_to_summary(home / "run", *SHORT, *code)
-    assert ended.code == 0 and summary.pose_from == "sensor", ended.out
+def test_control_holds_while_file_service_repeats_old_pose(home: Path) -> None:
+    (home / "lab" / "frozen.py").write_text("import msgspec\n" + SERVICE_CODE + FROZEN_CODE)
+    options = ["--set", "services.sensor.plugin=./lab/frozen.py:Frozen", "--duration", "1"]
+    result, summary = in_process.run_to_summary(home / "run", *SHORT_RUN, *options)
+    assert result.code == 0, result.out
+    assert summary.pose_from == "sensor", result.out
     assert summary.reported_state == "NotLocomoting"
     assert re.search(r"sensor/pose is 0\.\d+ s old", summary.reported_reason or "")
 
 
-def test_pose_service_alone_makes_no_one_wait_for_contacts(home: Path) -> None:
-    """On a robot whose file has no contact sensors."""
-    robot = (home / "bare.toml").read_text()
-    bare = "\n[".join(
-        part for part in robot.split("\n[") if not part.startswith("sensors.contacts]")
-    )
-    (home / "bare.toml").write_text(bare)
-    ended, _ = in_process.run_to_summary(home / "run", *SHORT, "--set", NAMED)
-    assert ended.code == 0, ended.out
+def test_run_without_contact_sensors_does_not_wait_for_contacts(home: Path) -> None:
+    robot_file = home / "bare.toml"
+    robot_file.write_text(remove_section(robot_file.read_text(), "sensors.contacts"))
+    result, _ = in_process.run_to_summary(home / "run", *SHORT_RUN, "--set", SERVICE_OPTION)
+    assert result.code == 0, result.out

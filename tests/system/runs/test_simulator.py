@@ -1,4 +1,4 @@
-"""`snakesim sim`, and what it leaves of a run: real processes, over their network."""
+"""`snakesim sim` pauses, steps and resets the simulator of a run of real processes, and the run stays identical."""
 
 import contextlib
 from pathlib import Path
@@ -24,60 +24,64 @@ RUN = ["peg_row", "--duration", "1"]
 
 @pytest.mark.slow  # tests/system/host/test_simulated_time.py
 def test_simulator_paused_stepped_and_reset_keeps_digest(tmp_path: Path) -> None:
-    plain = simulate(load_scenario(RUN[0], [parse_set_option("duration_s=1")]).config).summary
+    expected = simulate(load_scenario(RUN[0], [parse_set_option("duration_s=1")]).config).summary
     out = tmp_path / "run"
     with running_snakesim(out, *RUN) as run:
 
-        def sim(*asked: str, code: int = 0) -> str:
-            ended = run_command_for_robot(run, "sim", *asked)
-            assert ended.code == code, ended.out + ended.err
-            return ended.out + ended.err
+        def run_sim_command(*arguments: str, code: int = 0) -> str:
+            result = run_command_for_robot(run, "sim", *arguments)
+            assert result.code == code, result.out + result.err
+            return result.out + result.err
 
         run.wait_for("network:")
         with open_session(ConnectionSettings(run.endpoint, "planar13"), 30.0) as session:
-            statuses = session.declare_latched_reader(keys.STATUS, RobotStatus)
-            seen: list[RobotStatus] = []
+            reader = session.declare_latched_reader(keys.STATUS, RobotStatus)
+            statuses: list[RobotStatus] = []
 
-            def shows(lifecycle: str, tick: int) -> bool:
-                seen.extend(statuses.drain())
-                return bool(seen) and (seen[-1].lifecycle, seen[-1].tick) == (lifecycle, tick)
+            def is_at(lifecycle: str, tick: int) -> bool:
+                statuses.extend(reader.drain())
+                if not statuses:
+                    return False
+                newest = statuses[-1]
+                return newest.lifecycle == lifecycle and newest.tick == tick
 
-            wait_until(lambda: pause(session), "the pause")
-            wait_until(lambda: shows("armed", 0), "armed in the pause, before the first tick")
-            sim("step", "20")
-            wait_until(lambda: shows("armed", 20), "20 ticks")
-            sim("reset")
-            wait_until(lambda: shows("disarmed", 0) and seen[-1].ready_to_arm, "another host")
-            hosts = {status.host for status in seen}
+            wait_until(lambda: request_pause(session), "the pause")
+            wait_until(lambda: is_at("armed", 0), "armed in the pause, before the first tick")
+            run_sim_command("step", "20")
+            wait_until(lambda: is_at("armed", 20), "20 ticks")
+            run_sim_command("reset")
+            wait_until(lambda: is_at("disarmed", 0) and statuses[-1].ready_to_arm, "another host")
+            hosts = {status.host for status in statuses}
             assert len(hosts) == 2, hosts
-            assert "as fast as it can" in sim("speed", "2", code=1)
-            sim("pause")
+            assert "as fast as it can" in run_sim_command("speed", "2", code=1)
+            run_sim_command("pause")
             assert run_command_for_robot(run, "robot", "arm", "planar13", "sim").code == 0
-            sim("step", "7")
-            wait_until(lambda: shows("armed", 7), "7 ticks")
+            run_sim_command("step", "7")
+            wait_until(lambda: is_at("armed", 7), "7 ticks")
             wait_until(lambda: "PAUSED" in run.printed(), "the pause on the terminal")
-            sim("resume")
+            run_sim_command("resume")
         assert run.end() == 0, run.printed()
     assert_no_process_left(out)
-    said = run.printed()
-    assert "the simulator was reset" in said
-    assert "host" in said
-    assert f"command digest        {plain.command_digest[:16]}" in said
+    printed = run.printed()
+    assert "the simulator was reset" in printed
+    assert "host" in printed
+    assert f"command digest        {expected.command_digest[:16]}" in printed
     assert (out / "recording-1.mcap").is_file()
     assert (out / "blackbox-1.rows").is_file()
     recorded = RunRecord.load(out / "recording.mcap").host
-    assert recorded.command_digest == plain.command_digest
+    assert recorded.command_digest == expected.command_digest
     assert recorded.ticks == 100
-    told = snakesim("recording", "info", str(out), cwd=tmp_path)
-    assert told.code == 0 and "missing" not in told.out, told.printed
+    recording_info = snakesim("recording", "info", str(out), cwd=tmp_path)
+    assert recording_info.code == 0, recording_info.printed
+    assert "missing" not in recording_info.out, recording_info.printed
     replayed = snakesim("replay", str(out), "--control", cwd=tmp_path)
-    # The last may come too late.
-    same = {f"{count} commands, the same to the bit\n" for count in (100, 99)}
-    assert replayed.out in same, replayed.out + replayed.err
+    # The last command may arrive too late for the recording.
+    expected_outputs = {f"{count} commands, the same to the bit\n" for count in (100, 99)}
+    assert replayed.out in expected_outputs, replayed.out + replayed.err
 
 
-def pause(session: Session) -> bool:
-    """False while there is no host that answers."""
+def request_pause(session: Session) -> bool:
+    """Request a pause; return False while no host answers."""
     with contextlib.suppress(NotConnectedError):
         return session.send_request(
             keys.SIMULATOR, SimulatorRequest(action="pause", requester="ada")

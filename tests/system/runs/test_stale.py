@@ -1,4 +1,4 @@
-"""Streams that stop in a run of real processes: joints stop the robot, all others make the controller hold."""
+"""If joint states stop to arrive, the robot stops; if any other stream stops, the controller holds the robot."""
 
 from pathlib import Path
 
@@ -13,26 +13,29 @@ from snakesim_testing.runs.command import CompletedRun, run_to_summary
 
 pytestmark = [pytest.mark.e2e, pytest.mark.quiet]
 
-FROM_S, TO_S = 2.0, 3.4
-FADED_S = 0.9  # after the push has ended: three time constants of the fade
+DROP_START_S = 2.0
+DROP_END_S = 3.4
+FADE_S = 0.9  # after the end of the push: three time constants of its fade
 
 
 def run_with_fault(out: Path, fault: str) -> tuple[CompletedRun, RunSummary]:
+    """Run the case study for 6 s in real time with this fault."""
     return run_to_summary(
         out, "triplet", "--clock-mode", "realtime", "--duration", "6", "--fault", fault
     )
 
 
-def stopped_after_s(out: Path, summary: RunSummary) -> float:
+def get_fault_time_s(out: Path, summary: RunSummary) -> float:
+    """Return the time of the first fault since the start of the record."""
     return float(summary.faults[0].tick / summary.rate_hz - RunRecord.load(out).time_s[0])
 
 
-def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -> None:
-    ended, summary = run_with_fault(tmp_path / "run", f"drop:sensor/joints@{FROM_S}")
-    assert ended.code == 1
+def test_control_without_joint_states_stops_robot_and_reports_reason(tmp_path: Path) -> None:
+    result, summary = run_with_fault(tmp_path / "run", f"drop:sensor/joints@{DROP_START_S}")
+    assert result.code == 1
     assert summary.faults[0].what == "lease_expired"
-    # A state may be 30 ms old, a lease lasts 50 ms.
-    assert FROM_S < stopped_after_s(tmp_path / "run", summary) < FROM_S + 0.2
+    # A joint state may be 30 ms old, and a lease lasts 50 ms.
+    assert DROP_START_S < get_fault_time_s(tmp_path / "run", summary) < DROP_START_S + 0.2
     assert "sensor/joints is 0.0" in (tmp_path / "run" / "control.log").read_text()
     assert "at most 0.03 s: no commands" in (tmp_path / "run" / "control.log").read_text()
     assert "Control said: sensor/joints is 0.0" in (tmp_path / "run" / REPORT_FILENAME).read_text()
@@ -40,26 +43,29 @@ def test_without_joints_the_robot_stops_and_the_reason_is_told(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_control_without_stream_holds_and_continues_when_it_returns(tmp_path: Path) -> None:
-    """The others, one by one, are rows of the fault table."""
-    key, limit_s = "guidance/world", 0.22
-    ended, summary = run_with_fault(tmp_path / "run", f"drop:{key}@{FROM_S}-{TO_S}")
-    assert ended.code == 0 and summary.faults == [] and summary.ended == "complete", ended.out
+    """The fault table measures the other streams."""
+    key = "guidance/world"
+    max_age_s = 0.22
+    result, summary = run_with_fault(tmp_path / "run", f"drop:{key}@{DROP_START_S}-{DROP_END_S}")
+    assert result.code == 0, result.out
+    assert summary.faults == [], result.out
+    assert summary.ended == "complete", result.out
     record = RunRecord.load(tmp_path / "run")
     time_s = record.time_s - record.time_s[0]
     pushes = (record.mode == JointMode.TORQUE).any(axis=1)
-    held = (time_s > FROM_S + limit_s + 0.1) & (time_s < TO_S)
-    assert pushes[time_s < FROM_S].any()
-    assert not pushes[held].any()
-    assert pushes[time_s > TO_S + 0.5].any()
-    assert (record.mode[held] == JointMode.POSITION).all()
+    holds = (time_s > DROP_START_S + max_age_s + 0.1) & (time_s < DROP_END_S)
+    assert pushes[time_s < DROP_START_S].any()
+    assert not pushes[holds].any()
+    assert pushes[time_s > DROP_END_S + 0.5].any()
+    assert (record.mode[holds] == JointMode.POSITION).all()
     reported = [state for state in record.control_states if state.reason.startswith(f"{key} is 0.")]
     assert reported
     assert all(state.state == "NotLocomoting" for state in reported)
-    assert any(f"s old, at most {limit_s:g} s" in state.reason for state in reported)
+    assert any(f"s old, at most {max_age_s:g} s" in state.reason for state in reported)
     assert "Locomoting" in {state.state for state in record.control_states[-20:]}, (
         "in the last second"
     )
-    late = (time_s > FROM_S + limit_s + FADED_S) & (time_s < TO_S)
-    if late.any():  # nothing moves any more, and no target moves
-        assert np.ptp(record.target[late], axis=0).max() < 0.02
-        assert np.ptp(record.position_w_m[late][:, 0]) < 0.01
+    faded = (time_s > DROP_START_S + max_age_s + FADE_S) & (time_s < DROP_END_S)
+    if faded.any():  # then neither the robot nor a target moves any more
+        assert np.ptp(record.target[faded], axis=0).max() < 0.02
+        assert np.ptp(record.position_w_m[faded][:, 0]) < 0.01

@@ -1,4 +1,4 @@
-"""What `snakesim run --stay` does when processes end: it starts them again, and arms nothing. And faults on request."""
+"""`snakesim run --stay` restarts processes that end, and never arms the robot; it also injects requested faults."""
 
 import os
 import re
@@ -31,39 +31,48 @@ from snakesim_testing.runs.in_process_command import snakesim
 pytestmark = pytest.mark.e2e
 
 SERVICES = ("guidance", "navigation", "control")
-# 50 Hz has the longest lease, 100 ms: a busy test machine may well forget a process for 50 ms.
-LONG = ["triplet", "--controller", "hold", "--duration", "600", "--set", "rate_hz=50"]
-BACK_S = 20.0  # 5 s on a machine that has nothing else to do
+# 50 Hz has the longest lease, 100 ms: a busy test machine may pause a process for 50 ms.
+LONG_RUN = ["triplet", "--controller", "hold", "--duration", "600", "--set", "rate_hz=50"]
+RESTART_TIMEOUT_S = 20.0  # a restart takes 5 s on an idle machine
 
 
-class Robot:
-    """A run as somebody on its network sees it."""
+class RobotClient:
+    """A client on the network of a run."""
 
     def __init__(self, session: Session) -> None:
-        self._session, self._statuses = (
-            session,
-            session.declare_latched_reader(keys.STATUS, RobotStatus),
-        )
+        self._session = session
+        self._statuses = session.declare_latched_reader(keys.STATUS, RobotStatus)
         self._status: RobotStatus | None = None
 
     def status(self) -> RobotStatus:
-        def heard() -> RobotStatus | None:
+        """Return the newest status of the robot; wait for the first one."""
+
+        def read_newest() -> RobotStatus | None:
             self._status = (self._statuses.drain() or [self._status])[-1]
             return self._status
 
-        wait_until(heard, "a status")
+        wait_until(read_newest, "a status")
         assert self._status is not None
         return self._status
 
-    def reaches(self, lifecycle: str) -> RobotStatus:
-        wait_until(lambda: self.status().lifecycle == lifecycle, f"lifecycle {lifecycle}", BACK_S)
+    def wait_for_lifecycle(self, lifecycle: str) -> RobotStatus:
+        """Wait until the robot is in this lifecycle state, and return its status."""
+        wait_until(
+            lambda: self.status().lifecycle == lifecycle,
+            f"lifecycle {lifecycle}",
+            RESTART_TIMEOUT_S,
+        )
         return self.status()
 
-    def is_ready(self) -> None:
-        wait_until(lambda: self.status().ready_to_arm, "ready to arm", BACK_S)
+    def wait_until_ready(self) -> None:
+        """Wait until the robot may be armed."""
+        wait_until(lambda: self.status().ready_to_arm, "ready to arm", RESTART_TIMEOUT_S)
 
-    def tell(self, action: Literal["arm", "reset"]) -> Answer:
-        robot = self._session.wait_for_latched(keys.DESCRIPTION, RobotDescription, BACK_S)
+    def request_lifecycle(self, action: Literal["arm", "reset"]) -> Answer:
+        """Send a lifecycle request to the host."""
+        robot = self._session.wait_for_latched(
+            keys.DESCRIPTION, RobotDescription, RESTART_TIMEOUT_S
+        )
         assert robot is not None
         request = LifecycleRequest(
             action=action, robot=robot.robot, backend=robot.backend, config_hash=robot.config_hash
@@ -71,51 +80,60 @@ class Robot:
         return self._session.send_request(keys.LIFECYCLE, request)
 
     def arm(self) -> None:
-        wait_until(lambda: self.tell("arm").ok, "armed", BACK_S)
+        """Request arming until the host arms the robot."""
+        wait_until(lambda: self.request_lifecycle("arm").ok, "armed", RESTART_TIMEOUT_S)
 
-    def is_commanded(self, times: int) -> bool:
-        """Arm a robot that is disarmed; whether it has then accepted so many commands."""
+    def arm_and_check_commands(self, min_commands: int) -> bool:
+        """Arm a disarmed robot; return whether it is armed and has accepted more than this number of commands."""
         if self.status().lifecycle == "disarmed":
-            self.tell("arm")
-        return self.status().lifecycle == "armed" and self.status().commands_accepted > times
+            self.request_lifecycle("arm")
+        status = self.status()
+        return status.lifecycle == "armed" and status.commands_accepted > min_commands
 
-    def fault(self, kind: str, target: str, **more: object) -> Answer:
-        request = FaultRequest(kind=kind, target=target, **more)  # pyright: ignore[reportArgumentType]
+    def inject_fault(self, kind: str, target: str, **options: object) -> Answer:
+        """Request a fault from the supervisor of the run."""
+        request = FaultRequest(kind=kind, target=target, **options)  # pyright: ignore[reportArgumentType]
         return self._session.send_request(keys.fault_key("run"), request, 5.0)
 
 
-def pids(run: RunningCommand, *names: str) -> dict[str, int]:
+def get_process_ids(run: RunningCommand, *names: str) -> dict[str, int]:
+    """Return the process id of each named part of a run."""
     return {name: run.part(name) for name in names}
 
 
-def interrupt(run: RunningCommand) -> RunSummary:
-    assert run.interrupt() == 130 and "report:" in run.printed(), run.printed()
+def interrupt_and_read_summary(run: RunningCommand) -> RunSummary:
+    """End a run with Ctrl-C."""
+    assert run.interrupt() == 130, run.printed()
+    assert "report:" in run.printed(), run.printed()
     return read_summary(run.out)
 
 
 @pytest.mark.parametrize(
     "clock_mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)]
 )
-def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode: str) -> None:
+def test_supervisor_restarts_killed_host_without_arming_it(tmp_path: Path, clock_mode: str) -> None:
     with running_armed_snakesim(
-        tmp_path / "run", *LONG, "--clock-mode", clock_mode, "--stay"
+        tmp_path / "run", *LONG_RUN, "--clock-mode", clock_mode, "--stay"
     ) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
-            robot = Robot(session)
-            first, services = robot.reaches("armed"), pids(run, *SERVICES)
+            robot = RobotClient(session)
+            first_status = robot.wait_for_lifecycle("armed")
+            service_ids = get_process_ids(run, *SERVICES)
             os.kill(run.part("host"), signal.SIGKILL)
             wait_until(
-                lambda: robot.status().lease_epoch > first.lease_epoch + 1,
-                "another host's lease",
-                BACK_S,
+                lambda: robot.status().lease_epoch > first_status.lease_epoch + 1,
+                "the lease of another host",
+                RESTART_TIMEOUT_S,
             )
-            robot.is_ready()
+            robot.wait_until_ready()
             assert robot.status().lifecycle == "disarmed"
             assert robot.status().commands_accepted == 0
             assert robot.status().tick == 0 or clock_mode == "realtime"
-            assert pids(run, *SERVICES) == services  # they found the new host by themselves
-            wait_until(lambda: robot.is_commanded(20), "commands to the new host")
-        summary = interrupt(run)
+            assert (
+                get_process_ids(run, *SERVICES) == service_ids
+            )  # the services connected to the new host
+            wait_until(lambda: robot.arm_and_check_commands(20), "commands to the new host")
+        summary = interrupt_and_read_summary(run)
     assert summary.hosts == 2
     assert [restart.name for restart in summary.restarts] == ["host"]
     assert (tmp_path / "run" / "recording-1.mcap").is_file()
@@ -123,110 +141,125 @@ def test_a_killed_host_is_started_again_and_not_armed(tmp_path: Path, clock_mode
     assert "host was ended by SIGKILL; restart in 0.5 s" in run.printed()
 
 
-def test_killed_controller_latches_fault_until_a_person_resets(tmp_path: Path) -> None:
+def test_supervisor_after_killed_controller_waits_for_reset_by_operator(tmp_path: Path) -> None:
     with running_armed_snakesim(
-        tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay"
+        tmp_path / "run", *LONG_RUN, "--clock-mode", "realtime", "--stay"
     ) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
-            robot, before = Robot(session), run.part("control")
-            os.kill(before, signal.SIGKILL)
-            robot.reaches("fault")
+            robot = RobotClient(session)
+            first_control_id = run.part("control")
+            os.kill(first_control_id, signal.SIGKILL)
+            robot.wait_for_lifecycle("fault")
             wait_until(
-                lambda: run.parts().get("control", before) != before, "another process of control"
+                lambda: run.parts().get("control", first_control_id) != first_control_id,
+                "another process of control",
             )
             wait_until(
                 lambda: (
                     "control" in robot.status().alive and robot.status().lease_holder == "control"
                 ),
-                "control",
+                "control holds the lease",
             )
             assert robot.status().lifecycle == "fault"
-            assert not robot.tell("arm").ok
-            assert robot.tell("reset").ok
-            robot.is_ready()
+            assert not robot.request_lifecycle("arm").ok
+            assert robot.request_lifecycle("reset").ok
+            robot.wait_until_ready()
             robot.arm()
-            robot.reaches("armed")
-        summary = interrupt(run)
+            robot.wait_for_lifecycle("armed")
+        summary = interrupt_and_read_summary(run)
     assert {fault.what for fault in summary.faults} == {"service_lost", "lease_expired"}
     assert summary.ended == "interrupted"
     assert "continue with `snakesim robot reset`" in run.printed()
 
 
-@pytest.mark.slow  # a row of the fault table
-def test_dead_router_stops_robot_and_nothing_rearms_it(tmp_path: Path) -> None:
+@pytest.mark.slow  # the fault table measures this fault, too
+def test_supervisor_after_killed_router_does_not_arm_robot(tmp_path: Path) -> None:
     with running_armed_snakesim(
-        tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay", "--with-router"
+        tmp_path / "run", *LONG_RUN, "--clock-mode", "realtime", "--stay", "--with-router"
     ) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
-            robot = Robot(session)
-            robot.reaches("armed")
-            before = pids(run, "host", *SERVICES)
+            robot = RobotClient(session)
+            robot.wait_for_lifecycle("armed")
+            process_ids = get_process_ids(run, "host", *SERVICES)
             os.kill(run.part("router"), signal.SIGKILL)
-            robot.reaches("fault")  # told by the host as soon as there is a router again
-            wait_until(lambda: not robot.status().waiting_for, "everybody back", BACK_S)
+            robot.wait_for_lifecycle(
+                "fault"
+            )  # the host publishes it as soon as the router runs again
+            wait_until(
+                lambda: not robot.status().waiting_for, "all services connected", RESTART_TIMEOUT_S
+            )
             assert robot.status().lifecycle == "fault"
-            assert pids(run, "host", *SERVICES) == before
+            assert get_process_ids(run, "host", *SERVICES) == process_ids
             assert "lease_expired" in [fault.what for fault in robot.status().faults]
-            for command in (["robot", "reset"], ["robot", "arm", "planar13", "sim"]):
-                result = snakesim(*command, "--router", run.endpoint, cwd=tmp_path)
-                if command == ["robot", "reset"]:
-                    assert result.code == 0, result.err
-                    robot.is_ready()
-            robot.reaches("armed")
-        interrupt(run)
+            router = ("--router", run.endpoint)
+            reset = snakesim("robot", "reset", *router, cwd=tmp_path)
+            assert reset.code == 0, reset.err
+            robot.wait_until_ready()
+            snakesim("robot", "arm", "planar13", "sim", *router, cwd=tmp_path)
+            robot.wait_for_lifecycle("armed")
+        interrupt_and_read_summary(run)
 
 
 @pytest.mark.slow
-def test_a_service_that_may_not_be_restarted_ends_the_run(tmp_path: Path) -> None:
+def test_supervisor_ends_run_if_service_may_not_restart(tmp_path: Path) -> None:
     with running_armed_snakesim(
-        tmp_path / "run", *LONG, "--stay", "--set", "services.guidance.restart=false"
+        tmp_path / "run", *LONG_RUN, "--stay", "--set", "services.guidance.restart=false"
     ) as run:
         os.kill(run.part("guidance"), signal.SIGKILL)
         assert run.end() == 1
         assert "guidance was ended by SIGKILL" in run.printed()
 
 
-@pytest.mark.slow  # rows of the fault table
-def test_processes_go_wrong_on_request(tmp_path: Path) -> None:
+@pytest.mark.slow  # the fault table measures these faults, too
+def test_requested_process_faults_are_injected_or_refused(tmp_path: Path) -> None:
     with running_armed_snakesim(
-        tmp_path / "run", *LONG, "--clock-mode", "realtime", "--stay"
+        tmp_path / "run", *LONG_RUN, "--clock-mode", "realtime", "--stay"
     ) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
-            robot = Robot(session)
-            robot.reaches("armed")
-            assert robot.fault("freeze", "control", for_s=0.5).ok
-            robot.reaches("fault")
-            wait_until(lambda: "injected fault ends: freeze:control" in run.printed(), "the thaw")
-            before = run.part("navigation")
-            assert robot.fault("stop", "navigation").ok
-            wait_until(lambda: run.printed().count("; restart in") == 1, "navigation's end")
-            wait_until(lambda: not robot.status().waiting_for, "navigation again", BACK_S)
-            assert run.part("navigation") != before
-            for kind, target, word in (
+            robot = RobotClient(session)
+            robot.wait_for_lifecycle("armed")
+            assert robot.inject_fault("freeze", "control", for_s=0.5).ok
+            robot.wait_for_lifecycle("fault")
+            wait_until(
+                lambda: "injected fault ends: freeze:control" in run.printed(),
+                "the end of the fault",
+            )
+            first_navigation_id = run.part("navigation")
+            assert robot.inject_fault("stop", "navigation").ok
+            wait_until(lambda: run.printed().count("; restart in") == 1, "navigation has ended")
+            wait_until(
+                lambda: not robot.status().waiting_for, "navigation runs again", RESTART_TIMEOUT_S
+            )
+            assert run.part("navigation") != first_navigation_id
+            for kind, target, reason in (
                 ("kill", "nobody", "host, guidance, navigation, control"),
                 ("hang", "control", "fault/control"),
                 ("kill", "router", "no process 'router'"),
                 ("freeze", "sensor/imu", "knows no 'freeze'"),
                 ("freeze", "host", "give --for SECONDS"),
             ):
-                answer = robot.fault(kind, target)
-                assert (
-                    not answer.ok and answer.refusal == "unknown_fault" and word in answer.reason
-                ), answer
-            assert robot.fault("freeze", "host", for_s=60.0).ok
+                answer = robot.inject_fault(kind, target)
+                assert not answer.ok, answer
+                assert answer.refusal == "unknown_fault", answer
+                assert reason in answer.reason, answer
+            assert robot.inject_fault("freeze", "host", for_s=60.0).ok
             run.wait_for("injected fault: freeze:host")
-        interrupt(run)  # a frozen host is thawed to end in order
+        interrupt_and_read_summary(
+            run
+        )  # the supervisor continues a frozen host, so that it can end in order
 
 
-def test_a_killed_supervisor_leaves_no_frozen_child(tmp_path: Path) -> None:
-    frozen_soon = ("--set", 'faults=["freeze:control@0.2","freeze:host@0.2"]')
+def test_killed_supervisor_leaves_no_frozen_process(tmp_path: Path) -> None:
+    freeze_option = ("--set", 'faults=["freeze:control@0.2","freeze:host@0.2"]')
     with running_snakesim(
-        tmp_path / "run", *LONG, "--clock-mode", "realtime", "--with-router", *frozen_soon
+        tmp_path / "run", *LONG_RUN, "--clock-mode", "realtime", "--with-router", *freeze_option
     ) as run:
         run.wait_for("injected fault: freeze:host")
-        frozen = [Path(f"/proc/{run.part(name)}/stat").read_text() for name in ("control", "host")]
-        assert [re.sub(r".*\) ", "", line)[0] for line in frozen] == ["T", "T"]
-        # Router, host, three services, recorder.
+        for name in ("control", "host"):
+            stat_line = Path(f"/proc/{run.part(name)}/stat").read_text()
+            process_state = re.sub(r".*\) ", "", stat_line)[0]
+            assert process_state == "T"  # stopped by a signal
+        # The router, the host, three services, and the recorder.
         assert len(find_processes_of_run(tmp_path / "run")) == 6
         os.kill(run.process.pid, signal.SIGKILL)
         run.end()

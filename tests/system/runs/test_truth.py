@@ -1,4 +1,4 @@
-"""What a run says of itself is what happened: who stands still does not locomote, and a run that ended has an end."""
+"""A run reports what happened: a snake that does not move does not locomote, and the last state is the true one."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from snakesim_operator.results.run_reader import REPORT_FILENAME
 from snakesim_operator.results.summary import summarize_run
 from snakesim_testing.runs.in_process_command import run_to_summary
 
-STILL = (
+HOLD_WITHOUT_REPORT_CODE = (
     "from snakesim_hal.controller import ControllerCommand, make_position_setpoints\n"
     "from snakesim_gnc.control.hold import HoldPose\n\n\n"
     "class Still(HoldPose):\n"
@@ -26,16 +26,16 @@ STILL = (
 )
 
 
-def test_silent_standing_controller_does_not_locomote(tmp_path: Path) -> None:
-    (tmp_path / "still.py").write_text(STILL)
-    ended, summary = run_to_summary(
+def test_summary_of_standing_controller_without_report_is_not_locomoting(tmp_path: Path) -> None:
+    (tmp_path / "still.py").write_text(HOLD_WITHOUT_REPORT_CODE)
+    result, summary = run_to_summary(
         tmp_path / "run", "triplet", "--controller", "./still.py:Still", "--duration", "3"
     )
-    assert ended.code == 0
+    assert result.code == 0
     assert summary.locomoting_fraction == 0.0
     assert summary.last_state == "NotLocomoting"
     assert summary.last_reason == "standing still: less than 20 mm in 1 s"
-    assert "locomoting            0 %" in ended.out
+    assert "locomoting            0 %" in result.out
     assert (
         "Did not locomote: standing still: less than 20 mm in 1 s."
         in (tmp_path / "run" / REPORT_FILENAME).read_text()
@@ -43,9 +43,9 @@ def test_silent_standing_controller_does_not_locomote(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_moving_snake_locomotes_from_first_measured_motion(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(tmp_path / "run", "peg_row", "--duration", "4")
-    assert ended.code == 0
+def test_summary_of_moving_snake_is_locomoting_from_first_motion(tmp_path: Path) -> None:
+    result, summary = run_to_summary(tmp_path / "run", "peg_row", "--duration", "4")
+    assert result.code == 0
     assert summary.path_distance_m is not None
     assert summary.path_distance_m > 0.5
     assert summary.locomoting_fraction is not None
@@ -59,21 +59,26 @@ def test_moving_snake_locomotes_from_first_measured_motion(tmp_path: Path) -> No
     assert states[-1] == "Locomoting"
 
 
-def test_missing_clock_after_end_of_run_is_ignored(tmp_path: Path) -> None:
+def test_summary_ignores_missing_clock_after_end_of_run(tmp_path: Path) -> None:
     _, summary = run_to_summary(tmp_path / "run", "triplet", "--duration", "1")
     assert summary.last_state not in (None, "PowerOff")
-    last = RunRecord.load(tmp_path / "run").control_states[-1]
-    gone = msgspec.structs.replace(last, state="PowerOff", reason="no clock from the HAL")
-    before = list(RecordingReader(tmp_path / "run" / RECORDING_FILENAME).read_messages())
-    (tmp_path / "run" / RECORDING_FILENAME).unlink()
-    recording = RecordingWriter(tmp_path / "run" / RECORDING_FILENAME)
-    for reported in before:
+    last_state = RunRecord.load(tmp_path / "run").control_states[-1]
+    power_off = msgspec.structs.replace(
+        last_state, state="PowerOff", reason="no clock from the HAL"
+    )
+    path = tmp_path / "run" / RECORDING_FILENAME
+    messages = list(RecordingReader(path).read_messages())
+    path.unlink()
+    recording = RecordingWriter(path)
+    for message in messages:
         recording.write_arrival(
-            ReceivedSample(reported.key, reported.payload, reported.encoding, reported.wall_time_ns)
+            ReceivedSample(message.key, message.payload, message.encoding, message.wall_time_ns)
         )
-    reported = ReceivedSample(keys.CONTROL_STATE, encode(gone), format_encoding(ControlState), 0)
-    recording.write_arrival(reported)  # as control reports it while a host writes a long record
+    # Control reports this while a host writes a long record.
+    recording.write_arrival(
+        ReceivedSample(keys.CONTROL_STATE, encode(power_off), format_encoding(ControlState), 0)
+    )
     recording.close({})
-    again = summarize_run(RunRecord.load(tmp_path / "run"), "complete")
-    assert again.last_state == summary.last_state
-    assert again.last_reason == summary.last_reason
+    new_summary = summarize_run(RunRecord.load(tmp_path / "run"), "complete")
+    assert new_summary.last_state == summary.last_state
+    assert new_summary.last_reason == summary.last_reason

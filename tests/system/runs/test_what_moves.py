@@ -1,4 +1,4 @@
-"""Every drive type says of itself whether something real moves, and a run prints it at its begin and at its end."""
+"""Every drive type declares whether it moves real motors, and a run prints this at its start and at its end."""
 
 import dataclasses
 from pathlib import Path
@@ -29,29 +29,35 @@ MIXED_ROBOT = {
 }
 
 
-def configured(backend: str, **sections: Any) -> RunConfig:
-    """Four joints; nothing but the body's inertia under emulated drives."""
-    robot = MIXED_ROBOT if backend == "mixed" else {}
-    own = {backend: {"physics_model": "inertia"} | sections.pop(backend, {})}
-    clock_mode = "lockstep" if not sections and len(own[backend]) == 1 else "realtime"
+def make_four_joint_config(backend: str, **sections: Any) -> RunConfig:
+    """Make a run of four joints whose emulated drives move only the inertia of the body.
+
+    Args:
+        backend: name of the backend.
+        **sections: settings by backend, such as the buses. With settings, the run is in real time.
+    """
+    robot_keys = MIXED_ROBOT if backend == "mixed" else {}
+    own_section = {"physics_model": "inertia"} | sections.pop(backend, {})
+    has_buses = bool(sections) or len(own_section) > 1
     return make_run_config(
         backend=backend,
         robot__chain__modules=4,
         rate_hz=100,
-        clock_mode=clock_mode,
-        backends={**own, **sections},
-        **robot,
+        clock_mode="realtime" if has_buses else "lockstep",
+        backends={backend: own_section, **sections},
+        **robot_keys,
     )
 
 
-def opened(config: RunConfig) -> Any:
+def open_backend(config: RunConfig) -> Any:
+    """Create the backend of a run."""
     factory = load_plugin(BACKENDS, config.backend)
     return factory(config, decode_backend_settings(config, factory))
 
 
 @pytest.mark.parametrize("backend", ["can", "odrive", "moteus", "cia402", "dynamixel", "mixed"])
-def test_drives_without_a_bus_are_emulated_and_say_so(backend: str) -> None:
-    robot = opened(configured(backend))
+def test_backend_without_bus_declares_itself_emulated(backend: str) -> None:
+    robot = open_backend(make_four_joint_config(backend))
     try:
         assert (
             describe_what_moves(robot.describe())
@@ -76,7 +82,7 @@ def test_drives_without_a_bus_are_emulated_and_say_so(backend: str) -> None:
         ("mixed", {"odrive": ["can0"], "dynamixel": ["/dev/pts/7"]}, False),
     ],
 )
-def test_emulation_is_stated_only_without_real_drives(
+def test_backend_is_emulated_only_without_real_buses(
     monkeypatch: pytest.MonkeyPatch, backend: str, buses: dict[str, list[str]], emulated: bool
 ) -> None:
     monkeypatch.setattr(
@@ -86,9 +92,10 @@ def test_emulation_is_stated_only_without_real_drives(
         servo_backend, "SerialWire", lambda port, *_: SimpleNamespace(port=port, latency_s=0.0)
     )
     sections = {
-        name: {"ports" if name == "dynamixel" else "channels": own} for name, own in buses.items()
+        name: {"ports" if name == "dynamixel" else "channels": bus_names}
+        for name, bus_names in buses.items()
     }
-    config = configured(backend, **sections)
+    config = make_four_joint_config(backend, **sections)
     factory = load_plugin(BACKENDS, backend)
     clock = DriverClock(config)
     opened_buses: list[BusSpec] = []
@@ -97,28 +104,22 @@ def test_emulation_is_stated_only_without_real_drives(
     ):
         context = DriverTypeContext(config, part.settings, part.joints, clock, None)
         opened_buses += part.driver_type.plan_buses(context)
-    in_turn = msgspec.structs.replace(config, clock_mode="lockstep")  # without threads
-    assert (
-        RobotBuses(
-            in_turn,
-            DriveReadings(config.robot.joint_table, clock.now_ns),
-            opened_buses,
-            clock.now_ns,
-        ).emulated
-        == emulated
-    )
+    without_threads = msgspec.structs.replace(config, clock_mode="lockstep")
+    readings = DriveReadings(config.robot.joint_table, clock.now_ns)
+    robot_buses = RobotBuses(without_threads, readings, opened_buses, clock.now_ns)
+    assert robot_buses.emulated == emulated
 
 
-def test_one_real_joint_module_makes_a_robot_real(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Joint modules say it themselves, each in its Identity."""
-    found_by = modules.find_modules
+def test_robot_with_one_real_joint_module_is_real(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each joint module reports in its Identity whether it is emulated."""
+    find_modules = modules.find_modules
 
-    def find(*arguments: Any) -> Any:
-        first, *others = found_by(*arguments)
+    def find_modules_with_real_first(*arguments: Any) -> Any:
+        first, *others = find_modules(*arguments)
         return [dataclasses.replace(first, is_emulated=False), *others]
 
-    monkeypatch.setattr(modules, "find_modules", find)
-    robot = opened(configured("can"))
+    monkeypatch.setattr(modules, "find_modules", find_modules_with_real_first)
+    robot = open_backend(make_four_joint_config("can"))
     try:
         assert describe_what_moves(robot.describe()) == "REAL: motors move (backend can)"
     finally:
@@ -126,12 +127,12 @@ def test_one_real_joint_module_makes_a_robot_real(monkeypatch: pytest.MonkeyPatc
 
 
 def test_run_states_emulation_at_start_and_end(tmp_path: Path) -> None:
-    ended, summary = run_to_summary(
+    result, summary = run_to_summary(
         tmp_path / "run", "triplet", "--backend", "odrive", "--duration", "0.1"
     )
     assert summary.emulated
-    first, second, *others = ended.out.splitlines()
-    assert first.startswith("triplet: planar13")
-    assert second == "EMULATED: nothing real moves (backend odrive)"
-    assert "  EMULATED              nothing real moved (backend odrive)" in others
+    first_line, second_line, *other_lines = result.out.splitlines()
+    assert first_line.startswith("triplet: planar13")
+    assert second_line == "EMULATED: nothing real moves (backend odrive)"
+    assert "  EMULATED              nothing real moved (backend odrive)" in other_lines
     assert "EMULATED: nothing real moved" in (tmp_path / "run" / "report.html").read_text()
