@@ -51,13 +51,12 @@ from snakesim_operator.recording.tap import MessageTap
 from snakesim_operator.recording.writer import RecordingWriter
 
 CYCLE_S = 0.02
-# At the end of a run, messages are on their way. After so many cycles without one, no more are expected. Cycles and
-# not seconds, because on a busy computer this process may pause for seconds.
-QUIET_CYCLES = 2  # if the host has left
-QUIET_CYCLES_WITH_HOST = 100  # 2 s, if it has not
-LAST_MESSAGES_LIMIT_S = (
-    10.0  # a run kills its recorder after 15 s, and until then the file must be closed
-)
+# At the end of a run, messages are on their way. If the host has not left, no more are expected after so many cycles
+# without one: 2 s. Cycles and not seconds, because on a busy computer this process may pause for seconds.
+QUIET_CYCLES_WITH_HOST = 100
+# A run kills its recorder after 15 s, and until then the file must be closed.
+LAST_MESSAGES_LIMIT_S = 10.0
+ROUND_TRIP_TIMEOUT_S = 2.0
 NICENESS = 10  # a robot's own processes have precedence
 MAX_HOSTS = 100  # files: one for each host that a robot had
 EXIT_DISK_FULL = 4
@@ -297,7 +296,7 @@ def _record_until_stopped(
         _write_arrivals(tap, recorder)
         time.sleep(CYCLE_S)
     if wait_for_host_exit:
-        _write_last_messages(tap, recorder, present_hosts)
+        _write_last_messages(session, tap, recorder, present_hosts)
     _write_arrivals(tap, recorder)
     for key, dropped_count in sorted(tap.dropped_count_by_key.items()):
         print_stderr(f"{dropped_count} messages on {key} were dropped: the disk was too slow")
@@ -321,28 +320,32 @@ def _track_present_hosts(session: Session) -> set[str]:
     return hosts
 
 
-def _write_last_messages(tap: MessageTap, recorder: RobotRecorder, present_hosts: set[str]) -> None:
+def _write_last_messages(
+    session: Session, tap: MessageTap, recorder: RobotRecorder, present_hosts: set[str]
+) -> None:
     """Write the last messages of a run, until the host has left and no message is on its way.
 
     In a run the recorder ends last, so messages of the other processes may still be queued in the network. On a busy
     computer, there may be more than it can write within seconds.
 
+    When a host leaves, all its messages have reached the router. The router answers this session after them, on the
+    same connection. So once the router has answered, no message of the host is on its way.
+
     Args:
+        session: Session on the robot's network.
         tap: Has the messages that have arrived.
         recorder: Writes the messages.
         present_hosts: Liveliness keys of the hosts on the network; other threads update the set.
     """
     limit_s = time.monotonic() + LAST_MESSAGES_LIMIT_S
     quiet_cycles = 0
-    host_count = len(present_hosts)
     while time.monotonic() < limit_s:
+        has_left = not present_hosts
+        if has_left:
+            session.list_tokens(keys.alive_key(HAL), ROUND_TRIP_TIMEOUT_S)
         arrival_count = _write_arrivals(tap, recorder)
-        if arrival_count > 0 or len(present_hosts) != host_count:
-            quiet_cycles = 0
-            host_count = len(present_hosts)
-        else:
-            quiet_cycles += 1
-        if quiet_cycles >= (QUIET_CYCLES_WITH_HOST if present_hosts else QUIET_CYCLES):
+        quiet_cycles = 0 if arrival_count > 0 else quiet_cycles + 1
+        if quiet_cycles >= (1 if has_left else QUIET_CYCLES_WITH_HOST):
             return
         time.sleep(CYCLE_S)
 
