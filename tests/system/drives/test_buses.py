@@ -243,6 +243,8 @@ def test_bus_that_blocks_ages_alone_while_others_stop(open_robot: OpenRobot) -> 
     )
 
 
+# On a busy computer, the thread of the slow bus may pause so long that its drives are reported as silent.
+@pytest.mark.quiet
 def test_bus_with_slow_readings_does_not_delay_ticks(open_robot: OpenRobot) -> None:
     robot = open_robot("realtime")
     read = robot.servos.read
