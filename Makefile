@@ -40,19 +40,17 @@ demo: $(stamp) ## Run the simulated snake along a row of pegs, into runs/demo, w
 	  '  $(bin)/snakesim run triplet --console --clock-mode realtime      the paper'\''s case study: one joint at a time pushes' \
 	  '  docs/tutorials/write-a-controller.md                          push it your way'
 
-# The CAN tests may need a second kernel, which waits for half of its time. The unit tests wait for nothing, so they
-# fill its pauses, with less priority. The output of the CAN tests follows that of the unit tests.
-test: compiled ## Run the tests that every change must pass (5 minutes on two cores)
+# All folders together, because the unit tests, which wait for nothing, use the time in which tests with processes wait.
+test: compiled ## Run the tests of a contributor (4 minutes on two cores); CI also runs the heavy ones
 	@mkdir -p build; \
 	$(MAKE) --no-print-directory test-can > build/test-can.log 2>&1 & can=$$!; \
 	trap 'kill $$can' INT TERM; \
-	$(MAKE) --no-print-directory test-unit unit_priority=nice; unit=$$?; \
+	$(pytest) $(all_tests) -n $(SYSTEM_WORKERS) --dist worksteal $(ARGS); tests=$$?; \
 	wait $$can; can=$$?; cat build/test-can.log; \
-	[ $$unit = 0 ] && [ $$can = 0 ]
-	@$(MAKE) --no-print-directory test-contract test-system
+	[ $$tests = 0 ] && [ $$can = 0 ]
 
 test-unit: compiled ## Run the pure tests: no process, no socket, no waiting (ARGS="-k limiter")
-	$(unit_priority) $(pytest) tests/unit -n $(WORKERS) --dist worksteal $(ARGS)
+	$(pytest) tests/unit -n $(WORKERS) --dist worksteal $(ARGS)
 
 test-contract: compiled ## Run the contracts of backends and drives
 	$(pytest) tests/contract -n $(SYSTEM_WORKERS) --dist worksteal $(ARGS)
@@ -66,7 +64,7 @@ test-can: compiled ## Run the CAN tests on real SocketCAN, on a second kernel if
 coverage: compiled ## Print the lines and branches that the tests miss (FOLDERS="tests/unit tests/contract")
 	@mkdir -p build/coverage
 	$(bin)/python -m coverage erase
-	$(bin)/python -m coverage run -m pytest $(FOLDERS) -n $(WORKERS) $(ARGS)
+	$(bin)/python -m coverage run -m pytest $(FOLDERS) -m "not slow and not quiet" -n $(WORKERS) $(ARGS)
 	$(bin)/python -m coverage combine -q
 	$(bin)/python -m coverage report
 
@@ -83,6 +81,7 @@ compiled: .venv/.compiled
 	@touch $@
 
 pytest = $(bin)/python -m pytest
+all_tests = tests --ignore tests/system/can
 
 faults: $(stamp) ## Measure the fault table and write docs/benchmarks/faults.md and its CSV (ARGS="--rows NAME --trials 3")
 	$(bin)/python -m verification.faults --write $(ARGS)

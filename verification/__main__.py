@@ -18,6 +18,8 @@ from verification.mutation.trial import TESTS_BY_FILE
 ROOT = Path(__file__).parents[1]
 WITH_VCAN = "deploy/vm/with_vcan.py"
 PYTHON_MODULE = (sys.executable, "-m")
+ALL_TESTS = ("tests", "--ignore", "tests/system/can")
+HEAVY = "heavy and not (slow or quiet)"
 JOYSTICK_TESTS = "tests/system/can/test_joystick.py"
 PYTEST = ("pytest", "-q", "--timeout", "1800")
 
@@ -70,15 +72,20 @@ PARTS = {
             "verification/mutation/firmware",
         ),
     ),
+    "heavy": CampaignPart(
+        "tests that need more than a second of processor time; CI runs them with each change",
+        5,
+        (*PYTEST, *ALL_TESTS, "-n", "3", "--dist", "worksteal", "-m", HEAVY),
+    ),
     "quiet": CampaignPart(
         "robots in real time, one test after the other",
         4,
-        (*PYTEST, "tests", "--ignore", "tests/system/can", "-m", "quiet"),
+        (*PYTEST, *ALL_TESTS, "-m", "quiet"),
     ),
     "slow": CampaignPart(
         "the long forms of the tests",
         16,
-        (*PYTEST, "tests", "--ignore", "tests/system/can", "-n", "3", "-m", "slow and not quiet"),
+        (*PYTEST, *ALL_TESTS, "-n", "3", "-m", "slow and not quiet"),
     ),
     "trials": CampaignPart(
         "all random trials; with each change, a tenth of them runs",

@@ -182,6 +182,7 @@ def test_driver_describes_serials_and_firmware_that_drives_report(robot: DriveRo
     assert {joint.firmware for joint in joints} == {robot.driver_type.firmware}
 
 
+@pytest.mark.heavy
 def test_drive_error_persists_until_reset_and_is_reported_again(
     robot: DriveRobot,
 ) -> None:

@@ -94,6 +94,7 @@ def find_unnoticed_mutants(
     ]
 
 
+@pytest.mark.heavy
 def test_contract_driver_mutants_fail_the_clauses_they_break(tmp_path: Path) -> None:
     assert not find_unnoticed_mutants(DRIVER_MUTANTS, tmp_path / "report.xml")
 
@@ -147,6 +148,7 @@ def test_contract_passes_late_coarse_slow_or_realtime_backend(
     assert expected_output in completed.stdout, completed.stdout
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("options", "expected_output"),
     [

@@ -49,6 +49,7 @@ TESTS_BY_FILE = {
     "thermal.py": ("test_thermal.py",),
 }
 
+MARKS = ("-m", "not slow and not quiet")  # also the heavy tests, which pytest leaves out otherwise
 # Exit codes of pytest.
 SURVIVED = int(pytest.ExitCode.OK)
 KILLED = int(pytest.ExitCode.TESTS_FAILED)
@@ -127,7 +128,7 @@ def run_tests_on_mutant(file: str, source: str, folder: str) -> NoReturn:
     sys.meta_path.insert(0, MutantImporter(file, source))
     tests = [str(next(TEST_FOLDER.rglob(name))) for name in TESTS_BY_FILE[file]]
     exit_code = pytest.main(
-        ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "pytest_timeout", *tests]
+        ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "pytest_timeout", *MARKS, *tests]
     )
     sys.stdout.flush()
     os._exit(exit_code)

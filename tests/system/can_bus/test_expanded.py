@@ -55,6 +55,7 @@ def test_expanded_file_has_exactly_the_messages_of_every_node(database: Database
     assert {message.frame_id: message.name for message in database.messages} == expected
 
 
+@pytest.mark.heavy
 def test_expanded_file_signals_are_equal_for_every_node(database: Database) -> None:
     original_messages = {message.name: message for message in load_database().messages}
     for message in database.messages:

@@ -210,6 +210,7 @@ def test_python_client_stopped_by_another_client_gets_error(
     reset_robot(waiting_run)
 
 
+@pytest.mark.heavy
 def test_python_client_invalid_command_or_key_is_refused(waiting_run: RunningCommand) -> None:
     with snakesim.Robot.connect(waiting_run.endpoint) as robot:
         with raises_error(snakesim.ConfigError, code="python/invalid-argument"):

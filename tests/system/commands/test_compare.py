@@ -40,6 +40,7 @@ def test_compare_of_repeated_run_reports_no_difference(runs: Path) -> None:
     assert (runs / "again" / "compare.html").is_file()
 
 
+@pytest.mark.heavy
 def test_compare_of_different_runs_reports_and_draws_differences(
     runs: Path, tmp_path: Path
 ) -> None:

@@ -15,6 +15,7 @@ from snakesim_operator.this_computer.network_findings import check_ports, check_
 from snakesim_testing.harness.endpoint import find_free_endpoint
 
 
+@pytest.mark.heavy
 def test_doctor_reports_all_findings_and_keeps_scheduler_of_process(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

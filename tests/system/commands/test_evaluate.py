@@ -207,6 +207,7 @@ ARGUMENTS = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "command",
     ["evaluate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("optimize", "train"))],

@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 REPOSITORY = Path(__file__).parents[3]
 
 
+@pytest.mark.heavy
 def test_example_policy_is_evaluated_on_an_unseen_scene() -> None:
     command = [sys.executable, "examples/held_out.py", "clutter", "98100", "1"]
     completed = subprocess.run(

@@ -12,6 +12,7 @@ pytestmark = pytest.mark.skipif(find_spec("matplotlib") is None, reason="needs t
 PNG = b"\x89PNG\r\n"
 
 
+@pytest.mark.heavy
 def test_reproduce_prints_both_numbers_and_reasons_of_the_difference(tmp_path: Path) -> None:
     options = ("--quick", "--json", "--workers", "1", "--out", "pictures")
     completed = snakesim("reproduce", "gray-hancock", *options, cwd=tmp_path)
@@ -26,6 +27,7 @@ def test_reproduce_prints_both_numbers_and_reasons_of_the_difference(tmp_path: P
     assert (tmp_path / "pictures" / "gray-hancock.png").read_bytes().startswith(PNG)
 
 
+@pytest.mark.heavy
 def test_reproduce_list_is_printed_as_text_and_json(tmp_path: Path) -> None:
     listed = snakesim("reproduce", "--list", cwd=tmp_path)
     assert listed.code == 0, listed.err

@@ -243,6 +243,7 @@ class RosNode:
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
 
+@pytest.mark.heavy
 def test_ros_node_reads_sensors_steers_and_sets_parameters(tmp_path: Path) -> None:
     with (
         running_snakesim(tmp_path / "run", *RUN) as run,

@@ -45,6 +45,7 @@ def read_lifecycle(session: Session) -> str:
     return "" if status is None else status.lifecycle
 
 
+@pytest.mark.heavy
 def test_teleop_keys_drive_robot_and_lost_operator_stops_it(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with running_snakesim(out, "peg_row", "--clock-mode", "realtime", "--duration", "300") as run:
@@ -142,6 +143,7 @@ def test_teleop_with_paused_clock_shows_its_reason(
         assert "PowerOff" not in {state.state for state in states}
 
 
+@pytest.mark.heavy
 def test_teleop_with_silent_host_shows_missing_clock(
     lockstep_run: RunningCommand, tmp_path: Path
 ) -> None:

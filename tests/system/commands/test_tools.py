@@ -45,6 +45,7 @@ def echo_messages(run: RunningCommand, key: str, count: int, *options: str) -> l
     return lines
 
 
+@pytest.mark.heavy
 def test_command_with_unwritable_output_prints_one_line(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         completed = subprocess.run(
@@ -76,6 +77,7 @@ def test_run_with_unread_output_completes(tmp_path: Path) -> None:
         assert (tmp_path / str(number) / "summary.json").exists(), redirection
 
 
+@pytest.mark.heavy
 def test_run_with_closed_terminal_ends_in_order(tmp_path: Path) -> None:
     test_end, command_end = pty.openpty()
     endpoint = find_free_endpoint()
@@ -111,6 +113,7 @@ INTERRUPTED_COMMANDS = (
 )
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -157,6 +160,7 @@ def has_run_first_line(pid: int) -> bool:
     return is_zombie or (not catches_sigint and loads_modules)
 
 
+@pytest.mark.heavy
 def test_topic_and_status_commands_show_a_running_robot(tmp_path: Path) -> None:
     arguments = ["triplet", "--controller", "hold", "--duration", "600", "--clock-mode", "realtime"]
     with running_armed_snakesim(tmp_path / "run", *arguments) as run:
@@ -205,6 +209,7 @@ def test_run_on_every_address_needs_the_insecure_option(tmp_path: Path) -> None:
         assert completed.code == code, completed.printed
 
 
+@pytest.mark.heavy
 def test_tutorial_controller_runs_from_file_and_installed_package(tmp_path: Path) -> None:
     blocks = re.findall(
         r"```python wave\.py\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), re.DOTALL

@@ -31,6 +31,7 @@ def render_video(run: Path, out: Path, *options: str) -> str:
     return completed.err
 
 
+@pytest.mark.heavy
 def test_video_gif_shows_the_snake_in_every_frame(run: Path) -> None:
     out = run.parent / "film.gif"
     assert render_video(run, out, "--speed", "2") == ""

@@ -62,6 +62,7 @@ def press_enter(process: subprocess.Popen[str]) -> str:
     return process.communicate(timeout=30)[0]
 
 
+@pytest.mark.heavy
 def test_calibration_by_hand_writes_mounting_and_limits_to_robot_file(home: Path) -> None:
     pose_rad = [0.0] * JOINT_COUNT
     set_joint_angles(home, pose_rad)
@@ -129,6 +130,7 @@ def turn_wrong_joint(home: Path, endpoint: str) -> str:
     return result
 
 
+@pytest.mark.heavy
 def test_calibration_refuses_armed_robot_shipped_file_and_unknown_joint(home: Path) -> None:
     set_joint_angles(home, [0.0] * JOINT_COUNT)
     content_before = (home / "snake.toml").read_bytes()

@@ -31,6 +31,7 @@ zero_rad = 0.2
 REAL_BACKEND = ("--backend", "./real.py:Real")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("backend", DRIVE_TYPES)
 def test_shape_check_names_mounting_faults_on_every_drive_type(
     tmp_path: Path, backend: str
@@ -66,6 +67,7 @@ def run_real_robot(home: Path, out: str, *options: str) -> CompletedRun:
     return run_snakesim("run", "bench.toml", *flags, *options, cwd=home)
 
 
+@pytest.mark.heavy
 def test_robot_without_imus_can_be_armed_after_both_checks(tmp_path: Path) -> None:
     home = make_bent_folder(tmp_path, "Real")
     robot_file = home / "snake.toml"
@@ -113,6 +115,7 @@ def test_robot_without_imus_can_be_armed_after_both_checks(tmp_path: Path) -> No
     assert "was changed in its file since" in changed.out
 
 
+@pytest.mark.heavy
 def test_shape_check_with_loose_link_writes_nothing(tmp_path: Path) -> None:
     home = make_bent_folder(tmp_path, "Real")
     with running_bench_host(home, "./real.py:Real") as endpoint:
@@ -125,6 +128,7 @@ def test_shape_check_with_loose_link_writes_nothing(tmp_path: Path) -> None:
     assert "[checked]" not in (home / "snake.toml").read_text()
 
 
+@pytest.mark.heavy
 def test_shape_draw_writes_pdf_and_names_unknown_properties(tmp_path: Path) -> None:
     drawn = snakesim("robot", "shape", "draw", "planar13", "--out", "shapes.pdf", cwd=tmp_path)
     assert drawn.code == 0, drawn.err

@@ -60,6 +60,7 @@ def test_drives_mounted_reversed_move_the_robot_equally(
     )
 
 
+@pytest.mark.heavy
 def test_modules_mounted_reversed_and_declared_give_the_same_run(nominal: RunSummary) -> None:
     declaration = [f"robot.joints.{joint}.sign=-1" for joint in EVERY_SECOND_JOINT]
     declared = simulate_peg_row(*declaration)
@@ -83,6 +84,7 @@ def test_modules_mounted_reversed_and_declared_give_the_same_run(nominal: RunSum
     )
 
 
+@pytest.mark.heavy
 def test_drives_with_zero_and_gear_change_only_quantization(nominal: RunSummary) -> None:
     mixed = simulate_peg_row(*(f"robot.joints.{key}" for key in MIXED_MOUNTING))
     assert mixed.path_distance_m == pytest.approx(nominal.path_distance_m, rel=0.05)

@@ -11,6 +11,7 @@ from snakesim_testing.harness.command import run_program, snakesim
 SUITE_TIMEOUT_S = 300.0
 
 
+@pytest.mark.heavy
 @pytest.mark.timeout(400)
 def test_new_driver_passes_the_contract_suite_as_generated(tmp_path: Path) -> None:
     written = snakesim("drive", "new", "acme_servo", cwd=tmp_path)

@@ -46,6 +46,7 @@ def list_steps(record: Record, verdict: str) -> list[str]:
     return [step.key for step in record.steps if step.verdict == verdict]
 
 
+@pytest.mark.heavy
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     "driver_type",
@@ -86,6 +87,7 @@ def test_qualification_completes_on_an_emulated_drive(driver_type: str, tmp_path
     assert "finished" in repeated.err
 
 
+@pytest.mark.heavy
 def test_qualification_refutes_drive_without_watchdog(tmp_path: Path):
     record = qualify_drive(
         Request("moteus", tmp_path),
@@ -98,6 +100,7 @@ def test_qualification_refutes_drive_without_watchdog(tmp_path: Path):
     }
 
 
+@pytest.mark.heavy
 def test_qualification_refutes_drive_that_enables_itself_again(tmp_path: Path):
     record = qualify_drive(
         Request("moteus", tmp_path),
@@ -108,6 +111,7 @@ def test_qualification_refutes_drive_that_enables_itself_again(tmp_path: Path):
     assert "stays-off" in {claim.id for claim in record.claims if claim.verdict == "refuted"}
 
 
+@pytest.mark.heavy
 def test_qualification_refutes_drive_that_turns_the_other_way(tmp_path: Path):
     request = Request("moteus", tmp_path, emulator_sets=["backend.mounted.joint_1.sign=-1"])
     record = qualify_drive(request, make_options(tmp_path, "motion"), discard_line)
@@ -115,6 +119,7 @@ def test_qualification_refutes_drive_that_turns_the_other_way(tmp_path: Path):
     assert {claim.id for claim in record.claims if claim.verdict == "refuted"} == {"si-units"}
 
 
+@pytest.mark.heavy
 def test_interrupted_qualification_leaves_motor_off_and_continues(tmp_path: Path):
     folder = tmp_path / "out"
     arguments = ("drive", "qualify", "odrive", "--yes", "--out", "out", "--key", "key.pem")

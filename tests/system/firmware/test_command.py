@@ -37,6 +37,7 @@ def emulate_modules(folder: Path) -> Iterator[tuple[str, list[str]]]:
         printed.extend(output.splitlines())
 
 
+@pytest.mark.heavy
 @pytest.mark.e2e
 def test_scan_lists_every_module_of_reference_firmware(tmp_path: Path) -> None:
     with emulate_modules(tmp_path) as (channel, printed):

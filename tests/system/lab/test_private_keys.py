@@ -94,6 +94,7 @@ def test_lab_check_reports_private_key_readable_by_all(tmp_path: Path) -> None:
     assert "every user of this computer may read this private key (mode 604)" in lines[-1]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("max_memory_mb", [20, 30, 40, 100])
 def test_lab_certs_without_enough_memory_prints_one_line(
     tmp_path: Path, max_memory_mb: int

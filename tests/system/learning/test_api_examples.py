@@ -15,6 +15,7 @@ PAGES_THAT_RUN = [
 ]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("page", PAGES_THAT_RUN, ids=lambda page: page.file)
 def test_api_page_example_runs(page: Page, tmp_path: Path) -> None:
     program = tmp_path / "example.py"

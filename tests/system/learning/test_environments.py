@@ -71,6 +71,7 @@ def run_episode(
     return info
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "name",
     [
@@ -120,6 +121,7 @@ def test_environment_numbers_have_names_units_and_bounds() -> None:
     assert make_environment(action="velocity").action_units[0] == "rad/s"
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -148,6 +150,7 @@ def test_environment_episode_has_digest_of_equivalent_run(arguments: dict[str, A
     assert info["digest"] == run.digest
 
 
+@pytest.mark.heavy
 def test_environment_zero_residual_has_digest_of_shipped_controller(tmp_path) -> None:
     env = make_environment("peg_row", action="residual:obstacle_triplet", duration=0.5)
     zero_info = run_episode(env, seed=3, compute_action=lambda _: np.zeros(13))
@@ -474,6 +477,7 @@ def test_environment_outside_an_episode_needs_reset() -> None:
         env.step(compute_wave_rad(0.0))
 
 
+@pytest.mark.heavy
 def test_gym_extra_contains_all_packages_of_a_step() -> None:
     unneeded_packages = {
         package

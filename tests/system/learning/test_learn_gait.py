@@ -84,6 +84,7 @@ def test_wave_correction_shapes_are_smooth_along_the_body() -> None:
     assert sign_changes.tolist() == list(range(1, correction.SHAPE_COUNT))
 
 
+@pytest.mark.heavy
 def test_measured_policy_has_one_episode_of_each_seed(task: Any, wave_file: Path) -> None:
     result = task.measure_policy(str(wave_file), SEED, 3)
     with EpisodeRunner(task.ENVIRONMENT, worker_count=1) as runner:
@@ -93,6 +94,7 @@ def test_measured_policy_has_one_episode_of_each_seed(task: Any, wave_file: Path
     assert np.allclose(result.energy_j, [episode.energy_j for episode in episodes], rtol=1e-4)
 
 
+@pytest.mark.heavy
 def test_tuned_serpenoid_with_smaller_energy_budget_uses_less_energy(
     task: Any, tmp_path: Path
 ) -> None:

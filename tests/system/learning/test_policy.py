@@ -116,6 +116,7 @@ def run_policy(model: Path, scenario: str = "triplet", duration: float = 0.1) ->
     )
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("rows", [1, "batch"])
 def test_policy_run_has_digest_of_same_arithmetic_in_python(
     tmp_path: Path, rows: int | str
@@ -141,6 +142,7 @@ SETTINGS = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "case",
     ["simulator", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SETTINGS)[1:])],

@@ -212,6 +212,7 @@ def test_run_with_failing_controller_names_it_in_the_error(controller, cause: ty
     assert type(caught.value.__cause__) is (type(None) if cause is None else cause)
 
 
+@pytest.mark.heavy
 def test_python_controller_failure_in_child_process_is_reported(tmp_path: Path) -> None:
     """Runs happen in a child process if the program has imported NumPy before snakesim."""
     (tmp_path / "failing.py").write_text(FAILING_CONTROLLER)
@@ -238,6 +239,7 @@ def test_python_controller_too_slow_for_real_time_is_reported() -> None:
     assert "update() took" in repr(run)
 
 
+@pytest.mark.heavy
 def test_result_without_folder_makes_pages_plots_and_videos(
     result: snakesim.Result, tmp_path: Path
 ) -> None:
@@ -270,6 +272,7 @@ def test_result_to_pandas_has_signals_and_units(result: snakesim.Result) -> None
     assert frame.attrs["units"]["angle_rad.joint_3"] == "rad"
 
 
+@pytest.mark.heavy
 @pytest.mark.e2e
 def test_run_in_processes_has_same_digest(result: snakesim.Result, tmp_path: Path) -> None:
     run = snakesim.run("triplet", duration=1, processes=True, out=tmp_path / "run")

@@ -38,6 +38,7 @@ def read_metadata(model: Path) -> dict[str, str]:
     return {entry.key: entry.value for entry in onnx.load(model).metadata_props}
 
 
+@pytest.mark.heavy
 def test_training_search_writes_policy_and_learning_curve(search_folder: Path) -> None:
     rows = list(csv.DictReader((search_folder / "curve.csv").open()))
     assert [row["episodes"] for row in rows] == ["4", "8", "8"]
@@ -54,6 +55,7 @@ def test_training_search_writes_policy_and_learning_curve(search_folder: Path) -
     assert set(json.loads(metadata["snakesim.learned"])) == set(FORMS["feeling"])
 
 
+@pytest.mark.heavy
 def test_training_search_resumed_reaches_the_same_policy(
     search_folder: Path, tmp_path: Path
 ) -> None:

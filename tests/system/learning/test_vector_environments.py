@@ -176,6 +176,7 @@ EVERY_RESET = [
 ]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("name", "mode"), EVERY_RESET)
 def test_vector_environment_rows_have_bits_of_single_environments(
     name: str, mode: AutoresetMode
@@ -228,6 +229,7 @@ def test_vector_environment_without_autoreset_is_reset_by_mask() -> None:
     envs.close()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("count", [6, pytest.param(64, marks=pytest.mark.slow)])
 def test_vector_environment_with_more_threads_has_same_bits(count: int) -> None:
     case = CASES["positions among obstacles"]
@@ -296,6 +298,7 @@ def test_vector_environment_with_diverged_simulation_stops_only_that_one() -> No
     assert "diverged at tick 6" in reasons[0]
 
 
+@pytest.mark.heavy
 def test_vector_environment_of_different_scenes_has_single_digests() -> None:
     case: Case = (
         "surveyed_clutter",

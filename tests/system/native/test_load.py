@@ -89,6 +89,7 @@ def test_library_in_read_only_package_uses_user_cache(
     assert loaded.path.is_relative_to(tmp_path / "cache")
 
 
+@pytest.mark.heavy
 @pytest.mark.usefixtures("compiler")
 def test_library_compiled_by_two_processes_at_once_succeeds(tmp_path: Path) -> None:
     program = (

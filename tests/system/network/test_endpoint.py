@@ -89,6 +89,7 @@ UNSHARE_COMMAND = ["unshare", "--net", "--map-root-user"]
 CLI_CODE = "from snakesim_operator.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
 
 
+@pytest.mark.heavy
 def test_run_without_loopback_names_interface_and_remedy(tmp_path: Path) -> None:
     if (
         shutil.which("unshare") is None

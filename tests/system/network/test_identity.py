@@ -93,6 +93,7 @@ def test_host_arms_on_request_over_private_channel() -> None:
     starter.close()
 
 
+@pytest.mark.heavy
 def test_private_channel_whose_starter_does_not_read_blocks_nothing() -> None:
     starter_socket, host_socket = socket_pair()
     with starter_socket, host_socket:

@@ -8,6 +8,7 @@ from snakesim_testing.runs.whole_run import load_run_config, run_controller
 BEHIND_STEP_M = 2.8  # after this advance, the tail has left the step
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("height_m", [0.05, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_snake_with_pitch_joints_climbs_over_a_step(height_m: float) -> None:
     settings = (

@@ -184,6 +184,7 @@ def merge_neighbors(pushes: list[Push]) -> list[Push]:
     return merged
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("with_pose", [True, False])
 @pytest.mark.parametrize("scenario", ["triplet", "peg_row"])
 def test_contact_estimate_median_force_error_is_below_15_percent(

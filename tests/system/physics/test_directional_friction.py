@@ -101,6 +101,7 @@ def test_gliding_body_stops_where_independent_integrator_computes(
     assert distance_m == pytest.approx(expected_m, abs=tolerance_m)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("robot", "ground", "coefficients", "viscous"),
     [
@@ -254,6 +255,7 @@ def test_wall_friction_of_scaled_link_is_equal_in_both_directions() -> None:
         assert deceleration_m_s2 == pytest.approx(expected_m_s2, rel=0.02)
 
 
+@pytest.mark.heavy
 def test_undulation_moves_forward_on_scales_without_obstacles() -> None:
     """The example of the documentation moves along the initial heading of its body."""
     duration = parse_set_option("duration_s=5")

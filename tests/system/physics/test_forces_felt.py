@@ -15,6 +15,7 @@ RANDOM_SCENE: dict[str, Any] = {"scene.random_field.0.seed": 5413, "seed": 5413}
 slow = partial(pytest.param, marks=pytest.mark.slow)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("scenario", "settings", "min_correlation", "max_error", "max_no_contact_fraction"),
     [
@@ -42,6 +43,7 @@ def test_requested_obstacle_forces_are_reached_while_moving(
     assert tracking.no_contact_fraction < max_no_contact_fraction
 
 
+@pytest.mark.heavy
 def test_obstacle_aided_without_torque_mode_advances_in_position_mode():
     position_mode_only = {"robot.drive.modes": ["position"]}
     result = snakesim.run(

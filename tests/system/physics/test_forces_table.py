@@ -25,6 +25,7 @@ def test_step_forces_average_to_contact_sensor_samples():
     assert impulses_ns.sum() > 10.0
 
 
+@pytest.mark.heavy
 def test_difference_causes_add_up_to_100_percent():
     table_row = measure_difference_causes("triplet", "obstacle_aided", duration=2.0)
     cells = [cell.strip() for cell in table_row.split("|")[1:-1]]

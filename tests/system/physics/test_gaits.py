@@ -31,6 +31,7 @@ def find_displacement_m(record: RunRecord) -> tuple[float, float]:
     return float(x), float(y)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("gait", "scenario", "sets", "min_forward_m"),
     [
@@ -50,6 +51,7 @@ def test_gait_moves_forward(
     assert abs(sideways_m) < 0.5 * forward_m
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("gait", "side"),
     [("serpenoid", 1.0)]
@@ -71,6 +73,7 @@ def test_directional_control_turns_body_towards_its_goal(gait: str, side: float)
     assert not summary.limited_commands  # planned paths do not jerk the joints
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("height", "side"), [(0.015, 1.0), pytest.param(-0.015, -1.0, marks=pytest.mark.slow)]
 )
@@ -88,6 +91,7 @@ def test_backbone_rolling_moves_sideways() -> None:
     assert abs(forward_m) < 0.3 * abs(sideways_m)
 
 
+@pytest.mark.heavy
 def test_concertina_in_corridor_advances_and_braces_between_walls() -> None:
     record, summary = run_gait("concertina", "corridor", 8.5)
     forward_m, _ = find_displacement_m(record)
@@ -105,12 +109,14 @@ def test_concertina_without_walls_advances_less_than_in_corridor() -> None:
     assert braced_m > 1.5 * free_m
 
 
+@pytest.mark.heavy
 def test_rectilinear_motion_moves_body_forward() -> None:
     record, _ = run_gait("rectilinear", "mamba_flat", 5)
     forward_m, _ = find_displacement_m(record)
     assert forward_m > 0.06
 
 
+@pytest.mark.heavy
 def test_sinus_lifting_reverses_the_direction_of_travel() -> None:
     """On isotropic friction, the same wave moves the body backward if all of the body rests on the ground."""
     lifted, _ = run_gait("sinus_lifting", "mamba_flat", 5)

@@ -33,6 +33,7 @@ def list_propulsion_joints(run: RecordedTicks) -> list[int]:
 # --- the case study -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "noise", [(), *(pytest.param((seed,), marks=pytest.mark.slow) for seed in ("seed=2", "seed=3"))]
 )
@@ -58,6 +59,7 @@ def test_triplet_ends_when_obstacle_at_tail_is_lost():
     assert "2 usable push-points, 3 are needed" in run.reasons[-1]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("missing", ["world", pytest.param("trajectory", marks=pytest.mark.slow)])
 def test_locomotion_without_world_or_trajectory_stops_then_continues(missing: str):
     gap = range(200, 400)
@@ -220,6 +222,7 @@ def test_triplet_with_two_newtons_does_not_move_and_reports_reason():
     assert not any(report.jammed for report in run.reports)
 
 
+@pytest.mark.heavy
 def test_push_report_contains_measured_not_requested_forces():
     """Of the 8 N, twice the drag of 3.9 N, a part is missing, because one push-point is not in contact."""
     run = run_controller(load_run_config("peg_row", f"{TRIPLET}.propulsion_n=8"), duration_s=5.0)
@@ -267,6 +270,7 @@ def test_triplet_travels_three_body_lengths_with_backward_hand_overs():
     assert backward > 1.5 * forward
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("modules", "min_advance_m"), [(8, 0.8), pytest.param(30, 0.5, marks=pytest.mark.slow)]
 )
@@ -287,6 +291,7 @@ def test_robot_with_pitch_joints_crosses_hills_among_pegs():
     assert {axes[joint] for joint in list_propulsion_joints(run)} == {"yaw"}
 
 
+@pytest.mark.heavy
 def test_path_following_moves_steadily_along_the_row():
     run = run_controller(load_run_config("peg_row", "controller=path_following"), duration_s=6.0)
     expected_advance_m = run.record.config.mission.speed_m_s * 6.0
@@ -297,6 +302,7 @@ def test_path_following_moves_steadily_along_the_row():
 # --- jams -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_jam_is_reported_and_snake_stays():
     run = run_controller(load_run_config("jam"))
     jammed = np.array([report.jammed for report in run.reports])
@@ -307,6 +313,7 @@ def test_jam_is_reported_and_snake_stays():
     assert all(reason.startswith("jammed: standing still") for reason in run.reasons[jam_tick:])
 
 
+@pytest.mark.heavy
 def test_pegs_with_high_friction_are_reported_as_jam():
     run = run_controller(
         load_run_config("triplet", "scene.pegs_along_route.0.friction=1.0"), duration_s=4.0

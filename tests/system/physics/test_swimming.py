@@ -12,6 +12,7 @@ TOLERANCE_MM_S = 3.0
 SLOW_WAVE = JointWave(0.3, 0.7, 4.0)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("controller", "min_forward_m"),
     [("serpenoid", 0.7), pytest.param("cpg", 0.7, marks=pytest.mark.slow)],
@@ -31,6 +32,7 @@ def test_undulation_swims_forward_at_its_depth(controller: str, min_forward_m: f
     assert abs(up_m) < 0.02
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "wave",
     [SLOW_WAVE, pytest.param(SLOW_WAVE.reversed, marks=pytest.mark.slow)],

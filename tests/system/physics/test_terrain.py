@@ -78,12 +78,14 @@ def test_wave_towards_tail_moves_body_backward_in_pipe() -> None:
     assert (last - first).mean(axis=0)[0] < -0.2
 
 
+@pytest.mark.heavy
 def test_rectilinear_motion_advances_in_pipe() -> None:
     record = run_scenario("mamba_flat", 5, "scene=pipe", "controller=rectilinear")
     first, last = find_nodes_w(record)
     assert (last - first).mean(axis=0)[0] > 0.06
 
 
+@pytest.mark.heavy
 def test_rolling_arc_crosses_a_pipe() -> None:
     first, last = find_nodes_w(run_scenario("over_pipe", 10))
     # The pipe is 0.16 m wide at the height of the ground. The body starts before it, and ends behind it.
@@ -91,6 +93,7 @@ def test_rolling_arc_crosses_a_pipe() -> None:
     assert last[:, 1].max() < -0.53 - 0.035
 
 
+@pytest.mark.heavy
 def test_helix_climbs_stairs() -> None:
     record = run_scenario("stairs", 10)
     first, last = find_nodes_w(record)
@@ -100,6 +103,7 @@ def test_helix_climbs_stairs() -> None:
     assert last[:, 2].min() > stairs.count * stairs.rise_m
 
 
+@pytest.mark.heavy
 def test_stiff_robot_on_wheels_crosses_gaps() -> None:
     record = run_scenario("gaps", 7)
     first, last = find_nodes_w(record)

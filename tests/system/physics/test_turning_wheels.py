@@ -51,6 +51,7 @@ def test_wheels_roll_easily_and_slip_sideways_above_tire_friction(surface: str) 
     assert (pushed.position_w - position_w)[1] > 1e-3
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "wave",
     [SLOW_WAVE, pytest.param(SLOW_WAVE.reversed, marks=pytest.mark.slow)],

@@ -102,6 +102,7 @@ def is_safe_start(call: ast.Call, container: ast.AST) -> bool:
     return has_environment and {"make_python_command", "make_child_environment"} <= called
 
 
+@pytest.mark.heavy
 def test_child_processes_start_with_prepared_command_and_environment() -> None:
     starts_by_file = {
         path.relative_to(ROOT).as_posix(): list(find_process_starts(path)) for path in FILES

@@ -120,6 +120,7 @@ def test_run_folder_in_use_refuses_second_process_until_killed(tmp_path: Path) -
         holder.stdout.close()
 
 
+@pytest.mark.heavy
 def test_run_folder_requested_by_many_processes_is_locked_by_one(tmp_path: Path) -> None:
     """One process locks the folder, also while an earlier run is being moved."""
     out = tmp_path / "run"

@@ -55,6 +55,7 @@ def test_worker_pool_runs_calls_in_processes_without_listening_sockets(
     assert not list(tmp_path.iterdir()), "temporary files of the workers remain"
 
 
+@pytest.mark.heavy
 def test_worker_pool_call_that_fails_affects_no_other_call(tmp_path: Path) -> None:
     calls = [("os._exit(3)",), ("1 / 0",), ("time.sleep(60)",), ("1 + 1",)]
     with WorkerPool(2) as pool:

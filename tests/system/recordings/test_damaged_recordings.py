@@ -75,6 +75,7 @@ def write_with_damaged_chunk(path: Path, intact: bytes, index: int) -> Path:
     return write_file(path, flip_bit(intact, (chunk.begin + chunk.end) // 2))
 
 
+@pytest.mark.heavy
 def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(
     run: Path, intact: bytes, tmp_path: Path
 ) -> None:
@@ -425,6 +426,7 @@ PLUGIN_KINDS = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", PLUGIN_KINDS)
 def test_replay_runs_code_of_recording_only_on_request(tmp_path: Path, kind: str) -> None:
     base_class, own_options, shipped_options = PLUGIN_KINDS[kind]

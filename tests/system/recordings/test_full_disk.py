@@ -22,6 +22,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("command", "name"),
     [
@@ -57,6 +58,7 @@ def write_learning_curve(folder: Path) -> None:
     write_curve(folder, [SearchGeneration(0, 10, 0.1, 0.2, None, None, None)] * 200)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("write", "name"),
     [

@@ -69,6 +69,7 @@ def read_newest_status(session: Session) -> RobotStatus:
 # --- kills -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_record_of_killed_host_misses_only_the_last_second(tmp_path: Path) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG_RUN) as run:
         with open_session(ConnectionSettings(run.endpoint, "planar13")) as session:
@@ -118,6 +119,7 @@ def test_record_of_killed_supervisor_misses_only_the_last_second(tmp_path: Path)
 # --- complete, or not --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("when", [pytest.param("starting", marks=pytest.mark.slow), "armed"])
 def test_record_of_host_stopped_by_signal_is_incomplete(tmp_path: Path, when: str) -> None:
     with running_snakesim(tmp_path / "run", *LONG_RUN) as run:
@@ -217,6 +219,7 @@ def digest(tmp_path_factory: pytest.TempPathFactory) -> str:
     ].command_digest
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("options", "prepare", "extra_arguments", "warning"),
     [

@@ -30,6 +30,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.heavy
 def test_recordings_alone_contain_the_record_of_the_black_box(run: Path) -> None:
     with_black_box = RunRecord.load(run)
     recording_alone = RunRecord.load(run / RECORDING_FILENAME)

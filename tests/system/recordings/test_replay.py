@@ -24,6 +24,7 @@ def recorded_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "scenario",
     [
@@ -44,6 +45,7 @@ def test_replay_of_shipped_scenario_gives_bit_identical_commands(
     assert replayed.out == f"{ticks} commands, the same to the bit\n"
 
 
+@pytest.mark.heavy
 def test_replay_without_changes_stores_the_same_run(recorded_run: Path, tmp_path: Path) -> None:
     result = snakesim("replay", str(recorded_run), "--control", "--out", "again", cwd=tmp_path)
     assert result.code == 0, result.err

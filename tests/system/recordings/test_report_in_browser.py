@@ -21,6 +21,7 @@ def record() -> RunRecord:
     return simulate_triplet()
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(CHROMIUM is None, reason=BROWSER_MISSING)
 @pytest.mark.parametrize("width", [1400, 400])
 def test_report_in_browser_draws_every_chart_without_errors(

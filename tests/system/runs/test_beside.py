@@ -55,6 +55,7 @@ def test_control_in_host_with_failing_controller_ends_run(
     assert summary.duration_s < 60, result.out
 
 
+@pytest.mark.heavy
 def test_host_obeys_estop_while_its_controller_hangs(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text(BAD.replace("%s", "hangs"))
     with running_snakesim(

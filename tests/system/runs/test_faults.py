@@ -14,6 +14,7 @@ MAX_ONE_ISOLATED_JOINT = "robot.safety.max_isolated_joints=1"
 slow = partial(pytest.param, marks=pytest.mark.slow)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("backend", "fault", "what"),
     [
@@ -57,6 +58,7 @@ def test_planned_fault_occurs_at_its_tick_and_ends_run(
     assert record.lifecycle == "fault"
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "backend", ["sim", "can", slow("odrive"), slow("moteus"), slow("dynamixel")]
 )

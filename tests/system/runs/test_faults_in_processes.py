@@ -55,6 +55,7 @@ def test_harmless_faults_do_not_disturb_the_run(
     ]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("backend", ["can", pytest.param("sim", marks=pytest.mark.slow)])
 def test_fault_requested_by_command_is_injected_or_refused(tmp_path: Path, backend: str) -> None:
     arguments = [

@@ -15,6 +15,7 @@ DIFFERING_PARTS = arithmetic.find_differing_parts(arithmetic.measure_arithmetic(
 QUICK_SCENARIOS = ("triplet", "peg_row")
 
 
+@pytest.mark.heavy
 @pytest.mark.skipif(
     bool(DIFFERING_PARTS),
     reason=f"the digests of this computer are its own: {' and '.join(DIFFERING_PARTS)}",

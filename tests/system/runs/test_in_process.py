@@ -121,6 +121,7 @@ class Compiled(HoldPose):
 """
 
 
+@pytest.mark.heavy
 def test_in_process_controller_that_hangs_ends_in_safe_stop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,6 +141,7 @@ def test_in_process_controller_that_hangs_ends_in_safe_stop(
     assert result.record.host.lifecycle == "fault"
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "controller", ["Endless", pytest.param("Compiled", marks=pytest.mark.slow)]
 )
@@ -201,6 +203,7 @@ def test_in_process_ctrl_c_after_last_tick_keeps_report(
     assert (tmp_path / "run" / REPORT_FILENAME).is_file()
 
 
+@pytest.mark.heavy
 def test_in_process_run_with_fault_is_repeatable() -> None:
     config = load_scenario(
         "peg_row",

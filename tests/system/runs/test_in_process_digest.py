@@ -54,6 +54,7 @@ def reports_paused_time(message: ControlState | WorldModel) -> bool:
     return isinstance(message, ControlState) and message.reason.startswith("robot time is paused")
 
 
+@pytest.mark.heavy
 def test_in_process_digest_of_clutter_equals_that_of_processes(tmp_path: Path) -> None:
     """This scenario also uses the camera, the map and the planner."""
     run_both_ways_and_compare(tmp_path / "run", "clutter", "--duration", "0.5")

@@ -64,6 +64,7 @@ def run_and_return_world_models(
     return record.worlds
 
 
+@pytest.mark.heavy
 def test_perceived_map_is_independent_of_scene_file():
     worlds = run_and_return_world_models("perceived")
     worlds_with_wrong_scene = run_and_return_world_models("perceived", wrong_scene=True)
@@ -73,6 +74,7 @@ def test_perceived_map_is_independent_of_scene_file():
     assert worlds[1:common_count] == worlds_with_wrong_scene[1:common_count]
 
 
+@pytest.mark.heavy
 def test_dead_reckoning_localizes_without_pose_sensor() -> None:
     worlds = run_and_return_world_models("perceived", "mission.localization=dead_reckoning")
     assert all(world.pose_timestamp_ns is None for world in worlds)
@@ -81,6 +83,7 @@ def test_dead_reckoning_localizes_without_pose_sensor() -> None:
     assert 0.0 < sd_m < 0.05
 
 
+@pytest.mark.heavy
 def test_known_map_contains_obstacles_of_scene_file():
     worlds = run_and_return_world_models("known", wrong_scene=True)
     obstacles = [obstacle for world in worlds for obstacle in world.obstacles]

@@ -16,6 +16,7 @@ pytestmark = pytest.mark.e2e
 SERVICES = ("guidance", "navigation", "control")
 
 
+@pytest.mark.heavy
 def test_programs_started_in_any_order_equal_one_run(lab: LabPrograms) -> None:
     for name in SERVICES[:2]:
         lab.start_service(name)

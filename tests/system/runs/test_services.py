@@ -79,6 +79,7 @@ def run_and_return_digest(
     return summary.command_digest
 
 
+@pytest.mark.heavy
 def test_file_service_publishes_pose_in_all_process_layouts(home: Path) -> None:
     digest = run_and_return_digest(home, "many", run_to_summary)
     digest_in_process = run_and_return_digest(home, "one", in_process.run_to_summary)

@@ -108,6 +108,7 @@ def interrupt_and_read_summary(run: RunningCommand) -> RunSummary:
     return read_summary(run.out)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "clock_mode", ["lockstep", pytest.param("realtime", marks=pytest.mark.quiet)]
 )
@@ -141,6 +142,7 @@ def test_supervisor_restarts_killed_host_without_arming_it(tmp_path: Path, clock
     assert "host was ended by SIGKILL; restart in 0.5 s" in run.printed()
 
 
+@pytest.mark.heavy
 def test_supervisor_after_killed_controller_waits_for_reset_by_operator(tmp_path: Path) -> None:
     with running_armed_snakesim(
         tmp_path / "run", *LONG_RUN, "--clock-mode", "realtime", "--stay"
@@ -249,6 +251,7 @@ def test_requested_process_faults_are_injected_or_refused(tmp_path: Path) -> Non
         )  # the supervisor continues a frozen host, so that it can end in order
 
 
+@pytest.mark.heavy
 def test_killed_supervisor_leaves_no_frozen_process(tmp_path: Path) -> None:
     freeze_option = ("--set", 'faults=["freeze:control@0.2","freeze:host@0.2"]')
     with running_snakesim(

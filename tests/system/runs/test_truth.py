@@ -26,6 +26,7 @@ HOLD_WITHOUT_REPORT_CODE = (
 )
 
 
+@pytest.mark.heavy
 def test_summary_of_standing_controller_without_report_is_not_locomoting(tmp_path: Path) -> None:
     (tmp_path / "still.py").write_text(HOLD_WITHOUT_REPORT_CODE)
     result, summary = run_to_summary(

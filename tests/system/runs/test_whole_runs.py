@@ -35,6 +35,7 @@ def test_run_from_stored_configuration_repeats_the_run(tmp_path: Path) -> None:
     assert repeated.config == original.config
 
 
+@pytest.mark.heavy
 def test_run_that_jams_reports_it_at_the_end(tmp_path: Path) -> None:
     result, summary = run_to_summary(tmp_path / "run", "jam", "--duration", "4")
     assert result.code == 0, result.out + result.err
@@ -56,6 +57,7 @@ def test_run_from_user_files_in_another_folder_completes(tmp_path: Path) -> None
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+@pytest.mark.heavy
 def test_run_without_recording_reports_unknown_instead_of_none(tmp_path: Path) -> None:
     short_run = ["triplet", "--in-process", "--duration", "1"]
     recorded = snakesim("run", *short_run, "--out", "recorded", cwd=tmp_path)
