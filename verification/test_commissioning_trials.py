@@ -1,4 +1,7 @@
-"""Hidden faults of emulated robots, one trial of each kind; `python -m verification.commissioning_trials` has more."""
+"""Tests that hidden faults of emulated robots are reported, with one or a few robots of each kind.
+
+`commissioning_trials` and `torque_constant_trials` run the same trials with many robots.
+"""
 
 from dataclasses import fields
 from pathlib import Path
@@ -9,10 +12,13 @@ import pytest
 from snakesim_hal.model.robot_file.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.joint_check.gear_rules import IS_LOOSE
 from snakesim_operator.features.commissioning.joint_check.measurements import CheckMeasurements
-from verification.commissioning_trials import identify_trials
+from verification.identification_trials import identify_hidden_robot
 from verification.start_check_results import append_trial, judge_again, read_results
 from verification.start_check_signals import load_signals, save_signals
 from verification.start_check_trials import NONE, check_trial
+from verification.torque_constant_results import append_result
+from verification.torque_constant_results import read_results as read_torque_constant_results
+from verification.torque_constant_trials import draw_fault, identify_torque_constants
 
 
 @pytest.mark.parametrize("fault", ["backlash", NONE])
@@ -57,9 +63,38 @@ def test_recorded_signals_are_read_without_a_rounding_error(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_wrong_torque_constants_are_reported_and_no_right_one() -> None:
-    for trial in identify_trials(4, "duration_s=12", backlash=False):
-        assert trial.reported_constants == trial.wrong_constants == 4
-        assert not trial.falsely_reported_constants
+    for trial in identify_hidden_robot(4, "duration_s=12", backlash=False):
+        assert trial.reported_constant_count == trial.wrong_constant_count == 4
+        assert not trial.falsely_reported_constant_count
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["odrive", "dynamixel", "can"])
+def test_wrong_torque_constant_of_whole_chain_is_named(tmp_path: Path, backend: str) -> None:
+    result = identify_torque_constants(1, backend)
+    append_result(tmp_path / "trials.jsonl", result)
+    assert read_torque_constant_results(tmp_path / "trials.jsonl") == [result]
+    assert result.faulty_joint == "joint_2"
+    assert result.is_named, result
+    assert not result.falsely_reported
+    assert not result.unknown
+    assert all(abs(joint.relative_error or 0.0) < 0.05 for joint in result.joints)
+
+
+def test_servos_without_torque_have_unknown_constants() -> None:
+    result = identify_torque_constants(1, "feetech")
+    assert "needs the measured torque of every joint" in result.refusal
+    assert len(result.unknown) == len(result.joints)
+    assert not result.is_named
+    assert not result.falsely_reported
+
+
+def test_every_fourth_robot_has_no_wrong_torque_constant() -> None:
+    faults = [draw_fault(number) for number in range(400)]
+    assert [fault is None for fault in faults] == [number % 4 == 3 for number in range(400)]
+    ratios = [fault[1] for fault in faults if fault is not None]
+    assert all(0.15 <= abs(ratio - 1) <= 0.40 for ratio in ratios)
+    assert min(ratios) < 1 < max(ratios)
 
 
 @pytest.mark.slow
@@ -90,7 +125,8 @@ def test_backlash_wider_than_the_motion_is_not_called_a_coupling() -> None:
 
 @pytest.mark.slow
 def test_backlash_spoils_no_values_of_other_joints() -> None:
-    named, unnamed = identify_trials(4, "duration_s=12", backlash=True)
-    assert named.named == [named.loose]
-    for trial in (named, unnamed):
-        assert trial.covered == trial.written and trial.constants_off == 0
+    with_imus, without_imus = identify_hidden_robot(4, "duration_s=12", backlash=True)
+    assert with_imus.named_joints == [with_imus.loose_joint]
+    for trial in (with_imus, without_imus):
+        assert trial.covered_count == trial.written_count
+        assert trial.inaccurate_constant_count == 0

@@ -13,6 +13,7 @@ from math import inf
 from zlib import crc32
 
 import msgspec
+import numpy as np
 
 from snakesim_can_backend.bus.load import count_joints_per_bus
 from snakesim_can_backend.emulator.bus_time import BusTime, BusTraffic
@@ -32,7 +33,11 @@ from snakesim_can_backend.protocol.definitions import (
     parse_opcode,
 )
 from snakesim_can_backend.settings import CanSettings
-from snakesim_drivers.emulation.mounted import build_actual_config, build_actual_joints
+from snakesim_drivers.emulation.mounted import (
+    build_actual_config,
+    build_actual_joints,
+    compute_torque_ratios,
+)
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_drivers.mounting import DriveMounting, to_joint_target
 from snakesim_hal.model.fault_kinds import FaultInjection, FaultTransition, InjectionPlan
@@ -99,6 +104,8 @@ class ModuleChain:
         self.motors = PowerStages(
             build_actual_config(config, settings.mounted).robot, physics_model.step_s
         )
+        # Real torque of each module divided by the torque that it computes from its current.
+        self._torque_ratios = np.array(compute_torque_ratios(robot, settings.mounted))
         self.thermal = ThermalModel(self._joints)
 
         # Time.
@@ -356,7 +363,7 @@ class ModuleChain:
         joint_slots = slots_on_bus[: self.modules_per_bus[channel]]
         is_imu_due = [slot.module.is_imu_due() for slot in joint_slots]
         readings = self._sensors[channel].read(
-            self.motors.torque_nm, self.motors.find_derated(), is_imu_due
+            self.motors.torque_nm / self._torque_ratios, self.motors.find_derated(), is_imu_due
         )
         first_joint = sum(self.modules_per_bus[:channel])
         for slot in slots_on_bus:
@@ -403,6 +410,8 @@ class ModuleChain:
     def _drive_motor(self, slot: ModuleSlot) -> None:
         """Apply a module's demand and gains to its motor, converted from the module's shaft to the joint.
 
+        The module computes torques from its current, so the real torques are those times its torque ratio.
+
         Args:
             slot: Place of the module on the bus, with the joint that it moves; its `driven` demand is updated.
         """
@@ -411,21 +420,27 @@ class ModuleChain:
         values = slot.module.parameters.values
         drive = slot.joint_model.drive
         gear = drive.gear
+        torque_ratio = float(self._torque_ratios[slot.joint])
         damping = ModuleParameter.VELOCITY_GAIN
         if demand.mode == JointMode.POSITION:
             damping = ModuleParameter.DAMPING
         torque_limit_nm = inf
         if demand.mode != JointMode.PASSIVE:
             torque_limit_nm = (
-                min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT]) * gear
+                min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT])
+                * gear
+                * torque_ratio
             )
+        target = to_joint_target(drive, demand.mode, demand.target)
+        if demand.mode == JointMode.TORQUE:
+            target *= torque_ratio
         self.motors.set_demand(
             slot.joint,
             demand.mode,
-            to_joint_target(drive, demand.mode, demand.target),
+            target,
             torque_limit_nm,
-            values[ModuleParameter.STIFFNESS] * gear**2,
-            values[damping] * gear**2,
+            values[ModuleParameter.STIFFNESS] * gear**2 * torque_ratio,
+            values[damping] * gear**2 * torque_ratio,
             values[ModuleParameter.SPEED_LIMIT] / gear,
         )
 

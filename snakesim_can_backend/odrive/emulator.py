@@ -123,8 +123,8 @@ class EmulatedOdrive(CanEmulator):
         self.axes = [
             EmulatedAxis(
                 node_id=true_joint.id,
-                torque_constant=true_joint.motor.torque_constant_nm_per_a
-                or EMULATED_CONSTANT_NM_PER_A,
+                # An operator configures it as in the robot file, also if the motor has another one.
+                torque_constant=joint.motor.torque_constant_nm_per_a or EMULATED_CONSTANT_NM_PER_A,
                 saved=make_configuration(joint, settings),
             )
             for joint, true_joint in zip(context.joints, context.body.joints, strict=True)

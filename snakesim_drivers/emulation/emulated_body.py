@@ -29,6 +29,8 @@ class EmulatedBody:
     """The body of a robot, as the emulated drives of all or some of its joints move it.
 
     In all methods `i` is the index of a drive among these, from tail to head. All values are those at its shaft.
+    Torques are those that the drive computes from its current. They differ from the real ones if the torque constant
+    in the robot file is wrong.
     """
 
     def __init__(self, shared: SharedPhysics, joint_indices: Sequence[int]) -> None:
@@ -98,15 +100,20 @@ class EmulatedBody:
             speed_rad_s: Speed limit.
         """
         drive = self.joints[i].drive
+        j = self._joint_indices[i]
         # Revolutions of the shaft for one of the joint, so torques at the joint are higher by it.
         gear = drive.gear
+        torque_ratio = self._shared.torque_ratios[j]
+        joint_target = to_joint_target(drive, mode, target)
+        if mode == JointMode.TORQUE:
+            joint_target *= torque_ratio
         self.motors.set_demand(
-            self._joint_indices[i],
+            j,
             mode,
-            to_joint_target(drive, mode, target),
-            limit_nm * gear,
-            stiffness * gear**2,
-            damping * gear**2,
+            joint_target,
+            limit_nm * gear * torque_ratio,
+            stiffness * gear**2 * torque_ratio,
+            damping * gear**2 * torque_ratio,
             speed_rad_s / gear,
         )
 
@@ -117,7 +124,7 @@ class EmulatedBody:
         j = self._joint_indices[i]
         angle_rad = float(self.physics_model.angle_rad[j])
         velocity_rad_s = float(self.physics_model.velocity_rad_s[j])
-        torque_nm = float(self.motors.torque_nm[j])
+        torque_nm = float(self.motors.torque_nm[j]) / self._shared.torque_ratios[j]
         return ShaftState(
             drive.zero_rad + ratio * angle_rad, ratio * velocity_rad_s, torque_nm / ratio
         )

@@ -60,7 +60,11 @@ class MountedDrive(FileStruct, frozen=True, kw_only=True):
     """Time constant with which the torque follows its command. None: as in the robot file."""
 
     torque_constant_nm_per_a: TorqueConstant | None = None
-    """Torque for each ampere at the drive's shaft. None: as in the robot file."""
+    """Torque for each ampere at the drive's shaft. None: as in the robot file.
+
+    The drive computes torque and current with the constant of the robot file, so its torque is wrong by the ratio of
+    the two. It has no effect if the robot file has no constant.
+    """
 
     backlash_rad: Backlash | None = None
     """Whole backlash of the gear, between the encoder on the motor and the link. None: no backlash."""
@@ -108,6 +112,27 @@ def build_actual_config(config: RunConfig, mounted: Mapping[str, MountedDrive]) 
             joints[name] = msgspec.structs.replace(exceptions, **overrides)
     robot = msgspec.structs.replace(config.robot, joints=joints)
     return msgspec.structs.replace(config, robot=robot)
+
+
+def compute_torque_ratios(robot: RobotFile, mounted: Mapping[str, MountedDrive]) -> list[float]:
+    """Return the real torque of each drive divided by the torque that it computes from its current, tail to head.
+
+    A drive, or its driver, computes torques with the torque constant of the robot file. Without one, it computes the
+    real torque.
+
+    Args:
+        robot: The robot as its file describes it.
+        mounted: Differences between the real mounting and the robot file, by the name of the joint.
+    """
+    ratios: list[float] = []
+    for joint in robot.joint_table:
+        assumed_nm_per_a = joint.motor.torque_constant_nm_per_a
+        true_nm_per_a = mounted.get(joint.name, MountedDrive()).torque_constant_nm_per_a
+        if assumed_nm_per_a is None or true_nm_per_a is None:
+            ratios.append(1.0)
+        else:
+            ratios.append(true_nm_per_a / assumed_nm_per_a)
+    return ratios
 
 
 def _collect_overrides(

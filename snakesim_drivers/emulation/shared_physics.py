@@ -11,6 +11,7 @@ from snakesim_drivers.emulation.mounted import (
     MountedDrive,
     build_actual_config,
     build_actual_joints,
+    compute_torque_ratios,
 )
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
 from snakesim_hal.model.plugins import (
@@ -135,6 +136,8 @@ class SharedPhysics:
         self.physics_model = physics_model
         self.joints = build_actual_joints(config.robot, mounted)
         self.motors = PowerStages(build_actual_config(config, mounted).robot, physics_model.step_s)
+        # Real torque of each drive divided by the torque that it computes from its current.
+        self.torque_ratios = compute_torque_ratios(config.robot, mounted)
         self.thermal = ThermalModel(self.joints)
 
         # Time.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from verification.commissioning_trials import draw_hidden_robot, record_motion
+from verification.identification_trials import draw_hidden_robot, record_motion
 from verification.sysid.equations import identify_by_equations
 from verification.sysid.estimates import IdentificationResult
 from verification.sysid.rollout_fit import identify_by_rollouts
@@ -44,7 +44,7 @@ def compare_robot(number: int, sets: Sequence[str], *, backlash: bool) -> RobotC
         OURS_WITHOUT_IMUS: identify_by_equations(robot, columns, None),
         THEIRS: identify_by_rollouts(robot, columns),
     }
-    return RobotComparison(number, robot.loose, by_method)
+    return RobotComparison(number, robot.loose_joint, by_method)
 
 
 def append_result(path: Path, robot: RobotComparison) -> None:

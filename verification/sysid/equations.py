@@ -8,7 +8,7 @@ from snakesim_operator.features.commissioning.system_identification.identificati
     JointIdentification,
     identify_joints,
 )
-from verification.commissioning_trials import HiddenRobot, find_named_joints
+from verification.identification_trials import HiddenRobot, find_joints_with_backlash
 from verification.sysid.estimates import PARAMETERS, Estimate, IdentificationResult, get_truth
 
 
@@ -30,7 +30,7 @@ def identify_by_equations(
         for i, joint in enumerate(joints)
         for parameter in PARAMETERS
     ]
-    named_joints = find_named_joints(joints)
+    named_joints = find_joints_with_backlash(joints)
     return IdentificationResult(
         estimates,
         cpu_s,

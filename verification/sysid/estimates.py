@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from snakesim_hal.physics.loose_gear import LINK_SIDE_INERTIA_RATIO
-from verification.commissioning_trials import HiddenRobot
+from verification.identification_trials import HiddenRobot
 
 PARAMETERS = (
     "friction_nm",
@@ -69,9 +69,9 @@ def get_truth(robot: HiddenRobot, joint_index: int, parameter: str) -> float:
     if parameter == "latency_s":
         return robot.latency_s[joint_index]
     joint = robot.config.robot.joint_table[joint_index]
-    hidden = getattr(robot.truth[joint.name], parameter, None)
+    hidden = getattr(robot.true_drives[joint.name], parameter, None)
     true_value = getattr(joint.motor, parameter) if hidden is None else hidden
-    if parameter == "armature_kg_m2" and joint_index == robot.loose:
+    if parameter == "armature_kg_m2" and joint_index == robot.loose_joint:
         # The methods measure rotor and output stage of the gear together.
         true_value *= 1 + LINK_SIDE_INERTIA_RATIO
     return true_value

@@ -20,7 +20,7 @@ from snakesim_sim_backend.actuators import KD, KP
 from snakesim_sim_backend.model.build import assemble_model_blueprint
 from snakesim_sim_backend.physics_model import MujocoPhysicsModel
 from snakesim_sim_backend.settings import PhysicsModelSettings
-from verification.commissioning_trials import HiddenRobot
+from verification.identification_trials import HiddenRobot
 from verification.sysid.estimates import PARAMETERS, Estimate, IdentificationResult, get_truth
 
 START_LATENCY_S = 0.01  # the robot file has no value

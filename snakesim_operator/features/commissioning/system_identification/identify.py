@@ -1,19 +1,21 @@
 """`snakesim robot identify`: identifies the joints from a run of the controller `identify`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.files import resolve_file_path
+from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
-from snakesim_hal.wire.messages import JointMode
+from snakesim_hal.wire.messages import Imu, JointMode
 from snakesim_operator.features.commissioning.joint_check.measurements import (
     arrange_imus_by_tick,
-    compute_tick_numbers,
     read_imus,
 )
 from snakesim_operator.features.commissioning.system_identification.identification import (
@@ -32,6 +34,7 @@ from snakesim_operator.results.run_log import RunRecord
 PAGE_FILENAME = "identified.html"
 CONTROLLER = "identify"
 SIGNAL_NAMES = ("angle_rad", "velocity_rad_s", "torque_nm", "target")
+COLUMN_NAMES = (*SIGNAL_NAMES, "mode", "time_s")  # that an identification needs
 LABEL_AND_UNIT_BY_FIELD = {  # fields of the robot file -> name and unit
     "friction_nm": ("dry friction", "N·m"),
     "viscous_nm_s_per_rad": ("viscous friction", "N·m·s/rad"),
@@ -42,6 +45,14 @@ LABEL_AND_UNIT_BY_FIELD = {  # fields of the robot file -> name and unit
     "response_time_s": ("response time", "s"),
     "latency_s": ("latency", "s"),
 }
+
+
+@dataclass(frozen=True)
+class RunIdentification:
+    """What was identified of the joints from one run."""
+
+    joints: list[JointIdentification]  # tail to head
+    judges_links: bool  # whether links have IMUs, which show backlash
 
 
 def identify_and_report(
@@ -67,19 +78,16 @@ def identify_and_report(
             code="commissioning/not-possible",
         )
     record = RunRecord.load(run)
-    usable_ticks = _find_usable_ticks(record)
-    columns: dict[str, Any] = {name: getattr(record, name)[usable_ticks] for name in SIGNAL_NAMES}
-    link_rates, _ = arrange_imus_by_tick(
-        read_imus(record), compute_tick_numbers(record), len(record.description.links)
-    )
-    results = identify_joints(record.config, columns, link_rates[usable_ticks])
+    columns: dict[str, Any] = {name: getattr(record, name) for name in COLUMN_NAMES}
+    identification = identify_run(record.config, columns, read_imus(record), str(record.path))
+    results = identification.joints
     run_folder = run if run.is_dir() else run.parent
     page_path = output_path or run_folder / PAGE_FILENAME
     write_text(page_path, render_identification_page(record, results))
     if as_json:
         print_json({"joints": results, "page": str(page_path)})
     else:
-        _print_joints(results, judges_links=not np.isnan(link_rates).all())
+        _print_joints(results, judges_links=identification.judges_links)
         print_line(f"page: {page_path}")
     if robot_file is not None:
         _write_robot_file(robot_file, record, results)
@@ -87,7 +95,30 @@ def identify_and_report(
     return 0 if everything_identified else 1
 
 
-def _find_usable_ticks(record: RunRecord) -> slice:
+def identify_run(
+    config: RunConfig, columns: Mapping[str, Floats], imus: Iterable[Imu], run_name: str
+) -> RunIdentification:
+    """Identify the joints from the measurements of a whole run.
+
+    Args:
+        config: Configuration of the run.
+        columns: Recorded signals by name, those of COLUMN_NAMES, with one row for each tick.
+        imus: Every IMU message of the run.
+        run_name: Name of the run in error messages.
+
+    Raises:
+        ConfigError: The run is of another controller, or the joints never followed position targets.
+    """
+    usable_ticks = _find_usable_ticks(config, columns, run_name)
+    ticks = np.round(columns["time_s"] * config.rate_hz).astype(int).tolist()
+    link_count = len(config.robot.joint_table) + 1
+    link_rates, _ = arrange_imus_by_tick(imus, ticks, link_count)
+    usable_columns = {name: columns[name][usable_ticks] for name in SIGNAL_NAMES}
+    joints = identify_joints(config, usable_columns, link_rates[usable_ticks])
+    return RunIdentification(joints, judges_links=not np.isnan(link_rates).all())
+
+
+def _find_usable_ticks(config: RunConfig, columns: Mapping[str, Floats], run_name: str) -> slice:
     """Find the longest part of a run in which the joints can be identified.
 
     In that part every value is known, all joints are in position mode, and no tick is missing.
@@ -98,23 +129,23 @@ def _find_usable_ticks(record: RunRecord) -> slice:
     Raises:
         ConfigError: The run is of another controller, or has no such part.
     """
-    if record.config.controller != CONTROLLER:
+    if config.controller != CONTROLLER:
         raise ConfigError(
-            f"{record.path}: its controller was {record.config.controller!r}; hang the robot by its tail, and make a "
+            f"{run_name}: its controller was {config.controller!r}; hang the robot by its tail, and make a "
             f"run with `snakesim run identify`",
             code="commissioning/not-possible",
         )
-    columns = [getattr(record, name) for name in SIGNAL_NAMES]
-    is_usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in columns])
-    is_usable &= (record.mode == JointMode.POSITION).all(axis=1)
-    ticks_since_last_row = np.diff(record.time_s) * record.config.rate_hz
+    signals = [columns[name] for name in SIGNAL_NAMES]
+    is_usable = np.logical_and.reduce([np.isfinite(values).all(axis=1) for values in signals])
+    is_usable &= (columns["mode"] == JointMode.POSITION).all(axis=1)
+    ticks_since_last_row = np.diff(columns["time_s"]) * config.rate_hz
     is_usable[1:] &= np.abs(ticks_since_last_row - 1) < 0.5
     padded_is_usable = np.concatenate(([False], is_usable, [False])).astype(int)
     edges = np.flatnonzero(np.diff(padded_is_usable))
     usable_parts = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
     if not usable_parts:
         raise ConfigError(
-            f"{record.path}: the joints were never moved by position targets; run it again",
+            f"{run_name}: the joints were never moved by position targets; run it again",
             code="commissioning/not-possible",
         )
     start, end = max(usable_parts, key=lambda usable_part: usable_part[1] - usable_part[0])

@@ -8,7 +8,8 @@ The torque that the motion needs is fitted to the measured torque, by `least_squ
 divided by the measured torque. A latency of the measured torque is fitted along.
 
 A motion that is not that of the model, as behind a gear with backlash, is wrong in all blocks of the record alike. So
-what the balance does not explain widens its intervals (`ABSORBED_MISFIT`).
+what the balance does not explain widens its intervals (`ABSORBED_MISFIT`). Noise of the measured velocities, such as
+the steps of a coarse register, also leaves torque unexplained, and is no such motion. It is measured, and subtracted.
 """
 
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ MODEL_MISFIT = 0.04  # rms fraction of the torque that the balance does not expl
 # What the balance leaves unexplained beyond that may also have been absorbed by the values: as much of it, times this.
 # On drives with 10 to 45 mrad of backlash somewhere in the body, 1.5 covers the truth of all values.
 ABSORBED_MISFIT = 2.0
+LATENCY_COLUMN = 4  # of the regressors and instruments
 Mask = NDArray[np.bool_]
 
 
@@ -97,6 +99,9 @@ def fit_torque_balance(
     is_slow_tick = is_slow(record.velocity_rad_s, SLOW_RAD_S, MAX_SLOW_FRACTION)
     is_used = ~is_slow_tick & record.is_below_torque_limit()[HALF_WINDOW_TICKS:-HALF_WINDOW_TICKS]
     fitted_torque_nm = torque_nm[is_used]
+    noise_columns = regressors[is_used] - instruments[is_used]
+    # The instrument of the latency is another signal, not the same one with other noise.
+    noise_columns[:, LATENCY_COLUMN] = 0.0
     # The load is the last column; with a known scale it is subtracted from the torque.
     if not fit_scale:
         regressors = regressors[:, :-1]
@@ -109,7 +114,10 @@ def fit_torque_balance(
         number_jackknife_blocks(is_used, period_s),
     )
     explained = 1 - float(np.var(fit.residuals) / np.var(torque_nm[is_used]))
-    misfit = max(1 - explained - MODEL_MISFIT**2, 0.0) ** 0.5
+    coefficients = fit.values if fit_scale else np.append(fit.values, 1.0)
+    noise_variance = _estimate_noise_variance(fit.residuals, noise_columns @ coefficients)
+    noise_fraction = noise_variance / float(np.var(torque_nm[is_used]))
+    misfit = max(1 - explained - noise_fraction - MODEL_MISFIT**2, 0.0) ** 0.5
     fit = fit.with_bias(
         ABSORBED_MISFIT
         * misfit
@@ -129,6 +137,23 @@ def fit_torque_balance(
     return TorqueBalance(
         dry_nm, viscous_nm_s_per_rad, armature_kg_m2, scale, explained, misfit, measured_and_fitted
     )
+
+
+def _estimate_noise_variance(residuals: Floats, noise_difference: Floats) -> float:
+    """Return the part of the residuals' variance that is due to noise of the regressors, N²·m².
+
+    With the true torque of the model m, and with independent noises u of the regressors and v of the instruments, the
+    residual is r = e - u, where e is what the model does not explain. The difference is d = u - v, so that
+
+        E[r d] = -E[u^2]
+
+    because e, which comes from the motion, is independent of both noises.
+
+    Args:
+        residuals: Residual torque, (n,).
+        noise_difference: Torque by the regressors minus torque by the instruments, with the fitted values, (n,).
+    """
+    return max(-float(np.mean(residuals * noise_difference)), 0.0)
 
 
 def _make_regression_columns(

@@ -9,6 +9,7 @@ from snakesim_operator.features.commissioning.system_identification.smoothing im
     smooth_second_derivative,
 )
 from snakesim_operator.features.commissioning.system_identification.torque_balance import (
+    MODEL_MISFIT,
     JointRecord,
     TorqueBalance,
     fit_torque_balance,
@@ -28,15 +29,24 @@ TORQUE_LIMIT_NM = 7.0
 # Standard deviations of the noise of planar13.
 ANGLE_NOISE_RAD = 0.0005
 SPEED_NOISE_RAD_S = 0.005
+FOREIGN_FREQUENCY_HZ = 4.1
 TORQUE_NOISE_NM = 0.01
 
 
-def fit_simulated_joint(seed: int, *, scaled: bool) -> TorqueBalance:
+def fit_simulated_joint(
+    seed: int,
+    *,
+    scaled: bool,
+    speed_noise_rad_s: float = SPEED_NOISE_RAD_S,
+    foreign_torque_nm: float = 0.0,
+) -> TorqueBalance:
     """Fit the torque balance of a joint that moves as a sum of tones with random phases.
 
     Args:
         seed: of the phases and of the measurement noise.
         scaled: whether the drive reports torques with a wrong scale, which the fit must find.
+        speed_noise_rad_s: standard deviation of the noise of the measured speed.
+        foreign_torque_nm: amplitude of a torque that the model does not contain.
     """
     rng = np.random.default_rng(seed)
     time_s = np.arange(0, DURATION_S, PERIOD_S)
@@ -59,8 +69,9 @@ def fit_simulated_joint(seed: int, *, scaled: bool) -> TorqueBalance:
 
     scale = TORQUE_SCALE if scaled else 1.0
     reported_torque_nm = torque_nm / scale + TORQUE_NOISE_NM * rng.standard_normal(len(time_s))
+    reported_torque_nm += foreign_torque_nm * np.sin(2 * np.pi * FOREIGN_FREQUENCY_HZ * time_s)
     measured_angle_rad = angle_rad + ANGLE_NOISE_RAD * rng.standard_normal(len(time_s))
-    measured_speed_rad_s = speed_rad_s + SPEED_NOISE_RAD_S * rng.standard_normal(len(time_s))
+    measured_speed_rad_s = speed_rad_s + speed_noise_rad_s * rng.standard_normal(len(time_s))
     record = JointRecord(
         PERIOD_S,
         measured_angle_rad,
@@ -91,6 +102,21 @@ def test_torque_balance_intervals_have_their_coverage(scaled: bool) -> None:
         assert median_half_width < 0.1 * true_value, name
         mean_value = np.mean([estimate.value for estimate in estimates])
         assert abs(mean_value / true_value - 1) < 0.05, name
+
+
+def test_torque_balance_noisy_speed_is_no_misfit() -> None:
+    for seed in range(10):
+        noisy = fit_simulated_joint(seed, scaled=True, speed_noise_rad_s=0.05)
+        assert noisy.explained < 1 - MODEL_MISFIT**2
+        assert noisy.misfit < 0.02, noisy.misfit
+
+
+def test_torque_balance_unmodeled_torque_is_misfit_despite_noise() -> None:
+    for seed in range(10):
+        wrong = fit_simulated_joint(
+            seed, scaled=True, speed_noise_rad_s=0.05, foreign_torque_nm=0.05
+        )
+        assert wrong.misfit > 0.05, wrong.misfit
 
 
 def test_torque_balance_of_joint_at_rest_raises_error() -> None:
