@@ -30,7 +30,16 @@ from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 JOINTS = 4
+RATE_HZ = 100  # one tick is 10 ms
+TARGET_RAD = 0.1  # setpoint of every joint, by default of `DriveRig`
+TARGET_TOLERANCE_RAD = 0.02
+ALL_FOLLOW = [True] * JOINTS
+NONE_FOLLOWS = [False] * JOINTS
+
+# Durations in ticks.
+ARM_TICKS = 20  # until all drives of an armed robot follow setpoints
 FAULT_REPORT_TICKS = 20  # until a fault is reported: a heartbeat period has ten ticks
+RESTART_TICKS = 80  # until a drive has restarted and its driver has configured it again
 RESET_TICKS = 80  # until drives are reset, some by a restart
 TOO_FAST = 0  # stands for the rate that is too fast for a driver type
 
@@ -128,7 +137,7 @@ class DriveRobot(DriveRig):
     def __init__(self, driver_type: DriverTypeCase, **settings: Any) -> None:
         self.driver_type = driver_type
         config = make_run_config(
-            backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=100
+            backend=driver_type.backend.name, robot__chain__modules=JOINTS, rate_hz=RATE_HZ
         )
         config = apply_backend_modes(config, driver_type.backend)
         fixed: dict[str, Any] = {
@@ -151,6 +160,12 @@ class DriveRobot(DriveRig):
     def list_following(self) -> list[bool]:
         """Return for each drive whether it follows setpoints."""
         return [self.driver_type.follows(drive) for drive in self.driver_type.drives(self.emulator)]
+
+    def assert_joints_reached_target(self) -> None:
+        assert self.joints is not None
+        assert self.joints.angle_rad == pytest.approx(
+            [TARGET_RAD] * JOINTS, abs=TARGET_TOLERANCE_RAD
+        )
 
 
 @pytest.fixture(params=DRIVER_TYPES)
@@ -193,53 +208,74 @@ def test_drive_error_persists_until_reset_and_is_reported_again(
     assert fault.what == "drive_fault"
     assert fault.joint == "joint_2"
     assert robot.driver_type.overheated in fault.cause
-    assert robot.run(50, "fault") == []
-    assert robot.run(50, "estop") == []
-    assert robot.list_following() == [False] * JOINTS
+
+    assert robot.run(50, "fault") == [], "the same error is reported again"
+    assert robot.run(50, "estop") == [], "the same error is reported again"
+    assert robot.list_following() == NONE_FOLLOWS
     assert [fault.joint for fault in robot.run(RESET_TICKS, "disarmed")] == ["joint_2"], (
         "the drive was still hot at the reset"
     )
+
     robot.go_wrong("overheat:joint_2@0-9", begins=False)
     robot.emulator.body.thermal.winding_temperature_c[:] = 20.0
     robot.run(5, "fault")
     assert robot.run(RESET_TICKS, "disarmed") == []
     assert robot.run(60, "armed") == []
-    assert robot.joints is not None
-    assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+    robot.assert_joints_reached_target()
+
+
+RESTARTED_JOINT = 2
+RESTART = f"reboot:joint_{RESTARTED_JOINT + 1}@0"
 
 
 def test_drive_restarted_in_motion_stays_off_until_reset(robot: DriveRobot) -> None:
-    robot.run(20, "armed")
-    robot.go_wrong("reboot:joint_3@0")
-    faults = robot.run(80, "armed")
-    assert faults[0].what == "drive_silent"
-    assert faults[0].joint == "joint_3"
-    assert not faults[1:]
-    assert robot.list_following() == [False] * JOINTS
-    assert robot.run(10, "fault") == []
+    """A drive that restarts has lost its settings, so the whole robot stops, and stays off until a person resets it."""
+    robot.run(ARM_TICKS, "armed")
+
+    robot.go_wrong(RESTART)
+    faults = robot.run(RESTART_TICKS, "armed")
+
+    assert [(fault.what, fault.joint) for fault in faults] == [("drive_silent", "joint_3")]
+    assert robot.list_following() == NONE_FOLLOWS, "the drives are off, also after the restart"
+
+
+def test_drive_restarted_in_motion_follows_with_its_settings_after_reset(
+    robot: DriveRobot,
+) -> None:
+    robot.run(ARM_TICKS, "armed")
+    robot.go_wrong(RESTART)
+    robot.run(RESTART_TICKS, "armed")
+
+    assert robot.run(10, "fault") == [], "the same restart is reported again"
     assert robot.run(10, "disarmed") == []
     robot.run(40, "armed")
-    assert robot.list_following() == [True] * JOINTS
-    assert robot.joints is not None
-    assert robot.joints.angle_rad == pytest.approx([0.1] * JOINTS, abs=0.02)
+
+    assert robot.list_following() == ALL_FOLLOW
+    robot.assert_joints_reached_target()
     settings = [robot.driver_type.settings(robot.emulator, joint) for joint in range(JOINTS)]
-    assert settings[2] == settings[0]
-    assert get_motor_limits(robot.emulator, 2)[1] == pytest.approx(1.0, abs=0.01)
+    assert settings[RESTARTED_JOINT] == settings[0], (
+        "the driver has not configured it as the others"
+    )
+    _, torque_limit_nm = get_motor_limits(robot.emulator, RESTARTED_JOINT)
+    assert torque_limit_nm == pytest.approx(robot.limit_nm, abs=0.01)
 
 
 def test_drive_restarted_between_ticks_does_not_continue(
     robot: DriveRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The drive boots within one tick, so it is never silent. Its state shows that it has restarted."""
     monkeypatch.setattr("snakesim_drivers.emulation.emulated_body.BOOT_US", 10_000.0)
     robot.run(30, "armed")
-    robot.go_wrong("reboot:joint_3@0")
-    assert [(fault.what, fault.joint) for fault in robot.run(FAULT_REPORT_TICKS, "armed")] == [
-        ("drive_not_armed", "joint_3")
-    ]
+
+    robot.go_wrong(RESTART)
+    faults = robot.run(FAULT_REPORT_TICKS, "armed")
+
+    assert [(fault.what, fault.joint) for fault in faults] == [("drive_not_armed", "joint_3")]
 
 
 def test_joint_lost_while_armed_is_ignored_until_used_again(robot: DriveRobot) -> None:
-    robot.run(20, "armed")
+    robot.run(ARM_TICKS, "armed")
+
     robot.go_wrong("mute:joint_1@0")
     robot.isolated = frozenset({0})
     assert robot.run(60, "armed") == []
@@ -247,11 +283,12 @@ def test_joint_lost_while_armed_is_ignored_until_used_again(robot: DriveRobot) -
     assert robot.joints is not None and max(robot.joints.age_ns[1:]) == 0, (
         "a silent drive does not delay the others"
     )
+
     robot.go_wrong("mute:joint_1@0", begins=False)
     robot.isolated = frozenset()
     assert robot.run(30, "disarmed") == []
-    assert robot.run(20, "armed") == []
-    assert robot.list_following() == [True] * JOINTS
+    assert robot.run(ARM_TICKS, "armed") == []
+    assert robot.list_following() == ALL_FOLLOW
 
 
 @pytest.mark.usefixtures("with_watchdog")
@@ -260,13 +297,16 @@ def test_drives_stop_by_watchdog_when_driver_is_gone(
 ) -> None:
     """Command the torque limit of the joint. odrive/test_limits.py tests a lower one, which an ODrive keeps."""
     robot.limit_nm = robot.config.robot.limits.torque_nm
-    robot.run(20, "armed")
-    robot.backend._clock.robot_time_ns += 190_000_000
+    robot.run(ARM_TICKS, "armed")
+
+    robot.backend._clock.robot_time_ns += 190_000_000  # longer than each watchdog
     robot.emulator()
-    assert robot.list_following() == [False] * JOINTS
+    assert robot.list_following() == NONE_FOLLOWS
+
     faults = robot.run(FAULT_REPORT_TICKS, "armed")
     assert {fault.what for fault in faults} == {"drive_fault"}
-    assert all(robot.driver_type.expired in fault.cause for fault in faults)
+    assert all(robot.driver_type.expired in fault.cause for fault in faults), faults
+
     robot.backend._drives.bring_up()
     assert robot.run(FAULT_REPORT_TICKS, "disarmed") == []
     assert robot.run(FAULT_REPORT_TICKS, "armed") == []
@@ -278,53 +318,58 @@ def test_drives_stopped_behind_cut_bus_are_reported_before_reset(robot: DriveRob
     robot.run(30, "armed")
     robot.go_wrong("cut:bus_1@0-9")
     assert "interface_down" in {fault.what for fault in robot.run(30, "armed")}
-    assert robot.list_following() == [False] * JOINTS, "the watchdogs have stopped the drives"
+    assert robot.list_following() == NONE_FOLLOWS, "the watchdogs have stopped the drives"
+
     robot.go_wrong("cut:bus_1@0-9", begins=False)
     robot.damps = True
     faults = robot.run(FAULT_REPORT_TICKS, "fault")
     assert {(fault.what, fault.joint) for fault in faults} == {
         ("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)
     }
-    assert all(robot.driver_type.expired in fault.cause for fault in faults)
-    assert robot.list_following() == [False] * JOINTS
+    assert all(robot.driver_type.expired in fault.cause for fault in faults), faults
+    assert robot.list_following() == NONE_FOLLOWS
+
     assert robot.run(10, "disarmed") == []
     assert robot.run(30, "armed") == []
-    assert robot.list_following() == [True] * JOINTS
+    assert robot.list_following() == ALL_FOLLOW
 
 
 @pytest.mark.usefixtures("with_watchdog")
 def test_stop_of_silent_drive_is_reported_when_it_answers(robot: DriveRobot) -> None:
     """Report the stop of a drive that is silent after a pause of the host as soon as it answers again."""
-    robot.run(20, "armed")
+    robot.run(ARM_TICKS, "armed")
     robot.go_wrong("mute:joint_2@0-9")
-    robot.pause_host(1.0)
-    assert robot.list_following() == [False] * JOINTS
+    robot.pause_host(1.0)  # longer than each watchdog
+    assert robot.list_following() == NONE_FOLLOWS
+
     robot.damps = True
     first_faults = robot.run(30, "fault")
     stopped_joints = {
         fault.joint for fault in first_faults if robot.driver_type.expired in fault.cause
     }
     assert stopped_joints == {"joint_1", "joint_3", "joint_4"}, first_faults
+
     robot.go_wrong("mute:joint_2@0-9", begins=False)
     later_faults = robot.run(FAULT_REPORT_TICKS, "fault")
     assert [fault.joint for fault in later_faults if robot.driver_type.expired in fault.cause] == [
         "joint_2"
     ], later_faults
-    assert robot.list_following() == [False] * JOINTS
+    assert robot.list_following() == NONE_FOLLOWS
 
 
 def test_damping_before_start_enables_no_drive(robot: DriveRobot) -> None:
     robot.run(5, "disarmed")
     robot.damps = True
     robot.run(10, "fault")
-    assert robot.list_following() == [False] * JOINTS, "the robot was not armed before the fault"
+    assert robot.list_following() == NONE_FOLLOWS, "the robot was not armed before the fault"
+
     robot.run(5, "disarmed")
     drives = drives_of(robot.backend)
     drives.command = lambda *_arguments, **_options: None  # the command that enables them is lost
     robot.run(1, "armed")
     del drives.command
     robot.run(30, "fault")
-    assert robot.list_following() == [False] * JOINTS
+    assert robot.list_following() == NONE_FOLLOWS, "no drive was enabled before the fault"
 
 
 @for_can_driver_types
@@ -363,7 +408,7 @@ def test_duplicate_drive_ids_stop_the_robot_and_block_start(robot: DriveRobot) -
     assert fault.joint == "joint_2"
     assert fault.scope == "robot"
     assert serials[1] in fault.cause
-    assert robot.list_following() == [False] * JOINTS
+    assert robot.list_following() == NONE_FOLLOWS
     assert [fault.what for fault in robot.run(FAULT_REPORT_TICKS, "disarmed")] == [
         "duplicate_node"
     ], "the second drive was present at the reset"

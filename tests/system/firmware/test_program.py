@@ -32,14 +32,17 @@ from snakesim_native.programs import JOINT_MODULES, get_program
 from snakesim_testing.can.driver_loop import make_can_config
 from snakesim_testing.harness.wait import wait_until
 
-GARBAGE_RECORDS = 5_000
+MODULE_COUNT = 4  # of the small robot whose modules the program runs
+NODES = [1, 2, 3, 4]  # of these modules
+GARBAGE_SEEDS = range(5)
+GARBAGE_RECORDS = 5_000  # for each seed
 BATCH = 500  # frames, which fit into the smallest inbox
 
 
 def start_modules(
     folder: Path, *arguments: str, program: Path | None = None
 ) -> subprocess.Popen[bytes]:
-    """Start the program with the four modules of a small robot, and wait until they are on the bus."""
+    """Start the program with the modules of a small robot, and wait until they are on the bus."""
     modules_path = folder / "modules.txt"
     modules_path.write_text(describe_modules(make_can_config(), CanSettings()))
     process = subprocess.Popen(
@@ -100,44 +103,57 @@ def list_answering_nodes(wire: LocalWire) -> list[int]:
 
 def test_firmware_program_answers_for_every_module(tmp_path: Path) -> None:
     with run_modules(tmp_path) as (path, _), contextlib.closing(LocalWire(str(path))) as wire:
-        receive_until(wire, Opcode.HEARTBEAT, 4)
+        receive_until(wire, Opcode.HEARTBEAT, MODULE_COUNT)
+
         assert wire.send(make_command(CommandAction.IDENTIFY))
-        identities = receive_until(wire, Opcode.IDENTITY, 4)
-    assert [parse_node(frame.id) for frame in identities] == [1, 2, 3, 4]
+        identities = receive_until(wire, Opcode.IDENTITY, MODULE_COUNT)
+
+    assert [parse_node(frame.id) for frame in identities] == NODES
     serial_numbers = {frame.data[:4] for frame in identities}
-    assert len(serial_numbers) == 4
+    assert len(serial_numbers) == MODULE_COUNT, "two modules have the same serial number"
 
 
 def make_garbage(seed: int) -> Iterator[bytes]:
-    """Yield records of random bytes, most of them with an id that modules read, and some with a wrong size."""
+    """Yield what an inbox must survive: records with random contents, bytes between them, and a truncated record."""
     rng = random.Random(seed)
     for _ in range(GARBAGE_RECORDS):
         record = RECORD_FORMAT.pack(
             MAGIC,
-            rng.randrange(100),
-            rng.randrange(0x900),
-            rng.randrange(12),
+            rng.randrange(100),  # frames that the writer lost
+            rng.randrange(0x900),  # id: most of them are standard ids, which end at 0x7FF
+            rng.randrange(12),  # length of the data; a classic frame has at most 8 bytes
             rng.randbytes(64),
         )
-        yield record + rng.randbytes(rng.choice((0, 0, 0, 7)))
-    yield rng.randbytes(4000)
-    yield MAGIC + rng.randbytes(30)
+        bytes_between_records = rng.randbytes(rng.choice((0, 0, 0, 7)))
+        yield record + bytes_between_records
+    bytes_without_record = rng.randbytes(4000)
+    yield bytes_without_record
+    truncated_record = MAGIC + rng.randbytes(30)
+    yield truncated_record
+
+
+def write_into_only_inbox(bus_folder: Path, contents: Iterator[bytes]) -> None:
+    """Write raw bytes to the modules, which have the only inbox on their bus."""
+    (inbox_path,) = bus_folder.iterdir()
+    with inbox_path.open("wb", buffering=0) as inbox:
+        for content in contents:
+            inbox.write(content)
 
 
 def test_firmware_program_that_receives_random_bytes_continues(
     tmp_path: Path, sanitized_modules: Path
 ) -> None:
-    with run_modules(tmp_path, program=sanitized_modules) as (path, _):
-        for seed in range(5):
-            (inbox_path,) = path.iterdir()
-            with inbox_path.open("wb", buffering=0) as inbox:
-                for data in make_garbage(seed):
-                    inbox.write(data)
-        with contextlib.closing(LocalWire(str(path))) as wire:
+    """The program is compiled with sanitizers, so that a wrong memory access ends it."""
+    with run_modules(tmp_path, program=sanitized_modules) as (bus_folder, _):
+        for seed in GARBAGE_SEEDS:
+            write_into_only_inbox(bus_folder, make_garbage(seed))
+
+        with contextlib.closing(LocalWire(str(bus_folder))) as wire:
+            # Some random bytes are valid commands. A restart brings the modules into a known state.
             wire.send(make_command(CommandAction.REBOOT))
-            receive_until(wire, Opcode.HEARTBEAT, 4)
+            receive_until(wire, Opcode.HEARTBEAT, MODULE_COUNT)
             wire.send(make_command(CommandAction.IDENTIFY))
-            receive_until(wire, Opcode.IDENTITY, 4)
+            receive_until(wire, Opcode.IDENTITY, MODULE_COUNT)
 
 
 @pytest.mark.parametrize("stop_signal", [signal.SIGTERM, signal.SIGKILL])
@@ -145,19 +161,22 @@ def test_firmware_program_end_and_restart_are_reported_once(
     tmp_path: Path, stop_signal: signal.Signals
 ) -> None:
     path = tmp_path / "bus"
+    errors_at_first_start: list[str] = []
+    errors_at_restart = ["interface_up"]
     with contextlib.closing(LocalWire(str(path))) as wire:
-        for errors_at_start in ([], ["interface_up"]):
+        for errors_at_start in (errors_at_first_start, errors_at_restart):
             process = start_modules(tmp_path)
             try:
-                receive_until(wire, Opcode.HEARTBEAT, 4)
+                receive_until(wire, Opcode.HEARTBEAT, MODULE_COUNT)
                 assert [error.kind for error in wire.errors()] == errors_at_start
             finally:
                 process.send_signal(stop_signal)
                 process.wait(10)
             wire.send(make_emergency())
             assert [error.kind for error in wire.errors()] == ["interface_down"]
+
         wire.send(make_emergency())
-        assert wire.errors() == []
+        assert wire.errors() == [], "the same end is reported again"
     assert not path.exists()
 
 
@@ -165,28 +184,33 @@ def test_firmware_program_is_not_delayed_by_slow_reader(
     tmp_path: Path,
 ) -> None:
     """A host fills the inbox of a program that does not read. The modules then send to both."""
-    filler = CanFrame(frame_id(Opcode.JOINT_STATE, LAST_NODE), b"")
-    filler_count = INBOX_BYTES // RECORD_FORMAT.size + 200
+    filler = CanFrame(frame_id(Opcode.JOINT_STATE, LAST_NODE), b"")  # modules ignore it
+    filler_count = INBOX_BYTES // RECORD_FORMAT.size + 200  # 200 more than fit into an inbox
+    heartbeat_count = 2 * MODULE_COUNT  # two of each module, which the slow reader loses
     with (
         run_modules(tmp_path) as (path, process),
         contextlib.closing(LocalWire(str(path))) as host,
         contextlib.closing(LocalWire(str(path))) as slow_reader,
     ):
         # While they boot, modules answer no request.
-        wait_until(lambda: list_answering_nodes(host) == [1, 2, 3, 4], "answers after the boot")
+        wait_until(lambda: list_answering_nodes(host) == NODES, "answers after the boot")
+
         for begin in range(0, filler_count, BATCH):
             for _ in range(min(BATCH, filler_count - begin)):
                 host.send(filler)
             host.send(make_command(CommandAction.IDENTIFY))
-            receive_until(host, Opcode.IDENTITY, 4)  # the modules have read the batch
-        receive_until(host, Opcode.HEARTBEAT, 8)
+            # When they answer, the modules have read the batch.
+            receive_until(host, Opcode.IDENTITY, MODULE_COUNT)
+        receive_until(host, Opcode.HEARTBEAT, heartbeat_count)
         while slow_reader.receive():
             pass
-        receive_until(slow_reader, Opcode.HEARTBEAT, 4)
+        receive_until(slow_reader, Opcode.HEARTBEAT, MODULE_COUNT)
+
         (lost_at_reader,) = [
             error for error in slow_reader.errors() if error.kind == "receive_overflow"
         ]
-        assert int(lost_at_reader.detail.split()[0]) >= 8
+        lost_count = int(lost_at_reader.detail.split()[0])
+        assert lost_count >= heartbeat_count
         process.terminate()
         assert process.stdout is not None
         output = process.stdout.read()
@@ -198,7 +222,7 @@ def test_firmware_program_ends_with_the_process_that_started_it(tmp_path: Path) 
     with run_modules(tmp_path, "--until-input-ends") as (_, process):
         assert process.stdin is not None
         process.stdin.close()
-        assert process.wait(10) == 0
+        assert process.wait(10) == 0, "the program must not outlive the process that started it"
 
 
 def test_firmware_programs_with_equal_ids_both_answer(tmp_path: Path) -> None:
@@ -207,7 +231,7 @@ def test_firmware_programs_with_equal_ids_both_answer(tmp_path: Path) -> None:
         second = start_modules(tmp_path)
         try:
             wait_until(
-                lambda: list_answering_nodes(wire) == [1, 1, 2, 2, 3, 3, 4, 4],
+                lambda: list_answering_nodes(wire) == sorted(2 * NODES),
                 "answers of both programs to one request",
             )
         finally:
@@ -217,17 +241,19 @@ def test_firmware_programs_with_equal_ids_both_answer(tmp_path: Path) -> None:
 
 def test_firmware_program_refuses_folder_of_other_users(tmp_path: Path) -> None:
     folder = tmp_path / "bus"
-    folder.mkdir(mode=0o755)
+    folder.mkdir(mode=0o755)  # other users may read it
     (tmp_path / "modules.txt").write_text(describe_modules(make_can_config(), CanSettings()))
     command = [get_program(JOINT_MODULES), "--bus", folder, "--modules", tmp_path / "modules.txt"]
     refused = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
     assert refused.returncode == 2
     assert "only this user" in refused.stderr
-    assert [*folder.iterdir()] == []
+    assert [*folder.iterdir()] == [], "the program has put an inbox into the folder"
 
 
 @pytest.mark.parametrize(
-    "text", ["", "joint_1 node 70\n", "joint_1 node 1 speed 3\n", "joint_1 node 1 serial\n"]
+    "text",
+    ["", "joint_1 node 70\n", "joint_1 node 1 speed 3\n", "joint_1 node 1 serial\n"],
+    ids=["no module", "node beyond the last", "unknown key", "key without value"],
 )
 def test_firmware_program_refuses_invalid_description(tmp_path: Path, text: str) -> None:
     (tmp_path / "modules.txt").write_text(text)
@@ -238,4 +264,7 @@ def test_firmware_program_refuses_invalid_description(tmp_path: Path, text: str)
         "--modules",
         tmp_path / "modules.txt",
     ]
-    assert subprocess.run(command, capture_output=True, timeout=10, check=False).returncode == 2
+
+    refused = subprocess.run(command, capture_output=True, timeout=10, check=False)
+
+    assert refused.returncode == 2

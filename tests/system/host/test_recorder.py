@@ -28,6 +28,7 @@ TICK_OUTPUT = TickOutput(SafeSetpoints([JointMode.POSITION] * 3, [0.1] * 3, [4.0
 ROW_BYTES = BlackBox(ROBOT).layout.row_bytes
 UNLIMITED_BYTES = 2**30
 MAX_RECORD_BYTES = 2**20
+SLOW_DISK_LIMIT_S = 30.0  # for a busy computer; the recorder itself writes within a second
 
 
 class RecordNumbers(msgspec.Struct):
@@ -65,13 +66,16 @@ def read_numbers_on_disk(folder: Path) -> RecordNumbers:
     return msgspec.json.decode((folder / HOST_RECORD).read_bytes(), type=RecordNumbers)
 
 
+def read_ticks(path: Path) -> list[int]:
+    """Return the ticks of the rows in the file of a black box."""
+    _, columns = read_black_box(path)
+    return columns["tick"].tolist()
+
+
 def read_ticks_on_disk(folder: Path) -> list[int]:
     """Return the ticks of the rows on disk, or an empty list if there is no file yet."""
     path = folder / BLACK_BOX
-    if not path.exists():
-        return []
-    _, columns = read_black_box(path)
-    return columns["tick"].tolist()
+    return read_ticks(path) if path.exists() else []
 
 
 @pytest.fixture
@@ -85,45 +89,69 @@ def memory() -> Iterator[int]:
     os.close(handle)
 
 
+def has_numbers(memory: int) -> bool:
+    """Return whether the recorder has written into the memory file."""
+    return len(os.pread(memory, 1, 0)) > 0
+
+
 def read_numbers_in_memory(memory: int) -> RecordNumbers:
     return msgspec.json.decode(os.pread(memory, MAX_RECORD_BYTES, 0), type=RecordNumbers)
 
 
 def test_recorder_writes_rows_within_a_second_and_all_at_end(tmp_path: Path, memory: int) -> None:
     box = BlackBox(ROBOT)
+    early_ticks = range(40)  # written while the host runs
+    last_ticks = range(40, 45)  # recorded just before the end of the host
+    tick_count = len(early_ticks) + len(last_ticks)
+
+    def are_early_numbers_on_disk() -> bool:
+        if not (tmp_path / HOST_RECORD).exists():
+            return False
+        return read_numbers_on_disk(tmp_path).ticks == len(early_ticks)
+
+    assert writer_module.WRITE_PERIOD_S < 1.0, "a crash would lose more than the rows of a second"
     with make_writer(box, tmp_path, memory):
-        record_ticks(box, *range(40))
-        assert writer_module.WRITE_PERIOD_S < 1.0
-        wait_until(lambda: read_ticks_on_disk(tmp_path) == list(range(40)), "the rows", 30.0)
+        record_ticks(box, *early_ticks)
         wait_until(
-            lambda: (
-                (tmp_path / HOST_RECORD).exists() and read_numbers_on_disk(tmp_path).ticks == 40
-            ),
-            "the numbers",
-            30.0,
+            lambda: read_ticks_on_disk(tmp_path) == list(early_ticks), "the rows", SLOW_DISK_LIMIT_S
         )
-        record_ticks(box, *range(40, 45))
-    assert read_ticks_on_disk(tmp_path) == list(range(45))
+        wait_until(are_early_numbers_on_disk, "the numbers", SLOW_DISK_LIMIT_S)
+        record_ticks(box, *last_ticks)
+
+    assert read_ticks_on_disk(tmp_path) == list(range(tick_count))
     assert (
-        read_numbers_on_disk(tmp_path) == read_numbers_in_memory(memory) == RecordNumbers(45, 0, "")
+        read_numbers_on_disk(tmp_path)
+        == read_numbers_in_memory(memory)
+        == RecordNumbers(tick_count, lost_ticks=0, failure="")
     )
     assert compute_digest(read_black_box(tmp_path / BLACK_BOX)[1]) == box.command_digest
     assert (
         msgspec.json.decode((tmp_path / DESCRIPTION).read_bytes(), type=RobotDescription) == ROBOT
     )
-    assert {path.name for path in tmp_path.iterdir()} == {BLACK_BOX, HOST_RECORD, DESCRIPTION}
+    assert {path.name for path in tmp_path.iterdir()} == {BLACK_BOX, HOST_RECORD, DESCRIPTION}, (
+        "the recorder leaves no temporary file"
+    )
 
 
 def test_recorder_of_restarted_host_keeps_earlier_record(tmp_path: Path) -> None:
-    for first_tick in (0, 100, 200):
+    """A restarted host moves the record of each earlier start into files with a number, in order of the starts."""
+    # Each start of the host records one row. Its tick shows to which start a file belongs.
+    first_start_tick = 0
+    second_start_tick = 100
+    newest_start_tick = 200
+
+    for tick in (first_start_tick, second_start_tick, newest_start_tick):
         box = BlackBox(ROBOT)
         with make_writer(box, tmp_path):
-            record_ticks(box, first_tick)
-    assert read_ticks_on_disk(tmp_path) == [200]
-    for number in (1, 2):
-        _, columns = read_black_box(tmp_path / f"blackbox-{number}.rows")
-        assert columns["tick"].tolist() == [100 * (number - 1)]
-        assert (tmp_path / f"host-{number}.json").is_file()
+            record_ticks(box, tick)
+
+    assert read_ticks(tmp_path / "blackbox-1.rows") == [first_start_tick]
+    assert read_ticks(tmp_path / "blackbox-2.rows") == [second_start_tick]
+    assert read_ticks_on_disk(tmp_path) == [newest_start_tick], (
+        "the newest start has the file name without a number"
+    )
+    for filename in ("host-1.json", "host-2.json"):
+        assert (tmp_path / filename).is_file(), f"the numbers of an earlier start: {filename}"
 
 
 class Disk:
@@ -163,50 +191,69 @@ def test_recorder_writes_what_full_disk_refused_when_space_returns(
     tmp_path: Path, memory: int, disk: Disk, capfd: pytest.CaptureFixture[str]
 ) -> None:
     box = BlackBox(ROBOT)
-    # The disk has room for seven rows and a part of the eighth.
-    disk.free_bytes = len(box.layout.encode_header()) + 7 * ROW_BYTES + 11
+    tick_count = 20
+    rows_with_space = 7
+    part_of_a_row_bytes = 11
+    assert part_of_a_row_bytes < ROW_BYTES
+    header_bytes = len(box.layout.encode_header())
+    disk.free_bytes = header_bytes + rows_with_space * ROW_BYTES + part_of_a_row_bytes
+
     with make_writer(box, tmp_path, memory):
-        record_ticks(box, *range(20))
+        record_ticks(box, *range(tick_count))
         wait_until(
-            lambda: len(os.pread(memory, 9, 0)) and read_numbers_in_memory(memory).failure,
+            lambda: has_numbers(memory) and read_numbers_in_memory(memory).failure,
             "the failure in the record",
         )
-        assert read_ticks_on_disk(tmp_path) == list(range(7))
-        assert read_numbers_in_memory(memory).lost_ticks == 0
+        assert read_ticks_on_disk(tmp_path) == list(range(rows_with_space))
+        assert read_numbers_in_memory(memory).lost_ticks == 0, "the other rows are still in memory"
         disk.free_bytes = UNLIMITED_BYTES
         wait_until(lambda: not read_numbers_in_memory(memory).failure, "free space")
-    assert read_ticks_on_disk(tmp_path) == list(range(20))
+
+    assert read_ticks_on_disk(tmp_path) == list(range(tick_count))
     assert (
-        read_numbers_on_disk(tmp_path) == read_numbers_in_memory(memory) == RecordNumbers(20, 0, "")
+        read_numbers_on_disk(tmp_path)
+        == read_numbers_in_memory(memory)
+        == RecordNumbers(tick_count, lost_ticks=0, failure="")
     )
-    assert (
-        capfd.readouterr().err == f"record: {tmp_path}: No space left on device\n"
-    )  # printed once
+    assert capfd.readouterr().err == f"record: {tmp_path}: No space left on device\n", (
+        "the failure is printed once, not for each attempt to write"
+    )
 
 
 def test_recorder_counts_unwritten_rows_and_gaps_show_in_ticks(
     tmp_path: Path, memory: int, disk: Disk
 ) -> None:
+    """The disk is full after 3 rows. Of 30 rows, memory then keeps the newest, and 5 of them fit onto the disk."""
+    # Of ten rows in memory, nine are read, because the host may overwrite the oldest at this moment.
     box = BlackBox(ROBOT, memory_bytes=10 * ROW_BYTES)
     header_bytes = len(box.layout.encode_header())
     disk.free_bytes = header_bytes + 3 * ROW_BYTES
+
     with make_writer(box, tmp_path, memory):
         record_ticks(box, *range(5))
         wait_until(lambda: read_ticks_on_disk(tmp_path) == [0, 1, 2], "the first rows")
         record_ticks(box, *range(5, 30))
         disk.free_bytes = header_bytes + 8 * ROW_BYTES
         wait_until(lambda: len(read_ticks_on_disk(tmp_path)) == 8, "some of the newest")
-    assert read_ticks_on_disk(tmp_path) == [0, 1, 2, 21, 22, 23, 24, 25]
+
+    assert read_ticks_on_disk(tmp_path) == [0, 1, 2, 21, 22, 23, 24, 25], (
+        "a reader sees the gap in the ticks"
+    )
     last = read_numbers_in_memory(memory)
-    assert last.lost_ticks == 18 + 4
+    overwritten_in_memory = 18  # ticks 3 to 20
+    still_in_memory_at_end = 4  # ticks 26 to 29
+    assert last.lost_ticks == overwritten_in_memory + still_in_memory_at_end
     assert last.failure == f"{tmp_path}: No space left on device"
 
 
 def test_recorder_in_unwritable_folder_leaves_no_empty_file(tmp_path: Path, memory: int) -> None:
     box = BlackBox(ROBOT)
-    with make_writer(box, tmp_path / "gone", memory):
+    missing_folder = tmp_path / "gone"
+
+    with make_writer(box, missing_folder, memory):
         record_ticks(box, 1, 2)
-    assert not (tmp_path / "gone").exists()
+
+    assert not missing_folder.exists()
     last = read_numbers_in_memory(memory)
     assert last.lost_ticks == 2
     assert "No such file" in last.failure
@@ -215,9 +262,11 @@ def test_recorder_in_unwritable_folder_leaves_no_empty_file(tmp_path: Path, memo
 def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
     tmp_path: Path, memory: int, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(writer_module, "CLOSE_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(writer_module, "CLOSE_TIMEOUT_S", 0.3)  # does not wait long for the disk
+    tick_count = 75
+    rows_until_disk_hangs = 6
     with (
-        running_host(make_run_config(clock_mode="lockstep"), max_ticks=75) as run,
+        running_host(make_run_config(clock_mode="lockstep"), max_ticks=tick_count) as run,
         running_follower(run.link, SineFollower()),
     ):
         with HostRecordWriter(
@@ -228,28 +277,37 @@ def test_recorder_with_hanging_disk_delays_no_tick_and_no_end(
             memory,
         ):
             layout = run.host.black_box.layout
-            disk.free_bytes = len(layout.encode_header()) + 6 * layout.row_bytes
+            header_bytes = len(layout.encode_header())
+            disk.free_bytes = header_bytes + rows_until_disk_hangs * layout.row_bytes
             disk.hangs_when_full = True
+
             run.arm()
             wait_until(run.has_ended, "the end of the run")
-            assert disk.is_hanging.wait(5.0)
-        # Neither the run nor the end of its recorder waited for the disk.
-        assert not disk.should_continue.is_set()
+            assert disk.is_hanging.wait(5.0), "the recorder has filled the disk"
+
+        assert not disk.should_continue.is_set(), (
+            "the run and the end of its recorder must not wait for the disk"
+        )
         assert run.host.ending_status == "complete"
         assert not run.host.authority.faults
+
     last = msgspec.json.decode(os.pread(memory, MAX_RECORD_BYTES, 0), type=HostRecord)
     assert last.ended == "complete"
-    assert last.armed_ticks == 75
-    assert 0 < last.lost_ticks < 75
+    assert last.armed_ticks == tick_count
+    assert 0 < last.lost_ticks < tick_count
     assert "has not answered" in last.failure
     disk.should_continue.set()
 
 
 def test_recorder_without_folder_writes_numbers_into_memory(memory: int) -> None:
     box = BlackBox(ROBOT)
+
     with make_writer(box, None, memory):
         record_ticks(box, 1, 2, 3)
-    assert read_numbers_in_memory(memory) == RecordNumbers(3, 3, "")
+
+    assert read_numbers_in_memory(memory) == RecordNumbers(3, lost_ticks=3, failure=""), (
+        "without a folder no row is stored, which is no failure"
+    )
 
 
 def test_recorder_with_too_slow_disk_still_writes_numbers(
@@ -263,11 +321,12 @@ def test_recorder_with_too_slow_disk_still_writes_numbers(
             record_ticks(box, box.row_count)  # The host adds a row during each write.
         return write_to_disk(handle, content, offset)
 
+    def are_numbers_of_later_rows_on_disk() -> bool:
+        if not (tmp_path / HOST_RECORD).exists():
+            return False
+        return read_numbers_on_disk(tmp_path).ticks > 3
+
     monkeypatch.setattr(writer_module.os, "pwrite", write_while_host_continues)
     with make_writer(box, tmp_path, memory):
         record_ticks(box, 0)
-        wait_until(
-            lambda: (tmp_path / HOST_RECORD).exists() and read_numbers_on_disk(tmp_path).ticks > 3,
-            "numbers",
-            5.0,
-        )
+        wait_until(are_numbers_of_later_rows_on_disk, "numbers, although rows are left", 5.0)

@@ -312,24 +312,39 @@ def test_host_counts_invalid_messages_and_continues() -> None:
         )
 
 
+NO_TICK = -1  # tick that a service has answered before its first answer
+
+
+def deliver_command(host: Host, lease_epoch: int) -> None:
+    """Deliver an encoded command for tick 0 to a host, as its inbox does."""
+    command = make_joint_command(host.description, 0.1, lease_epoch=lease_epoch)
+    arrival = ReceivedSample(
+        keys.JOINT_COMMAND, encode(command), format_encoding(JointCommand), time.monotonic_ns()
+    )
+    CommandArrival(arrival, MessageDecoder(JointCommand)).deliver(host)
+
+
 def test_host_ignores_commands_with_wrong_lease_epoch() -> None:
     """In lockstep a tick ends when the holder has answered; a rejected command of another client is no answer."""
     with connected_sessions("worm") as (session,):
         host = Host(make_run_config(), GuardedBackend(LagBackend(make_run_config())), session)
+        control = host.participants["control"]
         host.authority.observe_joints(make_joint_state(host.description))
         host.authority.handle_lease_request(LeaseRequest(action="acquire", holder="control"), 0)
         holder_epoch = host.authority.lease.epoch
-        for epoch, done_tick in ((0, -1), (holder_epoch + 6, -1), (holder_epoch, 0)):
-            command = make_joint_command(host.description, 0.1, lease_epoch=epoch)
-            arrival = ReceivedSample(
-                keys.JOINT_COMMAND,
-                encode(command),
-                format_encoding(JointCommand),
-                time.monotonic_ns(),
-            )
-            host._inbox.handle(CommandArrival(arrival, MessageDecoder(JointCommand)))
-            assert host.participants["control"].done_tick == done_tick
+
+        epoch_without_lease = 0
+        deliver_command(host, epoch_without_lease)
+        assert control.done_tick == NO_TICK, "a client without a lease has ended the tick"
+
+        later_epoch = holder_epoch + 6
+        deliver_command(host, later_epoch)
+        assert control.done_tick == NO_TICK, "a client with a wrong epoch has ended the tick"
         assert host.authority.rejected_counts["wrong_epoch"] == 2
+
+        deliver_command(host, holder_epoch)
+        assert control.done_tick == 0, "the holder has answered tick 0"
+        assert host.authority.rejected_counts["wrong_epoch"] == 2, "the holder was rejected"
 
 
 def test_host_flooded_with_commands_obeys_estop() -> None:

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import struct
 from collections import Counter
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.run_log import RunRecord
 from snakesim_operator.results.summary import summarize_run
 from snakesim_testing.operator.damaged_recordings import (
+    RecordSpan,
     flip_bit,
     list_chunks,
     list_records,
@@ -34,22 +36,34 @@ from snakesim_testing.operator.damaged_recordings import (
 from snakesim_testing.runs.command import CompletedRun
 from snakesim_testing.runs.in_process_command import snakesim
 
-INCOMPLETE = 3
-CHUNK_LENGTH_OFFSET = 2
-CHUNK_NAME_OFFSET = 45
+INCOMPLETE = 3  # exit code of a command that has read an incomplete recording
+GAP_NS = 20_000_000  # between two clock messages that follow each other in time, which are 10 ms apart without a gap
+MIN_MESSAGE_COUNT = 500  # of a recording with one damaged chunk: the others were read
+
+# Bytes of a chunk record, counted from its start: opcode (1), length of the record (8), times of the first and the last
+# message (8 each), length (8) and checksum (4) of the unpacked data, name of the compression (4 + "zstd"), length of
+# the packed data (8), packed data.
+DAMAGED_BYTES: dict[str, Callable[[RecordSpan], int]] = {
+    "opcode": lambda chunk: chunk.begin,
+    "length of the record": lambda chunk: chunk.begin + 2,
+    "name of the compression": lambda chunk: chunk.begin + 41,
+    "length of the data": lambda chunk: chunk.begin + 45,
+    "data": lambda chunk: chunk.end - 5,
+}
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Provide the folder of a short run."""
-    return record_short_run(tmp_path_factory.mktemp("recorded") / "run", 1.5, 100_000)
+    folder = tmp_path_factory.mktemp("recorded") / "run"
+    return record_short_run(folder, duration_s=1.5, chunk_bytes=100_000)
 
 
 @pytest.fixture(scope="module")
 def intact(run: Path) -> bytes:
     """Provide the content of the undamaged recording of the run."""
     content = (run / RECORDING_FILENAME).read_bytes()
-    assert len(list_chunks(content)) >= 5
+    assert len(list_chunks(content)) >= 5, "the tests damage chunks in the middle"
     return content
 
 
@@ -80,42 +94,46 @@ def test_damaged_bit_costs_one_chunk_counted_by_time_and_key(
     run: Path, intact: bytes, tmp_path: Path
 ) -> None:
     path = write_with_damaged_chunk(tmp_path / "a.mcap", intact, 2)
+
     reader = RecordingReader(path)
     messages = list(reader.read_messages())
+
+    # The damage costs one chunk: its messages are counted by key, and the reader continues with the next chunk.
     lost_counts = count_lost_messages(run / RECORDING_FILENAME, path)
     assert lost_counts[keys.JOINTS] >= 2
-    assert len(messages) > 500
+    assert len(messages) > MIN_MESSAGE_COUNT
     assert get_reported_losses(reader) == lost_counts
+    assert reader.is_complete
+    assert len(list_chunks(intact)) > 3, "there is a chunk behind the damaged one"
+
+    # The reported gap in time is the gap in the messages.
     (gap,) = [gap for gap in reader.losses.gaps if gap.lost]
     clock_times_ns = [m.robot_time_ns for m in messages if m.key == keys.CLOCK]
     last_before_ns, first_after_ns = next(
-        (a, b) for a, b in pairwise(clock_times_ns) if b - a > 20_000_000
+        (a, b) for a, b in pairwise(clock_times_ns) if b - a > GAP_NS
     )
     assert gap.end_ns is not None
     assert last_before_ns <= gap.begin_ns < gap.end_ns <= first_after_ns
-    assert reader.is_complete
-    following_chunk = list_chunks(intact)[3]
-    assert following_chunk.begin  # the reader continues with a chunk behind the damaged one
 
 
 @pytest.mark.slow
-def test_each_chunk_may_be_the_damaged_one(run: Path, intact: bytes, tmp_path: Path) -> None:
-    for chunk in list_chunks(intact):
-        damaged_bytes = {
-            "opcode": chunk.begin,
-            "length": chunk.begin + CHUNK_LENGTH_OFFSET,
-            "name of the compression": chunk.begin + CHUNK_NAME_OFFSET,
-            "data": chunk.end - 5,
-        }
-        for part, byte in damaged_bytes.items():
-            path = write_file(tmp_path / "a.mcap", flip_bit(intact, byte))
-            reader = RecordingReader(path)
-            messages = list(reader.read_messages())
-            damage = (chunk, part, reader.missing)
-            assert messages, damage
-            assert reader.is_complete, damage
-            lost_counts = count_lost_messages(run / RECORDING_FILENAME, path)
-            assert get_reported_losses(reader) == lost_counts, damage
+@pytest.mark.parametrize("part", DAMAGED_BYTES)
+def test_damage_in_any_chunk_costs_only_reported_messages(
+    run: Path, intact: bytes, tmp_path: Path, part: str
+) -> None:
+    """Wherever one bit is flipped, the reader continues behind it, and reports exactly the messages that it lost."""
+    find_damaged_byte = DAMAGED_BYTES[part]
+    for number, chunk in enumerate(list_chunks(intact)):
+        path = write_file(tmp_path / "a.mcap", flip_bit(intact, find_damaged_byte(chunk)))
+
+        reader = RecordingReader(path)
+        messages = list(reader.read_messages())
+
+        damage = f"chunk {number}, {part}; the reader reports {reader.missing}"
+        assert messages, f"no message was read: {damage}"
+        assert reader.is_complete, f"the end of the recording was not found: {damage}"
+        lost_counts = count_lost_messages(run / RECORDING_FILENAME, path)
+        assert get_reported_losses(reader) == lost_counts, f"wrong counts: {damage}"
 
 
 def list_error_lines(result: CompletedRun) -> list[str]:
@@ -194,7 +212,7 @@ def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(
     message_count = len(list(RecordingReader(tmp_path / "a.mcap").read_messages()))
     copied_count = int(result.out.split()[0])
     assert result.code == INCOMPLETE
-    assert message_count > 500
+    assert message_count > MIN_MESSAGE_COUNT
     assert copied_count > message_count  # the copy also contains the messages for Foxglove
     reader = RecordingReader(tmp_path / "copy.mcap")
     assert len(list(reader.read_messages())) == message_count
@@ -361,7 +379,7 @@ def test_damaged_lz4_chunk_and_impossible_time_are_reported(intact: bytes, tmp_p
         tmp_path / "a.mcap", intact[: first.end] + invalid_chunk + intact[first.end :]
     )
     reader = RecordingReader(path)
-    assert len(list(reader.read_messages())) > 500
+    assert len(list(reader.read_messages())) > MIN_MESSAGE_COUNT
     assert "a chunk that cannot be unpacked" in reader.missing[0]
 
     (channel,) = struct.unpack("<H", b"\x01\x00")

@@ -10,9 +10,11 @@ from snakesim_sim_backend.settings import SimSettings
 from snakesim_testing.messages import raises_error
 from snakesim_testing.sim.simulator_rig import SimulatorRig, make_config
 
-RESPONSE_S = 0.01
+RESPONSE_S = 0.01  # time constant with which the torque of a motor follows its demand
 ZERO_TOLERANCE_NM = 1e-12
-STEP_S = 0.001
+STEP_S = 0.001  # of the physics, and between two samples
+RISE_S = 0.1  # ten response times: the torque has reached its demand
+JOINT_SPEED_INDEX = 6  # of the first joint in MuJoCo's qvel, after the six speeds of the free body
 TWO_LINKS = {
     "chain": {"modules": 1},
     "limits": {"angle_rad": 3.0},
@@ -35,9 +37,11 @@ def read_torque_nm(run):
 
 def test_actuator_without_response_time_follows_at_once():
     run = open_rig({**TWO_LINKS, "motor": {"response_time_s": 0.0}})
+
     run.command(JointMode.TORQUE, 0.02)
     run.advance()
     assert read_torque_nm(run) == pytest.approx(0.02)
+
     run.command(JointMode.PASSIVE)
     run.advance()
     assert read_torque_nm(run) == pytest.approx(0.0, abs=ZERO_TOLERANCE_NM)
@@ -45,7 +49,8 @@ def test_actuator_without_response_time_follows_at_once():
 
 def test_actuator_before_first_command_has_no_torque_at_any_speed():
     run = open_rig()
-    run.sim.data.qvel[6] = 20.0
+    run.sim.data.qvel[JOINT_SPEED_INDEX] = 20.0  # rad/s, faster than the joint may be driven
+
     for _ in range(50):
         run.advance()
         assert read_torque_nm(run) == pytest.approx(0.0, abs=ZERO_TOLERANCE_NM)
@@ -54,52 +59,68 @@ def test_actuator_before_first_command_has_no_torque_at_any_speed():
 @pytest.mark.parametrize("mode", [JointMode.POSITION, JointMode.VELOCITY, JointMode.TORQUE])
 def test_actuator_torque_stays_within_robot_and_command_limits(mode):
     run = open_rig(HEAVY_ROTOR)
-    run.command(mode, -100.0, limit=50.0)
-    run.advance(0.2)
-    assert read_torque_nm(run) == pytest.approx(-run.config.robot.limits.torque_nm)
-    run.command(mode, -100.0, limit=1.5)
-    run.advance(0.1)
-    assert read_torque_nm(run) == pytest.approx(-1.5)
+    robot_limit_nm = run.config.robot.limits.torque_nm
+    far_target = -100.0  # rad, rad/s or Nm: in every mode it demands more than any limit
+
+    run.command(mode, far_target, limit=50.0)
+    run.advance(2 * RISE_S)
+    assert read_torque_nm(run) == pytest.approx(-robot_limit_nm), "the robot's limit is lower"
+
+    run.command(mode, far_target, limit=1.5)
+    run.advance(RISE_S)
+    assert read_torque_nm(run) == pytest.approx(-1.5), "the command's limit is lower"
 
 
 def test_actuator_lowered_limit_applies_at_motor_response():
+    """The torque does not jump to a lowered limit. In one step it decays at most as the motor responds."""
     run = open_rig(HEAVY_ROTOR)
+    lowered_limit_nm = 1.0
+    max_decay = np.exp(-STEP_S / RESPONSE_S)  # factor per step
     run.command(JointMode.TORQUE, 6.0)
-    run.advance(0.2)
-    run.command(JointMode.TORQUE, 6.0, limit=1.0)
+    run.advance(2 * RISE_S)
+
+    run.command(JointMode.TORQUE, 6.0, limit=lowered_limit_nm)
     before_nm = read_torque_nm(run)
     for _ in range(100):
         run.advance()
-        assert read_torque_nm(run) >= before_nm * np.exp(-1e-3 / RESPONSE_S) - 1e-9
-        before_nm = read_torque_nm(run)
-    assert before_nm == pytest.approx(1.0)
+        torque_nm = read_torque_nm(run)
+        assert torque_nm >= before_nm * max_decay - 1e-9, "the torque has jumped"
+        before_nm = torque_nm
+
+    assert before_nm == pytest.approx(lowered_limit_nm)
 
 
 def test_actuator_does_not_drive_joint_beyond_its_speed_limit():
     run = open_rig()
     limit_rad_s = run.config.robot.limits.speed_rad_s
-    run.command(JointMode.TORQUE, 3.0)
+    max_angle_rad = 2.5  # the joint must not reach its end stop at 3 rad
     speeds_rad_s = []
     torques_nm = []
+
+    run.command(JointMode.TORQUE, 3.0)
     for _ in range(200):
         run.advance()
         speeds_rad_s.append(run.sim.true_state().velocities_rad_s[0])
         torques_nm.append(read_torque_nm(run))
-        if abs(run.sim.true_state().angles_rad[0]) > 2.5:
+        if abs(run.sim.true_state().angles_rad[0]) > max_angle_rad:
             break
+
     # The response time of the motor lets the joint exceed its limit for a moment.
     assert 0.9 * limit_rad_s < max(speeds_rad_s) < 1.15 * limit_rad_s
     assert speeds_rad_s[-1] == pytest.approx(limit_rad_s, rel=0.02)
-    assert torques_nm[-1] < 0.1
+    assert torques_nm[-1] < 0.1, "the motor drives a joint that is as fast as allowed"
 
 
 def test_actuator_below_nine_tenths_speed_has_full_torque():
     run = open_rig(HEAVY_ROTOR)
     limit_rad_s = run.config.robot.limits.speed_rad_s
-    run.sim.data.qvel[6] = 0.85 * limit_rad_s
+    run.sim.data.qvel[JOINT_SPEED_INDEX] = 0.85 * limit_rad_s
+
     run.command(JointMode.TORQUE, 7.0)
-    run.advance(0.1)
-    assert run.sim.true_state().velocities_rad_s[0] > 0.8 * limit_rad_s
+    run.advance(RISE_S)
+
+    speed_rad_s = run.sim.true_state().velocities_rad_s[0]
+    assert speed_rad_s > 0.8 * limit_rad_s, "the joint is not fast enough for this test"
     assert read_torque_nm(run) == pytest.approx(7.0, rel=1e-3)
 
 
@@ -114,8 +135,10 @@ def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
     }
     run = open_rig(HEAVY_ROTOR)
     robot = run.config.robot
+    response = 1 - np.exp(-STEP_S / RESPONSE_S)  # fraction of the missing torque per step
     run.command(before, targets[before])
-    run.advance(0.1)
+    run.advance(RISE_S)
+
     run.command(after, targets[after])
     for _ in range(30):
         state = run.sim.true_state()
@@ -124,7 +147,6 @@ def test_actuator_mode_change_moves_torque_at_motor_response(before, after):
             robot.motor, after, targets[after], state.angles_rad[0], state.velocities_rad_s[0]
         )
         run.advance()
-        response = 1 - np.exp(-STEP_S / RESPONSE_S)
         expected_nm = torque_nm + (demand_nm - torque_nm) * response
         assert read_torque_nm(run) == pytest.approx(expected_nm, abs=1e-6)
 
@@ -153,9 +175,11 @@ def test_actuator_of_very_stiff_joint_is_stable(response_s, torque_nm, speed):
     }
     limits = {"torque_nm": torque_nm, "speed_rad_s": speed}
     run = SimulatorRig(make_config({"motor": motor, "limits": limits}))
-    zigzag_rad = [0.3 * (-1) ** i for i in range(13)]
-    run.command([JointMode.POSITION] * 13, zigzag_rad)
+    zigzag_rad = [0.3 * (-1) ** i for i in range(run.count)]  # no joint moves as its neighbors
+
+    run.command([JointMode.POSITION] * run.count, zigzag_rad)
     run.advance(1.0)
+
     assert run.sim.true_state().angles_rad == pytest.approx(zigzag_rad, abs=1e-3)
 
 
@@ -191,48 +215,71 @@ WITH_LATENCY = {**HEAVY_ROTOR, "motor": {**HEAVY_ROTOR["motor"], "latency_s": LA
 def test_actuator_with_latency_follows_a_target_later():
     prompt_run = open_rig(HEAVY_ROTOR)
     delayed_run = open_rig(WITH_LATENCY)
-    for run in (prompt_run, delayed_run):
-        run.command(JointMode.POSITION, 0.0)
-        run.advance(0.02)
-        run.command(JointMode.POSITION, 0.1)
     prompt_torques_nm = []
     delayed_torques_nm = []
+    for run in (prompt_run, delayed_run):
+        run.command(JointMode.POSITION, 0.0)
+        run.advance(0.02)  # longer than the latency
+        run.command(JointMode.POSITION, 0.1)
+
     for _ in range(20):
         prompt_run.advance()
         delayed_run.advance()
         prompt_torques_nm.append(read_torque_nm(prompt_run))
         delayed_torques_nm.append(read_torque_nm(delayed_run))
-    steps = round(LATENCY_S / STEP_S)
-    assert delayed_torques_nm[:steps] == pytest.approx([0.0] * steps, abs=1e-6)
-    assert delayed_torques_nm[steps:] == pytest.approx(prompt_torques_nm[:-steps], rel=1e-3)
+
+    latency_steps = round(LATENCY_S / STEP_S)
+    assert delayed_torques_nm[:latency_steps] == pytest.approx([0.0] * latency_steps, abs=1e-6)
+    assert delayed_torques_nm[latency_steps:] == pytest.approx(
+        prompt_torques_nm[:-latency_steps], rel=1e-3
+    )
 
 
 def test_actuator_with_latency_changes_its_mode_at_once():
+    """The latency delays targets within a mode. A new mode, above all PASSIVE, acts in the next step."""
+    torque_nm = 2.0
     run = open_rig(WITH_LATENCY)
-    run.command(JointMode.TORQUE, 2.0)
+
+    run.command(JointMode.TORQUE, torque_nm)
     run.advance()
-    assert read_torque_nm(run) > 0.1
+    assert read_torque_nm(run) > 0.1, "torque mode was delayed"
+
     run.command(JointMode.POSITION, 0.0)
-    run.advance(0.1)
+    run.advance(RISE_S)
     assert read_torque_nm(run) == pytest.approx(0.0, abs=0.05)
-    run.command(JointMode.TORQUE, 2.0)
-    run.advance(0.1)
+
+    run.command(JointMode.TORQUE, torque_nm)
+    run.advance(RISE_S)
     run.command(JointMode.PASSIVE)
     run.advance()
-    assert read_torque_nm(run) == pytest.approx(2.0 * np.exp(-0.001 / RESPONSE_S), rel=1e-3)
+    torque_after_one_step_nm = torque_nm * np.exp(-STEP_S / RESPONSE_S)
+    assert read_torque_nm(run) == pytest.approx(torque_after_one_step_nm, rel=1e-3)
 
 
 def test_actuator_latency_of_single_joints_may_differ():
-    latency_steps = 3
-    joints = {"joint_2": {"latency_s": 0.003}}
+    """After a torque step for both joints, joint_1 follows in the first step, and joint_2 after its latency."""
+    latency_steps = 3  # of joint_2; joint_1 has no latency
+    follows_above_nm = (
+        0.01  # the first step already reaches more, and a delayed joint has no torque
+    )
     run = open_rig(
-        {"chain": {"modules": 2}, "motor": {"response_time_s": RESPONSE_S}, "joints": joints}
+        {
+            "chain": {"modules": 2},
+            "motor": {"response_time_s": RESPONSE_S},
+            "joints": {"joint_2": {"latency_s": latency_steps * STEP_S}},
+        }
     )
     run.command(JointMode.TORQUE, 0.0)
-    run.advance(0.01)
+    run.advance(0.01)  # longer than the latency
+
     run.command(JointMode.TORQUE, 0.5)
-    for step in range(4):
+    joint_1_follows = []
+    joint_2_follows = []
+    for _ in range(latency_steps + 1):
         run.advance()
         torques_nm = run.sim.true_state().torques_nm
-        assert torques_nm[0] > 0.01
-        assert bool(torques_nm[1] > 0.01) is (step >= latency_steps)
+        joint_1_follows.append(bool(torques_nm[0] > follows_above_nm))
+        joint_2_follows.append(bool(torques_nm[1] > follows_above_nm))
+
+    assert joint_1_follows == [True, True, True, True]
+    assert joint_2_follows == [False, False, False, True], "it must follow after three steps"

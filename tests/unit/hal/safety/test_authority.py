@@ -25,6 +25,7 @@ from snakesim_testing.hal.authority_rig import (
 from snakesim_testing.hal.small_robots import LEASE_NS, PERIOD_NS, make_joint_state
 
 MAX_REASON_LENGTH = 500  # characters that the reason of an answer may have on the wire
+MAX_CONDITION_LENGTH = 400  # characters of one unmet condition, of which a reason may list several
 ARM_UNCHECKED = msgspec.structs.replace(ARM, unchecked=True)
 HOT = Fault(tick=1, what="hot", cause="joint_2 is hot")
 
@@ -88,14 +89,31 @@ def test_arming_request_for_another_robot_is_explained(
     assert explanation in answer.reason
 
 
-def test_arming_hundred_unknown_joints_is_refused_within_message_length() -> None:
-    rig = AuthorityRig(chain__modules=100)
-    rig.observe(0.1, valid=[False] * 100)
-    assert len(rig.authority.list_unmet_conditions(0)[0]) == 400
+# A condition that all joints of a very long robot do not meet would name each of them, in too long a text.
+LONG_ROBOT_JOINTS = 100
+
+
+def test_arming_condition_of_hundred_unknown_joints_is_shortened() -> None:
+    rig = AuthorityRig(chain__modules=LONG_ROBOT_JOINTS)
+    rig.observe(0.1, valid=[False] * LONG_ROBOT_JOINTS)
+
+    first_condition = rig.authority.list_unmet_conditions(rig.now_ns)[0]
+
+    assert len(first_condition) == MAX_CONDITION_LENGTH
+
+
+def test_arming_hundred_joints_far_from_their_targets_has_a_short_reason() -> None:
+    """A longer reason could not be sent, so that the client would get no answer."""
+    far_target_rad = 9.0  # from the measured 0.1 rad
+    rig = AuthorityRig(chain__modules=LONG_ROBOT_JOINTS)
     rig.observe(0.1)
     rig.acquire()
-    rig.send(9.0)
-    assert len(rig.arm().reason) == MAX_REASON_LENGTH
+    rig.send(far_target_rad)
+
+    answer = rig.arm()
+
+    assert not answer.ok
+    assert len(answer.reason) == MAX_REASON_LENGTH
 
 
 @pytest.mark.parametrize("stop", ["estop", "fault", "disarm"])

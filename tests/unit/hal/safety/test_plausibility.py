@@ -22,7 +22,11 @@ from snakesim_testing.hal.small_robots import (
 )
 from snakesim_testing.hypothesis_profiles import choose_trial_count
 
-REACH_RAD = 0.05 + 2 * 5.0 * 0.01  # rad that an angle may change in a period
+NOISE_RAD = 0.05  # by which an angle may change in no time
+# How far an angle may be from the last one after one period of 10 ms: noise, and twice the speed limit of 5 rad/s.
+REACH_RAD = NOISE_RAD + 2 * 5.0 * 0.01
+SETTLED_SAMPLES = 5  # consistent samples in a row at a new place, until it is accepted
+MAX_CAUSE_LENGTH = 400  # characters of the cause of a fault
 FAULT_KIND = "state_invalid"
 NO_JOINTS: JointMask = np.zeros(JOINT_COUNT, dtype=np.bool_)
 
@@ -122,7 +126,8 @@ def test_plausibility_jump_of_several_joints_names_them_all() -> None:
 
 @pytest.mark.parametrize("periods", [2, 10])
 def test_plausibility_lost_samples_extend_the_reachable_angle(periods: int) -> None:
-    max_change_rad = 0.05 + 10.0 * periods * 0.01
+    max_change_rad = NOISE_RAD + 10.0 * periods * 0.01  # twice the speed limit, for all periods
+
     assert CheckerRig().check_sample(max_change_rad - 1e-6, periods=periods) is None
     assert CheckerRig().check_sample(max_change_rad + 1e-6, periods=periods) is not None
 
@@ -130,88 +135,138 @@ def test_plausibility_lost_samples_extend_the_reachable_angle(periods: int) -> N
 def test_plausibility_age_of_a_sample_counts_as_time() -> None:
     """Allow no change for a repeated measurement, and more change after an old one."""
     rig = CheckerRig()
-    assert rig.check_sample(0.1, age_ns=[PERIOD_NS] * JOINT_COUNT) is not None
-    assert rig.check_sample(0.04, age_ns=[2 * PERIOD_NS] * JOINT_COUNT) is None
+    aged_by_its_period_ns = [PERIOD_NS] * JOINT_COUNT  # measured with the sample before
+    assert rig.check_sample(0.1, age_ns=aged_by_its_period_ns) is not None
+    assert rig.check_sample(0.04, age_ns=[2 * PERIOD_NS] * JOINT_COUNT) is None, "noise is allowed"
+
     rig = CheckerRig(age_ns=[3 * PERIOD_NS] * JOINT_COUNT)
-    assert rig.check_sample(0.4, age_ns=[0] * JOINT_COUNT) is None
+    assert rig.check_sample(0.4, age_ns=[0] * JOINT_COUNT) is None, "four periods have passed"
 
 
 def test_plausibility_host_pause_extends_the_reachable_angle() -> None:
-    assert CheckerRig().check_sample(0.5) is not None
-    assert CheckerRig().check_sample(0.5, late_ns=4 * PERIOD_NS) is None
+    far_rad = 0.5  # within reach after five periods, and not after one
+
+    assert CheckerRig().check_sample(far_rad) is not None
+    assert CheckerRig().check_sample(far_rad, late_ns=4 * PERIOD_NS) is None
 
 
-def test_plausibility_new_place_is_accepted_after_repeats_unless_armed() -> None:
-    """Accept a joint that was bent by hand between two samples, after some consistent samples."""
-    for applied, accepted_sample in ((None, 5), (make_applied(), 6)):
-        rig = CheckerRig()
-        faults = [rig.check_sample(1.2 + 0.01 * k, applied=applied) for k in range(5)]
-        faults.append(rig.check_sample(1.25, periods=0.5))
-        assert [fault is None for fault in faults].index(True) == accepted_sample - 1
-        accepted_rad = 1.24 if accepted_sample == 5 else 1.25
-        assert rig.angles == pytest.approx([accepted_rad] * JOINT_COUNT, abs=0.011)
+@pytest.mark.parametrize(
+    ("applied", "accepted_sample", "accepted_rad"),
+    [(None, SETTLED_SAMPLES, 1.24), (make_applied(), SETTLED_SAMPLES + 1, 1.25)],
+    ids=["not armed", "armed"],
+)
+def test_plausibility_new_place_is_accepted_after_repeats_unless_armed(
+    applied: AppliedSetpoints | None, accepted_sample: int, accepted_rad: float
+) -> None:
+    """Accept a joint that was bent by hand between two samples, after some consistent samples.
+
+    An armed robot does not accept them. The sixth sample comes when the robot is not armed any more.
+    """
+    rig = CheckerRig()
+
+    faults = [rig.check_sample(1.2 + 0.01 * k, applied=applied) for k in range(SETTLED_SAMPLES)]
+    faults.append(rig.check_sample(1.25, periods=0.5))
+
+    assert [fault is None for fault in faults].index(True) == accepted_sample - 1
+    assert rig.angles == pytest.approx([accepted_rad] * JOINT_COUNT, abs=0.011)
 
 
 def test_plausibility_inconsistent_jumps_are_never_accepted() -> None:
     rig = CheckerRig()
-    for sample in range(6):
-        assert rig.check_sample((5.0, -5.0)[sample % 2]) is not None
-    for _ in range(3):  # the newest angle, repeated
-        assert rig.check_sample(-5.0) is not None
-    assert rig.check_sample(0.0) is None
-    assert rig.check_sample(-5.0) is not None  # after one plausible sample, counting starts again
+
     for _ in range(3):
+        assert rig.check_sample(5.0) is not None
         assert rig.check_sample(-5.0) is not None
+
+    for _ in range(SETTLED_SAMPLES - 2):  # with the newest of them, one sample too few at -5 rad
+        assert rig.check_sample(-5.0) is not None, "the samples at other places were counted, too"
+
+
+def test_plausibility_plausible_sample_restarts_counting_at_a_new_place() -> None:
+    rig = CheckerRig()
+    for _ in range(SETTLED_SAMPLES - 1):
+        assert rig.check_sample(-5.0) is not None
+
+    assert rig.check_sample(0.0) is None, "the joint is where it was before the jump"
+
+    for _ in range(SETTLED_SAMPLES - 1):
+        assert rig.check_sample(-5.0) is not None, "a sample from before the return was counted"
     assert rig.check_sample(-5.0) is None
 
 
-@pytest.mark.parametrize(("farther_rad", "agrees"), [(0.0, True), (1e-12, False)])
-def test_plausibility_jumps_exactly_within_reach_are_consistent(
-    farther_rad: float, agrees: bool
-) -> None:
+def count_samples_at_zero_after_jump(rig: CheckerRig) -> None:
+    """Let a joint at -3 rad jump to 0, and count all samples there but the last one that settles it.
+
+    The last sample is at time 0. Then the time to the next one, and with it the reach, has no rounding error.
+    """
+    rig.timestamp_ns = -SETTLED_SAMPLES * PERIOD_NS
+    assert rig.check_sample(5.0) is not None, "too far from -3 and from 0, so it counts for neither"
+    for _ in range(SETTLED_SAMPLES - 1):
+        assert rig.check_sample(0.0) is not None, "three rad in a period is a jump"
+    assert rig.timestamp_ns == 0
+
+
+def test_plausibility_jumps_exactly_within_reach_are_consistent() -> None:
+    """A sample exactly at the reach of the last one counts as the same new place, which is accepted now."""
     rig = CheckerRig(angle=-3.0)
-    rig.timestamp_ns = -5 * PERIOD_NS
-    assert rig.check_sample(5.0) is not None
-    for _ in range(4):
-        assert rig.check_sample(0.0) is not None
-    assert rig.timestamp_ns == 0  # the time to the next sample is exact
-    assert (rig.check_sample(REACH_RAD + farther_rad) is None) == agrees
+    count_samples_at_zero_after_jump(rig)
+
+    assert rig.check_sample(REACH_RAD) is None, "the last sample at the new place is rejected"
+
+
+def test_plausibility_jumps_just_beyond_reach_are_inconsistent() -> None:
+    """A sample farther away than the reach is another new place, where counting starts again."""
+    rig = CheckerRig(angle=-3.0)
+    count_samples_at_zero_after_jump(rig)
+
+    assert rig.check_sample(REACH_RAD + 1e-12) is not None, "two places were counted as one"
 
 
 def test_plausibility_repeated_sample_does_not_count_again() -> None:
+    """A sample with the timestamp of the last one is the same sample, sent again."""
     rig = CheckerRig()
-    for sample in range(8):
-        assert rig.check_sample(1.4, periods=0.0 if sample else 1.0) is not None
-    for _ in range(3):
+    assert rig.check_sample(1.4) is not None
+    for _ in range(7):
+        assert rig.check_sample(1.4, periods=0.0) is not None
+
+    for _ in range(SETTLED_SAMPLES - 2):  # with the first one, all but the last sample
         assert rig.check_sample(1.4) is not None
     assert rig.check_sample(1.4) is None
 
 
 def test_plausibility_repeated_sample_never_counts_twice() -> None:
+    """It does not count either if the host receives it a little later each time."""
     rig = CheckerRig()
-    for sample in range(12):
-        assert rig.check_sample(1.4, periods=0.0 if sample else 1.0, late_ns=sample) is not None
+    assert rig.check_sample(1.4) is not None
+
+    for late_ns in range(1, 12):
+        assert rig.check_sample(1.4, periods=0.0, late_ns=late_ns) is not None
 
 
 def test_plausibility_earlier_timestamp_leaves_at_least_the_slack() -> None:
-    assert CheckerRig().check_sample(0.04, periods=-0.5) is None
+    assert CheckerRig().check_sample(0.04, periods=-0.5) is None, "less than the noise of an angle"
 
 
 def test_plausibility_jumping_joints_are_counted_separately() -> None:
     """Require the same number of samples from each joint, also from one that jumps to zero."""
     rig = CheckerRig(angle=[0.0, 1.0, 0.0])
-    assert rig.check_sample([3.0, 1.0, 0.0]) is not None
-    for sample in range(4):
-        assert rig.check_sample([3.0, 0.0, 0.0]) is not None, sample
-    assert rig.angles[:2] == [3.0, 1.0]
+    assert rig.check_sample([3.0, 1.0, 0.0]) is not None, "joint_1 has jumped to 3"
+
+    for sample in range(SETTLED_SAMPLES - 1):
+        fault = rig.check_sample([3.0, 0.0, 0.0])
+        assert fault is not None, f"joint_2 has jumped to 0, sample {sample}"
+    assert rig.angles[:2] == [3.0, 1.0], "joint_1 is accepted, and joint_2 lacks one sample"
+
     assert rig.check_sample([3.0, 0.0, 0.0]) is None
 
 
 def test_plausibility_second_jumping_joint_is_reported_alone() -> None:
     rig = CheckerRig()
-    for _ in range(4):
-        assert rig.check_sample([1.4, 0.0, 0.0]) is not None
-    fault = rig.check_sample([1.4, 0.0, 1.4])
+    for _ in range(SETTLED_SAMPLES - 1):
+        assert rig.check_sample([1.4, 0.0, 0.0]) is not None, "joint_1 has jumped"
+
+    fault = rig.check_sample([1.4, 0.0, 1.4])  # joint_1 has settled, and joint_3 jumps
+
     assert fault is not None
     assert fault.joint == "joint_3"
     assert rig.angles == [1.4, 0.0, 0.0]
@@ -240,34 +295,51 @@ def test_plausibility_fault_of_many_joints_has_bounded_length() -> None:
     checker = PlausibilityChecker(JointLimits.from_description(robot))
     no_joints = np.zeros(100, dtype=np.bool_)
     checker.check(make_joint_state(robot), now_ns=0, applied=None, isolated=no_joints)
+
     doubt = checker.check(make_joint_state(robot, 1.0), now_ns=0, applied=None, isolated=no_joints)
+
     assert doubt is not None
-    assert len(doubt.fault.cause) == 400
+    assert len(doubt.fault.cause) == MAX_CAUSE_LENGTH
     assert doubt.joints.all()
 
 
-@pytest.mark.parametrize("failing_joint", [1, 2])
-def test_plausibility_isolated_joint_is_not_checked(failing_joint: int) -> None:
-    rig = CheckerRig()
-    isolated = NO_JOINTS.copy()
-    isolated[1] = True
-    valid = [i != failing_joint for i in range(JOINT_COUNT)]
-    fault = rig.check_sample(valid=valid, isolated=isolated)
-    assert (fault is None) == (failing_joint == 1)
-    assert rig.doubted_joints == [2] * (failing_joint == 2)
-    angles = [0.0, 0.0, 0.0]
-    angles[failing_joint] = 1.0
-    assert (rig.check_sample(angles, isolated=isolated) is None) == (failing_joint == 1)
-    assert rig.doubted_joints == [2] * (failing_joint == 2)
+JOINT_2_ISOLATED: JointMask = np.array([False, True, False])
 
 
-def test_plausibility_fault_reaches_joints_or_the_whole_robot() -> None:
+def test_plausibility_isolated_joint_is_not_checked() -> None:
     rig = CheckerRig()
+
+    assert rig.check_sample(valid=[True, False, True], isolated=JOINT_2_ISOLATED) is None
+    assert rig.doubted_joints == []
+    assert rig.check_sample([0.0, 1.0, 0.0], isolated=JOINT_2_ISOLATED) is None, "a jump of joint_2"
+    assert rig.doubted_joints == []
+
+
+def test_plausibility_other_joints_are_checked_beside_an_isolated_one() -> None:
+    rig = CheckerRig()
+
+    assert rig.check_sample(valid=[True, True, False], isolated=JOINT_2_ISOLATED) is not None
+    assert rig.doubted_joints == [2]
+    jumped = [0.0, 0.0, 1.0]
+    assert rig.check_sample(jumped, isolated=JOINT_2_ISOLATED) is not None
+    assert rig.doubted_joints == [2]
+
+
+def test_plausibility_fault_of_some_joints_has_the_scope_of_joints() -> None:
+    rig = CheckerRig()
+
     fault = rig.check_sample(valid=[True, False, False])
+
     assert fault is not None
     assert fault.scope == "joint"
     assert rig.doubted_joints == [1, 2]
+
+
+def test_plausibility_state_of_wrong_length_is_a_fault_of_the_robot() -> None:
+    rig = CheckerRig()
+
     fault = rig.check_sample(valid=[])
+
     assert fault is not None
     assert fault.scope == "robot"
     assert rig.doubted_joints == [0, 1, 2]
@@ -278,8 +350,11 @@ def test_plausibility_fault_reaches_joints_or_the_whole_robot() -> None:
 
 
 def test_plausibility_angle_exactly_at_reach_is_accepted() -> None:
-    assert CheckerRig(angle=0.0).check_sample(0.05, periods=0) is None
-    assert CheckerRig(angle=0.0).check_sample(float(np.nextafter(0.05, 1.0)), periods=0) is not None
+    """Without time between two samples, the reach is the noise of an angle."""
+    next_float_rad = float(np.nextafter(NOISE_RAD, 1.0))
+
+    assert CheckerRig(angle=0.0).check_sample(NOISE_RAD, periods=0) is None
+    assert CheckerRig(angle=0.0).check_sample(next_float_rad, periods=0) is not None
 
 
 @pytest.mark.parametrize("column", ["angle_rad", "velocity_rad_s", "torque_nm"])

@@ -17,12 +17,22 @@ from snakesim_serial_backend.feetech import registers
 from snakesim_serial_backend.feetech.backend import FeetechBackend
 from snakesim_serial_backend.feetech.emulator import EmulatedFeetech, EmulatedFeetechServo
 from snakesim_serial_backend.feetech.settings import FeetechSettings
+from snakesim_testing.benches.emulated_drives import DrivesOfAnyType
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
 from snakesim_testing.hal.small_robots import make_run_config
 from snakesim_testing.messages import raises_error
 
 JOINTS = 4
+RATE_HZ = 100  # one tick is 10 ms
+ALL_ON = [True] * JOINTS
+ALL_OFF = [False] * JOINTS
+
+# Durations in ticks.
 FAULT_REPORT_TICKS = 10  # until a fault is reported: each servo reports its state every fourth tick
+ARM_TICKS = 20  # until all servos of an armed robot have their torque
+OFF_TICKS = 3  # until the torque of all servos is off
+RESET_TICKS = 20  # until a disarmed robot has reset its faults
+REARM_TICKS = 30  # until all servos have their torque again after a stop
 REAL_PORTS = ["/dev/ttyACM0"]  # such a port may have real servos
 
 
@@ -31,7 +41,7 @@ class ServoRobot(DriveRig):
 
     def __init__(self, settings: FeetechSettings | None = None, **dotted: Any) -> None:
         config = make_run_config(
-            backend="feetech", robot__chain__modules=JOINTS, rate_hz=100, **dotted
+            backend="feetech", robot__chain__modules=JOINTS, rate_hz=RATE_HZ, **dotted
         )
         config = apply_backend_modes(config, FeetechBackend)
         settings = settings or FeetechSettings(physics_model="inertia", bring_up_limit_s=0.5)
@@ -44,6 +54,11 @@ class ServoRobot(DriveRig):
     def list_torque_states(self) -> list[bool]:
         """Return for each servo whether its torque is on."""
         return [servo.is_torque_on for servo in self.emulator.servos]
+
+    def pause_driver(self, seconds: float) -> None:
+        """Let time pass at the servos while the driver is paused."""
+        DrivesOfAnyType(self.backend).freeze_driver(seconds, lambda _seconds: None)
+        self.tick += round(seconds * RATE_HZ)
 
 
 @pytest.fixture
@@ -119,87 +134,123 @@ def test_mixed_robot_names_the_joints_without_watchdog() -> None:
     assert "; no watchdog: joint_2: it holds" in describe_what_moves(description)
 
 
-def test_servos_hold_without_driver_and_are_off_once_it_runs(robot: ServoRobot) -> None:
-    robot.run(20, "armed")
-    robot.tick += 100
-    robot.backend._clock.robot_time_ns += 1_000_000_000
-    robot.emulator()
-    assert robot.list_torque_states() == [True] * JOINTS, (
-        "servos without a watchdog hold while their driver is paused"
-    )
+# A pause after which the driver must not simply continue: the robot may have moved, or a person may be near it.
+LONG_PAUSE_S = 1.0
+SHORT_PAUSE_S = 0.07  # as of a busy computer
+
+
+def test_servos_hold_their_angle_while_the_driver_is_paused(robot: ServoRobot) -> None:
+    robot.run(ARM_TICKS, "armed")
+
+    robot.pause_driver(LONG_PAUSE_S)
+
+    assert robot.list_torque_states() == ALL_ON, "servos have no watchdog that switches them off"
+
+
+def test_servos_are_switched_off_after_a_long_pause_of_the_driver(robot: ServoRobot) -> None:
+    robot.run(ARM_TICKS, "armed")
+    robot.pause_driver(LONG_PAUSE_S)
+
     faults = robot.run(FAULT_REPORT_TICKS, "armed")
+
     assert {(fault.what, fault.joint) for fault in faults} == {
         ("drive_fault", f"joint_{i + 1}") for i in range(JOINTS)
     }
     assert all("held its last angle for 1.0" in fault.cause for fault in faults), faults
-    assert robot.list_torque_states() == [False] * JOINTS
-    assert robot.run(5, "fault") == []
-    assert robot.run(20, "disarmed") == []
-    assert robot.list_torque_states() == [False] * JOINTS
-    assert robot.run(30, "armed") == []
-    assert robot.list_torque_states() == [True] * JOINTS
+    assert robot.list_torque_states() == ALL_OFF
+
+
+def test_servos_after_a_long_pause_stay_off_until_armed_again(robot: ServoRobot) -> None:
+    robot.run(ARM_TICKS, "armed")
+    robot.pause_driver(LONG_PAUSE_S)
+    assert robot.run(FAULT_REPORT_TICKS, "armed"), "the pause is a fault"
+
+    assert robot.run(5, "fault") == [], "the same pause is reported again"
+    assert robot.run(RESET_TICKS, "disarmed") == []
+    assert robot.list_torque_states() == ALL_OFF, "a reset alone must not switch torque on"
+
+    assert robot.run(REARM_TICKS, "armed") == []
+    assert robot.list_torque_states() == ALL_ON
 
 
 def test_short_pause_of_the_driver_is_no_fault(robot: ServoRobot) -> None:
-    robot.run(20, "armed")
-    robot.tick += 7
-    robot.backend._clock.robot_time_ns += 70_000_000
+    robot.run(ARM_TICKS, "armed")
+
+    robot.pause_driver(SHORT_PAUSE_S)
+
     assert robot.run(FAULT_REPORT_TICKS, "armed") == []
-    assert robot.list_torque_states() == [True] * JOINTS
+    assert robot.list_torque_states() == ALL_ON
 
 
 def test_servos_hold_on_cut_bus_and_are_off_after_it(robot: ServoRobot) -> None:
-    robot.run(20, "armed")
+    robot.run(ARM_TICKS, "armed")
+
     robot.go_wrong("cut:bus_1@0-9")
     assert "interface_down" in {fault.what for fault in robot.run(30, "armed")}
-    assert robot.list_torque_states() == [True] * JOINTS
+    assert robot.list_torque_states() == ALL_ON, "no message reaches a servo on the cut bus"
+
     robot.go_wrong("cut:bus_1@0-9", begins=False)
     robot.run(20, "fault")
-    assert robot.list_torque_states() == [False] * JOINTS
+    assert robot.list_torque_states() == ALL_OFF
 
 
 @pytest.mark.parametrize("lifecycle", ["disarmed", "estop"])
 def test_torque_is_off_whenever_the_robot_is_not_armed(robot: ServoRobot, lifecycle: Any) -> None:
-    robot.run(20, "armed")
-    robot.run(3, lifecycle)
-    assert robot.list_torque_states() == [False] * JOINTS
+    robot.run(ARM_TICKS, "armed")
+
+    robot.run(OFF_TICKS, lifecycle)
+
+    assert robot.list_torque_states() == ALL_OFF
 
 
 def test_closing_the_backend_switches_torque_off() -> None:
     robot = ServoRobot()
-    robot.run(20, "armed")
+    robot.run(ARM_TICKS, "armed")
     servos = robot.emulator.servos
+
     robot.backend.close()
-    assert [servo.is_torque_on for servo in servos] == [False] * JOINTS
+
+    assert [servo.is_torque_on for servo in servos] == ALL_OFF
 
 
 def test_joint_that_becomes_passive_has_no_torque(robot: ServoRobot) -> None:
-    robot.run(20, "armed")
+    robot.run(ARM_TICKS, "armed")
+
     robot.mode = JointMode.PASSIVE
-    robot.run(3, "armed")
-    assert robot.list_torque_states() == [False] * JOINTS
+    robot.run(OFF_TICKS, "armed")
+    assert robot.list_torque_states() == ALL_OFF
+
     robot.mode = JointMode.POSITION
-    assert robot.run(30, "armed") == []
-    assert robot.list_torque_states() == [True] * JOINTS
+    assert robot.run(REARM_TICKS, "armed") == []
+    assert robot.list_torque_states() == ALL_ON
 
 
 def test_silent_servo_gets_no_goal_until_it_reports_its_state(robot: ServoRobot) -> None:
-    robot.run(20, "armed")
+    silent_servo = robot.emulator.servos[1]
+    other_servo = robot.emulator.servos[2]
+    new_target_rad = 0.3
+    robot.run(ARM_TICKS, "armed")
     robot.go_wrong("mute:joint_2@0-9")
     robot.run(2, "armed")
-    robot.target = 0.3
-    goal = robot.emulator.servos[1].read_word(registers.GOALS)
+    goal_before = silent_servo.read_word(registers.GOALS)
+
+    robot.target = new_target_rad
     robot.run(1, "armed")
-    assert robot.emulator.servos[1].read_word(registers.GOALS) == goal
-    assert robot.emulator.servos[2].read_word(registers.GOALS) == registers.to_position(0.3)
+
+    assert silent_servo.read_word(registers.GOALS) == goal_before
+    assert other_servo.read_word(registers.GOALS) == registers.to_position(new_target_rad)
 
 
 def test_torque_limit_register_is_a_fraction_of_stall_torque() -> None:
     settings = FeetechSettings(physics_model="inertia", stall_torque_nm=8.0)
     robot = ServoRobot(settings)
     robot.limit_nm = 2.0
+
     robot.run(5, "armed")
-    assert {servo.read_word(registers.TORQUE_LIMIT) for servo in robot.emulator.servos} == {250}
+
+    per_mille_of_stall_torque = 250  # 2 Nm of 8 Nm
+    torque_limits = {servo.read_word(registers.TORQUE_LIMIT) for servo in robot.emulator.servos}
+    assert torque_limits == {per_mille_of_stall_torque}
     robot.backend.close()
 
 
@@ -285,11 +336,13 @@ def test_second_servo_with_same_id_stops_robot_and_blocks_start(
 ) -> None:
     if answers == "collide":
         robot.emulator._second_servo_delays[1] = 0
-    robot.run(20, "armed")
+    robot.run(ARM_TICKS, "armed")
+
     robot.go_wrong("duplicate:joint_2@0-9")
     faults = robot.run(FAULT_REPORT_TICKS, "armed")
+
     assert faults[0].joint == "joint_2"
     assert faults[0].what in ("duplicate_node", "drive_silent")
-    assert robot.list_torque_states() == [False] * JOINTS
+    assert robot.list_torque_states() == ALL_OFF
     with raises_error(BackendError, code="drive/not-complete", field="joint_2"):
         robot.backend._drives.bring_up()

@@ -35,6 +35,7 @@ STRAIGHT = Route([(0.0, 0.0), (5.0, 0.0)])
 SEARCH_WINDOW = {"search_middle_s_m": 1.5, "window_m": 3.0}  # on the path
 LIMITS = {"gap_m": 0.06, "give_up_gap_m": 0.12, "end_m": 0.03}
 HYSTERESIS_M = 0.003  # by which noise must not change the propulsion joint
+TAIL_S_M = 0.2  # place of the tail on the path, from where the body covers the first five pegs
 
 
 def plan_peg_contacts():
@@ -101,7 +102,8 @@ def test_planned_contact_with_box_on_path_has_negative_clearance():
 
 
 def test_push_points_are_contacts_that_the_body_covers():
-    points, pose = find_points_at(0.2)
+    points, pose = find_points_at(TAIL_S_M)
+
     assert list_obstacles(points) == ["peg_0", "peg_1", "peg_2", "peg_3", "peg_4"]
     for point in points:
         body_s_m = np.interp(point.contact.path_s_m, pose.body_points_s_m, BODY_S_M)
@@ -110,26 +112,41 @@ def test_push_points_are_contacts_that_the_body_covers():
 
 
 def test_push_points_of_body_beside_path_are_too_far():
-    displaced_along_path, _ = find_points_at(0.2, offset_w=(0.07, 0.0))
-    assert displaced_along_path
-    displaced_across_path, _ = find_points_at(0.2, offset_w=(0.0, 0.08))
-    assert not displaced_across_path
+    """A new push-point has a gap of at most 6 cm. A shift along x, as the path leads, hardly changes it."""
+    shifted_along_path, _ = find_points_at(TAIL_S_M, offset_w=(0.07, 0.0))
+    shifted_across_path, _ = find_points_at(TAIL_S_M, offset_w=(0.0, 0.08))
+
+    assert shifted_along_path
+    assert not shifted_across_path
 
 
 def test_present_push_points_may_be_further_away_than_new_ones():
-    present = list_obstacles(find_points_at(0.2)[0])
-    new_points, _ = find_points_at(0.2, offset_w=(0.0, 0.08))
-    kept_points, _ = find_points_at(0.2, kept=present, offset_w=(0.0, 0.08))
+    """A present push-point is given up at a gap of 12 cm, twice the gap at which a new one is found."""
+    beside_path_w = (0.0, 0.08)
+    present = list_obstacles(find_points_at(TAIL_S_M)[0])
+
+    new_points, _ = find_points_at(TAIL_S_M, offset_w=beside_path_w)
+    kept_points, _ = find_points_at(TAIL_S_M, kept=present, offset_w=beside_path_w)
+
     assert len(kept_points) > len(new_points)
-    distant_points, _ = find_points_at(0.2, kept=present, offset_w=(5.0, 5.0))
+
+
+def test_present_push_points_far_from_body_are_given_up():
+    present = list_obstacles(find_points_at(TAIL_S_M)[0])
+
+    distant_points, _ = find_points_at(TAIL_S_M, kept=present, offset_w=(5.0, 5.0))
+
     assert not distant_points
 
 
 def test_contacts_at_the_tips_of_body_are_no_push_points():
+    """The last 3 cm of the body cannot push: `end_m` in LIMITS."""
     contact_s_m = make_route().find_inflections_s_m()[0]
-    inside, _ = find_points_at(contact_s_m - 0.04)
-    assert "peg_0" in list_obstacles(inside)
+
+    inside, _ = find_points_at(contact_s_m - 0.04)  # the contact is 4 cm ahead of the tail
     at_tip, _ = find_points_at(contact_s_m - 0.02)
+
+    assert "peg_0" in list_obstacles(inside)
     assert "peg_0" not in list_obstacles(at_tip)
 
 
@@ -147,28 +164,50 @@ def test_selection_propulsion_joint_is_first_ahead_of_middle_contact(
     middle_s_m, distance_m, present_joint
 ):
     head_s_m = middle_s_m + distance_m  # of the contact nearest to the head
+
     joint = find_propulsion_joint(BODY_S_M, middle_s_m, head_s_m, present_joint, HYSTERESIS_M)
+
     between = [i for i in range(13) if middle_s_m < BODY_S_M[i + 1] < head_s_m]
     if joint is None:
-        assert not between
+        assert not between, "a joint is between the contacts, but none was found"
     else:
         assert joint in between
         first = between[0]
         is_kept = (
             joint == present_joint == first + 1 and BODY_S_M[first + 1] - middle_s_m < HYSTERESIS_M
         )
-        assert joint == first or is_kept
+        assert joint == first or is_kept, "another joint than the first is not the present one"
 
 
-def test_selection_noise_does_not_change_the_propulsion_joint():
-    joint_s_m = BODY_S_M[6]  # of joint 5
-    head_s_m = 1.2
-    within_s_m = joint_s_m - 0.001
-    beyond_s_m = joint_s_m - 0.004
-    assert find_propulsion_joint(BODY_S_M, within_s_m, head_s_m, 6, HYSTERESIS_M) == 6
-    assert find_propulsion_joint(BODY_S_M, beyond_s_m, head_s_m, 6, HYSTERESIS_M) == 5
-    assert find_propulsion_joint(BODY_S_M, within_s_m, head_s_m, 5, HYSTERESIS_M) == 5
-    assert find_propulsion_joint(BODY_S_M, within_s_m, head_s_m, None, HYSTERESIS_M) == 5
+FIRST_JOINT = 5  # ahead of a middle contact that is just behind it
+FIRST_JOINT_S_M = BODY_S_M[FIRST_JOINT + 1]  # BODY_S_M begins with the tail
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "present_joint", "expected_joint"),
+    [
+        (0.001, FIRST_JOINT + 1, FIRST_JOINT + 1),
+        (0.004, FIRST_JOINT + 1, FIRST_JOINT),
+        (0.001, FIRST_JOINT, FIRST_JOINT),
+        (0.001, None, FIRST_JOINT),
+    ],
+    ids=[
+        "next joint is kept within the hysteresis",
+        "next joint is given up beyond the hysteresis",
+        "first joint is kept",
+        "first joint is chosen without a present one",
+    ],
+)
+def test_selection_noise_does_not_change_the_propulsion_joint(
+    distance_m: float, present_joint: int | None, expected_joint: int
+):
+    """When the middle contact passes a joint, the present joint stays until the contact is 3 mm away."""
+    middle_s_m = FIRST_JOINT_S_M - distance_m
+    head_s_m = 1.2  # of the contact nearest to the head, with several joints between the contacts
+
+    joint = find_propulsion_joint(BODY_S_M, middle_s_m, head_s_m, present_joint, HYSTERESIS_M)
+
+    assert joint == expected_joint
 
 
 def make_choices(count=7):
@@ -184,49 +223,109 @@ def make_choices(count=7):
     ]
 
 
-def test_selection_keeps_triplet_and_successor_shares_most_push_points():
+SWITCH_FRACTION = (
+    0.5  # another triplet must need less torque than this fraction to replace the present one
+)
+
+
+def test_selection_keeps_the_present_triplet():
     choices = make_choices()
-    present = choices[3].triplet
-    assert choose_triplet(choices, present, switch_fraction=0.5) is choices[3]
-    without_present = [choices[0], choices[1], choices[4], choices[6]]
-    assert choose_triplet(without_present, present, switch_fraction=0.5) is choices[4]
+    present = choices[3]
+
+    chosen = choose_triplet(choices, present.triplet, switch_fraction=SWITCH_FRACTION)
+
+    assert chosen is present
+
+
+def test_selection_of_successor_shares_most_push_points_with_present_triplet():
+    """Without triplet 3, triplet 4 follows: it shares two of its three pegs, the others share at most one."""
+    choices = make_choices()
+    present = choices[3]
+    left = [choices[0], choices[1], choices[4], choices[6]]
+
+    chosen = choose_triplet(left, present.triplet, switch_fraction=SWITCH_FRACTION)
+
+    assert chosen is choices[4]
 
 
 def test_selection_of_equal_triplets_is_nearest_to_the_tail():
     choices = make_choices()
+
+    assert choose_triplet(choices, None, switch_fraction=SWITCH_FRACTION) is choices[0]
+
+
+def test_selection_skips_banned_triplets():
+    choices = make_choices()
     names = [choice.triplet.names for choice in choices]
-    assert choose_triplet(choices, None, switch_fraction=0.5) is choices[0]
-    second = choose_triplet(choices, None, switch_fraction=0.5, banned_triplets=names[:1])
-    assert second is choices[1]
-    assert choose_triplet(choices, None, switch_fraction=0.5, banned_triplets=names) is None
 
-
-def test_triplet_finder_returns_choices_with_joints_and_refusals():
-    points, pose = find_points_at(0.2)
-    finder = make_triplet_finder()
-    choices, refusals = finder.find_propulsion_choices(
-        points, pose.body_points_w, BODY_S_M, None, None
+    without_first = choose_triplet(
+        choices, None, switch_fraction=SWITCH_FRACTION, banned_triplets=names[:1]
     )
-    peg_numbers = [[int(name[-1]) for name in choice.triplet.names] for choice in choices]
-    assert peg_numbers == [[0, 1, 2], [0, 1, 4], [1, 2, 3], [2, 3, 4]]
-    assert len(refusals) == 1
-    assert "peg_0/peg_3/peg_4: a contact would have to pull: lambda_1" in refusals[0]
-    for choice in choices:
-        assert choice.body_s_m[1] < BODY_S_M[choice.joint + 1] < choice.body_s_m[2]
-        assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9
-
-    barred_joint = choices[0].joint
-    other_choices, more_refusals = finder.find_propulsion_choices(
-        points, pose.body_points_w, BODY_S_M, None, barred_joint
+    without_all = choose_triplet(
+        choices, None, switch_fraction=SWITCH_FRACTION, banned_triplets=names
     )
-    assert [choice.joint for choice in other_choices] == [
-        choice.joint for choice in choices if choice.joint != barred_joint
-    ]
-    assert len(other_choices) + len(more_refusals) == len(choices) + len(refusals)
+
+    assert without_first is choices[1]
+    assert without_all is None
 
 
 def make_triplet_finder() -> TripletFinder:
     return TripletFinder(condition_max=100.0, authority_min=0.02, hold_on_m=HYSTERESIS_M)
+
+
+def find_choices_of_five_pegs(
+    excluded_joint: int | None = None,
+) -> tuple[list[PropulsionChoice], list[str]]:
+    """Return the choices and the refusals for a body that touches peg_0 to peg_4, without a present choice."""
+    points, pose = find_points_at(TAIL_S_M)
+    choices, refusals = make_triplet_finder().find_propulsion_choices(
+        points, pose.body_points_w, BODY_S_M, None, excluded_joint
+    )
+    return list(choices), list(refusals)
+
+
+def test_triplet_finder_returns_alternating_triplets_that_push():
+    """Of five pegs on alternating sides, five triplets alternate. In one of them a contact would have to pull."""
+    choices, refusals = find_choices_of_five_pegs()
+
+    assert [choice.triplet.names for choice in choices] == [
+        ("peg_0", "peg_1", "peg_2"),
+        ("peg_0", "peg_1", "peg_4"),
+        ("peg_1", "peg_2", "peg_3"),
+        ("peg_2", "peg_3", "peg_4"),
+    ]
+    assert len(refusals) == 1
+    assert "peg_0/peg_3/peg_4: a contact would have to pull: lambda_1" in refusals[0]
+
+
+def test_triplet_finder_chooses_joints_between_middle_and_front_contact():
+    choices, _ = find_choices_of_five_pegs()
+
+    for choice in choices:
+        _, middle_s_m, front_s_m = choice.body_s_m
+        joint_s_m = BODY_S_M[choice.joint + 1]  # BODY_S_M begins with the tail
+        assert middle_s_m < joint_s_m < front_s_m, choice.triplet.names
+
+
+def test_triplet_finder_torque_of_joint_is_at_most_that_of_triplet():
+    choices, _ = find_choices_of_five_pegs()
+
+    for choice in choices:
+        assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9, choice.triplet.names
+
+
+def test_triplet_finder_refuses_triplets_of_an_excluded_joint():
+    choices, refusals = find_choices_of_five_pegs()
+    excluded_joint = choices[0].joint
+
+    other_choices, more_refusals = find_choices_of_five_pegs(excluded_joint)
+
+    assert [choice.joint for choice in other_choices] == [
+        choice.joint for choice in choices if choice.joint != excluded_joint
+    ]
+    assert len(other_choices) + len(more_refusals) == len(choices) + len(refusals), (
+        "each triplet is a choice, or is refused with a reason"
+    )
 
 
 @pytest.mark.parametrize(
