@@ -33,32 +33,54 @@ HOT = Fault(tick=1, what="hot", cause="joint_2 is hot")
 
 
 def test_arming_unmet_conditions_are_named_until_met() -> None:
+    """Each step meets one condition more, and the next answer names the ones that are left."""
+    measured_rad = 0.1
     rig = AuthorityRig()
     assert rig.arm().reason == "no joint state yet; nothing commands the robot: the lease is free"
-    rig.observe(0.1)
+
+    rig.observe(measured_rad)
     assert rig.arm().reason == "nothing commands the robot: the lease is free"
+
     rig.acquire()
     assert rig.arm().reason == "no commands from control yet"
-    rig.send(0.7)
+
+    rig.send(measured_rad + 0.6)
     assert "joint_1 has a target +0.60 rad" in rig.arm().reason
-    rig.send(0.1, JointMode.TORQUE)
+
+    rig.send(measured_rad, JointMode.TORQUE)
     assert (
         "joint_1 is commanded in mode torque; it must hold its position at arming"
         in rig.arm().reason
     )
-    rig.send(0.0, JointMode.PASSIVE)
-    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
-    rig.send(0.1)
-    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
+
+    rig.send(measured_rad)
     answer = rig.arm()
     assert answer.ok
     assert answer.lifecycle == "armed"
 
 
+@pytest.mark.parametrize(
+    ("target_rad", "mode"), [(0.0, JointMode.PASSIVE), (0.1, JointMode.POSITION)]
+)
+def test_arming_commands_that_move_no_joint_meet_all_conditions(
+    target_rad: float, mode: JointMode
+) -> None:
+    """A passive joint may have any target, and a joint at 0.1 rad holds its position."""
+    rig = AuthorityRig()
+    rig.observe(0.1)
+    rig.acquire()
+
+    rig.send(target_rad, mode)
+
+    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
+
+
 def test_arming_stopped_robot_is_refused_until_reset() -> None:
     rig = make_armed_rig()
+
     rig.authority.latch_fault(HOT)
     assert "state is fault, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
+
     rig.authority.handle_estop_request(ESTOP, rig.tick)
     assert "state is estop, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
 
@@ -82,9 +104,10 @@ def test_arming_request_for_another_robot_is_explained(
     request_fields: dict[str, Any], refusal: str, explanation: str
 ) -> None:
     rig = make_commanded_rig()
-    answer = rig.authority.handle_lifecycle_request(
-        msgspec.structs.replace(ARM, **request_fields), rig.now_ns
-    )
+    request = msgspec.structs.replace(ARM, **request_fields)
+
+    answer = rig.authority.handle_lifecycle_request(request, rig.now_ns)
+
     assert answer.refusal == refusal
     assert explanation in answer.reason
 
@@ -102,7 +125,7 @@ def test_arming_condition_of_hundred_unknown_joints_is_shortened() -> None:
     assert len(first_condition) == MAX_CONDITION_LENGTH
 
 
-def test_arming_hundred_joints_far_from_their_targets_has_a_short_reason() -> None:
+def test_arming_hundred_joints_far_from_targets_has_short_reason() -> None:
     """A longer reason could not be sent, so that the client would get no answer."""
     far_target_rad = 9.0  # from the measured 0.1 rad
     rig = AuthorityRig(chain__modules=LONG_ROBOT_JOINTS)
@@ -133,28 +156,34 @@ def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
         rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.acquire()
     rig.send(0.1)
+
     answer = rig.arm()
     assert answer.refusal == "not_ready"
     assert "have not received the stop" in answer.reason
-    rig.authority.compute_setpoints()
+
+    rig.authority.compute_setpoints()  # the motors receive the stop
     assert rig.arm().ok
 
 
 def test_arming_for_the_first_time_waits_for_no_stop() -> None:
+    """A robot that was never armed has motors that are off, so they need not receive the stop of a fault."""
     rig = AuthorityRig()
     rig.authority.latch_fault(HOT)
     rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.observe(0.1)
     rig.acquire()
     rig.send(0.1)
+
     assert rig.arm().ok
 
 
 def test_arming_after_a_disarm_needs_a_new_command() -> None:
     rig = make_armed_rig()
     rig.run_tick_with_command(0.1)
+
     rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     rig.pass_tick()
+
     assert rig.arm().reason == "no commands from control yet"
 
 
@@ -179,10 +208,13 @@ def test_arming_unchecked_robot_needs_explicit_request() -> None:
 
 def test_arming_waits_until_backend_reports_no_obstacle() -> None:
     rig = make_commanded_rig()
+
     rig.authority.set_backend_obstacles(["joint_2 is at step `home`"])
     answer = rig.arm()
-    assert (answer.ok, answer.refusal) == (False, "not_ready")
+    assert not answer.ok
+    assert answer.refusal == "not_ready"
     assert "joint_2 is at step `home`" in answer.reason
+
     rig.authority.set_backend_obstacles([])
     assert rig.arm().ok
 
@@ -218,6 +250,7 @@ def test_arming_in_lockstep_drops_commands_of_the_last_session(was_used: bool) -
         rig.authority.compute_setpoints(rig.tick)
     assert rig.authority.handle_lifecycle_request(DISARM, rig.now_ns).ok
     rig.authority.compute_setpoints(rig.tick)  # the motors receive the stop
+
     rig.send(0.1)
     assert rig.arm().ok
     decision = rig.authority.compute_setpoints(rig.tick)
@@ -320,9 +353,11 @@ def test_holder_gone_while_armed_keeps_the_lease() -> None:
 def test_holder_gone_after_estop_frees_lease_and_keeps_reason() -> None:
     rig = make_armed_rig()
     rig.authority.handle_estop_request(ESTOP, rig.tick)
+
     rig.authority.handle_lease_holder_exit("control is gone")
     assert rig.authority.lease.holder is None
-    assert "emergency stop by a person" in rig.authority.reason
+    assert "emergency stop by a person" in rig.authority.reason, "why the robot is stopped"
+
     rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.authority.handle_lease_holder_exit("control is gone")
     assert rig.authority.reason == "control is gone"

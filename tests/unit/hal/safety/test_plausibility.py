@@ -335,7 +335,7 @@ def test_plausibility_fault_of_some_joints_has_the_scope_of_joints() -> None:
     assert rig.doubted_joints == [1, 2]
 
 
-def test_plausibility_state_of_wrong_length_is_a_fault_of_the_robot() -> None:
+def test_plausibility_state_of_wrong_length_is_fault_of_robot() -> None:
     rig = CheckerRig()
 
     fault = rig.check_sample(valid=[])

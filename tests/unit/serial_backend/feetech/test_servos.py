@@ -155,7 +155,7 @@ def test_servos_hold_their_angle_while_the_driver_is_paused(robot: ServoRobot) -
     assert robot.list_torque_states() == ALL_ON, "servos have no watchdog that switches them off"
 
 
-def test_servos_are_switched_off_after_a_long_pause_of_the_driver(robot: ServoRobot) -> None:
+def test_servos_are_switched_off_after_long_pause_of_driver(robot: ServoRobot) -> None:
     robot.run(ARM_TICKS, "armed")
     robot.pause_driver(LONG_PAUSE_S)
 
