@@ -376,14 +376,19 @@ def test_damping_before_start_enables_no_drive(robot: DriveRobot) -> None:
 def test_drive_with_other_id_is_silent_and_an_unknown_node(
     robot: DriveRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    wrong_id = 9  # of no joint
     readdressed_drive = robot.driver_type.drives(robot.emulator)[0]
-    setattr(readdressed_drive, "node_id" if hasattr(readdressed_drive, "node_id") else "id", 9)
+    id_attribute = "node_id" if hasattr(readdressed_drive, "node_id") else "id"
+    setattr(readdressed_drive, id_attribute, wrong_id)
+
     faults = robot.run(40, "disarmed")
+
     assert {(fault.what, fault.joint) for fault in faults} == {
         ("drive_silent", "joint_1"),
         ("unknown_node", None),
     }
-    assert any("node 9 is on the bus" in fault.cause for fault in faults)
+    assert any(f"node {wrong_id} is on the bus" in fault.cause for fault in faults)
+
     emulator_class = type(robot.emulator)
     create_emulator = emulator_class.__init__
 
@@ -402,6 +407,7 @@ def test_duplicate_drive_ids_stop_the_robot_and_block_start(robot: DriveRobot) -
     serials = [joint.serial for joint in robot.backend.describe().joints]
     assert len(set(serials)) == JOINTS
     assert all(serials)
+
     robot.go_wrong("duplicate:joint_2@0-9")
     [fault] = robot.run(FAULT_REPORT_TICKS, "armed")
     assert fault.what == "duplicate_node"
@@ -414,6 +420,7 @@ def test_duplicate_drive_ids_stop_the_robot_and_block_start(robot: DriveRobot) -
     ], "the second drive was present at the reset"
     with raises_error(BackendError, code="drive/not-complete"):
         robot.backend._drives.bring_up()
+
     robot.go_wrong("duplicate:joint_2@0-9", begins=False)
     robot.backend._drives.bring_up()
     assert robot.run(5, "fault") == []
@@ -445,7 +452,7 @@ def test_bus_log_is_read_by_python_can_as_sent(driver_type: DriverTypeCase, tmp_
     logged_robot.backend.close()
     with can.LogReader(tmp_path / "bus.log") as log:
         frames = list(log)
-    assert len(frames) > 5 * 3 * JOINTS
+    assert len(frames) > 5 * 3 * JOINTS, "fewer than three frames per joint and tick"
     assert {frame.is_fd for frame in frames} == {driver_type.backend is MoteusBackend}
     assert {frame.is_rx for frame in frames} == {True, False}
     assert all(frame.is_extended_id == (frame.arbitration_id > 0x7FF) for frame in frames)

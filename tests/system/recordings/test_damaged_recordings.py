@@ -83,6 +83,11 @@ def get_reported_losses(reader: RecordingReader) -> dict[str, int]:
     }
 
 
+def write_truncated(path: Path, intact: bytes) -> Path:
+    """Write the first half of the recording, as a computer leaves it that lost its supply."""
+    return write_file(path, intact[: len(intact) // 2])
+
+
 def write_with_damaged_chunk(path: Path, intact: bytes, index: int) -> Path:
     """Write the recording with one flipped bit in the middle of this chunk."""
     chunk = list_chunks(intact)[index]
@@ -172,10 +177,12 @@ def test_command_reports_damaged_recording_and_ends_with_code_3(
     }[damage]
     write_file(tmp_path / "whole.mcap", intact)
     write_file(tmp_path / "a.mcap", damaged)
+
     result = snakesim(*command, cwd=tmp_path)
+
     assert result.code == INCOMPLETE, result
     errors = list_error_lines(result)
-    assert len(errors) == 1
+    assert len(errors) == 1, errors
     assert errors[0].startswith("snakesim: a.mcap is incomplete: ")
     assert ("breaks off at" if damage == "truncated" else "actuator/joints") in result.err
     if "--json" in command:
@@ -189,10 +196,12 @@ def test_undamaged_recording_is_not_reported_and_names_its_command(
 ) -> None:
     for name in ("whole.mcap", "a.mcap"):
         write_file(tmp_path / name, intact)
+
     for command in COMMANDS:
         result = snakesim(*command, cwd=tmp_path)
         assert result.code == 0, result
         assert not list_error_lines(result), result
+
     page = (tmp_path / "a.html").read_text()
     assert "The run ended early" not in page
     assert "The record is incomplete" not in page
@@ -206,17 +215,20 @@ def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(
     run: Path, intact: bytes, tmp_path: Path
 ) -> None:
     write_with_damaged_chunk(tmp_path / "a.mcap", intact, 0)
+    message_count = len(list(RecordingReader(tmp_path / "a.mcap").read_messages()))
+    assert message_count > MIN_MESSAGE_COUNT
+
     result = snakesim(
         "recording", "export", "a.mcap", "--format", "mcap", "--out", "copy.mcap", cwd=tmp_path
     )
-    message_count = len(list(RecordingReader(tmp_path / "a.mcap").read_messages()))
-    copied_count = int(result.out.split()[0])
+
     assert result.code == INCOMPLETE
-    assert message_count > MIN_MESSAGE_COUNT
-    assert copied_count > message_count  # the copy also contains the messages for Foxglove
+    copied_count = int(result.out.split()[0])
+    assert copied_count > message_count, "the copy also contains the messages for Foxglove"
     reader = RecordingReader(tmp_path / "copy.mcap")
     assert len(list(reader.read_messages())) == message_count
     assert reader.is_complete
+
     info = snakesim("recording", "info", "copy.mcap", cwd=tmp_path)
     assert info.code == INCOMPLETE
     assert "before it was copied: damaged in 1 place" in info.err
@@ -226,36 +238,35 @@ def test_damaged_recording_copy_keeps_intact_parts_and_lists_gaps(
 def test_truncated_recording_exported_as_csv_or_npz_names_missing(
     intact: bytes, tmp_path: Path
 ) -> None:
-    write_file(tmp_path / "a.mcap", intact[: len(intact) // 2])
+    write_truncated(tmp_path / "a.mcap", intact)
+
     for file_format in ("csv", "npz"):
+        out = f"a.{file_format}"
         snakesim(
-            "recording",
-            "export",
-            "a.mcap",
-            "--format",
-            file_format,
-            "--out",
-            f"a.{file_format}",
-            cwd=tmp_path,
+            "recording", "export", "a.mcap", "--format", file_format, "--out", out, cwd=tmp_path
         )
+
     with (tmp_path / "a.csv").open() as file:
         assert next(file).startswith("# incomplete: recording: its end: it breaks off at ")
         rows = list(csv.DictReader(file))
     with np.load(tmp_path / "a.npz") as arrays:
         assert "its end" in str(arrays["missing"][0])
-        assert len(arrays["time_s"]) == len(rows) > 20
+        assert len(arrays["time_s"]) == len(rows)
+    assert len(rows) > 20, "the rows before the end are exported"
 
 
 def test_truncated_recording_exported_as_parquet_or_dataset_names_missing(
     intact: bytes, tmp_path: Path
 ) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
-    write_file(tmp_path / "a.mcap", intact[: len(intact) // 2])
+    write_truncated(tmp_path / "a.mcap", intact)
+
     for file_format, out in (("parquet", "a.parquet"), ("lerobot", "set")):
         exported = snakesim(
             "recording", "export", "a.mcap", "--format", file_format, "--out", out, cwd=tmp_path
         )
         assert exported.code == INCOMPLETE
+
     metadata = parquet.read_table(tmp_path / "a.parquet").schema.metadata
     assert b"its end" in metadata[b"snakesim.missing"]
     missing = json.loads((tmp_path / "set" / "meta" / "missing.json").read_text())
@@ -271,12 +282,14 @@ def test_gap_in_recording_ends_an_episode_of_the_dataset(
     path = write_with_damaged_chunk(tmp_path / "a.mcap", intact, len(list_chunks(intact)) // 2)
     (intact_episode,) = read_episodes([run], None, images=False)
     parts = read_episodes([path], None, images=False)
+
     write_lerobot(parts, tmp_path / "set", write_parquet, fps)
+
     files = sorted((tmp_path / "set" / "data").rglob("*.parquet"))
-    assert len(files) == 2
+    assert len(files) == 2, "an episode before the gap, and one behind it"
     record = RunRecord.load(path)
     periods_s = np.diff(record.time_s)
-    assert float(periods_s.max()) > 0.1
+    assert float(periods_s.max()) > 0.1, "the recording has no gap of 0.1 s"
     first_row_after_gap = int(np.argmax(periods_s)) + 1
     starts_s = [record.time_s[0], record.time_s[first_row_after_gap]]
     intact_record = intact_episode.record
@@ -286,12 +299,14 @@ def test_gap_in_recording_ends_an_episode_of_the_dataset(
         frames = parquet.read_table(file).to_pydict()
         rows = [intact_record.find_nearest_row(start_s + time_s) for time_s in frames["timestamp"]]
         angles_rad = np.array(frames["observation.state"])[:, : intact_record.angle_rad.shape[1]]
-        # The robot had these angles at these times.
-        assert np.allclose(angles_rad, intact_record.angle_rad[rows], atol=1e-6)
+        assert np.allclose(angles_rad, intact_record.angle_rad[rows], atol=1e-6), (
+            "the robot had other angles at these times"
+        )
         expected_reward_m = float(reward_m[rows[0] : rows[-1] + 1].sum())
         assert sum(frames["next.reward"]) == pytest.approx(expected_reward_m, abs=0.002)
-        assert max(frames["next.reward"]) < 4 * reward_m.max()
+        assert max(frames["next.reward"]) < 4 * reward_m.max(), "a frame has the reward of the gap"
         assert frames["next.done"] == [False] * (len(rows) - 1) + [True]
+
     summary = summarize_run(record, "complete")
     intact_summary = summarize_run(intact_record, "complete")
     assert summary.mean_speed_m_s == pytest.approx(intact_summary.mean_speed_m_s, rel=1e-6)
@@ -305,15 +320,19 @@ def test_damaged_episode_after_a_gap_starts_with_an_image(intact: bytes, tmp_pat
     record = before.record
     first_tick = int(record.ticks[0])
     first_tick_after = int(record.ticks[after.rows[0]])
+    rows_without_image = 3  # at the start of the part behind the gap
     images = CameraImages(2, 1)
-    for shade, tick in enumerate((first_tick, first_tick_after + 3)):
+    image_ticks = (first_tick, first_tick_after + rows_without_image)
+    for shade, tick in enumerate(image_ticks):
         images.add(tick, np.full((1, 2, 3), shade, np.uint8))
     parts = [dataclasses.replace(part, pictures={"head": images}) for part in (before, after)]
+
     write_lerobot(parts, tmp_path / "set", write_parquet)
+
     lengths = parquet.read_table(
         tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
     ).to_pydict()["length"]
-    assert lengths == [len(before.rows), len(after.rows) - 3]
+    assert lengths == [len(before.rows), len(after.rows) - rows_without_image]
 
 
 def test_video_of_recording_with_gap_is_frozen_in_the_gap(intact: bytes, tmp_path: Path) -> None:
@@ -322,25 +341,41 @@ def test_video_of_recording_with_gap_is_frozen_in_the_gap(intact: bytes, tmp_pat
     rows_before, rows_after = record.contiguous_rows
     gap_start_s = record.time_s[int(rows_before[-1])]
     gap_end_s = record.time_s[int(rows_after[0])]
-    frame_times_s = video.choose_frame_times_s(record, 100.0, 1.0, (0.0, np.inf))
-    # All frames of the gap show the last pose before it, and none shows the pose behind it.
     gap_s = gap_end_s - gap_start_s
-    assert (frame_times_s == gap_start_s).sum() == round(gap_s * 100)
-    (sentence,) = video.describe_frozen_spans(frame_times_s, 0.01, 0.01)
+    fps = 100.0
+    period_s = 0.01  # of the frames, and of the record
+
+    frame_times_s = video.choose_frame_times_s(record, fps, 1.0, (0.0, np.inf))
+
+    frozen_frame_count = (frame_times_s == gap_start_s).sum()
+    assert frozen_frame_count == round(gap_s * 100), (
+        "all frames of the gap show the last pose before it, and none the pose behind it"
+    )
+    (sentence,) = video.describe_frozen_spans(frame_times_s, period_s, period_s)
     assert f"between {gap_start_s:.2f} and {gap_end_s:.2f} s" in sentence
 
 
 def test_report_of_truncated_recording_leaves_end_of_run_unknown(
     intact: bytes, tmp_path: Path
 ) -> None:
-    write_file(tmp_path / "whole.mcap", intact)
-    write_file(tmp_path / "a.mcap", intact[: len(intact) // 2])
+    write_truncated(tmp_path / "a.mcap", intact)
+
     snakesim("recording", "report", "a.mcap", cwd=tmp_path)
+
     page = (tmp_path / "a.html").read_text()
     assert "How the run ended is not known: the recording breaks off after 0." in page
     assert "ended early" not in page
     assert "The record is incomplete. recording: its end" in page
+
+
+def test_comparison_with_truncated_recording_covers_what_both_contain(
+    intact: bytes, tmp_path: Path
+) -> None:
+    write_file(tmp_path / "whole.mcap", intact)
+    write_truncated(tmp_path / "a.mcap", intact)
+
     compared = snakesim("study", "compare", "whole.mcap", "a.mcap", cwd=tmp_path)
+
     assert (
         "Only a part of the runs is compared, because the record of B is incomplete."
         in compared.out
@@ -366,56 +401,77 @@ def test_export_to_symbolic_link_is_refused(intact: bytes, tmp_path: Path) -> No
 def test_recording_without_last_metadata_is_complete(intact: bytes, tmp_path: Path) -> None:
     metadata = next(span for span in list_records(intact) if span.opcode == Opcode.METADATA)
     path = write_file(tmp_path / "a.mcap", intact[: metadata.begin] + intact[metadata.end :])
+
     reader = RecordingReader(path)
+
     assert list(reader.read_messages())
     assert reader.is_complete
     assert not reader.missing
 
 
-def test_damaged_lz4_chunk_and_impossible_time_are_reported(intact: bytes, tmp_path: Path) -> None:
-    first, second = list_chunks(intact)[:2]
+def test_damaged_lz4_chunk_is_reported(intact: bytes, tmp_path: Path) -> None:
+    first = list_chunks(intact)[0]
     invalid_chunk = make_chunk_record(b"abc", "lz4", packed_content=b"no lz4 at all")
     path = write_file(
         tmp_path / "a.mcap", intact[: first.end] + invalid_chunk + intact[first.end :]
     )
+
     reader = RecordingReader(path)
-    assert len(list(reader.read_messages())) > MIN_MESSAGE_COUNT
+
+    assert len(list(reader.read_messages())) > MIN_MESSAGE_COUNT, "the other chunks are read"
     assert "a chunk that cannot be unpacked" in reader.missing[0]
 
-    (channel,) = struct.unpack("<H", b"\x01\x00")
-    late_message = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, channel, 10**6, 2**63, 0)
+
+def test_damaged_message_with_impossible_time_is_left_out_and_reported(
+    intact: bytes, tmp_path: Path
+) -> None:
+    second = list_chunks(intact)[1]
+    channel = 1
+    sequence = 10**6
+    log_time_ns = 2**63  # in 292 years
+    fields = (channel, sequence, log_time_ns, 0)
+    late_message = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22, *fields)  # the fields have 22 bytes
     late_chunk = make_chunk_record(late_message)
     path = write_file(
         tmp_path / "a.mcap", intact[: second.begin] + late_chunk + intact[second.begin :]
     )
+
     reader = RecordingReader(path)
+
     assert max(message.robot_time_ns for message in reader.read_messages()) < 2**62
     assert reader.missing
     assert snakesim("recording", "info", "a.mcap", cwd=tmp_path).code == INCOMPLETE
 
 
+@pytest.mark.parametrize(
+    "opcode", [Opcode.CHUNK, Opcode.METADATA, Opcode.MESSAGE, Opcode.ATTACHMENT]
+)
 def test_recording_with_impossible_record_length_counts_one_damage(
-    intact: bytes, tmp_path: Path
+    intact: bytes, tmp_path: Path, opcode: Opcode
 ) -> None:
+    """The reader skips a record that is longer than the file, and finds the next one, so that nothing is lost."""
     second = list_chunks(intact)[1]
-    for opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.MESSAGE, Opcode.ATTACHMENT):
-        impossible_record = struct.pack("<BQ", opcode, 2**63) + b"x" * 50
-        reader = RecordingReader(
-            write_file(
-                tmp_path / "a.mcap",
-                intact[: second.begin] + impossible_record + intact[second.begin :],
-            )
-        )
-        list(reader.read_messages())
-        assert reader.is_complete
-        assert not reader.losses.lost_by_key
-        assert reader.losses.damage_count == 1
+    length_bytes = 2**63
+    impossible_record = struct.pack("<BQ", opcode, length_bytes) + b"x" * 50
+    path = write_file(
+        tmp_path / "a.mcap", intact[: second.begin] + impossible_record + intact[second.begin :]
+    )
+
+    reader = RecordingReader(path)
+    list(reader.read_messages())
+
+    assert reader.is_complete
+    assert not reader.losses.lost_by_key
+    assert reader.losses.damage_count == 1
 
 
 def test_recording_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
-    compressed_zeros = make_chunk_record(bytes(60_000_000))
+    chunk_bytes = 60_000_000
+    chunk_count = 20  # 1.2 GB in all, which fit into a file of 200 kB
+    compressed_zeros = make_chunk_record(bytes(chunk_bytes))
     assert len(compressed_zeros) < 10_000
-    write_file(tmp_path / "bomb.mcap", MCAP0_MAGIC + compressed_zeros * 20)
+    write_file(tmp_path / "bomb.mcap", MCAP0_MAGIC + compressed_zeros * chunk_count)
+
     for command in (
         ["recording", "info", "bomb.mcap"],
         ["recording", "export", "bomb.mcap", "--format", "mcap", "--out", "o.mcap"],
@@ -493,8 +549,11 @@ def test_damaged_recording_is_reported_for_its_run_folder(
     for path in run.iterdir():
         if path.is_file():
             write_file(tmp_path / path.name, path.read_bytes())
-    write_file(tmp_path / RECORDING_FILENAME, intact[: len(intact) // 2])
+    write_truncated(tmp_path / RECORDING_FILENAME, intact)
+
     result = snakesim("recording", "report", ".", cwd=tmp_path)
+
     assert result.code == INCOMPLETE
     assert "its end: it breaks off" in result.err
-    assert len(RunRecord.load(tmp_path).time_s) == 150  # the black box has all rows
+    rows_of_run = 150  # of 1.5 s
+    assert len(RunRecord.load(tmp_path).time_s) == rows_of_run, "the black box has all rows"

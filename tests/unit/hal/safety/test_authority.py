@@ -33,32 +33,54 @@ HOT = Fault(tick=1, what="hot", cause="joint_2 is hot")
 
 
 def test_arming_unmet_conditions_are_named_until_met() -> None:
+    """Each step meets one condition more, and the next answer names the ones that are left."""
+    measured_rad = 0.1
     rig = AuthorityRig()
     assert rig.arm().reason == "no joint state yet; nothing commands the robot: the lease is free"
-    rig.observe(0.1)
+
+    rig.observe(measured_rad)
     assert rig.arm().reason == "nothing commands the robot: the lease is free"
+
     rig.acquire()
     assert rig.arm().reason == "no commands from control yet"
-    rig.send(0.7)
+
+    rig.send(measured_rad + 0.6)
     assert "joint_1 has a target +0.60 rad" in rig.arm().reason
-    rig.send(0.1, JointMode.TORQUE)
+
+    rig.send(measured_rad, JointMode.TORQUE)
     assert (
         "joint_1 is commanded in mode torque; it must hold its position at arming"
         in rig.arm().reason
     )
-    rig.send(0.0, JointMode.PASSIVE)
-    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
-    rig.send(0.1)
-    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
+
+    rig.send(measured_rad)
     answer = rig.arm()
     assert answer.ok
     assert answer.lifecycle == "armed"
 
 
+@pytest.mark.parametrize(
+    ("target_rad", "mode"), [(0.0, JointMode.PASSIVE), (0.1, JointMode.POSITION)]
+)
+def test_arming_commands_that_move_no_joint_meet_all_conditions(
+    target_rad: float, mode: JointMode
+) -> None:
+    """A passive joint may have any target, and a joint at 0.1 rad holds its position."""
+    rig = AuthorityRig()
+    rig.observe(0.1)
+    rig.acquire()
+
+    rig.send(target_rad, mode)
+
+    assert rig.authority.list_unmet_conditions(rig.now_ns) == []
+
+
 def test_arming_stopped_robot_is_refused_until_reset() -> None:
     rig = make_armed_rig()
+
     rig.authority.latch_fault(HOT)
     assert "state is fault, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
+
     rig.authority.handle_estop_request(ESTOP, rig.tick)
     assert "state is estop, must be disarmed; first `snakesim robot reset`" in rig.arm().reason
 
@@ -82,9 +104,10 @@ def test_arming_request_for_another_robot_is_explained(
     request_fields: dict[str, Any], refusal: str, explanation: str
 ) -> None:
     rig = make_commanded_rig()
-    answer = rig.authority.handle_lifecycle_request(
-        msgspec.structs.replace(ARM, **request_fields), rig.now_ns
-    )
+    request = msgspec.structs.replace(ARM, **request_fields)
+
+    answer = rig.authority.handle_lifecycle_request(request, rig.now_ns)
+
     assert answer.refusal == refusal
     assert explanation in answer.reason
 
@@ -102,7 +125,7 @@ def test_arming_condition_of_hundred_unknown_joints_is_shortened() -> None:
     assert len(first_condition) == MAX_CONDITION_LENGTH
 
 
-def test_arming_hundred_joints_far_from_their_targets_has_a_short_reason() -> None:
+def test_arming_hundred_joints_far_from_targets_has_short_reason() -> None:
     """A longer reason could not be sent, so that the client would get no answer."""
     far_target_rad = 9.0  # from the measured 0.1 rad
     rig = AuthorityRig(chain__modules=LONG_ROBOT_JOINTS)
@@ -133,28 +156,34 @@ def test_arming_before_motors_received_the_stop_is_refused(stop: str) -> None:
         rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.acquire()
     rig.send(0.1)
+
     answer = rig.arm()
     assert answer.refusal == "not_ready"
     assert "have not received the stop" in answer.reason
-    rig.authority.compute_setpoints()
+
+    rig.authority.compute_setpoints()  # the motors receive the stop
     assert rig.arm().ok
 
 
 def test_arming_for_the_first_time_waits_for_no_stop() -> None:
+    """A robot that was never armed has motors that are off, so they need not receive the stop of a fault."""
     rig = AuthorityRig()
     rig.authority.latch_fault(HOT)
     rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.observe(0.1)
     rig.acquire()
     rig.send(0.1)
+
     assert rig.arm().ok
 
 
 def test_arming_after_a_disarm_needs_a_new_command() -> None:
     rig = make_armed_rig()
     rig.run_tick_with_command(0.1)
+
     rig.authority.handle_lifecycle_request(DISARM, rig.now_ns)
     rig.pass_tick()
+
     assert rig.arm().reason == "no commands from control yet"
 
 
@@ -179,10 +208,13 @@ def test_arming_unchecked_robot_needs_explicit_request() -> None:
 
 def test_arming_waits_until_backend_reports_no_obstacle() -> None:
     rig = make_commanded_rig()
+
     rig.authority.set_backend_obstacles(["joint_2 is at step `home`"])
     answer = rig.arm()
-    assert (answer.ok, answer.refusal) == (False, "not_ready")
+    assert not answer.ok
+    assert answer.refusal == "not_ready"
     assert "joint_2 is at step `home`" in answer.reason
+
     rig.authority.set_backend_obstacles([])
     assert rig.arm().ok
 
@@ -218,6 +250,7 @@ def test_arming_in_lockstep_drops_commands_of_the_last_session(was_used: bool) -
         rig.authority.compute_setpoints(rig.tick)
     assert rig.authority.handle_lifecycle_request(DISARM, rig.now_ns).ok
     rig.authority.compute_setpoints(rig.tick)  # the motors receive the stop
+
     rig.send(0.1)
     assert rig.arm().ok
     decision = rig.authority.compute_setpoints(rig.tick)
@@ -229,12 +262,18 @@ def test_arming_in_lockstep_drops_commands_of_the_last_session(was_used: bool) -
 
 
 def test_command_of_another_arm_session_neither_moves_nor_renews() -> None:
+    """The lease of five periods expires although commands of other sessions arrive in each of them."""
+    last_session = 0
+    this_session = 1
+    later_session = 2
     rig = make_armed_rig()
-    rig.run_tick_with_command(0.1, arm_session=1)
-    for other_session in (0, 2, 0, 2):
+    rig.run_tick_with_command(0.1, arm_session=this_session)
+
+    for other_session in (last_session, later_session, last_session, later_session):
         assert rig.send(0.2, arm_session=other_session) == "before_arming"
         assert rig.pass_tick().setpoints.target == pytest.approx([0.1] * JOINT_COUNT)
-    rig.run_tick_with_command(0.2, arm_session=0)
+    rig.run_tick_with_command(0.2, arm_session=last_session)
+
     assert rig.authority.state == "fault"
     assert rig.authority.faults[0].what == "lease_expired"
     assert rig.authority.rejected_counts == {"before_arming": 5}
@@ -248,9 +287,13 @@ def test_command_under_way_at_arming_is_not_counted_as_rejected() -> None:
     rig.send(0.1)
     rig.arm()
     rig.tick = 6
-    assert rig.send(0.1, tick=5, arm_session=0) == "before_arming"
-    assert rig.authority.rejected_counts == {}
-    assert rig.send(0.1, tick=6, arm_session=0) == "before_arming"
+
+    answers_tick_before_arming = rig.send(0.1, tick=5, arm_session=0)
+    assert answers_tick_before_arming == "before_arming"
+    assert rig.authority.rejected_counts == {}, "the client could not know that it is armed"
+
+    answers_tick_after_arming = rig.send(0.1, tick=6, arm_session=0)
+    assert answers_tick_after_arming == "before_arming"
     assert rig.authority.rejected_counts == {"before_arming": 1}
 
 
@@ -258,9 +301,12 @@ def test_lease_without_commands_expires_with_a_fault() -> None:
     rig = make_armed_rig()
     for _ in range(20):
         rig.run_tick_with_command(0.1)
-    for _ in range(LEASE_NS // PERIOD_NS - 1):  # the last command remains in force for one term
-        assert rig.pass_tick().command_sequence == rig.sequence
+
+    periods_in_term = LEASE_NS // PERIOD_NS - 1
+    for _ in range(periods_in_term):
+        assert rig.pass_tick().command_sequence == rig.sequence, "the last command is in force"
     decision = rig.pass_tick()
+
     assert rig.authority.state == "fault"
     assert decision.command_sequence is None
     assert list_modes(decision) == {JointMode.VELOCITY}
@@ -275,13 +321,15 @@ def test_lease_without_commands_expires_with_a_fault() -> None:
 def test_lease_taken_by_higher_priority_disarms_and_rejects_old_holder() -> None:
     rig = make_armed_rig()
     rig.run_tick_with_command(0.1)
-    assert not rig.acquire("teleop").ok
+    assert not rig.acquire("teleop").ok, "its priority is not higher"
     assert rig.authority.state == "armed"
+
     answer = rig.acquire("teleop", priority=200)
+
     assert answer.epoch == 2
     assert answer.lifecycle == "disarmed"
     assert list_modes(rig.pass_tick()) == {JointMode.PASSIVE}
-    assert rig.send(0.1, lease_epoch=1) == "wrong_epoch"
+    assert rig.send(0.1, lease_epoch=1) == "wrong_epoch", "a command of the old holder"
     assert rig.arm().reason == "no commands from teleop yet"
     rig.send(0.1, sequence=1)  # a new holder starts with new sequence numbers
     assert rig.arm().ok
@@ -305,9 +353,11 @@ def test_holder_gone_while_armed_keeps_the_lease() -> None:
 def test_holder_gone_after_estop_frees_lease_and_keeps_reason() -> None:
     rig = make_armed_rig()
     rig.authority.handle_estop_request(ESTOP, rig.tick)
+
     rig.authority.handle_lease_holder_exit("control is gone")
     assert rig.authority.lease.holder is None
-    assert "emergency stop by a person" in rig.authority.reason
+    assert "emergency stop by a person" in rig.authority.reason, "why the robot is stopped"
+
     rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.authority.handle_lease_holder_exit("control is gone")
     assert rig.authority.reason == "control is gone"
@@ -341,10 +391,13 @@ def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
         rig.send(0.3)
         decisions.append(rig.authority.compute_setpoints(tick))
     before = decisions[-1]
+
+    # More commands for the next tick than are kept, so that none for tick 4 is left.
     rig.tick = 5
     for _ in range(RECENT_COMMAND_COUNT + 1):
         rig.send(0.1)
     after = rig.authority.compute_setpoints(4)
+
     assert after.command_sequence == before.command_sequence
     assert after.setpoints.target == pytest.approx([0.3] * JOINT_COUNT)
 
@@ -355,13 +408,16 @@ def test_decision_in_lockstep_after_a_flood_keeps_the_last_command() -> None:
 def test_estop_stays_until_reset_and_arming() -> None:
     rig = make_armed_rig()
     rig.run_tick_with_command(0.2)
+
     assert rig.authority.handle_estop_request(ESTOP, rig.tick).ok
     for _ in range(3):
         assert list_modes(rig.run_tick_with_command(0.2)) == {JointMode.PASSIVE}
     assert not rig.arm().ok
     assert not rig.authority.handle_lifecycle_request(DISARM, rig.now_ns).ok
+
     assert rig.authority.handle_lifecycle_request(RESET, rig.now_ns).ok
     assert list_modes(rig.run_tick_with_command(0.2)) == {JointMode.PASSIVE}
+
     assert rig.arm().ok
     assert rig.pass_tick().setpoints.target == [0.1] * JOINT_COUNT  # resumes from the measured pose
 
@@ -379,7 +435,9 @@ def test_fault_starts_the_stop_mode_of_the_robot(
 ) -> None:
     rig = make_armed_rig(safety__action=stop_mode)
     rig.observe(0.4)
+
     rig.authority.latch_fault(HOT)
+
     # Later motion of the joint does not change the pose that is held.
     for angle_rad in (0.4, 0.6, 0.9):
         rig.observe(angle_rad)
@@ -423,21 +481,31 @@ def test_fault_after_the_first_does_not_replace_the_reason() -> None:
 
 @pytest.mark.parametrize("stop", ["fault", "estop"])
 def test_faults_of_a_full_log_include_the_first_stop(stop: str) -> None:
+    """Of a full log, the first 16 faults stay, and after them the fault that has stopped the robot.
+
+    The tick of a fault shows which one it is.
+    """
+    first_count = 16
+    stop_tick = first_count
     rig = make_armed_rig()
-    for tick in range(16):
+
+    for tick in range(first_count):
         rig.authority.log_fault(Fault(tick=tick, what="late", cause="late"))
     match stop:
         case "fault":
-            rig.authority.latch_fault(Fault(tick=16, what="hot", cause="hot"))
+            rig.authority.latch_fault(Fault(tick=stop_tick, what="hot", cause="hot"))
         case _:
-            rig.authority.handle_estop_request(ESTOP, 16)
-            rig.authority.handle_estop_request(ESTOP, 17)
+            rig.authority.handle_estop_request(ESTOP, stop_tick)
+            rig.authority.handle_estop_request(ESTOP, stop_tick + 1)  # repeats the stop
+    # None of the following faults stops the robot, which is stopped already.
     rig.authority.latch_fault(Fault(tick=18, what="hot", cause="hot"))
     for tick in range(19, 60):
         rig.authority.latch_fault(Fault(tick=tick, what="late", cause="late", scope="none"))
     for tick in range(60, 100):
         rig.authority.log_fault(Fault(tick=tick, what="late", cause="late"))
-    assert [fault.tick for fault in rig.authority.faults][:17] == [*range(17)]
+
+    kept_ticks = [fault.tick for fault in rig.authority.faults]
+    assert kept_ticks[: first_count + 1] == [*range(first_count), stop_tick]
 
 
 def test_faults_since_start_survive_a_reset() -> None:
@@ -452,12 +520,15 @@ def test_faults_since_start_survive_a_reset() -> None:
 
 
 def test_heat_derates_then_stops_then_blocks_arming() -> None:
+    """The motor of joint_2 gets hot, too hot, and cools down."""
     rig = make_armed_rig()
+
     report_power(rig, [20.0, 92.5, 20.0])
     derated = rig.run_tick_with_command(0.1)
     assert derated.setpoints.torque_limit_nm == pytest.approx([4.0, 2.4, 4.0])
     assert derated.limit_by_joint == {1: "thermal"}
     assert rig.authority.derated_joints == {"joint_2": pytest.approx(0.6)}
+
     report_power(rig, [20.0, 110.0, 20.0])
     stopped = rig.pass_tick()
     assert [(fault.what, fault.joint) for fault in rig.authority.faults] == [
@@ -465,10 +536,12 @@ def test_heat_derates_then_stops_then_blocks_arming() -> None:
     ]
     # Torque is also derated while the robot stops.
     assert stopped.setpoints.torque_limit_nm == pytest.approx([4.0, 0.8, 4.0])
+
     rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
     rig.acquire()
     rig.run_tick_with_command(0.1)
     assert "joint_2 is at 110" in rig.arm().reason
+
     report_power(rig, [20.0, 70.0, 20.0])
     rig.pass_tick()
     rig.send(0.1)
@@ -477,22 +550,27 @@ def test_heat_derates_then_stops_then_blocks_arming() -> None:
 
 def test_weak_supply_blocks_arming_with_one_explanation() -> None:
     rig = AuthorityRig()
-    for _ in range(7):
+    for _ in range(7):  # long enough for a fault of the supply, which is reset then
         report_power(rig, [20.0] * JOINT_COUNT, volts=12.0)
         rig.pass_tick()
     rig.authority.handle_lifecycle_request(RESET, rig.now_ns)
+
     answer = rig.arm()
+
     assert answer.refusal == "not_ready"
-    assert answer.reason.count("12.0 V") == 1
+    assert answer.reason.count("12.0 V") == 1, "all joints have the same supply"
     assert WHERE_TO_SET_MIN_VOLTAGE in answer.reason
 
 
 def test_joint_angle_after_a_host_pause_may_be_far() -> None:
+    """The timestamp has not advanced, but a second has passed for the host, in which a joint may turn far."""
     rig = make_armed_rig()
-    rig.authority.observe_joints(
-        make_joint_state(rig.robot, 0.9, timestamp_ns=rig.timestamp_ns), rig.timestamp_ns + 10**9
-    )
+    far_state = make_joint_state(rig.robot, 0.9, timestamp_ns=rig.timestamp_ns)
+    one_second_ns = 10**9
+
+    rig.authority.observe_joints(far_state, rig.timestamp_ns + one_second_ns)
     rig.pass_tick()
+
     assert rig.authority.state == "armed"
 
 
@@ -534,7 +612,8 @@ def test_constant_angles_are_implausible_only_while_commanded_to_move(
 ) -> None:
     """Accept constant angles of a robot without commands for any time."""
     rig = make_armed_rig() if is_armed else make_commanded_rig()
-    for tick in range(1, 400):
+
+    for tick in range(1, 400):  # 4 s, many times as long as a joint may be frozen
         rig.run_tick_with_command(0.1 + 0.001 * tick)
         rig.authority.observe_joints(
             make_joint_state(
@@ -542,4 +621,5 @@ def test_constant_angles_are_implausible_only_while_commanded_to_move(
             )
         )
         rig.authority.latch_faults_and_expire_lease(rig.now_ns, rig.tick)
-    assert (rig.authority.state == "fault") == is_armed
+
+    assert (rig.authority.state == "fault") == is_armed, rig.authority.reason

@@ -335,7 +335,7 @@ def test_plausibility_fault_of_some_joints_has_the_scope_of_joints() -> None:
     assert rig.doubted_joints == [1, 2]
 
 
-def test_plausibility_state_of_wrong_length_is_a_fault_of_the_robot() -> None:
+def test_plausibility_state_of_wrong_length_is_fault_of_robot() -> None:
     rig = CheckerRig()
 
     fault = rig.check_sample(valid=[])
@@ -394,9 +394,11 @@ def test_plausibility_state_of_wrong_length_is_published_unchanged(column: str) 
 # --- frozen sensors --------------------------------------------------------------------------------------------
 
 LEASE_PERIODS = LEASE_NS // PERIOD_NS
-
-
-FAR_PERIODS = 4  # by then, a target that moves by 0.02 rad per period is more than 0.075 rad away
+FAR_TARGET_RAD = 0.075  # a target that has moved farther must have changed the torque
+FAR_PERIODS = (
+    4  # by then, a target that moves by 0.02 rad per period is more than FAR_TARGET_RAD away
+)
+MANY_PERIODS = 50  # many times as long as a joint may be frozen
 
 
 def repeat_state(
@@ -418,10 +420,11 @@ def repeat_state(
 
 def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
     rig = CheckerRig(torque=0.5)
-    assert (
-        repeat_state(rig, FAR_PERIODS + LEASE_PERIODS + 1) is None
-    )  # repeated for one lease, which is allowed
+    repeated_for_one_lease = repeat_state(rig, FAR_PERIODS + LEASE_PERIODS + 1)
+    assert repeated_for_one_lease is None
+
     fault = rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.2))
+
     assert fault is not None
     assert fault.what == "joint_frozen"
     assert (
@@ -430,52 +433,50 @@ def test_plausibility_joint_that_repeats_while_target_moves_is_frozen() -> None:
 
 
 def test_plausibility_isolated_joint_is_not_reported_as_frozen() -> None:
-    isolated = NO_JOINTS.copy()
-    isolated[1] = True
+    periods_until_frozen = FAR_PERIODS + LEASE_PERIODS + 2
     rig = CheckerRig(torque=0.5)
-    assert repeat_state(rig, FAR_PERIODS + LEASE_PERIODS + 2, isolated=isolated) is not None
-    assert rig.doubted_joints == [0, 2]
+
+    assert repeat_state(rig, periods_until_frozen, isolated=JOINT_2_ISOLATED) is not None
+    assert rig.doubted_joints == [0, 2], "the joints that are not isolated"
+
+    rig = CheckerRig(torque=0.5)
     all_joints = ~NO_JOINTS
-    assert (
-        repeat_state(CheckerRig(torque=0.5), FAR_PERIODS + LEASE_PERIODS + 2, isolated=all_joints)
-        is None
-    )
+    assert repeat_state(rig, periods_until_frozen, isolated=all_joints) is None
+
+
+JOINT_1_ISOLATED: JointMask = np.array([True, False, False])
+SAMPLE_COUNT = 60
+HALFWAY = 30  # sample from which joint_2 may be frozen
 
 
 def test_plausibility_joint_freezes_while_an_isolated_joint_is_frozen() -> None:
-    isolated = NO_JOINTS.copy()
-    isolated[0] = True
+    """The isolated joint_1 is frozen from the start, joint_2 stops halfway, and joint_3 always moves."""
     rig = CheckerRig(torque=0.5)
     faults: list[Fault | None] = []
-    for sample in range(60):
-        angle = [
-            0.0,
-            0.01 * min(sample, 30),
-            0.01 * sample,
-        ]  # the second joint stops after 30 samples
-        faults.append(
-            rig.check_sample(
-                angle, 0.0, 0.5, applied=make_applied(0.02 * sample), isolated=isolated
-            )
-        )
-    assert not any(faults[:30])
+
+    for sample in range(SAMPLE_COUNT):
+        angle = [0.0, 0.01 * min(sample, HALFWAY), 0.01 * sample]
+        applied = make_applied(0.02 * sample)
+        faults.append(rig.check_sample(angle, 0.0, 0.5, applied=applied, isolated=JOINT_1_ISOLATED))
+
+    assert not any(faults[:HALFWAY]), "joint_2 still moved"
     assert faults[-1] is not None
     assert rig.doubted_joints == [1]
 
 
 def test_plausibility_joint_freezes_after_its_mode_has_changed() -> None:
-    isolated = NO_JOINTS.copy()
-    isolated[0] = True
+    """A repeated state of joint_2 is no fault in velocity mode, and is one after a change to position mode."""
     rig = CheckerRig(torque=0.5)
     fault = None
-    for sample in range(60):
+
+    for sample in range(SAMPLE_COUNT):
         applied = make_applied(0.02 * sample)
-        if sample < 30:
+        if sample < HALFWAY:
             applied.mode[1] = JointMode.VELOCITY
-        fault = rig.check_sample(
-            [0.0, 0.0, 0.01 * sample], 0.0, 0.5, applied=applied, isolated=isolated
-        )
-        assert fault is None or sample > 30
+        angle = [0.0, 0.0, 0.01 * sample]
+        fault = rig.check_sample(angle, 0.0, 0.5, applied=applied, isolated=JOINT_1_ISOLATED)
+        assert fault is None or sample > HALFWAY, f"joint_2 was in velocity mode, sample {sample}"
+
     assert fault is not None
     assert rig.doubted_joints == [1]
 
@@ -487,9 +488,12 @@ def test_plausibility_state_may_repeat_for_exactly_one_lease() -> None:
     for target in (0.0, 0.2):
         assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(target)) is None
     assert rig.timestamp_ns == 0
-    lease_periods = LEASE_NS / PERIOD_NS
-    assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.2), periods=lease_periods) is None
-    assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.2), periods=1e-6) is not None
+
+    far = make_applied(0.2)
+    one_lease = LEASE_NS / PERIOD_NS  # in periods
+    a_moment = 1e-6  # in periods
+    assert rig.check_sample(0.0, 0.0, 0.5, applied=far, periods=one_lease) is None
+    assert rig.check_sample(0.0, 0.0, 0.5, applied=far, periods=a_moment) is not None
 
 
 @pytest.mark.parametrize("step", [0.02, -0.02])
@@ -498,15 +502,22 @@ def test_plausibility_target_motion_in_both_directions_reveals_frozen_joint(step
 
 
 def test_plausibility_slow_target_reveals_frozen_joint_only_later() -> None:
-    assert (
-        repeat_state(CheckerRig(torque=0.5), 50, 0.0014) is None
-    )  # the target moves by 0.069 rad, and 0.075 rad is required
-    assert repeat_state(CheckerRig(torque=0.5), 70, 0.0014) is not None
+    step_rad = 0.0014
+    moves_too_little = 50  # periods, in which the target moves by 0.069 rad
+    moves_far_enough = (
+        70  # periods, in which it moves by 0.097 rad, of which the last are after FAR_TARGET_RAD
+    )
+
+    assert repeat_state(CheckerRig(torque=0.5), moves_too_little, step_rad) is None
+    assert repeat_state(CheckerRig(torque=0.5), moves_far_enough, step_rad) is not None
 
 
 def test_plausibility_rested_joint_has_one_lease_to_follow_a_jump() -> None:
     rig = CheckerRig(torque=0.5)
-    assert repeat_state(rig, 100, 0.0) is None
+    assert repeat_state(rig, 100, target_step_rad=0.0) is None, (
+        "a joint at rest may repeat its state"
+    )
+
     faults = [
         rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.3)) for _ in range(LEASE_PERIODS + 2)
     ]
@@ -515,62 +526,77 @@ def test_plausibility_rested_joint_has_one_lease_to_follow_a_jump() -> None:
 
 
 def test_plausibility_saturated_motor_may_repeat_its_state() -> None:
-    assert repeat_state(CheckerRig(torque=4.0), 50, torque=3.9) is None
-    assert repeat_state(CheckerRig(torque=-4.0), 50, torque=-3.9) is None
+    """At its torque limit of 4 Nm, a motor cannot react to a target that moves."""
+    assert repeat_state(CheckerRig(torque=4.0), MANY_PERIODS, torque=3.9) is None
+    assert repeat_state(CheckerRig(torque=-4.0), MANY_PERIODS, torque=-3.9) is None
+
     rig = CheckerRig()
-    for k in range(50):
+    for k in range(MANY_PERIODS):
         assert rig.check_sample(applied=make_applied(0.02 * k, torque_limit=0.0)) is None
 
 
-def test_plausibility_frozen_needs_position_target_of_armed_robot() -> None:
-    for mode in (JointMode.PASSIVE, JointMode.VELOCITY, JointMode.TORQUE):
-        assert repeat_state(CheckerRig(torque=0.5), 50, mode=mode) is None
+@pytest.mark.parametrize("mode", [JointMode.PASSIVE, JointMode.VELOCITY, JointMode.TORQUE])
+def test_plausibility_joint_without_position_target_is_not_frozen(mode: JointMode) -> None:
+    assert repeat_state(CheckerRig(torque=0.5), MANY_PERIODS, mode=mode) is None
+
+
+def test_plausibility_joint_of_a_disarmed_robot_is_not_frozen() -> None:
     rig = CheckerRig(torque=0.5)
-    for _ in range(50):
-        assert rig.check_sample(0.0, 0.0, 0.5) is None
-    repeat_state(rig, FAR_PERIODS + LEASE_PERIODS)
-    assert rig.check_sample(0.0, 0.0, 0.5) is None  # while disarmed, counting starts again
-    assert repeat_state(rig, FAR_PERIODS + LEASE_PERIODS) is None
+
+    for _ in range(MANY_PERIODS):
+        assert rig.check_sample(0.0, 0.0, 0.5, applied=None) is None
+
+
+def test_plausibility_disarming_starts_the_frozen_time_again() -> None:
+    rig = CheckerRig(torque=0.5)
+    nearly_frozen_periods = FAR_PERIODS + LEASE_PERIODS
+    repeat_state(rig, nearly_frozen_periods)
+
+    assert rig.check_sample(0.0, 0.0, 0.5, applied=None) is None
+
+    assert repeat_state(rig, nearly_frozen_periods) is None, "time before the disarming was counted"
 
 
 def test_plausibility_mode_change_starts_the_frozen_time_again() -> None:
     rig = CheckerRig(torque=0.5)
+    nearly_frozen_periods = FAR_PERIODS + LEASE_PERIODS
+    in_velocity_mode = make_applied(9.0, JointMode.VELOCITY)
+
     for _ in range(4):
-        assert repeat_state(rig, FAR_PERIODS + LEASE_PERIODS) is None
-        assert (
-            rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(9.0, JointMode.VELOCITY)) is None
-        )
+        assert repeat_state(rig, nearly_frozen_periods) is None
+        assert rig.check_sample(0.0, 0.0, 0.5, applied=in_velocity_mode) is None
 
 
 def test_plausibility_revived_joint_has_a_full_lease_until_frozen() -> None:
     rig = CheckerRig(torque=0.5)
-    assert (
-        repeat_state(rig, FAR_PERIODS + LEASE_PERIODS) is None
-    )  # the target is far for nearly one lease
-    assert rig.check_sample(1e-9, 0.0, 0.5, applied=make_applied(0.2)) is None  # every joint moves
-    assert [
-        rig.check_sample(1e-9, 0.0, 0.5, applied=make_applied(0.4)) for _ in range(LEASE_PERIODS)
-    ] == [None] * LEASE_PERIODS
+    nearly_frozen_periods = FAR_PERIODS + LEASE_PERIODS
+    assert repeat_state(rig, nearly_frozen_periods) is None
+    moved_rad = 1e-9  # any change shows that the sensor works
+    assert rig.check_sample(moved_rad, 0.0, 0.5, applied=make_applied(0.2)) is None
+
+    faults = [
+        rig.check_sample(moved_rad, 0.0, 0.5, applied=make_applied(0.4))
+        for _ in range(LEASE_PERIODS)
+    ]
+
+    assert faults == [None] * LEASE_PERIODS
 
 
-@pytest.mark.parametrize("column", [0, 1, 2])
+@pytest.mark.parametrize("column", [0, 1, 2], ids=["angle", "velocity", "torque"])
 def test_plausibility_joint_with_any_changing_value_is_not_frozen(column: int) -> None:
     rig = CheckerRig()
-    for k in range(50):
-        row = np.array([0.0, 0.0, 0.5]) + 1e-9 * (k % 2) * (np.arange(3) == column)
-        assert (
-            rig.check_sample(
-                float(row[0]), float(row[1]), float(row[2]), applied=make_applied(0.02 * k)
-            )
-            is None
-        )
+    for k in range(MANY_PERIODS):
+        angle_velocity_torque = [0.0, 0.0, 0.5]
+        angle_velocity_torque[column] += 1e-9 * (k % 2)
+        applied = make_applied(0.02 * k)
+        assert rig.check_sample(*angle_velocity_torque, applied=applied) is None
 
 
 def test_plausibility_target_exactly_at_threshold_reveals_nothing() -> None:
     rig = CheckerRig(torque=0.5)
     assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.0)) is None
     for _ in range(3 * LEASE_PERIODS):
-        assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.075)) is None
+        assert rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(FAR_TARGET_RAD)) is None
 
 
 def test_plausibility_host_pauses_do_not_count_as_frozen() -> None:

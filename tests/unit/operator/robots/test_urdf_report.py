@@ -343,15 +343,18 @@ def test_urdf_report_lists_every_unread_value(tmp_path: Path) -> None:
     file = tmp_path / "robot.urdf"
     unread = _list_unread_values(file)
     base = import_urdf(file, ImportOptions()).robot
-    assert len(unread) > 30
+    assert len(unread) > 30, "the URDF must have values of many kinds that no import reads"
+
     for kind in ("zero", "negative", "huge"):
         root = ET.fromstring(SNAKE_URDF)
         changes: list[tuple[UrdfValue, ET.Element, str]] = []
         for value in unread:
             text = str(_make_changes(value.name, _read_original(value))[kind])
             changes.append((value, _change_value(root, value, text), text))
+
         result = import_urdf(_write_urdf(root, file), ImportOptions())
-        assert result.robot == base
+
+        assert result.robot == base, f"an unread value changed the robot: {kind}"
         for value, element, text in changes:
             assert _is_reported(result.left_out, _find_line(root, element), text), (
                 f"{value.name} = {text[:50]}"
@@ -410,7 +413,10 @@ def _import_with_edits(tmp_path: Path, *edits: tuple[str, str]) -> ImportResult:
 
 
 def test_urdf_report_joint_friction_is_individual_or_absent(tmp_path: Path) -> None:
-    result = _import_with_edits(tmp_path, ('<dynamics damping="0.04" friction="0.07"/>', ""))
+    without_dynamics_of_j3 = ('<dynamics damping="0.04" friction="0.07"/>', "")
+
+    result = _import_with_edits(tmp_path, without_dynamics_of_j3)
+
     assert [joint.motor.friction_nm for joint in result.robot.joint_table] == [0.06, 0.06, 0.0]
     assert [joint.motor.viscous_nm_s_per_rad for joint in result.robot.joint_table] == [
         0.03,
@@ -423,9 +429,11 @@ def test_urdf_report_joint_friction_is_individual_or_absent(tmp_path: Path) -> N
 
 
 def test_urdf_report_joint_without_motor_gets_none_from_neighbors(tmp_path: Path) -> None:
+    """The effort 4.7 Nm of j3 is replaced by zero, which is refused, or left out, which assumes the smallest other."""
     line = _find_text_line('effort="4.7"')
     with raises_error(ConfigError, code="urdf/invalid", field="j3", value=0):
         _import_with_edits(tmp_path, ('effort="4.7"', 'effort="0"'))
+
     absent = _import_with_edits(tmp_path, ('effort="4.7" ', ""))
     assert absent.robot.joint_table[2].limits.torque_nm == 4.5, "no more than any other joint"
     expected = "<limit effort> has no value: 4.5 N·m, the smallest of the other joints; is there a motor in this joint?"
@@ -503,6 +511,7 @@ def test_urdf_report_edited_export_is_refused_or_listed(tmp_path: Path) -> None:
     file = tmp_path / "robot.urdf"
     text = format_urdf(decode_table(read_table_with_base("planar13_camera", "robots"), RobotFile))
     file.write_text(text)
+
     reimported = import_urdf(file, ImportOptions())
     assert not reimported.changed
     assert not reimported.assumed
@@ -510,14 +519,17 @@ def test_urdf_report_edited_export_is_refused_or_listed(tmp_path: Path) -> None:
     assert all("a name of its own" in line for line in reimported.left_out), (
         "an export and its import lose nothing"
     )
+
     wider_image = text.replace("<width>160</width>", "<width>320</width>", 1)
     file.write_text(wider_image)
     assert any(
         "<width> left out: '320'" in line for line in import_urdf(file, ImportOptions()).left_out
     )
+
     file.write_text(text.replace("</robot>", '<snakesim key="chain.modules" value="3"/></robot>'))
     with raises_error(ConfigError, code="urdf/invalid"):
         import_urdf(file, ImportOptions())
+
     repeated_key = '<snakesim key="safety.action" value="&quot;passive&quot;"/></robot>'
     file.write_text(text.replace("</robot>", repeated_key))
     with raises_error(ConfigError, code="urdf/invalid"):
@@ -530,7 +542,10 @@ def test_urdf_import_never_copies_check_of_another_robot(tmp_path: Path) -> None
         'extends = "planar13"\n[checked]\nby = "me"\non = "today"\njoints = "abc"\nbackend = "can"\n'
     )
     (tmp_path / "robot.urdf").write_text(SNAKE_URDF)
-    assert import_urdf(tmp_path / "robot.urdf", ImportOptions(like=str(like))).robot.checked is None
+
+    robot = import_urdf(tmp_path / "robot.urdf", ImportOptions(like=str(like))).robot
+
+    assert robot.checked is None, "a person has checked another robot"
 
 
 def test_urdf_import_prints_length_of_whole_body(

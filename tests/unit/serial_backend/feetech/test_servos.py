@@ -34,6 +34,7 @@ OFF_TICKS = 3  # until the torque of all servos is off
 RESET_TICKS = 20  # until a disarmed robot has reset its faults
 REARM_TICKS = 30  # until all servos have their torque again after a stop
 REAL_PORTS = ["/dev/ttyACM0"]  # such a port may have real servos
+EMULATED_PORTS = ["/dev/pts/7"]  # pseudo terminals have none
 
 
 class ServoRobot(DriveRig):
@@ -99,12 +100,17 @@ def test_real_servos_are_refused_until_the_missing_watchdog_is_accepted() -> Non
         check_settings(ports=REAL_PORTS, stall_torque_nm=2.0)
     with raises_error(ConfigError, code="drive/unsupported-setting", field="stall_torque_nm"):
         check_settings(ports=REAL_PORTS, accept_no_watchdog=True)
+
     check_settings(ports=REAL_PORTS, accept_no_watchdog=True, stall_torque_nm=2.0)
-    check_settings(ports=["/dev/pts/7"])
+
+
+def test_emulated_servos_need_no_accepted_watchdog_and_stall_torque() -> None:
+    check_settings(ports=EMULATED_PORTS)
 
 
 def test_servos_are_described_without_watchdog_and_torque(robot: ServoRobot) -> None:
     description = robot.backend.describe()
+
     assert [joint.watchdog for joint in description.joints] == [False] * JOINTS
     assert all("torque" not in joint.measures for joint in description.joints)
     assert all(
@@ -127,8 +133,10 @@ def test_mixed_robot_names_the_joints_without_watchdog() -> None:
     )
     config = apply_backend_modes(config, MixedBackend)
     backend = MixedBackend(config, MixedBackend.Settings(physics_model="inertia"))
+
     description = backend.describe()
     backend.close()
+
     assert [joint.watchdog for joint in description.joints] == [True, False]
     assert ["torque" in joint.measures for joint in description.joints] == [True, False]
     assert "; no watchdog: joint_2: it holds" in describe_what_moves(description)
@@ -147,7 +155,7 @@ def test_servos_hold_their_angle_while_the_driver_is_paused(robot: ServoRobot) -
     assert robot.list_torque_states() == ALL_ON, "servos have no watchdog that switches them off"
 
 
-def test_servos_are_switched_off_after_a_long_pause_of_the_driver(robot: ServoRobot) -> None:
+def test_servos_are_switched_off_after_long_pause_of_driver(robot: ServoRobot) -> None:
     robot.run(ARM_TICKS, "armed")
     robot.pause_driver(LONG_PAUSE_S)
 
@@ -257,16 +265,19 @@ def test_torque_limit_register_is_a_fraction_of_stall_torque() -> None:
 def test_registers_are_written_only_where_they_differ(
     robot: ServoRobot, change_delivered_servos: Any
 ) -> None:
+    """The driver sets the delay of answers to 0, clears one bit of the phase, keeps the others, and locks."""
     servo = robot.emulator.servos[0]
     assert servo.table[registers.DELAY] == 0
-    assert servo.table[registers.LOCK] == registers.LOCKED
-    change_delivered_servos(
-        lambda servos: servos[0].table.__setitem__(
-            registers.PHASE, 12 | registers.MULTI_TURN_FEEDBACK
-        )
-    )
+    assert servo.table[registers.LOCK] == registers.LOCKED, "the EEPROM is not protected again"
+
+    other_phase_bits = 12
+
+    def change_phase(servos: list[EmulatedFeetechServo]) -> None:
+        servos[0].table[registers.PHASE] = other_phase_bits | registers.MULTI_TURN_FEEDBACK
+
+    change_delivered_servos(change_phase)
     changed_robot = ServoRobot()
-    assert changed_robot.emulator.servos[0].table[registers.PHASE] == 12
+    assert changed_robot.emulator.servos[0].table[registers.PHASE] == other_phase_bits
     changed_robot.backend.close()
 
 
@@ -296,27 +307,34 @@ def test_unsafe_register_is_named_at_start(
     change_delivered_servos: Any, address: int, value: int, reason: str
 ) -> None:
     def change_register(servos: list[EmulatedFeetechServo]) -> None:
-        servos[1].table[address] = value
+        servos[1].table[address] = value  # of joint_2
         if address == registers.MAX_POSITION:
             servos[1].write_word(address, registers.MIDDLE + value)
 
     change_delivered_servos(change_register)
+
     with pytest.raises(BackendError) as refusal:
         ServoRobot()
+
     assert "joint_2 (id 2 on /dev/pts/" in str(refusal.value)
     assert reason in str(refusal.value)
 
 
 def test_homing_offset_is_kept_and_another_one_is_refused(change_delivered_servos: Any) -> None:
+    offset_counts = 100
+    sign_bit = 1 << 11  # the offset is negative, which adds to the angle
+    offset_word = offset_counts | sign_bit
     change_delivered_servos(
-        lambda servos: servos[0].write_word(registers.HOMING_OFFSET, 100 | 1 << 11)
+        lambda servos: servos[0].write_word(registers.HOMING_OFFSET, offset_word)
     )
     robot = ServoRobot()
+
     robot.run(1, "disarmed")
     assert robot.joints is not None
-    assert robot.joints.angle_rad[0] == pytest.approx(100 * registers.RAD, abs=0.002)
-    assert robot.emulator.servos[0].read_word(registers.HOMING_OFFSET) == 100 | 1 << 11
+    assert robot.joints.angle_rad[0] == pytest.approx(offset_counts * registers.RAD, abs=0.002)
+    assert robot.emulator.servos[0].read_word(registers.HOMING_OFFSET) == offset_word
     robot.backend.close()
+
     with raises_error(BackendError, code="drive/not-complete", field="homing_offsets"):
         ServoRobot(FeetechSettings(physics_model="inertia", homing_offsets={"joint_1": 7}))
 
@@ -325,6 +343,7 @@ def test_homing_offset_is_kept_and_another_one_is_refused(change_delivered_servo
     "drive", [{"zero_rad": 3.0}, {"gear": 8.0}, {"zero_rad": -3.0, "sign": -1}]
 )
 def test_travel_across_the_end_of_the_count_is_refused(drive: dict[str, Any]) -> None:
+    """A servo counts a single turn, so the travel of its joint must not contain the end of the turn."""
     config = make_run_config(backend="feetech", robot__chain__modules=JOINTS, robot__drive=drive)
     with raises_error(ConfigError, code="drive/unsupported-setting", field="zero_rad"):
         FeetechBackend.check(apply_backend_modes(config, FeetechBackend), FeetechSettings())

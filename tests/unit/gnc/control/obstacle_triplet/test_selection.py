@@ -301,15 +301,17 @@ def test_triplet_finder_returns_alternating_triplets_that_push():
 def test_triplet_finder_chooses_joints_between_middle_and_front_contact():
     choices, _ = find_choices_of_five_pegs()
 
+    assert choices, "there is nothing to compare"
     for choice in choices:
         _, middle_s_m, front_s_m = choice.body_s_m
         joint_s_m = BODY_S_M[choice.joint + 1]  # BODY_S_M begins with the tail
         assert middle_s_m < joint_s_m < front_s_m, choice.triplet.names
 
 
-def test_triplet_finder_torque_of_joint_is_at_most_that_of_triplet():
+def test_triplet_finder_joint_needs_at_most_torque_of_its_triplet():
     choices, _ = find_choices_of_five_pegs()
 
+    assert choices, "there is nothing to compare"
     for choice in choices:
         assert abs(choice.torque_per_n) <= choice.triplet.torque_per_n + 1e-9, choice.triplet.names
 

@@ -63,7 +63,7 @@ def test_map_obstacle_seen_repeatedly_gains_confidence():
     assert get_single_obstacle(map_after_six_scans).confidence > 0.9
 
 
-def test_map_obstacle_of_scans_has_time_of_newest_scan_and_is_untouched():
+def test_map_obstacle_of_scans_has_time_of_newest_scan():
     obstacle = get_single_obstacle(make_map(make_cylinder("a", 0.8, 0.0), scans=6))
 
     assert obstacle.last_seen_ns == 5 * SCAN_PERIOD_NS, "the first scan is at time 0"
@@ -97,7 +97,7 @@ def test_map_contacts_all_around_find_an_unseen_obstacle(radius_m, angles_rad):
     assert error_m < 3 * obstacle.position_sd_m + 0.005
 
 
-def test_map_contact_on_scanned_obstacle_touches_it_and_keeps_its_name():
+def test_map_contact_on_scanned_obstacle_keeps_its_name():
     center_w = (0.8, 0.0)
     map_ = make_map(make_cylinder("a", *center_w))
     name_before_contact = get_single_obstacle(map_).name
