@@ -75,7 +75,7 @@ PARTS = {
     "heavy": CampaignPart(
         "tests that need more than a second of processor time; CI runs them with each change",
         5,
-        (*PYTEST, *ALL_TESTS, "-n", "3", "--dist", "worksteal", "-m", HEAVY),
+        (*PYTEST, *ALL_TESTS, "-n", "4", "--dist", "worksteal", "-m", HEAVY),
     ),
     "quiet": CampaignPart(
         "robots in real time, one test after the other",
