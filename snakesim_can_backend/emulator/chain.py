@@ -38,8 +38,9 @@ from snakesim_drivers.emulation.mounted import (
     build_actual_joints,
     compute_torque_ratios,
 )
+from snakesim_drivers.emulation.shaft_demand import set_shaft_demand
 from snakesim_drivers.motion_capture.emulated_mocap import PoseCamera
-from snakesim_drivers.mounting import DriveMounting, to_joint_target
+from snakesim_drivers.mounting import DriveMounting
 from snakesim_hal.model.fault_kinds import FaultInjection, FaultTransition, InjectionPlan
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.physics.motors import PowerStages
@@ -418,30 +419,23 @@ class ModuleChain:
         demand = slot.module.demand
         slot.driven = demand
         values = slot.module.parameters.values
-        drive = slot.joint_model.drive
-        gear = drive.gear
-        torque_ratio = float(self._torque_ratios[slot.joint])
         damping = ModuleParameter.VELOCITY_GAIN
         if demand.mode == JointMode.POSITION:
             damping = ModuleParameter.DAMPING
         torque_limit_nm = inf
         if demand.mode != JointMode.PASSIVE:
-            torque_limit_nm = (
-                min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT])
-                * gear
-                * torque_ratio
-            )
-        target = to_joint_target(drive, demand.mode, demand.target)
-        if demand.mode == JointMode.TORQUE:
-            target *= torque_ratio
-        self.motors.set_demand(
+            torque_limit_nm = min(demand.torque_limit_nm, values[ModuleParameter.TORQUE_LIMIT])
+        set_shaft_demand(
+            self.motors,
             slot.joint,
-            demand.mode,
-            target,
-            torque_limit_nm,
-            values[ModuleParameter.STIFFNESS] * gear**2 * torque_ratio,
-            values[damping] * gear**2 * torque_ratio,
-            values[ModuleParameter.SPEED_LIMIT] / gear,
+            slot.joint_model.drive,
+            float(self._torque_ratios[slot.joint]),
+            mode=demand.mode,
+            target=demand.target,
+            torque_limit_nm=torque_limit_nm,
+            stiffness=values[ModuleParameter.STIFFNESS],
+            damping=values[damping],
+            speed_limit_rad_s=values[ModuleParameter.SPEED_LIMIT],
         )
 
     # --- injected faults -----------------------------------------------------------------------------------

@@ -4,8 +4,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from snakesim_drivers.emulation.shaft_demand import set_shaft_demand
 from snakesim_drivers.emulation.shared_physics import MAX_CATCH_UP_US, SharedPhysics
-from snakesim_drivers.mounting import to_joint_target
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import FaultInjection
 from snakesim_hal.model.robot_file.joints import Joint
@@ -99,22 +99,18 @@ class EmulatedBody:
             damping: Gain of position and velocity mode in N·m·s/rad.
             speed_rad_s: Speed limit.
         """
-        drive = self.joints[i].drive
         j = self._joint_indices[i]
-        # Revolutions of the shaft for one of the joint, so torques at the joint are higher by it.
-        gear = drive.gear
-        torque_ratio = self._shared.torque_ratios[j]
-        joint_target = to_joint_target(drive, mode, target)
-        if mode == JointMode.TORQUE:
-            joint_target *= torque_ratio
-        self.motors.set_demand(
+        set_shaft_demand(
+            self.motors,
             j,
-            mode,
-            joint_target,
-            limit_nm * gear * torque_ratio,
-            stiffness * gear**2 * torque_ratio,
-            damping * gear**2 * torque_ratio,
-            speed_rad_s / gear,
+            self.joints[i].drive,
+            self._shared.torque_ratios[j],
+            mode=mode,
+            target=target,
+            torque_limit_nm=limit_nm,
+            stiffness=stiffness,
+            damping=damping,
+            speed_limit_rad_s=speed_rad_s,
         )
 
     def read_shaft(self, i: int) -> ShaftState:
