@@ -83,8 +83,9 @@ def report_joint_check(
             code="commissioning/not-possible",
         )
     columns: dict[str, Floats] = {name: getattr(record, name) for name in SIGNAL_NAMES}
+    ticks = compute_tick_numbers(record.time_s, record.config.rate_hz)
     measurements = collect_measurements(
-        record.config, record.description, compute_tick_numbers(record), columns, read_imus(record)
+        record.config, record.description, ticks, columns, read_imus(record)
     )
     verdicts = judge_joints(
         measurements,

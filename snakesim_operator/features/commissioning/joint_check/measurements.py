@@ -120,9 +120,14 @@ def read_imus(record: RunRecord) -> Iterable[Imu]:
         yield decoder.decode(message.payload, message.encoding)
 
 
-def compute_tick_numbers(record: RunRecord) -> list[int]:
-    """Return the tick number of every row of a run log."""
-    return np.round(record.time_s * record.config.rate_hz).astype(int).tolist()
+def compute_tick_numbers(time_s: Floats, rate_hz: float) -> list[int]:
+    """Return the tick number of every row of a run log.
+
+    Args:
+        time_s: Robot time of each row, (n,).
+        rate_hz: Ticks per second of the run.
+    """
+    return np.round(time_s * rate_hz).astype(int).tolist()
 
 
 def arrange_imus_by_tick(

@@ -16,6 +16,7 @@ from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.wire.messages import Imu, JointMode
 from snakesim_operator.features.commissioning.joint_check.measurements import (
     arrange_imus_by_tick,
+    compute_tick_numbers,
     read_imus,
 )
 from snakesim_operator.features.commissioning.system_identification.identification import (
@@ -110,7 +111,7 @@ def identify_run(
         ConfigError: The run is of another controller, or the joints never followed position targets.
     """
     usable_ticks = _find_usable_ticks(config, columns, run_name)
-    ticks = np.round(columns["time_s"] * config.rate_hz).astype(int).tolist()
+    ticks = compute_tick_numbers(columns["time_s"], config.rate_hz)
     link_count = len(config.robot.joint_table) + 1
     link_rates, _ = arrange_imus_by_tick(imus, ticks, link_count)
     usable_columns = {name: columns[name][usable_ticks] for name in SIGNAL_NAMES}
