@@ -6,7 +6,6 @@ import os
 import signal
 import tempfile
 import time
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import wait
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import verification.mutation
 from verification.mutation import trial
+from verification.mutation.explained import read_explained
 from verification.mutation.mutants import SourceMutant, generate_mutants
 
 EQUIVALENT_MUTANTS = Path(__file__).with_name("equivalent.toml")
@@ -69,7 +69,7 @@ def main() -> int:
     if not _check_original_sources(sources, arguments.workers, arguments.time_limit):
         return 2
 
-    explained = _read_equivalent_mutants()
+    explained = read_explained(EQUIVALENT_MUTANTS)
     result = _run_mutants(sources, explained, arguments.workers, arguments.time_limit)
     obsolete = {text for text in explained if text.partition(" ")[0] in sources} - result.equivalent
     for text in sorted(obsolete):
@@ -166,14 +166,6 @@ def _run_mutants(
             result.survived.append(mutant)
             print(f"survived: {mutant}", flush=True)
     return result
-
-
-def _read_equivalent_mutants() -> set[str]:
-    """Return every mutant that `equivalent.toml` explains."""
-    mutants_by_reason: dict[str, list[str]] = tomllib.loads(
-        EQUIVALENT_MUTANTS.read_text(encoding="utf-8")
-    )
-    return {text for mutants in mutants_by_reason.values() for text in mutants}
 
 
 def _parse_arguments() -> argparse.Namespace:

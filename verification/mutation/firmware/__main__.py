@@ -3,13 +3,13 @@
 import argparse
 import sys
 import tempfile
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import verification.mutation.firmware
 from snakesim_native.compile import NO_COMPILER, list_compilers
+from verification.mutation.explained import read_explained
 from verification.mutation.firmware.faulty_copy import (
     CONTRACT_CLAUSES,
     FIRMWARE_TESTS,
@@ -136,7 +136,7 @@ def run_small_changes(files: Sequence[str]) -> int:
     """Print each small change of some files that no test finds. Return the exit code."""
     if not _pass_without_fault((QUICK_TESTS,)):
         return TESTS_FAIL_WITHOUT_FAULT
-    explained = read_equivalent_changes()
+    explained = read_explained(EQUIVALENT_CHANGES)
     result = SmallChangeResult()
     with tempfile.TemporaryDirectory(prefix="snakesim-faulty-firmware-") as folder:
         traffic_check = TrafficCheck(Path(folder))
@@ -184,14 +184,6 @@ def _test_small_change(
     else:
         result.survived.append(change)
         print(f"survived: {change}", flush=True)
-
-
-def read_equivalent_changes() -> set[str]:
-    """Return the key of every small change that `equivalent.toml` explains."""
-    changes_by_reason: dict[str, list[str]] = tomllib.loads(
-        EQUIVALENT_CHANGES.read_text(encoding="utf-8")
-    )
-    return {key for keys in changes_by_reason.values() for key in keys}
 
 
 def _parse_arguments() -> argparse.Namespace:

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from snakesim_native.compile import NO_COMPILER, list_compilers
+from verification.mutation.explained import read_explained
 from verification.mutation.firmware.__main__ import (
     EQUIVALENT_CHANGES,
     FILES,
     describe_test,
     find_failing_tests,
-    read_equivalent_changes,
 )
 from verification.mutation.firmware.faulty_copy import (
     QUICK_TESTS,
@@ -151,7 +151,7 @@ def test_equivalent_changes_exist() -> None:
         for file in FILES
         for change in generate_small_changes(file, read_firmware_file(file))
     }
-    assert read_equivalent_changes() - keys == set(), EQUIVALENT_CHANGES
+    assert read_explained(EQUIVALENT_CHANGES) - keys == set(), EQUIVALENT_CHANGES
 
 
 def test_test_is_described_as_a_sentence() -> None:
