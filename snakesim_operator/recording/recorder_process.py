@@ -343,9 +343,13 @@ def _write_last_messages(
         has_left = not present_hosts
         if has_left:
             session.list_tokens(keys.alive_key(HAL), ROUND_TRIP_TIMEOUT_S)
-        arrival_count = _write_arrivals(tap, recorder)
-        quiet_cycles = 0 if arrival_count > 0 else quiet_cycles + 1
-        if quiet_cycles >= (1 if has_left else QUIET_CYCLES_WITH_HOST):
+        if _write_arrivals(tap, recorder) > 0:
+            quiet_cycles = 0
+        elif has_left:
+            return
+        else:
+            quiet_cycles += 1
+        if quiet_cycles >= QUIET_CYCLES_WITH_HOST:
             return
         time.sleep(CYCLE_S)
 

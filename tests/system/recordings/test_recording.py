@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +18,7 @@ from mcap.reader import make_reader
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.local_network import LocalNetwork
-from snakesim_hal.network.session import ConnectionSettings, open_session
+from snakesim_hal.network.session import ConnectionSettings, Session, open_session
 from snakesim_hal.network.streams import ReceivedSample
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import encode, format_encoding
@@ -131,6 +132,7 @@ def test_recording_is_read_by_mcap_library_with_schemas(tmp_path: Path) -> None:
 
 RECORD_ENDLESSLY_CODE = """
 import os, sys, time
+from collections.abc import Iterator
 from pathlib import Path
 from snakesim_operator.recording.writer import RecordingWriter
 from snakesim_operator.recording.recover import recover_recording
@@ -229,10 +231,15 @@ def test_recover_recording_of_unreadable_file_leaves_no_copy(tmp_path: Path) -> 
     assert not (tmp_path / "copy.mcap").exists()
 
 
-def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
+@contextlib.contextmanager
+def recorded_host(path: Path) -> Iterator[tuple[Session, threading.Event]]:
+    """Record a host into a file, and end the recording when the host leaves at the end of the context.
+
+    Yields:
+        The session of the host, and an event that requests the end of the recording.
+    """
     endpoint = find_free_endpoint()
     link = ConnectionSettings(endpoint, "planar13")
-    path = tmp_path / "a.mcap"
     stop_requested = threading.Event()
     recorder = threading.Thread(
         target=lambda: record_to_file(
@@ -247,14 +254,37 @@ def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
             lambda: clocks.has_subscriber() and host.list_tokens(keys.alive_key("recorder")),
             "the recorder connects",
         )
+        yield host, stop_requested
+    recorder.join()
+
+
+def read_clock_payloads(path: Path) -> list[bytes]:
+    """Return the payload of every clock message of a recording."""
+    return [message.payload for message in RecordingReader(path).read_messages([keys.CLOCK])]
+
+
+def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with recorded_host(path) as (host, stop_requested):
         for tick in range(40):
             host.send(keys.CLOCK, make_clock_sample(tick).payload)
             if tick == 20:
                 stop_requested.set()
                 time.sleep(0.2)  # many cycles of the recorder
-    recorder.join()
-    payloads = [message.payload for message in RecordingReader(path).read_messages([keys.CLOCK])]
-    assert payloads == [make_clock_sample(tick).payload for tick in range(40)]
+    assert read_clock_payloads(path) == [make_clock_sample(tick).payload for tick in range(40)]
+
+
+def test_recording_at_its_end_continues_as_long_as_messages_arrive(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    tick_count = 300
+    tick_s = 0.01  # together longer than the two seconds in which a silent host is waited for
+    with recorded_host(path) as (host, stop_requested):
+        stop_requested.set()
+        for tick in range(tick_count):
+            host.send(keys.CLOCK, make_clock_sample(tick).payload)
+            time.sleep(tick_s)
+    expected = [make_clock_sample(tick).payload for tick in range(tick_count)]
+    assert read_clock_payloads(path) == expected
 
 
 def test_recording_sample_before_description_keeps_its_schema(tmp_path: Path) -> None:
