@@ -256,7 +256,7 @@ def find_memory_folder(request: GuestRequest) -> str:
 
 def parse_memory_size(text: str) -> int:
     """Return the bytes in a size such as `2G` or `512M`."""
-    return int(text[:-1]) * BYTES_BY_UNIT[text[-1].upper()]
+    return int(text[:-1]) * BYTES_BY_UNIT[text[-1]]
 
 
 class Guest:

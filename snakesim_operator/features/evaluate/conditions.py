@@ -24,9 +24,8 @@ class Condition:
 
     name: str
     overrides: list[KeyOverride]
-    varied_number: float | None = (
-        None  # if the condition differs from the others in a single number
-    )
+    # None if the condition differs from the others in more than a single number.
+    varied_number: float | None = None
     randomizations: Sequence[Randomization] = ()
 
 
