@@ -29,26 +29,11 @@ class Cia402Backend(CanDriveBackend):
     reserved_ids = "0 means all nodes, and 127 is the host's as shipped"
     # A drive reports with every SYNC, but its way to Operation enabled takes a while.
     report_period_s = 0.1
+    # For each drive, a setpoint and two answers to SYNC; a change of the mode is rare. For each cycle, SYNC, the
+    # heartbeat, and five reads of health and serial number.
     traffic = CycleTraffic(
-        bytes_per_drive=(
-            8,
-            8,
-            7,
-        ),  # a setpoint and two answers to SYNC; a change of the mode is rare
-        bytes_per_cycle=(
-            0,
-            1,
-            8,
-            8,
-            8,
-            8,
-            8,
-            8,
-            8,
-            8,
-            8,
-            8,
-        ),  # SYNC and heartbeat; five reads of health and serial number
+        bytes_per_drive=(8, 8, 7),
+        bytes_per_cycle=(0, 1, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8),
         heartbeats_hz=10.0,
     )
 

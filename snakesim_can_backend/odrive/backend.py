@@ -33,6 +33,7 @@ class OdriveBackend(CanDriveBackend):
     plural_noun = "axes"
     last_id = LAST_NODE
     reserved_ids = "63 is the broadcast address"
+    uses_torque_constant = True
     report_period_s = HEARTBEAT_US * 1e-6
     traffic = CycleTraffic(
         bytes_per_drive=(0, 0, 8, 8, 8),  # two requests, two answers and an input

@@ -181,6 +181,9 @@ class DriverTypeBackend(BusesBackend):
 
     has_watchdog: ClassVar[bool] = True  # False: a drive whose host dies holds its last setpoint
     unmeasured: ClassVar[Collection[Measurement]] = ()  # what drives of this type do not measure
+    # True: the driver converts between torque and current, by the torque constant in the robot file. False: the drives
+    # exchange torques, which they compute themselves, and the value in the file has no effect.
+    uses_torque_constant: ClassVar[bool] = False
 
     @classmethod
     def limit_modes(cls, robot: RobotFile) -> RobotFile:

@@ -107,16 +107,23 @@ def _make_part(
     """Return the joints of a driver type, and its settings from the scenario.
 
     Raises:
-        ConfigError: The section of the driver type is invalid, or has a key that concerns the whole robot.
+        ConfigError: The section of the driver type is invalid, or sets a key that concerns the whole robot to another
+            value than `[backends.mixed]`.
     """
     name = driver.rpartition(":")[2]  # for `./file.py:Servo` the section is `backends.Servo`
     section = f"backends.{name}"
     section_values = config.backends.get(name, {})
-    robot_wide_keys = sorted(section_values.keys() & {*BodySettings.__struct_fields__})
-    if robot_wide_keys:
+    robot_wide_values = config.backends.get(MixedBackend.name, {})
+    contradicting_keys = sorted(
+        key
+        for key in section_values.keys() & {*BodySettings.__struct_fields__}
+        if key not in robot_wide_values or section_values[key] != robot_wide_values[key]
+    )
+    if contradicting_keys:
+        key = contradicting_keys[0]
         raise ConfigError(
-            f"`{section}.{robot_wide_keys[0]}` is of a robot of {name} alone; of a mixed one it concerns all drives: "
-            f"set `backends.mixed.{robot_wide_keys[0]}`",
+            f"`{section}.{key}` is of a robot of {name} alone; of a mixed one it concerns all drives: set "
+            f"`backends.mixed.{key}`, to the same value if you keep both",
             code="config/conflict",
         )
     settings = decode_plugin_settings(

@@ -38,6 +38,7 @@ class DynamixelBackend(ServoBackend[EmulatedDynamixel]):
     port_load: ClassVar[PortLoad] = PORT_LOAD
     # The bus watchdog counts every packet to the servo.
     polling_feeds_watchdog: ClassVar[bool] = True
+    uses_torque_constant: ClassVar[bool] = True
     # Servos have no other mode, even if the robot file lists one.
     supported_modes = "position", "torque"
 

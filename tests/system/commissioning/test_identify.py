@@ -26,6 +26,17 @@ modules = 3
 friction_nm = 0.15
 viscous_nm_s_per_rad = 0.1 # a guess
 """
+MIXED_ROBOT_FILE = """extends = "planar13"
+name = "suspended"
+[chain]
+modules = 2
+[motor]
+torque_constant_nm_per_a = 0.5
+[joints.joint_1]
+driver = "odrive"
+[joints.joint_2]
+driver = "moteus"
+"""
 
 
 def make_set_options(settings: Iterable[str]) -> list[str]:
@@ -66,6 +77,31 @@ def test_identify_finds_hidden_parameters_and_writes_them_to_robot_file(tmp_path
         # Modules apply a target at the next Sync message.
         assert abs(identified[name]["latency_s"] - PERIOD_S) < 0.2 * PERIOD_S
     assert "Torque of joint_3, measured" in (tmp_path / "run" / "identified.html").read_text()
+
+
+@pytest.mark.slow
+def test_identify_writes_torque_constant_only_if_driver_uses_it(tmp_path: Path) -> None:
+    true_nm_per_a = 0.65  # of both drives; the file has 0.5
+    robot_path = tmp_path / "snake.toml"
+    robot_path.write_text(MIXED_ROBOT_FILE)
+    mounted = "backends.mixed.mounted"
+    options = make_set_options(
+        [
+            f"robot={robot_path}",
+            f"{mounted}.joint_1.torque_constant_nm_per_a={true_nm_per_a}",
+            f"{mounted}.joint_2.torque_constant_nm_per_a={true_nm_per_a}",
+        ]
+    )
+    run_to_summary(tmp_path / "run", "identify", "--backend", "mixed", *options)
+    completed = snakesim("robot", "identify", "run", "--write", "snake.toml", cwd=tmp_path)
+    assert completed.out.count("wrong: torque constant") == 2
+    assert "`torque_constant_nm_per_a` of joint_2 was left as it was" in completed.out
+    written = tomllib.loads(robot_path.read_text())
+    assert written["joints"]["joint_1"]["torque_constant_nm_per_a"] == pytest.approx(
+        true_nm_per_a, rel=0.02
+    )
+    assert "torque_constant_nm_per_a" not in written["joints"]["joint_2"]
+    assert "stiffness_nm_per_rad" in written["joints"]["joint_2"]
 
 
 @pytest.mark.slow

@@ -380,6 +380,30 @@ def test_mixed_robot_errors_name_joint_type_and_section(changes: dict[str, Any])
         MixedBackend.check(config, MixedSettings())
 
 
+def test_section_of_driver_type_may_only_repeat_values_of_whole_robot() -> None:
+    suspended = {"suspended": True}
+    standing = {"suspended": False}
+    robot: dict[str, Any] = {
+        "backend": "mixed",
+        "robot__chain__modules": 4,
+        "rate_hz": 100,
+        "robot__drive": BODY_DRIVE,
+        "robot__joints": HEAD_JOINTS,
+    }
+
+    def check(whole_robot: dict[str, bool]) -> None:
+        backends = {
+            "mixed": {"physics_model_settings": whole_robot},
+            "odrive": {"physics_model_settings": suspended},
+        }
+        settings = MixedSettings(physics_model_settings=whole_robot)
+        MixedBackend.check(make_run_config(**robot, backends=backends), settings)
+
+    check(suspended)
+    with raises_error(ConfigError, code="config/conflict"):
+        check(standing)
+
+
 def test_mixed_robot_may_use_an_id_once_per_driver_type() -> None:
     config = make_run_config(
         robot__drive=BODY_DRIVE, robot__joints={"joint_3": {"driver": "dynamixel", "id": 1}}

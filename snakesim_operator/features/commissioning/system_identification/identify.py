@@ -11,6 +11,8 @@ from snakesim_hal.base.arrays import Floats
 from snakesim_hal.base.errors import ConfigError
 from snakesim_hal.base.terminal import print_json, print_line
 from snakesim_hal.model.files import resolve_file_path
+from snakesim_hal.model.plugins import BACKENDS, load_plugin_unless_file
+from snakesim_hal.model.robot_file.joints import Joint
 from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.model.textfiles import write_text
 from snakesim_hal.wire.messages import Imu, JointMode
@@ -34,13 +36,14 @@ from snakesim_operator.results.run_log import RunRecord
 
 PAGE_FILENAME = "identified.html"
 CONTROLLER = "identify"
+TORQUE_CONSTANT = "torque_constant_nm_per_a"
 SIGNAL_NAMES = ("angle_rad", "velocity_rad_s", "torque_nm", "target")
 COLUMN_NAMES = (*SIGNAL_NAMES, "mode", "time_s")  # that an identification needs
 LABEL_AND_UNIT_BY_FIELD = {  # fields of the robot file -> name and unit
     "friction_nm": ("dry friction", "N·m"),
     "viscous_nm_s_per_rad": ("viscous friction", "N·m·s/rad"),
     "armature_kg_m2": ("rotor inertia", "kg·m²"),
-    "torque_constant_nm_per_a": ("torque constant", "N·m/A"),
+    TORQUE_CONSTANT: ("torque constant", "N·m/A"),
     "stiffness_nm_per_rad": ("servo stiffness", "N·m/rad"),
     "damping_nm_s_per_rad": ("servo damping", "N·m·s/rad"),
     "response_time_s": ("response time", "s"),
@@ -194,21 +197,55 @@ def _format_interval(estimate: IntervalEstimate) -> str:
 def _write_robot_file(
     path: Path, record: RunRecord, results: Sequence[JointIdentification]
 ) -> None:
-    """Write the values of the joints that do not fail into a robot file, and print what was written."""
+    """Write the values of the joints that do not fail into a robot file, and print what was written.
+
+    A torque constant is written only if the driver uses it. The drives of other types compute the torque themselves, so
+    that a new value in the file would not change the torque, and would hide the wrong value in the drive.
+    """
     from snakesim_operator.features.commissioning.robot_edit import write_joint_fields
 
+    joints_that_use_constant = {
+        joint.name
+        for joint in record.config.robot.joint_table
+        if _uses_torque_constant(record.config, joint)
+    }
     values: dict[str, dict[str, Any]] = {}
+    joints_with_old_constant: list[str] = []
     for result in results:
-        if result.fields and not result.fails:
-            # An estimate of a small friction or latency may be below zero, which no robot file may hold.
-            values[result.joint] = {
-                field: max(estimate.value, 0.0) for field, estimate in result.fields.items()
-            }
+        if not result.fields or result.fails:
+            continue
+        # An estimate of a small friction or latency may be below zero, which no robot file may hold.
+        values[result.joint] = {
+            field: max(estimate.value, 0.0) for field, estimate in result.fields.items()
+        }
+        if result.joint not in joints_that_use_constant:
+            withheld_constant = values[result.joint].pop(TORQUE_CONSTANT, None)
+            if withheld_constant is not None:
+                joints_with_old_constant.append(result.joint)
     unchanged = [result.joint for result in results if result.joint not in values]
     if not values:
         print_line(f"{path}: nothing was written: the values of no joint are sure")
         return
     write_joint_fields(path, values, f"identified from {record.path.name}")
     print_line(f"{path}: {len(values)} joints changed; restart the host with it")
+    if joints_with_old_constant:
+        print_line(
+            f"{path}: `{TORQUE_CONSTANT}` of {', '.join(joints_with_old_constant)} was left as it was, because their "
+            f"drivers are not known to use it: if it is wrong, correct it in the drives"
+        )
     if unchanged:
         print_line(f"{path}: left as they were: {', '.join(unchanged)}")
+
+
+def _uses_torque_constant(config: RunConfig, joint: Joint) -> bool:
+    """Return whether the driver of a joint surely uses the torque constant in the robot file.
+
+    The code of a driver in a file is not run, because a recording may come from an unknown user. Such a driver counts
+    as one that does not use the constant, and so does one that is not installed here.
+    """
+    driver = joint.drive.driver if config.backend == "mixed" else config.backend
+    try:
+        driver_type = load_plugin_unless_file(BACKENDS, driver)
+    except ConfigError:
+        return False
+    return getattr(driver_type, "uses_torque_constant", False)
