@@ -678,4 +678,4 @@ class Host:
         self._latch.close()
         if self._options.cable_file is not None:
             self._options.cable_file.close()
-        self._outbox.close()
+        self._outbox.close(self._state.clock.tick)

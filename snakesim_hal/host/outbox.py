@@ -26,12 +26,14 @@ from snakesim_hal.wire.messages import (
     RobotDescription,
     RobotStatus,
     RunConfiguration,
+    TickDone,
 )
 
 # Queued actions; each sends one message, or all messages of a tick; the oldest are dropped.
 MAX_QUEUED_ACTIONS = 64
 MAX_QUEUED_IMAGES = 8
 FLUSH_S = 1.0  # how long queued actions still run at the end: a network or a disk may hang
+RECEIPT_TIMEOUT_S = 10.0  # for recorders on a busy computer, at the end of a run in lockstep
 
 # Key and message; None: it has not been encoded yet.
 Outgoing = tuple[str, Message, EncodedMessage | None]
@@ -150,12 +152,33 @@ class HostOutbox:
         """Return for how long the network has been blocked, in s."""
         return self._streams.busy_duration_s()
 
-    def close(self) -> None:
-        """Send queued messages for at most FLUSH_S."""
+    def close(self, last_tick: int) -> None:
+        """Send queued messages for at most FLUSH_S. In lockstep, wait until the recorders have received everything.
+
+        Args:
+            last_tick: The last tick of the run.
+        """
         # Two of them may be the same.
         senders = dict.fromkeys((self._answers, self._images, self._streams))
         for sender in senders:
             sender.close()
+        if self._lockstep:
+            self._wait_for_recorders(last_tick)
+
+    def _wait_for_recorders(self, last_tick: int) -> None:
+        """Wait until every recorder has received all messages, for at most RECEIPT_TIMEOUT_S.
+
+        Messages that a recorder has not read yet may be lost when the session of this host is closed. The request
+        follows all messages, so an answer means that they have arrived.
+        """
+        answers = self._session.send_request_to_all(
+            keys.RECEIVED,
+            TickDone(tick=last_tick),
+            RECEIPT_TIMEOUT_S,
+            follows_all_messages=True,
+        )
+        for _ in answers:
+            pass
 
     def _get_publisher(self, key: str, message: type[Message]) -> Publisher[Any]:
         publisher = self._publishers.get(key)

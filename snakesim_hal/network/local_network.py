@@ -314,8 +314,13 @@ class LocalSession(Session):
         return query
 
     def _iterate_answers(
-        self, pattern: str, request: Message, timeout_s: float
+        self,
+        pattern: str,
+        request: Message,
+        timeout_s: float,
+        priority: object = None,
     ) -> Iterator[tuple[str, Answer | WireError]]:
+        """Send a request to all matching keys, and yield the answers. Messages in a process are delivered in order."""
         decoder = MessageDecoder(Answer)
         query = self.send_query(pattern, request)
         self._network.run_responders()

@@ -290,18 +290,35 @@ class Session:
         )
 
     def send_request_to_all(
-        self, pattern: str, request: Message, timeout_s: float = 2.0
+        self,
+        pattern: str,
+        request: Message,
+        timeout_s: float = 2.0,
+        *,
+        follows_all_messages: bool = False,
     ) -> Iterator[tuple[str, Answer]]:
         """Send a request to all matching keys at once.
+
+        Args:
+            pattern: Key of the request. It may have wildcards.
+            request: Message with the request.
+            timeout_s: Time in s in which answers are accepted.
+            follows_all_messages: Whether the request must not overtake any message that was published before.
 
         Yields:
             The key and the answer of each host as it arrives, until all have answered or the time is up.
         """
-        answers = self._iterate_answers(pattern, request, timeout_s)
+        # Zenoh sends waiting messages by priority, and messages of the same priority in order.
+        priority = zenoh.Priority.BACKGROUND if follows_all_messages else zenoh.Priority.DATA
+        answers = self._iterate_answers(pattern, request, timeout_s, priority)
         return ((key, answer) for key, answer in answers if isinstance(answer, Answer))
 
     def _iterate_answers(
-        self, pattern: str, request: Message, timeout_s: float
+        self,
+        pattern: str,
+        request: Message,
+        timeout_s: float,
+        priority: zenoh.Priority = zenoh.Priority.DATA,
     ) -> Iterator[tuple[str, Answer | WireError]]:
         """Send a request to all hosts whose keys match a pattern, and yield their answers as they arrive.
 
@@ -309,6 +326,7 @@ class Session:
             pattern: Key of the request. It may have wildcards.
             request: Message with the request.
             timeout_s: Time in s in which answers are accepted.
+            priority: Zenoh's priority of the request.
 
         Yields:
             The key and the answer of each host. If the answer cannot be decoded, it is counted in `rejected`, and the
@@ -319,6 +337,7 @@ class Session:
             payload=encode(request),
             encoding=format_encoding(type(request)),
             timeout=timeout_s,
+            priority=priority,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,  # no answer replaces another
         )

@@ -36,6 +36,7 @@ INTENT = "operator/intent"
 ALIVE_ALL = "alive/*"
 HOST_ALL = "hal/host/*"
 PROCESS_ALL = "process/*"
+RECEIVED = "recorder/received"
 
 
 @dataclass(frozen=True)
@@ -260,6 +261,14 @@ SPACE: tuple[KeyRow, ...] = (
         "latched",
         "once",
         "its machine, version, settings, and its token",
+    ),
+    KeyRow(
+        RECEIVED,
+        m.TickDone,
+        "HAL",
+        "query",
+        "once, at the end of a run in lockstep",
+        "whether all messages of the run have arrived. Replies Answer",
     ),
     KeyRow(
         HOST_ALL,

@@ -55,11 +55,13 @@ _ASKERS: dict[str, tuple[Role, ...]] = {
     keys.ESTOP: (Role.GNC, Role.VIEWER, *_PERSONS),
     keys.FAULT_ALL: (Role.ADMINISTRATOR,),
     keys.PARAMETERS: _PERSONS,
+    keys.RECEIVED: (Role.ROBOT,),
 }
 # The roles that answer a query, by its key. All other queries are answered by the robot alone.
 _ANSWERERS: dict[str, tuple[Role, ...]] = {
     keys.FAULT_ALL: (Role.ROBOT, Role.GNC),
     keys.PARAMETERS: (Role.GNC,),
+    keys.RECEIVED: (Role.RECORDER,),
 }
 # What follows the name of a service or a process at a key, if anything: here the process's random id.
 _SUFFIX_OF_NAME = {keys.PROCESS_ALL: "-$*"}

@@ -31,7 +31,7 @@ from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import make_own_entry, publish_process_entry
 from snakesim_hal.network.run_key import has_valid_proof, read_own_run_key
 from snakesim_hal.network.session import ConnectionSettings, Session
-from snakesim_hal.network.streams import ReceivedSample
+from snakesim_hal.network.streams import IncomingQuery, ReceivedSample
 from snakesim_hal.network.waiting import open_session_when_ready
 from snakesim_hal.programs.arguments import (
     add_network_arguments,
@@ -42,7 +42,7 @@ from snakesim_hal.programs.service_program import ProcessOptions, read_process_o
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import RobotDescription
+from snakesim_hal.wire.messages import Answer, RobotDescription
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.recording.foxglove_messages.file_writer import OnViewerMessage
 from snakesim_operator.recording.log_clock import LogTimeClock
@@ -54,7 +54,7 @@ CYCLE_S = 0.02
 # At the end of a run, messages are on their way. If the host has not left, no more are expected after so many cycles
 # without one: 2 s. Cycles and not seconds, because on a busy computer this process may pause for seconds.
 QUIET_CYCLES_WITH_HOST = 100
-# A run kills its recorder after 15 s, and until then the file must be closed.
+# For messages that do not end: those of a host that stays, or of another program.
 LAST_MESSAGES_LIMIT_S = 10.0
 ROUND_TRIP_TIMEOUT_S = 2.0
 NICENESS = 10  # a robot's own processes have precedence
@@ -290,6 +290,7 @@ def _record_until_stopped(
         ) from error
     tap = MessageTap(session)
     present_hosts = _track_present_hosts(session)
+    session.on_query(keys.RECEIVED, _confirm_receipt)
     session.declare_alive(RECORDER)
     publish_process_entry(session, make_own_entry(RECORDER))
     while should_continue() and not recorder.writer.failure:
@@ -304,6 +305,14 @@ def _record_until_stopped(
     if failure:
         print_stderr(f"recording ended: {failure}")
     return recorder
+
+
+def _confirm_receipt(query: IncomingQuery) -> None:
+    """Answer a host that has ended its run, and waits until its messages have arrived.
+
+    Zenoh's thread calls this after all earlier messages of the host, so that the tap has them.
+    """
+    query.reply(Answer(ok=True, reason="all messages have arrived"))
 
 
 def _track_present_hosts(session: Session) -> set[str]:
@@ -325,11 +334,9 @@ def _write_last_messages(
 ) -> None:
     """Write the last messages of a run, until the host has left and no message is on its way.
 
-    In a run the recorder ends last, so messages of the other processes may still be queued in the network. On a busy
-    computer, there may be more than it can write within seconds.
-
-    When a host leaves, all its messages have reached the router. The router answers this session after them, on the
-    same connection. So once the router has answered, no message of the host is on its way.
+    In a run the recorder ends last, so messages of the other processes may still be queued in the network. In lockstep,
+    a host leaves only after `_confirm_receipt`. Otherwise its last messages may be queued in a router, which answers
+    this session after them, on the same connection. So once the router has answered, none of them is on its way.
 
     Args:
         session: Session on the robot's network.

@@ -5,7 +5,8 @@ network waits for room, and the robot with it, but once for at most LIMIT_S. Aft
 the robot continues without the recording.
 
 In lockstep messages come as fast as the computer is, and the processes that make them need the processors. So the
-receiving thread reads what the kernel holds, rests, and is not woken meanwhile.
+receiving thread reads what the kernel holds, rests, and is not woken meanwhile. On a busy computer, a rest may last
+much longer than requested; then the thread also reads for longer, so that it keeps its share.
 """
 
 import threading
@@ -18,8 +19,8 @@ from snakesim_hal.wire import keys
 
 MAX_QUEUED_BYTES = 64 * 1024 * 1024
 DISK_TIMEOUT_S = 2.0  # for a disk to take messages, in lockstep
-RECEIVE_DURATION_NS = 1_000_000  # between two rests, in lockstep
 REST_DURATION_S = 0.005  # less than the kernel can hold on a connection
+RECEIVE_SHARE = 0.2  # in lockstep: the time in which messages are received, of the rest before
 ROOM_POLL_S = 0.001
 
 
@@ -57,7 +58,9 @@ class MessageTap:
         """Queue a message, or drop and count it if the queue is full. This runs in Zenoh's threads."""
         if self.is_lossless and arrival.monotonic_ns > self._next_rest_ns:
             time.sleep(REST_DURATION_S)
-            self._next_rest_ns = time.monotonic_ns() + RECEIVE_DURATION_NS
+            now_ns = time.monotonic_ns()
+            rest_ns = now_ns - arrival.monotonic_ns
+            self._next_rest_ns = now_ns + round(RECEIVE_SHARE * rest_ns)
         size = len(arrival.payload)
         if self.is_lossless and self._queued_bytes + size > MAX_QUEUED_BYTES:
             self._wait_for_room(size)

@@ -25,6 +25,7 @@ from snakesim_hal.programs.preflight import validate_and_complete_config
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.base import extras
+from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.results.run_reader import CONFIG_FILENAME
 from snakesim_operator.run.ending import RunEnding, end_run_on_signals
 from snakesim_operator.run.folder import choose_default_folder, lock_run_folder
@@ -298,7 +299,9 @@ class _RunProcesses:
         ]
         if self.request.raw_only:
             arguments.append("--raw-only")
-        self.supervisor.start(RECORDER, arguments, vital=False)
+        self.supervisor.start(
+            RECORDER, arguments, vital=False, written_file=folder / RECORDING_FILENAME
+        )
 
 
 def _run_until_over(processes: _RunProcesses, ending: RunEnding) -> None:

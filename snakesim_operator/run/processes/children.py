@@ -8,13 +8,14 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 
 from snakesim_hal.base import arithmetic
 from snakesim_hal.base.process import make_child_environment, make_python_command
 from snakesim_hal.base.workers import start_restarting_thread
 
-# A child that has not ended by then is killed. A recorder on a busy computer once took over 5 s to close its file.
+# A child that has not ended by then is killed, unless the file that it writes still grows.
 STOP_TIMEOUT_S = 15.0
 MAX_LINES_SHOWN = 15  # of the output of a child that failed
 OUTPUT_TAIL_BYTES = 16384  # held in memory, more than MAX_LINES_SHOWN lines usually take
@@ -61,8 +62,15 @@ class ChildProcess:
     name: str
     process: subprocess.Popen[bytes]
     output: ProcessOutput
+    written_file: Path | None = None  # which the child completes before it ends
     is_end_requested: bool = False  # by this process, while the child ran
     was_killed: bool = False  # by this process, because it did not end within STOP_TIMEOUT_S
+
+    def measure_written_bytes(self) -> int:
+        """Return the size of the file that the child writes; 0 if there is none."""
+        if self.written_file is None or not self.written_file.exists():
+            return 0
+        return self.written_file.stat().st_size
 
     def describe_exit(self) -> str | None:
         """Describe how the process ended, with its last error message; None while it runs."""
@@ -88,6 +96,7 @@ def start_child(
     *,
     pass_fds: Sequence[int] = (),
     extra_env: Mapping[str, str] = MappingProxyType({}),
+    written_file: Path | None = None,
 ) -> ChildProcess:
     """Start a Python module as a child that dies with this process.
 
@@ -100,6 +109,7 @@ def start_child(
         on_output: Called with each piece of output of the child, in another thread.
         pass_fds: File descriptors that stay open in the child.
         extra_env: Environment variables of the child, in addition to those of this process.
+        written_file: File that the child completes before it ends.
     """
     deterministic_env = {"PYTHONUNBUFFERED": "1", "PYTHONHASHSEED": "0"}
     environment = make_child_environment(
@@ -127,7 +137,7 @@ def start_child(
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
         os.close(write_end)
-    return ChildProcess(name, process, ProcessOutput(read_end, on_output))
+    return ChildProcess(name, process, ProcessOutput(read_end, on_output), written_file)
 
 
 def request_child_end(child: ChildProcess) -> None:
@@ -142,17 +152,41 @@ def request_child_end(child: ChildProcess) -> None:
 
 
 def stop_children(children: Sequence[ChildProcess]) -> None:
-    """Request the end of every child, wait for STOP_TIMEOUT_S, kill those that still run, and wait for these."""
+    """Request the end of every child, wait for STOP_TIMEOUT_S, kill those that still run, and wait for these.
+
+    A child whose file still grows is not killed: a recorder on a busy computer may have messages of many seconds to
+    write.
+    """
     for child in children:
         request_child_end(child)
-    deadline = time.monotonic() + STOP_TIMEOUT_S
+    deadline_s = time.monotonic() + STOP_TIMEOUT_S
     for child in children:
+        if _wait_for_end(child, deadline_s):
+            continue
+        child.was_killed = True
+        child.process.kill()
+        # A disk that hangs may block even a killed process.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.process.wait(STOP_TIMEOUT_S)
+
+
+def _wait_for_end(child: ChildProcess, deadline_s: float) -> bool:
+    """Wait until a child ends, and return whether it has ended.
+
+    Args:
+        child: Child whose end was requested.
+        deadline_s: Monotonic time until which to wait. Then the wait continues as long as the child's file grows within
+            each STOP_TIMEOUT_S.
+    """
+    written_bytes = child.measure_written_bytes()
+    timeout_s = max(deadline_s - time.monotonic(), 0.05)
+    while True:
         try:
-            child.process.wait(max(deadline - time.monotonic(), 0.05))
+            child.process.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            child.was_killed = True
-            child.process.kill()
-            with contextlib.suppress(
-                subprocess.TimeoutExpired
-            ):  # a disk that hangs may block even a killed process
-                child.process.wait(STOP_TIMEOUT_S)
+            previous_bytes, written_bytes = written_bytes, child.measure_written_bytes()
+            if written_bytes <= previous_bytes:
+                return False
+            timeout_s = STOP_TIMEOUT_S
+        else:
+            return True

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 
 import msgspec
 
@@ -45,6 +46,7 @@ class SupervisedProcess:
     may_restart: bool
     child: ChildProcess
     vital: bool = True  # whether the run ends when this process ends
+    written_file: Path | None = None  # which it completes before it ends
     started_s: float = field(default_factory=time.monotonic)
     delay_s: float = MIN_RESTART_DELAY_S
     restart_due_s: float | None = None  # monotonic time of its restart; None while it runs
@@ -115,7 +117,13 @@ class RunSupervisor:
         self._start_time_s = time.monotonic()
 
     def start(
-        self, name: str, arguments: Sequence[str], *, may_restart: bool = True, vital: bool = True
+        self,
+        name: str,
+        arguments: Sequence[str],
+        *,
+        may_restart: bool = True,
+        vital: bool = True,
+        written_file: Path | None = None,
     ) -> None:
         """Start a Python module as a process of the run.
 
@@ -124,16 +132,24 @@ class RunSupervisor:
             arguments: Name of the module, followed by its command-line arguments.
             may_restart: Whether the process may be restarted when it ends.
             vital: Whether the run ends when this process ends.
+            written_file: File that the process completes before it ends. At the end of the run, the process is not
+                killed while this file grows.
         """
-        child = self._launch(name, arguments)
-        self._processes[name] = SupervisedProcess(name, arguments, may_restart, child, vital)
+        child = self._launch(name, arguments, written_file)
+        self._processes[name] = SupervisedProcess(
+            name, arguments, may_restart, child, vital, written_file
+        )
 
-    def _launch(self, name: str, arguments: Sequence[str]) -> ChildProcess:
+    def _launch(
+        self, name: str, arguments: Sequence[str], written_file: Path | None
+    ) -> ChildProcess:
         """Start a process of the run, whose output is appended to its log."""
         on_output = partial(self._files.append, f"{name}.log")
         if name == HOST:
             return self._launch_host(arguments, on_output)
-        return children.start_child(name, arguments, on_output, extra_env=self._secret)
+        return children.start_child(
+            name, arguments, on_output, extra_env=self._secret, written_file=written_file
+        )
 
     def _launch_host(
         self, arguments: Sequence[str], on_output: Callable[[bytes], object]
@@ -239,7 +255,7 @@ class RunSupervisor:
                 if not self._handle_end(process, how):
                     return False
             elif process.is_restart_due():
-                process.child = self._launch(process.name, process.arguments)
+                process.child = self._launch(process.name, process.arguments, process.written_file)
                 process.restart_due_s = None
                 process.started_s = time.monotonic()
         return True

@@ -105,3 +105,32 @@ def test_child_that_does_not_end_is_killed_and_described(
         child.describe_exit()
         == "control was killed: it had not ended 0.2 s after the request to end"
     )
+
+
+def test_child_is_not_killed_while_its_file_grows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes_bytes = iter([0, 100, 200, 200])
+    (tmp_path / "ignore_sigterm.py").write_text(IGNORE_SIGTERM_CODE)
+    monkeypatch.setattr(children, "STOP_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(
+        children.ChildProcess, "measure_written_bytes", lambda _child: next(sizes_bytes)
+    )
+    printed = bytearray()
+    child = start_child(
+        "recorder", ["ignore_sigterm"], printed.extend, extra_env={"PYTHONPATH": str(tmp_path)}
+    )
+    wait_until(lambda: b"ready" in printed, "the child ignores SIGTERM")
+    stop_children([child])
+    assert list(sizes_bytes) == [], "the child was killed before its file stopped growing"
+    assert child.was_killed
+
+
+def test_child_without_file_has_written_nothing(tmp_path: Path) -> None:
+    child = start_child(
+        "recorder", ["ends_at_once"], lambda _output: None, written_file=tmp_path / "recording.mcap"
+    )
+    assert child.measure_written_bytes() == 0
+    (tmp_path / "recording.mcap").write_bytes(b"abc")
+    assert child.measure_written_bytes() == 3
+    stop_children([child])

@@ -274,6 +274,21 @@ def test_recording_ends_after_last_samples_of_its_host(tmp_path: Path) -> None:
     assert read_clock_payloads(path) == [make_clock_sample(tick).payload for tick in range(40)]
 
 
+def test_recorder_confirms_receipt_of_all_earlier_messages(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    tick_count = 2000
+    with recorded_host(path) as (host, stop_requested):
+        for tick in range(tick_count):
+            host.send(keys.CLOCK, make_clock_sample(tick).payload)
+        answers = host.send_request_to_all(
+            keys.RECEIVED, TickDone(tick=tick_count), 60.0, follows_all_messages=True
+        )
+        assert [answer.ok for _, answer in answers] == [True]
+        stop_requested.set()
+    expected = [make_clock_sample(tick).payload for tick in range(tick_count)]
+    assert read_clock_payloads(path) == expected
+
+
 def test_recording_at_its_end_continues_as_long_as_messages_arrive(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     tick_count = 300
