@@ -72,7 +72,12 @@ class RequestPort(ABC, Generic[StatusT]):
     """
 
     def __init__(self, wire: SerialWire, response_gap_s: float) -> None:
-        """gap_s: silence that ends an answer, besides the time that bytes and adapter take."""
+        """Create a port on which nothing has been sent yet.
+
+        Args:
+            wire: The serial port.
+            response_gap_s: Silence that ends an answer, besides the time that bytes and adapter take.
+        """
         self.wire = wire
         self._response_gap_s = response_gap_s
         self._next_response_gap_s = response_gap_s

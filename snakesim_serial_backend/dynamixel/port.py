@@ -32,7 +32,12 @@ class DynamixelPort(RequestPort[DynamixelPacket]):
     """
 
     def __init__(self, wire: SerialWire, response_gap_s: float) -> None:
-        """gap_s: silence that ends an answer, besides the time that bytes and adapter take."""
+        """Create a port on which nothing has been sent yet.
+
+        Args:
+            wire: The serial port.
+            response_gap_s: Silence that ends an answer, besides the time that bytes and adapter take.
+        """
         super().__init__(wire, response_gap_s)
         self.fast = True
 
