@@ -53,7 +53,7 @@ test-unit: compiled ## Run the pure tests: no process, no socket, no waiting (AR
 	$(pytest) tests/unit -n $(WORKERS) --dist worksteal $(ARGS)
 
 test-contract: compiled ## Run the contracts of backends and drives
-	$(pytest) tests/contract -n $(SYSTEM_WORKERS) --dist worksteal $(ARGS)
+	$(pytest) tests/contract -m "not (slow or quiet)" -n $(SYSTEM_WORKERS) --dist worksteal $(ARGS)
 
 test-system: compiled ## Run the tests with real processes, but those on a CAN bus
 	$(pytest) tests/system --ignore tests/system/can -n $(SYSTEM_WORKERS) --dist worksteal $(ARGS)

@@ -39,6 +39,8 @@ CAMERA_OVERRIDES = (
 )
 # Benches whose clauses other benches cover: moteus and ODrive use the same kit, Dynamixel has position mode alone.
 COVERED_BENCHES = ("moteus", "sim-position", "threads")
+# Driver types that share the kit with others. CI runs their clauses, and `make test` leaves them out.
+HEAVY_BENCHES = ("can-firmware", "cia402", "dynamixel", "feetech", "homing-driver")
 # These clauses are special for moteus. tests/system/drives/test_buses.py tests buses in threads.
 DRIVER_FAILURE_CLAUSES = "test_drives_"
 POSITION_ONLY_OVERRIDES = ('robot.drive.modes=["position"]', "robot.drive.measures=[]")
@@ -120,11 +122,16 @@ def pytest_snakesim_benches() -> list[Bench]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark clauses as slow that do not depend on the purpose of a bench. `make verify` runs all."""
+    """Mark the clauses that `make test` leaves out. `make verify` runs all, and CI runs the heavy ones.
+
+    Clauses that do not depend on the purpose of a bench are slow.
+    """
     for item in items:
         is_needed = DRIVER_FAILURE_CLAUSES in item.name and "[moteus" in item.name
         if any(f"[{bench}" in item.name for bench in COVERED_BENCHES) and not is_needed:
             item.add_marker(pytest.mark.slow)
+        if any(f"[{bench}" in item.name for bench in HEAVY_BENCHES):
+            item.add_marker(pytest.mark.heavy)
         if "sim-camera" in item.name and not any(
             name_part in item.name for name_part in SENSOR_CLAUSES
         ):

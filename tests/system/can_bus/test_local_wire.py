@@ -138,6 +138,7 @@ def test_local_bus_end_of_classic_can_ignores_other_frames(folder: Path) -> None
             sender.send(CanFrame(1, bytes(65)))
 
 
+@pytest.mark.heavy
 def test_local_bus_frozen_reader_delays_no_other_one(folder: Path) -> None:
     with join(folder, 2) as (writer, reader), run_member(folder) as frozen:
         reader.receive()

@@ -108,6 +108,7 @@ def write_recording(path: Path, images: list[DepthImage]) -> str:
     return str(path)
 
 
+@pytest.mark.heavy
 def test_sensor_service_replays_recording_with_timestamps_of_this_run(tmp_path: Path) -> None:
     recorded = record_images(load_camera_config("backend=can"))
     file = write_recording(tmp_path / "head.jsonl", recorded[2:5])

@@ -160,6 +160,7 @@ def test_environment_zero_residual_has_digest_of_shipped_controller(tmp_path) ->
     assert info["digest"] != zero_info["digest"]
 
 
+@pytest.mark.heavy
 def test_environment_digest_depends_only_on_seed_and_actions() -> None:
     first = make_environment("surveyed_clutter", duration=0.3)
     second = make_environment("surveyed_clutter", duration=0.3)

@@ -374,6 +374,7 @@ def step_an_environment(action: str) -> None:
     env.close()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "use",
     [

@@ -149,6 +149,7 @@ def test_training_policy_file_computes_targets_of_the_search(tmp_path: Path) -> 
         assert np.allclose(model(observation), expected_rad, atol=1e-5)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("backend", ["sim", pytest.param("can", marks=pytest.mark.slow)])
 def test_training_policy_drives_simulator_and_emulated_modules(
     search_folder: Path, backend: str

@@ -142,6 +142,7 @@ def run_episodes(env: SnakeEnv) -> list[Any]:
     return returned
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", EVERY_CASE)
 def test_environment_on_arrays_has_bits_of_hal_limiter(
     name: str, monkeypatch: pytest.MonkeyPatch
@@ -250,6 +251,7 @@ def test_vector_environment_with_more_threads_has_same_bits(count: int) -> None:
     assert len({*digests.pop()}) > 1
 
 
+@pytest.mark.heavy
 def test_vector_environment_in_loop_has_bits_of_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     """A loop steps the simulations if the laws run in Python; otherwise a batch in C does."""
     if choose_laws() == "python":

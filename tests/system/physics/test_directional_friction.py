@@ -85,6 +85,7 @@ def test_pushed_body_slides_only_beyond_the_friction_ellipse(
     assert np.linalg.norm(glider.position_w - position_w) > 1e-3
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("surface", list(SURFACES))
 @pytest.mark.parametrize("velocity", [(1.0, 0.6), (-0.8, 0.8)])
 def test_gliding_body_stops_where_independent_integrator_computes(

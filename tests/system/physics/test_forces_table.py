@@ -12,6 +12,7 @@ from snakesim_testing.runs.desired_and_measured_forces import (
 SENSOR_PERIOD_S = 0.05
 
 
+@pytest.mark.heavy
 def test_step_forces_average_to_contact_sensor_samples():
     result, forces = run_and_measure_forces("triplet", "obstacle_aided", duration=2.0)
     steps_per_sample = round(SENSOR_PERIOD_S / STEP_S)

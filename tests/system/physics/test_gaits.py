@@ -84,6 +84,7 @@ def test_backbone_sidewinding_moves_to_the_requested_side(height: float, side: f
     assert abs(forward_m) < 0.6 * abs(sideways_m)
 
 
+@pytest.mark.heavy
 def test_backbone_rolling_moves_sideways() -> None:
     record, _ = run_gait("backbone_rolling", "mamba_flat", 4)
     forward_m, sideways_m = find_displacement_m(record)

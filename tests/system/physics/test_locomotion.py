@@ -235,6 +235,7 @@ def test_push_report_contains_measured_not_requested_forces():
     assert "too little against the friction of the ground" in explanation
 
 
+@pytest.mark.heavy
 def test_body_clear_of_every_peg_is_not_jammed():
     thin_robot = (
         "robot.chain.modules=10",

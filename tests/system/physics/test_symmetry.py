@@ -74,6 +74,7 @@ def test_reversed_wave_reverses_the_drift_for_every_physics_step(step_s: float) 
     assert max(differences) < MAX_SPURIOUS_DRIFT_MM_S
 
 
+@pytest.mark.heavy
 def test_reflected_or_rotated_snake_moves_reflected_or_rotated() -> None:
     wave = JointWave(bend=0.04)
     reflected_wave = JointWave(-wave.amplitude, bend=-wave.bend)

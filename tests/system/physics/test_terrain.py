@@ -63,6 +63,7 @@ def test_robot_stays_at_rest_at_start_of_terrain_scenario(scenario: str) -> None
     assert np.abs(final_state.velocities_rad_s).max() < 0.02
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_wave_towards_head_advances_in_pipe(seed: int) -> None:
     first, last = find_nodes_w(run_scenario("pipe", 5, f"seed={seed}"))

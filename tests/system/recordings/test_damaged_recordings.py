@@ -355,6 +355,7 @@ def test_video_of_recording_with_gap_is_frozen_in_the_gap(intact: bytes, tmp_pat
     assert f"between {gap_start_s:.2f} and {gap_end_s:.2f} s" in sentence
 
 
+@pytest.mark.heavy
 def test_report_of_truncated_recording_leaves_end_of_run_unknown(
     intact: bytes, tmp_path: Path
 ) -> None:

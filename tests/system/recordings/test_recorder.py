@@ -117,6 +117,7 @@ def test_recorder_loss_does_not_end_run_and_another_records(tmp_path: Path) -> N
     assert command.snakesim("recording", "report", "second.mcap", cwd=tmp_path).code == 0
 
 
+@pytest.mark.heavy
 def test_played_recording_keeps_its_timing_at_half_rate(tmp_path: Path) -> None:
     result = command.snakesim(
         "run",
