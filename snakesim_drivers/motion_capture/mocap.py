@@ -7,8 +7,8 @@ any steady clock of the motion-capture system; `mocap_times` relates it to the d
 `angular_velocity_w` are optional. Otherwise both are derived from two poses and their timestamps, and a pose without a
 velocity is dropped.
 
-Any host that reaches the port can send datagrams. At most `MAX_AT_ONCE` are read in a control cycle. Unusable ones are
-counted by reason and dropped.
+Any host that reaches the port can send datagrams. At most `MAX_DATAGRAMS_PER_CYCLE` are read in a control cycle.
+Unusable ones are counted by reason and dropped.
 """
 
 import logging
@@ -209,7 +209,7 @@ class MocapReceiver:
         return newest
 
     def _read_samples(self) -> list[MocapSample]:
-        """Return well-formed samples in their order of arrival; read at most `MAX_AT_ONCE` datagrams."""
+        """Return well-formed samples in their order of arrival; read at most `MAX_DATAGRAMS_PER_CYCLE` datagrams."""
         samples: list[MocapSample] = []
         for _ in range(MAX_DATAGRAMS_PER_CYCLE):
             try:

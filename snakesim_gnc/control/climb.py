@@ -21,7 +21,7 @@ def compute_path_height_m(rises: Sequence[PathRise], s_m: float) -> float:
     """Return the height of the path above the ground at an arc length.
 
     With the height h_i of each platform and the distance d_i to it along the path, it is
-    max(0, max_i (h_i + ABOVE_M - MAX_SLOPE d_i)).
+    max(0, max_i (h_i + CLEARANCE_M - MAX_SLOPE d_i)).
     """
     height_m = 0.0
     for rise in rises:

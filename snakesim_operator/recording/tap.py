@@ -1,8 +1,8 @@
-"""Collects everything that a robot publishes, for a writer that may be slower; at most MAX_BYTES wait.
+"""Collects everything that a robot publishes, for a writer that may be slower; at most MAX_QUEUED_BYTES wait.
 
 In real time, a message that finds no room is dropped and counted. In lockstep no message may be lost: there the
-network waits for room, and the robot with it, but once for at most LIMIT_S. After that the disk is taken to hang, and
-the robot continues without the recording.
+network waits for room, and the robot with it, but once for at most DISK_TIMEOUT_S. After that the disk is taken to
+hang, and the robot continues without the recording.
 
 In lockstep messages come as fast as the computer is, and the processes that make them need the processors. So the
 receiving thread reads what the kernel holds, rests, and is not woken meanwhile. On a busy computer, a rest may last
@@ -57,10 +57,7 @@ class MessageTap:
     def _queue_or_drop(self, arrival: ReceivedSample) -> None:
         """Queue a message, or drop and count it if the queue is full. This runs in Zenoh's threads."""
         if self.is_lossless and arrival.monotonic_ns > self._next_rest_ns:
-            time.sleep(REST_DURATION_S)
-            now_ns = time.monotonic_ns()
-            rest_ns = now_ns - arrival.monotonic_ns
-            self._next_rest_ns = now_ns + round(RECEIVE_SHARE * rest_ns)
+            self._rest()
         size = len(arrival.payload)
         if self.is_lossless and self._queued_bytes + size > MAX_QUEUED_BYTES:
             self._wait_for_room(size)
@@ -71,8 +68,15 @@ class MessageTap:
             self._queued_bytes += size
             self._queue.append(arrival)
 
+    def _rest(self) -> None:
+        """Rest, and plan the next rest. The time until then is in proportion to how long this rest really lasted."""
+        start_ns = time.monotonic_ns()
+        time.sleep(REST_DURATION_S)
+        end_ns = time.monotonic_ns()
+        self._next_rest_ns = end_ns + round(RECEIVE_SHARE * (end_ns - start_ns))
+
     def _wait_for_room(self, size: int) -> None:
-        """Wait until a message of this size finds room; after LIMIT_S, never wait again."""
+        """Wait until a message of this size finds room; after DISK_TIMEOUT_S, never wait again."""
         deadline_s = time.monotonic() + DISK_TIMEOUT_S
         while self._queued_bytes + size > MAX_QUEUED_BYTES:
             if time.monotonic() > deadline_s:

@@ -40,7 +40,7 @@ from verification.attack.tools.processes import freeze_process
 FLOOD_DURATION_S = float(choose_effort(2, 20))
 MAX_FLOODED_STOP_S = 5.0  # the promised limit during a flood; a stop takes about 0.02 s
 MAX_FLOOD_MEMORY_MB = 80.0  # that a flood may add to the console
-# Together far more than the console may open files (`MAX_OPEN_FILES` in console.py).
+# Together far more than the console may open files (`MAX_OPEN_FILES` in features/console/command.py).
 HALF_REQUESTS_PER_PROCESS = 2000
 HALF_REQUEST_PROCESSES = 3
 
