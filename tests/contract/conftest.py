@@ -38,7 +38,9 @@ CAMERA_OVERRIDES = (
     f'robot.sensors.custom=[{{name="whisker", model="{WHISKER}:WhiskerModel"}}]',
 )
 # Benches whose clauses other benches cover: moteus and ODrive use the same kit, Dynamixel has position mode alone.
-COVERED_BENCHES = ("moteus", "sim-position", "threads")
+COVERED_BENCHES = ("moteus", "sim-position")
+# In real time, with the leases of a robot: only a quiet computer keeps them.
+REAL_TIME_BENCH = "threads"
 # Driver types that share the kit with others. CI runs their clauses, and `make test` leaves them out.
 HEAVY_BENCHES = ("can-firmware", "cia402", "dynamixel", "feetech", "homing-driver")
 # These clauses are special for moteus. tests/system/drives/test_buses.py tests buses in threads.
@@ -112,7 +114,7 @@ def pytest_snakesim_benches() -> list[Bench]:
             make_emulated_drives=DrivesOfAnyType,
         ),
         Bench(
-            "threads",
+            REAL_TIME_BENCH,
             REAL_TIME_MIXED_BACKEND,
             overrides=ALL_DRIVER_TYPES_OVERRIDES,
             mute_joint=mute_drive,
@@ -130,6 +132,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         is_needed = DRIVER_FAILURE_CLAUSES in item.name and "[moteus" in item.name
         if any(f"[{bench}" in item.name for bench in COVERED_BENCHES) and not is_needed:
             item.add_marker(pytest.mark.slow)
+        if f"[{REAL_TIME_BENCH}" in item.name:
+            item.add_marker(pytest.mark.quiet)
         if any(f"[{bench}" in item.name for bench in HEAVY_BENCHES):
             item.add_marker(pytest.mark.heavy)
         if "sim-camera" in item.name and not any(
