@@ -1,4 +1,4 @@
-"""Reads a log of a CAN bus: every whole frame, and which lines are no whole frames.
+"""Reads a log of a CAN bus: every complete frame, and which lines are not complete frames.
 
 `.log` is what candump writes: `candump -L`, as the driver's own log is, or what it prints on a terminal, with any of
 its times or none. `.asc` and `.blf` are read by python-can. A log that ends in the middle of a line, as after a power
@@ -47,7 +47,7 @@ HEX_BYTE_PATTERN = re.compile(r"\s+([0-9A-Fa-f]{2})(?=\s|$)")
 
 @dataclass(frozen=True)
 class DroppedLine:
-    """A line, or the rest of a file, that is no whole frame."""
+    """A line, or the rest of a file, that is not a complete frame."""
 
     where: str  # such as "line 17"
     text: str
@@ -66,7 +66,7 @@ class BusLog:
         self.has_times = True
 
     def __iter__(self) -> Iterator[can.Message]:
-        """Yield every whole frame. Raises ConfigError for a file without any, if it is not empty."""
+        """Yield every complete frame. Raises ConfigError for a file without any, if it is not empty."""
         messages = self._read_candump() if self._is_candump() else self._read_by_python_can()
         frames = 0
         for message in messages:
@@ -78,9 +78,9 @@ class BusLog:
     def report(self) -> Iterator[str]:
         """Yield lines for a person: what was left out, and what is not known of the rest."""
         if self.dropped_count:
-            subject = "1 line is no whole frame and was"
+            subject = "1 line is not a complete frame and was"
             if self.dropped_count > 1:
-                subject = f"{self.dropped_count} lines are no whole frames and were"
+                subject = f"{self.dropped_count} lines are not complete frames and were"
             named = "; ".join(str(line) for line in self.dropped)
             unnamed_count = self.dropped_count - len(self.dropped)
             more = f"; and {unnamed_count} more" if unnamed_count else ""

@@ -120,7 +120,7 @@ class ErrorReporter:
         self._last_printed_s[error_key] = now_s
         lines = "".join(traceback.format_exception(error)).rstrip().splitlines()
         with contextlib.suppress(OSError, ValueError):  # stderr is closed, or its disk is full
-            print_stderr(f"{self._name}: unexpected error, going on: {error_key}")
+            print_stderr(f"{self._name}: unexpected error, but it continues: {error_key}")
             for line in lines[-REPORTED_LINE_COUNT:-1]:
                 print_stderr(f"{self._name}:   {line.strip()}")
 

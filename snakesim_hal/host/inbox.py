@@ -78,7 +78,7 @@ class QueuedInput(Protocol):
 
 @dataclass(frozen=True)
 class CommandArrival:
-    """A joint command that came over Zenoh."""
+    """A joint command that arrived over Zenoh."""
 
     arrival: ReceivedSample
     decoder: MessageDecoder[JointCommand]
@@ -110,7 +110,7 @@ class _PresenceChange:
 
 @dataclass(frozen=True)
 class _LocalRequest:
-    """A request that did not come over Zenoh."""
+    """A request that did not arrive over Zenoh."""
 
     request: Request
     reply: Reply
@@ -121,7 +121,7 @@ class _LocalRequest:
 
 @dataclass(frozen=True)
 class _RemoteRequest:
-    """A request that came over Zenoh."""
+    """A request that arrived over Zenoh."""
 
     query: IncomingQuery
     decoder: RequestDecoder
@@ -183,7 +183,7 @@ class HostInbox:
         return self._queue.qsize()
 
     def put_local_request(self, request: Request, reply: Reply) -> None:
-        """Queue a request that did not come over Zenoh, before all other input; from any thread."""
+        """Queue a request that did not arrive over Zenoh, before all other input; from any thread."""
         self._queue.put(_LocalRequest(request, reply), STOP_LANE)
 
     def wait(self, timeout_s: float) -> None:

@@ -162,7 +162,7 @@ class StopRequester:
             timeout_s: Time in s after which the request is no longer repeated.
 
         Returns:
-            The answer, or None if none came in time.
+            The answer, or None if none arrived in time.
 
         Raises:
             NotConnectedError: The port is closed.
@@ -245,7 +245,7 @@ def _repeat_stop_request(
         timeout_s: Time in s after which the request is no longer repeated.
 
     Returns:
-        The answer, or None if none came in time.
+        The answer, or None if none arrived in time.
 
     Raises:
         NotConnectedError: The port is closed: it refused more than MAX_REFUSAL_COUNT requests.

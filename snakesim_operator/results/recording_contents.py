@@ -189,9 +189,9 @@ class RecordingContents:
         if lost <= 0:
             return []
         if self.last_applied_time_ns is None:
-            last = "none came"
+            last = "it received none"
         else:
-            last = f"the last that came is of {self.last_applied_time_ns * 1e-9:.2f} s"
+            last = f"the last one that it received is of {self.last_applied_time_ns * 1e-9:.2f} s"
         return [f"recording: {lost} of {ticks} ticks did not reach the recorder; {last}"]
 
     def collect_outputs(

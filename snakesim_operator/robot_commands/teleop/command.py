@@ -199,7 +199,7 @@ class TeleopLoop:
             self._request_end("the terminal is gone")
 
     def _read_keyboard(self, keyboard: KeyReader, now_s: float) -> None:
-        """Process all pressed keys. Keys that came late may stop the robot, but not steer it."""
+        """Process all pressed keys. Late keys may stop the robot, but not steer it."""
         pressed_keys = keyboard.read_keys(0.0)
         if pressed_keys:
             self._ignored_late_keys = keyboard.has_late_keys
@@ -299,7 +299,7 @@ class TeleopLoop:
     def _format_screen_lines(self) -> list[str]:
         request = self._describe_request()
         if self._ignored_late_keys:
-            request = f"{request}   (keys that came late were ignored)"
+            request = f"{request}   (late keys were ignored)"
         return [
             self._describe_status(),
             self._describe_control(),

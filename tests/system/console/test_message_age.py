@@ -234,4 +234,4 @@ def test_console_page_that_answers_gets_an_age(capfd: pytest.CaptureFixture[str]
 
             wait_until(has_known_age, "an answer", 10.0)
             assert 0.0 < actions[-1].age_s < 10.0
-    assert "a page: unexpected error, going on: RuntimeError" in capfd.readouterr().err
+    assert "a page: unexpected error, but it continues: RuntimeError" in capfd.readouterr().err

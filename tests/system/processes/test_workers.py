@@ -36,7 +36,7 @@ def test_worker_restarts_after_error_and_reports_it_once(capfd: pytest.CaptureFi
     start_restarting_thread("worker", fail_twice, on_error=errors.append).join(10.0)
     assert attempts == 3
     assert len(errors) == 2
-    message = "worker: unexpected error, going on: UnexpectedError: no file is left"
+    message = "worker: unexpected error, but it continues: UnexpectedError: no file is left"
     assert capfd.readouterr().err.count(message) == 1
 
 

@@ -67,7 +67,7 @@ def test_bus_replay_of_truncated_log_compares_up_to_its_end(run: Path, tmp_path:
     assert ticks is not None, result.out
     assert 10 < int(ticks[1]) < 50, result.out
     line_count = len(log.read_bytes().splitlines())
-    assert f"1 line is no whole frame and was left out: line {line_count}: '(" in result.out
+    assert f"1 line is not a complete frame and was left out: line {line_count}: '(" in result.out
     assert "did not answer" not in result.out, "the log does not contain the rest of that tick"
 
 

@@ -74,7 +74,7 @@ def test_recordings_report_ticks_that_never_reached_the_recorder(run: Path, tmp_
     # The recording itself does not show that ticks are missing.
     assert RunRecord.load(tmp_path / RECORDING_FILENAME).missing == []
     result = snakesim("recording", "report", ".", cwd=tmp_path)
-    sentence = "recording: 99 of 200 ticks did not reach the recorder; the last that came is of "
+    sentence = "recording: 99 of 200 ticks did not reach the recorder; the last one that it received is of "
     assert result.code == 3, result.err
     assert sentence in result.err
     assert sentence in (tmp_path / "report.html").read_text()

@@ -38,7 +38,9 @@ def test_control_without_joint_states_stops_robot_and_reports_reason(tmp_path: P
     assert DROP_START_S < get_fault_time_s(tmp_path / "run", summary) < DROP_START_S + 0.2
     assert "sensor/joints is 0.0" in (tmp_path / "run" / "control.log").read_text()
     assert "at most 0.03 s: no commands" in (tmp_path / "run" / "control.log").read_text()
-    assert "Control said: sensor/joints is 0.0" in (tmp_path / "run" / REPORT_FILENAME).read_text()
+    assert (
+        "Control reported: sensor/joints is 0.0" in (tmp_path / "run" / REPORT_FILENAME).read_text()
+    )
 
 
 @pytest.mark.slow

@@ -122,7 +122,7 @@ def test_read_log_of_cut_file_names_the_dropped_line(
     log = write_log(tmp_path, cut)
     assert len(list(log)) == frames
     line = next(iter(log.report()))
-    assert line.startswith(f"1 line is no whole frame and was left out: {report}")
+    assert line.startswith(f"1 line is not a complete frame and was left out: {report}")
     assert len(line) < 200
 
 
@@ -136,7 +136,7 @@ def test_read_log_of_many_dropped_lines_reports_their_count(tmp_path: Path) -> N
     log = write_log(tmp_path, LOG_LINES + "noise\n" * 10)
     assert len(list(log)) == 6
     assert list(log.report()) == [
-        "10 lines are no whole frames and were left out: line 7: 'noise'; line 8: 'noise'; line 9: 'noise'; and 7 more"
+        "10 lines are not complete frames and were left out: line 7: 'noise'; line 8: 'noise'; line 9: 'noise'; and 7 more"
     ]
 
 
@@ -153,7 +153,7 @@ def test_read_log_of_cut_asc_or_gzip_returns_whole_frames(tmp_path: Path) -> Non
     compressed_path.write_bytes(gzip.compress(LOG_LINES.encode() * 1000)[:-300])
     log = BusLog(compressed_path)
     assert len(list(log)) > 100
-    assert "1 line is no whole" in next(iter(log.report()))
+    assert "1 line is not a complete frame" in next(iter(log.report()))
 
 
 @pytest.mark.parametrize("text", ["not a frame\n", "\0" * 100, "(nan) can0 105#00\n"])
