@@ -162,27 +162,27 @@ def test_signal_units_are_known_for_every_signal(record: RunRecord) -> None:
         assert find_unit(name, record) == UNITS[name.partition(".")[0]]
 
 
-def summarize_sideways_run(record: RunRecord) -> RunSummary:
+def summarize_body_moving_to_its_left(record: RunRecord) -> RunSummary:
     """Return the summary of a run of a straight body that moves to its left at SPEED_M_S."""
     left_rad = YAW_RAD + np.pi / 2  # the body heads along YAW_RAD
     return summarize_run(make_straight_run(record, direction_rad=left_rad), "complete")
 
 
 def test_summary_sideways_motion_is_no_advance_along_heading(record: RunRecord) -> None:
-    summary = summarize_sideways_run(record)
+    summary = summarize_body_moving_to_its_left(record)
     assert summary.heading_advance_m == pytest.approx(0.0, abs=1e-6)
     assert summary.heading_energy_j_per_m is None, "energy for each meter of an advance of 0 m"
 
 
 def test_summary_sideways_motion_is_displacement_to_the_left(record: RunRecord) -> None:
-    summary = summarize_sideways_run(record)
+    summary = summarize_body_moving_to_its_left(record)
     left_of_heading_rad = np.pi / 2
     assert summary.displacement_m_s == pytest.approx(SPEED_M_S, rel=0.01)
     assert summary.displacement_bearing_rad == pytest.approx(left_of_heading_rad)
 
 
 def test_summary_sideways_motion_costs_energy_along_the_displacement(record: RunRecord) -> None:
-    summary = summarize_sideways_run(record)
+    summary = summarize_body_moving_to_its_left(record)
     weight_n = 9.81 * sum(link.mass_kg for link in record.description.links)
     friction_n = record.config.scene.ground.friction * weight_n
     assert summary.energy_j is not None
@@ -201,7 +201,7 @@ def test_summary_sideways_motion_costs_energy_along_the_displacement(record: Run
 
 def test_summary_sideways_motion_is_lateral_slip_only(record: RunRecord) -> None:
     """All motion of the links is across their axes, and none of it is lost for the displacement."""
-    summary = summarize_sideways_run(record)
+    summary = summarize_body_moving_to_its_left(record)
     assert summary.displacement_slip == pytest.approx(0.0, abs=1e-9)
     assert summary.lateral_slip == pytest.approx(1.0)
 
