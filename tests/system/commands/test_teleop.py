@@ -16,11 +16,11 @@ from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import ControlState, LocomotionIntent, RobotStatus, Trajectory
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs.command import RunningCommand, running_snakesim
-from snakesim_testing.runs.teleop_terminal import LEFT, UP, running_teleop
+from snakesim_testing.runs.teleop_terminal import LEFT, UP, TeleopTerminal, running_teleop
 
 pytestmark = pytest.mark.e2e
 STEER = Path(__file__).parents[3] / "examples" / "steer.py"
-NO_INTENT = LocomotionIntent(timestamp_ns=0, requester="nobody")
+INTENT_WITHOUT_DIRECTION = LocomotionIntent(timestamp_ns=0, requester="placeholder of the test")
 
 
 class PathFollower:
@@ -60,7 +60,10 @@ def test_teleop_keys_drive_robot_and_lost_operator_stops_it(tmp_path: Path) -> N
                 wait_until(lambda: path.has_speed(0.1, "teleop"), "navigation to go at 0.1 m/s")
                 lost_operator.type(LEFT)
                 wait_until(
-                    lambda: (intents.drain() or [NO_INTENT])[-1].heading_w_rad is not None,
+                    lambda: (
+                        (intents.drain() or [INTENT_WITHOUT_DIRECTION])[-1].heading_w_rad
+                        is not None
+                    ),
                     "a direction",
                 )
                 lost_operator.wait_for_text("requested: +0.10 m/s")
@@ -116,31 +119,46 @@ def suspended_process(pid: int) -> Iterator[None]:
         os.kill(pid, signal.SIGCONT)
 
 
-def test_teleop_with_paused_clock_shows_its_reason(
-    lockstep_run: RunningCommand, tmp_path: Path
-) -> None:
-    """The reason is that of the robot, which teleop does not report as lost."""
-    reason = " waits for navigation's answer to tick "
-    run = lockstep_run
-    with (
-        open_session(ConnectionSettings(run.endpoint, "planar13")) as session,
-        running_teleop(run, tmp_path) as operator,
-    ):
+@contextlib.contextmanager
+def teleop_of_robot_waiting_for_navigation(
+    run: RunningCommand, home: Path
+) -> Iterator[TeleopTerminal]:
+    """Request a speed by teleop, and then suspend navigation, so that a host in lockstep pauses the clock."""
+    with running_teleop(run, home) as operator:
         operator.type(UP)
         operator.wait_for_text("requested: +0.05 m/s")
-        reader = session.declare_reader(keys.CONTROL_STATE, ControlState)
-        states = list[ControlState]()
+        with suspended_process(run.part("navigation")):
+            yield operator
 
-        def has_reported_reason() -> bool:
+
+WAITS_FOR_NAVIGATION = " waits for navigation's answer to tick "
+
+
+def test_teleop_of_paused_robot_shows_what_host_waits_for(
+    lockstep_run: RunningCommand, tmp_path: Path
+) -> None:
+    with teleop_of_robot_waiting_for_navigation(lockstep_run, tmp_path) as operator:
+        operator.wait_for_text(WAITS_FOR_NAVIGATION)
+
+
+def test_control_of_paused_robot_reports_what_host_waits_for(
+    lockstep_run: RunningCommand, tmp_path: Path
+) -> None:
+    """The robot does not move while the clock is paused, but its power is on and its connection is not lost."""
+    with open_session(ConnectionSettings(lockstep_run.endpoint, "planar13")) as session:
+        reader = session.declare_reader(keys.CONTROL_STATE, ControlState)
+        states: list[ControlState] = []
+
+        def has_reported_pause() -> bool:
             states.extend(reader.drain())
             return any(
-                state.state == "NotLocomoting" and reason in state.reason for state in states
+                state.state == "NotLocomoting" and WAITS_FOR_NAVIGATION in state.reason
+                for state in states
             )
 
-        with suspended_process(run.part("navigation")):
-            operator.wait_for_text(reason)
-            wait_until(has_reported_reason, "the same reason from control")
-        assert "PowerOff" not in {state.state for state in states}
+        with teleop_of_robot_waiting_for_navigation(lockstep_run, tmp_path):
+            wait_until(has_reported_pause, "control reports the pause and its reason")
+    assert "PowerOff" not in {state.state for state in states}
 
 
 @pytest.mark.heavy

@@ -13,7 +13,7 @@ import pytest
 from snakesim_can_backend.odrive.protocol import AxisState
 from snakesim_drivers.kit.mixed import MixedBackend, MixedSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
-from snakesim_hal.wire.messages import ClockMode, JointMode
+from snakesim_hal.wire.messages import ClockMode, Fault, JointMode
 from snakesim_testing.benches.emulated_drives import DrivesOfAnyType
 from snakesim_testing.drivers.drive_rig import DriveRig, drives_of
 from snakesim_testing.hal.small_robots import make_run_config
@@ -68,6 +68,10 @@ class MixedRobot(DriveRig):
     def get_servo_enable_states(self) -> set[bool]:
         """Return whether servos are enabled: a set of one value if all have the same state."""
         return {servo.is_torque_on for servo in self.servos._emulator.servos}
+
+    def has_axis_errors(self) -> bool:
+        """Return whether an axis reports an error, such as an expired watchdog."""
+        return any(axis.errors for axis in self.axes._emulator.axes)
 
     def assert_all_drives(self, *, enabled: bool) -> None:
         """Check that all drives are enabled, or that all are disabled."""
@@ -268,27 +272,52 @@ def test_bus_with_slow_readings_does_not_delay_ticks(open_robot: OpenRobot) -> N
     assert max(robot.get_ages_ms(SERVOS)) > 0
 
 
-def test_bus_without_fresh_setpoints_disables_drives_within_the_lease(
-    open_robot: OpenRobot,
-) -> None:
+def open_robot_and_stop_sending_setpoints(open_robot: OpenRobot) -> MixedRobot:
+    """Open a robot, enable its drives, and send no setpoints until its two buses have disabled them.
+
+    A bus does so after one lease. The watchdogs of the drives are longer, so that they do not expire before.
+    """
     robot = open_robot(
-        "realtime",
+        clock_mode="realtime",  # each bus has its own thread
         odrive={"watchdog_s": LONG_WATCHDOG_S},
         dynamixel={"watchdog_s": LONG_WATCHDOG_S},
     )
     robot.run_until_enabled(lambda: robot.has_all_drives(enabled=True))
     wait_until(lambda: robot.has_all_drives(enabled=False), "all drives are disabled", 10.0)
-    assert not any(axis.errors for axis in robot.axes._emulator.axes), "a watchdog disabled them"
-    faults = robot.run(1, "armed")
+    return robot
+
+
+def run_until_each_bus_has_a_fault(robot: MixedRobot) -> list[Fault]:
+    """Send setpoints in one armed tick, run until the two buses have reported faults, and return the faults."""
+    faults = robot.run(ticks=1, lifecycle="armed")
 
     def are_both_buses_reported() -> bool:
-        faults.extend(robot.run(1, "fault"))
+        faults.extend(robot.run(ticks=1, lifecycle="fault"))
         return len(faults) >= 2
 
     wait_until(are_both_buses_reported, "a fault of each bus", 10.0)
+    return faults
+
+
+def test_bus_without_setpoints_disables_drives_before_their_watchdogs(
+    open_robot: OpenRobot,
+) -> None:
+    robot = open_robot_and_stop_sending_setpoints(open_robot)
+    robot.assert_all_drives(enabled=False)
+    assert not robot.has_axis_errors(), "a watchdog disabled them, which is an error of the axis"
+
+
+def test_bus_without_setpoints_reports_the_expired_lease(open_robot: OpenRobot) -> None:
+    robot = open_robot_and_stop_sending_setpoints(open_robot)
+    faults = run_until_each_bus_has_a_fault(robot)
     assert {fault.what for fault in faults} == {"no_setpoints"}
     assert "one lease" in faults[0].cause
-    # The setpoints of the armed tick above have not enabled the drives again.
+
+
+def test_bus_after_expired_lease_ignores_setpoints_of_armed_tick(open_robot: OpenRobot) -> None:
+    """The drives stay off until the operator resets the fault."""
+    robot = open_robot_and_stop_sending_setpoints(open_robot)
+    run_until_each_bus_has_a_fault(robot)
     robot.assert_all_drives(enabled=False)
 
 

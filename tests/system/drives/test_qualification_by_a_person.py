@@ -206,25 +206,55 @@ def test_qualification_whose_terminal_is_closed_stops_the_motor(tmp_path: Path):
         assert list(get_verdicts(terminal.read_progress())) == STEP_KEYS[:2]
 
 
-def test_qualification_ignores_early_keys_and_stops_at_end_of_input(tmp_path: Path):
-    with emulated_drive_on_bench(tmp_path, "odrive") as bench:
-        with running_qualification(tmp_path, bench) as terminal:
-            go_to_step(terminal, "limits")
+def test_qualification_ignores_keys_typed_before_the_question(tmp_path: Path):
+    """The person presses Enter three times, although only one question is shown."""
+    with (
+        emulated_drive_on_bench(tmp_path, "odrive") as bench,
+        running_qualification(tmp_path, bench) as terminal,
+    ):
+        go_to_step(terminal, "limits")
+        terminal.answer(ENTER + 2 * ENTER)  # the first answers; the others are too early
 
-            # The first key answers this question, and the two others are typed before the next question appears.
-            terminal.answer(3 * ENTER)
-            assert READY in terminal.wait_for_question()
-            time.sleep(1.0)  # a key that is not ignored would have answered by now
-            assert READY in terminal.printed.splitlines()[-1], "a key typed early has answered"
-            assert not bench.read_newest_state().is_enabled
+        # The first Enter has started the step "limits", after which the next step asks before it moves the motor.
+        assert READY in terminal.wait_for_question()
+        assert terminal.find_step() == TITLES["motion"]
+        time.sleep(1.0)  # a key that is not ignored would have answered by now
+        newest_line = terminal.printed.splitlines()[-1]
+        assert READY in newest_line, "a key that was typed early has answered the question"
+        assert not bench.read_newest_state().is_enabled
 
-            answer_until(terminal, SHAFT_TURNED)
-            assert bench.read_newest_state().is_enabled
-            terminal.answer(CTRL_D)
-            assert terminal.end() == INTERRUPTED
-            bench.assert_stays_off()
+        terminal.answer(CTRL_D)
+        assert terminal.end() == INTERRUPTED
 
-        record = terminal.read_progress()
-        assert get_verdicts(record) == dict.fromkeys(STEP_KEYS[:3], "confirmed")
-        claims = {claim.id: claim.verdict for claim in judge_claims("odrive", record.steps)}
-        assert claims["si-units"] == "unknown"
+
+def end_input_while_motor_is_enabled(terminal: QualificationTerminal) -> None:
+    """Answer until the step "motion" asks which way the shaft turned, and type Ctrl-D instead of an answer."""
+    answer_until(terminal, SHAFT_TURNED)
+    assert terminal.bench.read_newest_state().is_enabled, "the motor does not hold the shaft"
+    terminal.answer(CTRL_D)
+
+
+def test_qualification_at_end_of_input_stops_the_motor(tmp_path: Path):
+    with (
+        emulated_drive_on_bench(tmp_path, "odrive") as bench,
+        running_qualification(tmp_path, bench) as terminal,
+    ):
+        end_input_while_motor_is_enabled(terminal)
+        assert terminal.end() == INTERRUPTED
+        bench.assert_stays_off()
+
+
+def test_qualification_at_end_of_input_keeps_completed_steps(tmp_path: Path):
+    with (
+        emulated_drive_on_bench(tmp_path, "odrive") as bench,
+        running_qualification(tmp_path, bench) as terminal,
+    ):
+        end_input_while_motor_is_enabled(terminal)  # in the step "motion"
+        assert terminal.end() == INTERRUPTED
+
+    record = terminal.read_progress()
+    steps_before_motion = STEP_KEYS[: STEP_KEYS.index("motion")]
+    assert steps_before_motion == ["identity", "configuration", "limits"]
+    assert get_verdicts(record) == dict.fromkeys(steps_before_motion, "confirmed")
+    claims = {claim.id: claim.verdict for claim in judge_claims("odrive", record.steps)}
+    assert claims["si-units"] == "unknown", "it depends on the step that was not completed"

@@ -131,22 +131,35 @@ def test_training_search_with_one_process_gives_same_policy(
         assert (tmp_path / "one" / name).read_bytes() == (search_folder / name).read_bytes(), name
 
 
-def test_training_policy_file_computes_targets_of_the_search(tmp_path: Path) -> None:
+def test_training_policy_file_computes_same_targets_as_numpy(tmp_path: Path) -> None:
+    """A search evaluates its policies in NumPy; a robot executes the ONNX file that is written of them."""
     env = SnakeEnv("surveyed_clutter", observe=OBSERVE, duration=1)
-    values = {
+    # Any parameters will do; these are not 0, so that each has an effect.
+    parameters = {
         name: parameter.start + parameter.sigma for name, parameter in FORMS["feeling"].items()
     }
-    sizes = {name: len(part.names) for name, part in env.parts.items()}
-    policy = PolicyArrays.make_from_parameters(
-        values, [joint.axis for joint in env.description.joints], sizes
+    numpy_policy = PolicyArrays.make_from_parameters(
+        values=parameters,
+        axes=[joint.axis for joint in env.description.joints],
+        sizes={name: len(part.names) for name, part in env.parts.items()},
     )
-    write_onnx_file(tmp_path / "policy.onnx", policy, values, 5, ["snakesim", "policy", "train"])
-    model = PolicyModel(env.description, str(tmp_path / "policy.onnx"))
+    onnx_path = tmp_path / "policy.onnx"
+    write_onnx_file(
+        onnx_path,
+        numpy_policy,
+        values=parameters,
+        # Two entries of the metadata, which do not change the targets.
+        frame_skip=5,
+        again=["snakesim", "policy", "train"],
+    )
+    onnx_policy = PolicyModel(env.description, str(onnx_path))
+
     random = np.random.default_rng(1)
     for _ in range(20):
         observation = random.normal(size=len(env.observation_names)).astype(np.float32)
-        expected_rad = policy.compute_targets(observation)
-        assert np.allclose(model(observation), expected_rad, atol=1e-5)
+        target_rad = onnx_policy(observation)
+        expected_rad = numpy_policy.compute_targets(observation)
+        assert np.allclose(target_rad, expected_rad, atol=1e-5)
 
 
 @pytest.mark.heavy

@@ -32,17 +32,19 @@ def iterate_ticks_after(
     return client.iterate_ticks(SILENCE_TIMEOUT_S)
 
 
-def test_client_in_lockstep_answers_repeated_tick_once(
+def test_client_in_lockstep_yields_repeated_tick_once(
     sessions: tuple[Session, Session],
 ) -> None:
-    clocks_before_arming = [make_clock(0)] * 50
-    armed_clocks = [make_clock(tick, arm_session=1) for tick in range(3)]
-    ticks = iterate_ticks_after(sessions, clocks_before_arming + armed_clocks)
-    for expected_tick in range(3):
-        clock = next(ticks)
-        assert clock is not None
-        assert (clock.tick, clock.arm_session) == (expected_tick, 1)
-    assert next(ticks) is None
+    """The host repeats the clock of tick 0 until it is armed. The client yields the newest clock of each tick."""
+    disarmed, armed = 0, 1  # arm sessions
+    repeated_before_arming = [make_clock(tick=0, arm_session=disarmed)] * 50
+    after_arming = [make_clock(tick=tick, arm_session=armed) for tick in (0, 1, 2)]
+
+    ticks = iterate_ticks_after(sessions, repeated_before_arming + after_arming)
+
+    yielded_clocks = [next(ticks) for _ in after_arming]
+    assert yielded_clocks == after_arming
+    assert next(ticks) is None, "a further tick"
 
 
 def test_client_in_lockstep_ignores_sample_of_later_tick(

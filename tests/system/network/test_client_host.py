@@ -240,22 +240,37 @@ def test_lease_second_holder_needs_higher_priority() -> None:
         assert all(are_passive(setpoints) for setpoints in run.backend.enacted[ticks_before + 1 :])
 
 
-def test_arming_waits_for_all_services_with_time_paused() -> None:
-    with running_host(make_run_config()) as run:
+def test_host_without_its_control_service_refuses_to_arm() -> None:
+    config = make_run_config(services={"control": {}})  # the services that must be connected
+    with running_host(config) as run:
         assert run.status.waiting_for == ["control"]
         assert "waiting for control" in run.status.reason
         answer = run.request_lifecycle("arm")
         assert not answer.ok
         assert answer.reason == "waiting for control"
-        with running_follower(run.link, SineFollower()) as control:
-            wait_until(lambda: len(control.ticks_seen) >= 3, "tick 0 published three times")
-            assert set(control.ticks_seen) == {0}
-            assert run.backend.advanced == 0
-            assert not run.backend.enacted
-            assert run.status.tick == 0
-            assert run.host.black_box.row_count == 0
+
+
+def test_lockstep_host_repeats_tick_0_until_it_is_armed() -> None:
+    config = make_run_config(clock_mode="lockstep")
+    with running_host(config) as run, running_follower(run.link, SineFollower()) as control:
+        wait_until(lambda: len(control.ticks_seen) >= 3, "tick 0 published three times")
+        assert set(control.ticks_seen) == {0}
+        assert run.status.tick == 0
+        assert run.backend.advanced == 0, "the backend has moved the robot"
+        assert not run.backend.enacted, "the backend has received setpoints"
+        assert run.host.black_box.row_count == 0, "the host has recorded a tick"
+        run.arm()
+
+
+def test_host_reports_fault_when_control_leaves_armed_robot() -> None:
+    config = make_run_config(services={"control": {}})
+    with running_host(config) as run:
+        with running_follower(run.link, SineFollower()):
+            wait_until(lambda: run.status.alive == ["control"], "control is connected")
             run.arm()
-        assert run.status.alive == ["control"] or run.host.authority.faults
+        # The follower has closed its session, which the host notices a little later.
+        faults = run.host.authority.faults
+        wait_until(lambda: "service_lost" in {fault.what for fault in faults}, "control is lost")
 
 
 # --- unauthorized clients -------------------------------------------------------------------------------------

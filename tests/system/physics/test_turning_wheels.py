@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.scene_file.friction import DirectionalFriction
 from snakesim_testing.sim.gliding import GlidingSnake
 from snakesim_testing.sim.simulator_rig import G
@@ -21,22 +22,34 @@ COEFFICIENTS = DirectionalFriction(ROLLING_FRICTION, ROLLING_FRICTION, TIRE_FRIC
 SLOW_WAVE = JointWave(0.3, 0.7, 4.0)
 
 
-def test_wheels_that_roll_and_slip_keep_full_sideways_friction() -> None:
-    glider = GlidingSnake("flat ground", SEPARATE_LIMITS)
-    force_n = glider.drag(np.array([0.5, 0.1]), 0.4)
-    assert np.abs(force_n) / (glider.mass_kg * G) == pytest.approx(
-        (ROLLING_FRICTION, TIRE_FRICTION), rel=0.01
-    )
-    # With a common limit, as scales have it, rolling reduces the sideways friction.
-    common_limit = GlidingSnake("flat ground", {"wheels": WHEELS})
-    force_n = common_limit.drag(np.array([0.5, 0.1]), 0.4)
-    assert abs(force_n[1]) / (common_limit.mass_kg * G) < 0.2
+def measure_friction_per_weight(snake: GlidingSnake, velocity_m_s: tuple[float, float]) -> Floats:
+    """Drag a snake for 0.4 s at a velocity along its wheels and across them, and return friction over weight, (2,)."""
+    force_n = snake.drag(velocity_w=np.array(velocity_m_s), time_s=0.4)
+    return np.abs(force_n) / (snake.mass_kg * G)
+
+
+ROLLING_AND_SLIPPING_M_S = (0.5, 0.1)  # along the wheels and across them
+
+
+def test_wheels_with_separate_limits_keep_full_sideways_friction() -> None:
+    """Wheels that roll and slip have the rolling friction along them, and the full friction of the tires across."""
+    snake = GlidingSnake("flat ground", {"wheels": {**WHEELS, "separate_limits": True}})
+    friction = measure_friction_per_weight(snake, ROLLING_AND_SLIPPING_M_S)
+    assert friction == pytest.approx((ROLLING_FRICTION, TIRE_FRICTION), rel=0.01)
+
+
+def test_wheels_with_common_limit_lose_sideways_friction_by_rolling() -> None:
+    """One limit for the whole force, as scales have it, leaves less for the direction in which the wheels slip less."""
+    snake = GlidingSnake("flat ground", {"wheels": WHEELS})  # separate_limits is false by default
+    _, sideways_friction = measure_friction_per_weight(snake, ROLLING_AND_SLIPPING_M_S)
+    a_third_of_tire_friction = 0.2
+    assert sideways_friction < a_third_of_tire_friction
 
 
 @pytest.mark.parametrize("surface", ["flat ground", "level hills", "step", "top of an obstacle"])
 def test_wheels_roll_easily_and_slip_sideways_above_tire_friction(surface: str) -> None:
     glider = GlidingSnake(surface, SEPARATE_LIMITS)
-    force_n = glider.drag(np.array([0.5, 0.0]), 0.4)
+    force_n = glider.drag(velocity_w=np.array([0.5, 0.0]), time_s=0.4)
     assert np.linalg.norm(force_n) / (glider.mass_kg * G) == pytest.approx(
         ROLLING_FRICTION, rel=0.02
     )

@@ -51,11 +51,22 @@ def test_arithmetic_of_unknown_processor_is_not_pinned(
     assert arithmetic.is_pinned()
 
 
-def measure_arithmetic_after(code: str, **variables: str) -> dict[str, str]:
-    """Measure the arithmetic of a new process that runs this code, with these environment variables."""
-    program = (
-        "import json; from snakesim_hal.base import arithmetic; {}; "
-        "print(json.dumps(arithmetic.measure_arithmetic()))"
+def measure_arithmetic_of_process(
+    *first_statements: str, variables: dict[str, str]
+) -> dict[str, str]:
+    """Return the arithmetic of a new Python process, by part, as hashes of its results.
+
+    Args:
+        *first_statements: Statements that the process executes before it measures. It has imported `arithmetic`.
+        variables: Environment variables of the process.
+    """
+    program = "; ".join(
+        [
+            "import json",
+            "from snakesim_hal.base import arithmetic",
+            *first_statements,
+            "print(json.dumps(arithmetic.measure_arithmetic()))",
+        ]
     )
     environment = {
         name: value
@@ -63,7 +74,7 @@ def measure_arithmetic_after(code: str, **variables: str) -> dict[str, str]:
         if name not in arithmetic.make_common_arithmetic_env()
     }
     result = subprocess.run(
-        [sys.executable, "-c", program.format(code)],
+        [sys.executable, "-c", program],
         env={**environment, **variables},
         capture_output=True,
         check=True,
@@ -71,16 +82,40 @@ def measure_arithmetic_after(code: str, **variables: str) -> dict[str, str]:
     return json.loads(result.stdout)
 
 
-def test_measure_arithmetic_detects_code_selected_before_numpy_import() -> None:
+# Variables with which BLAS and NumPy use their code for old processors, without AVX2 and FMA, which rounds otherwise.
+OLD_CODE = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3"}
+
+
+@pytest.fixture
+def needs_avx2_and_fma() -> None:
+    """Skip the test on a processor that has only the old code."""
     if not arithmetic.make_common_arithmetic_env():
         pytest.skip("this processor has no AVX2 and FMA, so that no other code can be selected")
-    old = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3"}
-    old_arithmetic = measure_arithmetic_after("pass", **old)
+
+
+@pytest.mark.usefixtures("needs_avx2_and_fma")
+def test_measure_arithmetic_detects_old_code_of_blas_and_numpy() -> None:
+    old_arithmetic = measure_arithmetic_of_process(variables=OLD_CODE)
     assert arithmetic.find_differing_parts(old_arithmetic) == ["BLAS", "NumPy"]
-    pin_first = "arithmetic.pin_common_arithmetic()"
-    assert measure_arithmetic_after(pin_first, **old) == arithmetic.measure_arithmetic()
-    pin_too_late = "import numpy; arithmetic.pin_common_arithmetic()"
-    assert measure_arithmetic_after(pin_too_late, **old) == old_arithmetic
+
+
+@pytest.mark.usefixtures("needs_avx2_and_fma")
+def test_pin_arithmetic_before_numpy_import_replaces_old_code() -> None:
+    """The process of the test computes in the common arithmetic, too."""
+    pinned_arithmetic = measure_arithmetic_of_process(
+        "arithmetic.pin_common_arithmetic()", variables=OLD_CODE
+    )
+    assert pinned_arithmetic == arithmetic.measure_arithmetic()
+
+
+@pytest.mark.usefixtures("needs_avx2_and_fma")
+def test_pin_arithmetic_after_numpy_import_changes_nothing() -> None:
+    """NumPy and BLAS select their code when they are imported."""
+    old_arithmetic = measure_arithmetic_of_process(variables=OLD_CODE)
+    pinned_too_late = measure_arithmetic_of_process(
+        "import numpy", "arithmetic.pin_common_arithmetic()", variables=OLD_CODE
+    )
+    assert pinned_too_late == old_arithmetic
 
 
 def test_arithmetic_digest_of_other_kernels_is_marked_as_local() -> None:

@@ -23,6 +23,8 @@ pytestmark = pytest.mark.e2e
 RUN = ("clutter", "--clock-mode", "realtime", "--duration", "600", "--stay", "--set", "rate_hz=50")
 LEROBOT_VENV = REPOSITORY / "build" / "lerobot"  # a separate environment: PyTorch takes 6 GB
 MIN_EPISODE_BYTES = 150_000
+TASK = "through the field"
+EPISODES_FOLDER = "demos"
 LEROBOT = "lerobot==0.4.4"
 LOAD_DATASET_CODE = """
 import json, torch
@@ -52,9 +54,9 @@ class EpisodeRecorder:
             "--endpoint",
             run.endpoint,
             "--episodes",
-            "demos",
+            EPISODES_FOLDER,
             "--task",
-            "through the field",
+            TASK,
         )
         self.process = subprocess.Popen(
             [*SNAKESIM_COMMAND, *command],
@@ -81,12 +83,16 @@ class EpisodeRecorder:
 
 
 @pytest.fixture(scope="module")
-def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record four episodes and keep two: one is dropped, and one is not labelled before the recorder ends."""
+def episodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record four episodes, and return the folder with those that are kept.
+
+    The first is labelled as a success, the second as a failure, the third is dropped, and the fourth is not labelled
+    before the recorder ends.
+    """
     home = tmp_path_factory.mktemp("demos")
     with running_armed_snakesim(home / "run", *RUN) as run:
         record_demonstrations(run, home)
-    return home
+    return home / EPISODES_FOLDER
 
 
 def record_demonstrations(run: RunningCommand, home: Path) -> None:
@@ -104,7 +110,7 @@ def record_demonstrations(run: RunningCommand, home: Path) -> None:
         ):
             name = f"episode-{number:03d}.mcap"
             recorder.type("", f"{name}: recording")
-            file = home / "demos" / name
+            file = home / EPISODES_FOLDER / name
             wait_until(
                 lambda file=file: file.is_file() and file.stat().st_size > MIN_EPISODE_BYTES,
                 "the episode contains messages",
@@ -122,30 +128,38 @@ def record_demonstrations(run: RunningCommand, home: Path) -> None:
 
 
 @pytest.mark.slow
-def test_episodes_store_their_label_and_task(demos: Path) -> None:
-    lines = (demos / "demos" / "episodes.jsonl").read_text().splitlines()
+def test_episodes_are_listed_with_label_and_task(episodes: Path) -> None:
+    """The operator labelled the first episode as a success, and the second as a failure."""
+    lines = (episodes / "episodes.jsonl").read_text().splitlines()
     labels = [json.loads(line) for line in lines]
-    assert [(label["file"], label["success"]) for label in labels] == [
-        ("episode-000.mcap", True),
-        ("episode-001.mcap", False),
+    listed = [(label["file"], label["success"], label["task"]) for label in labels]
+    assert listed == [
+        ("episode-000.mcap", True, TASK),
+        ("episode-001.mcap", False, TASK),
     ]
-    assert {label["task"] for label in labels} == {"through the field"}
-    assert {path.name for path in (demos / "demos").iterdir()} == {
-        "episodes.jsonl",
-        *(label["file"] for label in labels),
-    }
-    info = snakesim("recording", "info", "demos/episode-000.mcap", cwd=demos)
+
+
+@pytest.mark.slow
+def test_episodes_dropped_or_without_label_are_deleted(episodes: Path) -> None:
+    """The operator dropped the third episode, and ended the recorder during the fourth."""
+    labelled_files = {"episode-000.mcap", "episode-001.mcap"}
+    assert {path.name for path in episodes.iterdir()} == {"episodes.jsonl", *labelled_files}
+
+
+@pytest.mark.slow
+def test_episode_contains_intents_and_depth_images(episodes: Path) -> None:
+    info = snakesim("recording", "info", "episode-000.mcap", cwd=episodes)
     assert "operator/intent" in info.out, info.printed
     assert "sensor/depth/head" in info.out, info.printed
 
 
 @pytest.mark.slow
-def test_demonstrations_exported_with_images_form_a_dataset(demos: Path, tmp_path: Path) -> None:
+def test_demonstrations_exported_with_images_form_a_dataset(episodes: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `report`")
     export_command = (
         "recording",
         "export",
-        str(demos / "demos"),
+        str(episodes),
         "--format",
         "lerobot",
         "--images",
@@ -177,7 +191,7 @@ def test_demonstrations_exported_with_images_form_a_dataset(demos: Path, tmp_pat
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @needs_uv
-def test_exported_dataset_is_loaded_by_lerobot(demos: Path, tmp_path: Path) -> None:
+def test_exported_dataset_is_loaded_by_lerobot(episodes: Path, tmp_path: Path) -> None:
     """The test installs lerobot into build/lerobot if it is not there."""
     python = LEROBOT_VENV / "bin" / "python"
     for command in (
@@ -190,7 +204,7 @@ def test_exported_dataset_is_loaded_by_lerobot(demos: Path, tmp_path: Path) -> N
     export_command = (
         "recording",
         "export",
-        str(demos / "demos"),
+        str(episodes),
         "--format",
         "lerobot",
         "--images",
@@ -206,7 +220,7 @@ def test_exported_dataset_is_loaded_by_lerobot(demos: Path, tmp_path: Path) -> N
     dataset = json.loads(program.out.splitlines()[-1])
     assert dataset["episodes"] == 2
     assert dataset["fps"] == 10
-    assert dataset["task"] == "through the field"
+    assert dataset["task"] == TASK
     assert dataset["image"] == [3, 120, 160]
     assert 0 < dataset["brightest"] <= 1
     assert dataset["mean"] == [3, 1, 1]

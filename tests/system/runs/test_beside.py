@@ -25,6 +25,12 @@ REALTIME = (
 )
 
 
+def write_failing_controller(folder: Path, failure: str) -> str:
+    """Write a controller that fails in its 30th tick, such as "raises" or "hangs", and return its plugin name."""
+    (folder / "bad.py").write_text(BAD.replace("%s", failure))
+    return "./bad.py:Controller"
+
+
 @pytest.mark.slow
 def test_control_in_host_process_sends_the_same_commands(tmp_path: Path) -> None:
     arguments = ("triplet", "--duration", "2", "--clock-mode", "lockstep")
@@ -47,8 +53,8 @@ def test_control_in_host_process_sends_the_same_commands(tmp_path: Path) -> None
 def test_control_in_host_with_failing_controller_ends_run(
     tmp_path: Path, backend: str, failure: str, message: str
 ) -> None:
-    (tmp_path / "bad.py").write_text(BAD.replace("%s", failure))
-    arguments = (*REALTIME, "--controller", "./bad.py:Controller", "--backend", backend)
+    controller = write_failing_controller(tmp_path, failure)
+    arguments = (*REALTIME, "--controller", controller, "--backend", backend)
     result, summary = run_to_summary(tmp_path / "out", *arguments)
     assert result.code == 1, result.out
     assert message in result.out + summary.ended, result.out
@@ -57,10 +63,8 @@ def test_control_in_host_with_failing_controller_ends_run(
 
 @pytest.mark.heavy
 def test_host_obeys_estop_while_its_controller_hangs(tmp_path: Path) -> None:
-    (tmp_path / "bad.py").write_text(BAD.replace("%s", "hangs"))
-    with running_snakesim(
-        tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay"
-    ) as run:
+    controller = write_failing_controller(tmp_path, "hangs")
+    with running_snakesim(tmp_path / "out", *REALTIME, "--controller", controller, "--stay") as run:
         run.wait_for("lease of control expired")
         stopped = command.run_command_for_robot(run, "estop")
         assert stopped.code == 0, stopped.out + stopped.err
@@ -69,15 +73,17 @@ def test_host_obeys_estop_while_its_controller_hangs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_failed_service_is_restarted_and_waits_for_arming(tmp_path: Path) -> None:
-    (tmp_path / "bad.py").write_text(BAD.replace("%s", "raises"))
+def test_failed_service_is_restarted_and_can_be_armed(tmp_path: Path) -> None:
+    """The host refuses to arm a robot without a control service, so arming succeeds only after its restart."""
+    controller_that_raises = write_failing_controller(tmp_path, "raises")
     with running_snakesim(
-        tmp_path / "out", *REALTIME, "--controller", "./bad.py:Controller", "--stay"
+        tmp_path / "out", *REALTIME, "--controller", controller_that_raises, "--stay"
     ) as run:
-        run.wait_for("fault: ")
+        run.wait_for("fault: ")  # the exception has ended the control service
 
         def reset_and_arm() -> bool:
-            command.run_command_for_robot(run, "robot", "reset")
-            return command.run_command_for_robot(run, "robot", "arm", "planar13", "sim").code == 0
+            command.run_command_for_robot(run, "robot", "reset")  # clears the fault
+            armed = command.run_command_for_robot(run, "robot", "arm", "planar13", "sim")
+            return armed.code == 0
 
-        wait_until(reset_and_arm, "the robot is armed again")
+        wait_until(reset_and_arm, "control has restarted and the robot is armed again")

@@ -27,6 +27,7 @@ DECLARED_TIME = "2026-11-25T02:40:12+00:00"
 NOW_S = datetime(2026, 11, 25, 2, 50, tzinfo=UTC).timestamp()
 LATER_S = NOW_S + 10 * MAX_DECLARATION_AGE_S
 TURN_RAD = 2 * math.pi
+ANGLE_LIMIT_RAD = 3.0  # of joint_2, to either side
 
 
 def make_robot_with(folder: Path, joint_2: str, extra: str = "") -> RobotFile:
@@ -37,7 +38,9 @@ def make_robot_with(folder: Path, joint_2: str, extra: str = "") -> RobotFile:
         .replace("modules = 13", "modules = 3")
     )
     path = folder / "snake.toml"
-    path.write_text(f"{shipped}\n[joints.joint_2]\nangle_rad = 3.0\n{joint_2}\n{extra}")
+    path.write_text(
+        f"{shipped}\n[joints.joint_2]\nangle_rad = {ANGLE_LIMIT_RAD}\n{joint_2}\n{extra}"
+    )
     return decode_table(read_table_with_base(str(path), "robots"), RobotFile)
 
 
@@ -61,8 +64,13 @@ class CableRig:
         self.joints = robot.joint_table
         self.robot = msgspec.structs.replace(described, emulated=False)
 
-    def run_host(self, *angles_rad: float, now_s: float = NOW_S, closes: bool = True) -> list[str]:
-        """Run a host that reads these angles of the drive of joint_2, and return why it does not arm."""
+    def run_host(
+        self, *drive_angles_rad: float, now_s: float = NOW_S, closes: bool = True
+    ) -> list[str]:
+        """Run a host while the drive of joint_2 reports these angles, and return why the host does not arm.
+
+        The host reads the record that the host before it has left, and leaves one for the next.
+        """
         serials = [
             msgspec.structs.replace(joint, serial=self.serial) for joint in self.robot.joints
         ]
@@ -70,7 +78,7 @@ class CableRig:
         cable_file = CableFile(
             self.folder, self.joints, msgspec.structs.replace(self.robot, joints=serials), now_s
         )
-        for angle_rad in angles_rad:
+        for angle_rad in drive_angles_rad:
             cable_file.update(make_joint_state(self.robot, [0.0, angle_rad, 0.0]))
         obstacles = cable_file.tracker.list_arming_obstacles()
         if closes:
@@ -84,24 +92,44 @@ def list_writers() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name == "cables"}
 
 
-def test_cable_turns_are_known_after_drive_lost_them(tmp_path: Path) -> None:
+def test_cable_turns_lost_by_the_drive_prevent_arming(tmp_path: Path) -> None:
+    """A drive that was off reports an angle that is whole turns too low, but the record of the last host has them."""
+    cable_turns = 0.6  # that the cable bears to either side
+    rig = CableRig(tmp_path, f'cable_turns = {cable_turns}\ncable_unwound = "{DECLARED_TIME}"')
+    wound_rad = 4.0  # beyond ANGLE_LIMIT_RAD, because the joint is turned by hand
+    assert rig.run_host(0.1, 1.5, 3.0, wound_rad) == [], "the first host may arm"
+
+    drive_rad = wound_rad - TURN_RAD  # the drive was off between the hosts, and has lost one turn
+    (obstacle,) = rig.run_host(drive_rad, now_s=LATER_S)
+
+    assert (
+        f"joint_2: its drive reports {drive_rad:+.2f} rad, but it is at {wound_rad:+.2f} rad "
+        "by the turns counted over restarts"
+    ) in obstacle
+    # The motor could turn until the drive reports ANGLE_LIMIT_RAD, which is one turn more for the cable.
+    max_winding_turns = (ANGLE_LIMIT_RAD + TURN_RAD) / TURN_RAD
+    assert (
+        f"wound by up to {max_winding_turns:.2f} turns, and `cable_turns` = {cable_turns}. "
+        "Turn it by hand by 1 turn to lower angles"
+    ) in obstacle
+
+
+def test_cable_turned_back_allows_arming_after_drive_restart(tmp_path: Path) -> None:
+    """A drive that has lost a turn reports the true angle again if the joint is unwound while it restarts."""
     rig = CableRig(tmp_path)
-    assert rig.run_host(0.1, 1.5, 3.0, 4.0) == []  # moved by hand beyond its limit of 3 rad
-    (obstacle,) = rig.run_host(4.0 - TURN_RAD, now_s=LATER_S)
-    assert (
-        "joint_2: its drive reports -2.28 rad, but it is at +4.00 rad by the turns counted over restarts"
-        in obstacle
-    )
-    assert (
-        "wound by up to 1.48 turns, and `cable_turns` = 0.6. Turn it by hand by 1 turn to lower angles"
-        in obstacle
-    )
-    # The operator moves the joint by hand, and the drive counts.
-    assert (
-        rig.run_host(4.0 - TURN_RAD, 2.0 - TURN_RAD, -TURN_RAD, -2.0 - TURN_RAD, now_s=LATER_S)
-        != []
-    )
-    assert rig.run_host(-2.0, now_s=LATER_S) == []  # the drive has lost that turn, too
+    wound_rad = 4.0
+    unwound_rad = (
+        -2.0
+    )  # within half a turn of zero, where a drive that starts reports the true angle
+    assert rig.run_host(0.1, 1.5, 3.0, wound_rad) == [], "the first host may arm"
+
+    turned_back_by_hand_rad = [wound_rad, 2.0, 0.0, unwound_rad]
+    drive_rad = [
+        angle_rad - TURN_RAD for angle_rad in turned_back_by_hand_rad
+    ]  # it has lost a turn
+    assert rig.run_host(*drive_rad, now_s=LATER_S) != [], "the drive reports the wrong turn"
+
+    assert rig.run_host(unwound_rad, now_s=LATER_S) == [], "the drive has restarted"
 
 
 def test_cable_turns_within_the_declared_range_allow_arming(tmp_path: Path) -> None:

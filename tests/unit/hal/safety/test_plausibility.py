@@ -600,12 +600,25 @@ def test_plausibility_target_exactly_at_threshold_reveals_nothing() -> None:
 
 
 def test_plausibility_host_pauses_do_not_count_as_frozen() -> None:
+    """A joint is frozen if it repeats its state for over one lease after its target has moved far.
+
+    The time is that between the timestamps of the samples. The host, which checks them late, does not count its pauses.
+    """
+    target_step_rad = 0.02  # in each period
+    far_sample = math.floor(FAR_TARGET_RAD / target_step_rad) + 1  # from it on, the target is far
+    lease_samples = LEASE_NS // PERIOD_NS
+    sample_count = (
+        far_sample + lease_samples - 1
+    )  # the last is less than a lease after `far_sample`
+    host_pause_ns = LEASE_NS  # between two samples; their sum is many leases
     rig = CheckerRig(torque=0.5)
-    for k in range(FAR_PERIODS + 4):
-        assert (
-            rig.check_sample(0.0, 0.0, 0.5, applied=make_applied(0.02 * k), late_ns=k * LEASE_NS)
-            is None
+
+    for sample in range(sample_count):  # their timestamps are one period apart
+        applied = make_applied(target=sample * target_step_rad)
+        fault = rig.check_sample(
+            angle=0.0, torque=0.5, applied=applied, late_ns=sample * host_pause_ns
         )
+        assert fault is None, f"the pauses of the host were counted, sample {sample}"
 
 
 def test_plausibility_old_sample_is_not_frozen() -> None:

@@ -488,22 +488,53 @@ def test_compare_runs_with_one_common_tick_succeeds() -> None:
     render_and_check(compute_difference(make_run(), make_run(seconds=0.01, reports_path=False)))
 
 
-def test_compare_folders_without_run_are_refused_by_name(tmp_path: Path) -> None:
+def test_compare_folder_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with raises_error(ConfigError, code="recording/not-a-run"):
-        compare_runs(tmp_path / "nowhere", tmp_path)
+        compare_runs(run_a=tmp_path / "nowhere", run_b=tmp_path)
+
+
+def test_compare_folder_without_run_config_is_refused(tmp_path: Path) -> None:
+    empty_folder = tmp_path
     with raises_error(ConfigError, code="recording/not-a-run", field="config.json"):
-        compare_runs(tmp_path, tmp_path)
+        compare_runs(run_a=empty_folder, run_b=empty_folder)
+
+
+def write_run_with_truncated_files(folder: Path, *, intact: frozenset[str] = frozenset()) -> None:
+    """Write the files of a run, of which all but the intact ones end after their first character.
+
+    Args:
+        folder: Folder of the run.
+        intact: Names of the files that are complete: "config.json", or also "description.json".
+    """
     for name in ("config.json", "blackbox.rows", "host.json", "description.json"):
-        (tmp_path / name).write_text("{")
+        (folder / name).write_text("{")
+    config = load_triplet_config()
+    if "config.json" in intact:
+        write_config(config, folder / "config.json")
+    if "description.json" in intact:
+        description = describe_run_robot(config)
+        (folder / "description.json").write_bytes(msgspec.json.encode(description))
+
+
+def test_compare_run_with_truncated_config_is_refused(tmp_path: Path) -> None:
+    write_run_with_truncated_files(tmp_path)
     with raises_error(ConfigError, code="file/invalid-syntax", field="config.json"):
-        compare_runs(tmp_path, tmp_path)
-    write_config(load_triplet_config(), tmp_path / "config.json")
+        compare_runs(run_a=tmp_path, run_b=tmp_path)
+
+
+def test_compare_run_with_truncated_description_is_refused(tmp_path: Path) -> None:
+    write_run_with_truncated_files(tmp_path, intact=frozenset({"config.json"}))
     with raises_error(ConfigError, code="recording/not-readable"):
-        compare_runs(tmp_path, tmp_path)
-    (tmp_path / "description.json").write_bytes(
-        msgspec.json.encode(describe_run_robot(load_triplet_config()))
-    )
+        compare_runs(run_a=tmp_path, run_b=tmp_path)
+
+
+def test_compare_run_with_truncated_black_box_is_refused(tmp_path: Path) -> None:
+    write_run_with_truncated_files(tmp_path, intact=frozenset({"config.json", "description.json"}))
     with raises_error(ConfigError, code="recording/not-readable", field="blackbox.rows"):
-        compare_runs(tmp_path, tmp_path)
+        compare_runs(run_a=tmp_path, run_b=tmp_path)
+
+
+def test_compare_negative_tolerance_is_refused_before_runs_are_read(tmp_path: Path) -> None:
+    unreadable_run = tmp_path / "nowhere"
     with raises_error(ConfigError, code="command/invalid-option", field="--within"):
-        compare_runs(tmp_path, tmp_path, within_percent=-1)
+        compare_runs(run_a=unreadable_run, run_b=unreadable_run, within_percent=-1)

@@ -24,7 +24,7 @@ from snakesim_operator.results.signals import (
 )
 from snakesim_operator.results.signals.contact_forces import compute_contact_signals
 from snakesim_operator.results.signals.motion import compute_motion_signals
-from snakesim_operator.results.summary import summarize_run
+from snakesim_operator.results.summary import RunSummary, summarize_run
 
 SPEED_M_S = 0.2
 YAW_RAD = 0.5
@@ -162,20 +162,46 @@ def test_signal_units_are_known_for_every_signal(record: RunRecord) -> None:
         assert find_unit(name, record) == UNITS[name.partition(".")[0]]
 
 
-def test_summary_sideways_motion_counts_along_displacement(record: RunRecord) -> None:
-    summary = summarize_run(make_straight_run(record, YAW_RAD + np.pi / 2), "complete")
+def summarize_body_moving_to_its_left(record: RunRecord) -> RunSummary:
+    """Return the summary of a run of a straight body that moves to its left at SPEED_M_S."""
+    left_rad = YAW_RAD + np.pi / 2  # the body heads along YAW_RAD
+    return summarize_run(make_straight_run(record, direction_rad=left_rad), "complete")
+
+
+def test_summary_sideways_motion_is_no_advance_along_heading(record: RunRecord) -> None:
+    summary = summarize_body_moving_to_its_left(record)
     assert summary.heading_advance_m == pytest.approx(0.0, abs=1e-6)
-    assert summary.heading_energy_j_per_m is None
+    assert summary.heading_energy_j_per_m is None, "energy for each meter of an advance of 0 m"
+
+
+def test_summary_sideways_motion_is_displacement_to_the_left(record: RunRecord) -> None:
+    summary = summarize_body_moving_to_its_left(record)
+    left_of_heading_rad = np.pi / 2
     assert summary.displacement_m_s == pytest.approx(SPEED_M_S, rel=0.01)
-    assert summary.displacement_bearing_rad == pytest.approx(np.pi / 2)
-    assert summary.energy_j is not None and summary.net_displacement_m is not None
-    cost_j_per_m = summary.energy_j / summary.net_displacement_m
-    assert summary.displacement_energy_j_per_m == pytest.approx(cost_j_per_m)
+    assert summary.displacement_bearing_rad == pytest.approx(left_of_heading_rad)
+
+
+def test_summary_sideways_motion_costs_energy_along_the_displacement(record: RunRecord) -> None:
+    summary = summarize_body_moving_to_its_left(record)
     weight_n = 9.81 * sum(link.mass_kg for link in record.description.links)
-    cost_of_transport = cost_j_per_m / weight_n
+    friction_n = record.config.scene.ground.friction * weight_n
+    assert summary.energy_j is not None
+    assert summary.net_displacement_m is not None
+
+    energy_j_per_m = summary.energy_j / summary.net_displacement_m
+    assert summary.displacement_energy_j_per_m == pytest.approx(energy_j_per_m)
+
+    cost_of_transport = energy_j_per_m / weight_n
     assert summary.displacement_cost_of_transport == pytest.approx(cost_of_transport, rel=0.001)
-    efficiency = record.config.scene.ground.friction * weight_n / cost_j_per_m
+
+    # Pulling the body over the ground takes the work of friction, in J for each meter.
+    efficiency = friction_n / energy_j_per_m
     assert summary.displacement_efficiency == pytest.approx(efficiency, rel=0.001)
+
+
+def test_summary_sideways_motion_is_lateral_slip_only(record: RunRecord) -> None:
+    """All motion of the links is across their axes, and none of it is lost for the displacement."""
+    summary = summarize_body_moving_to_its_left(record)
     assert summary.displacement_slip == pytest.approx(0.0, abs=1e-9)
     assert summary.lateral_slip == pytest.approx(1.0)
 

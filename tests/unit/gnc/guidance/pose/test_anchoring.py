@@ -1,11 +1,15 @@
 """Tests how known obstacles correct a dead-reckoned pose: by contacts, and because the body cannot overlap them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
 from snakesim_gnc.guidance.pose.anchoring import (
     ESTIMATED_CONTACT_TRUST,
     MEASURED_CONTACT_TRUST,
+    MIN_FORCE_N,
+    GapTrust,
     ObstacleAnchors,
 )
 from snakesim_gnc.guidance.pose.body_history import BasePose
@@ -19,6 +23,7 @@ ROBOT = make_robot()
 LENGTHS = [link.length_m for link in ROBOT.links]
 SHAPE = 0.35 * np.sin(0.9 * np.arange(len(ROBOT.joints)))
 TRUE_W = np.array([0.2, -0.1, 0.3])  # x, y, heading
+NO_ERROR_W = (0.0, 0.0, 0.0)
 PEG_M = 0.05
 LINKS_AT_PEGS = ((2, 1), (7, -1), (11, 1))  # link, and the side of it where a peg is (1: left)
 CONTACT_ALONG_M = 0.07  # of estimated contacts: 15 mm from the middle of their links
@@ -50,65 +55,93 @@ def make_pegs(gap_m: float = 0.0) -> list[KnownObstacle]:
     return pegs
 
 
-def make_contacts(side: int = 1, force_n: float = 10.0) -> list[Contact]:
-    """Return a contact on each link at a peg: on the side of the peg (1), or on the other side (-1)."""
-    return [
-        make_link_contact(
+def make_contacts_on_links_at_pegs(
+    *, is_on_side_of_peg: bool = True, force_n: float = 10.0
+) -> list[Contact]:
+    """Return a contact on each link that has a peg beside it, on the side of the peg or on the other side."""
+    contacts: list[Contact] = []
+    for link, peg_side in LINKS_AT_PEGS:
+        side = peg_side if is_on_side_of_peg else -peg_side
+        contact = make_link_contact(
             link,
-            position_l=(CONTACT_ALONG_M, peg_side * side * BODY_RADIUS_M, 0.0),
-            normal_l=(0.0, -float(peg_side * side), 0.0),
-            tangent_2_l=(0.0, 0.0, float(peg_side * side)),
-            force_l=(0.0, -peg_side * side * force_n, 0.0),
+            position_l=(CONTACT_ALONG_M, side * BODY_RADIUS_M, 0.0),
+            normal_l=(0.0, -float(side), 0.0),
+            tangent_2_l=(0.0, 0.0, float(side)),
+            force_l=(0.0, -side * force_n, 0.0),
         )
-        for link, peg_side in LINKS_AT_PEGS
-    ]
+        contacts.append(contact)
+    return contacts
 
 
-def localize(
-    offset_w, obstacles, contacts, trust=ESTIMATED_CONTACT_TRUST, updates: int = 20
-) -> PoseLocalizer:
-    """Return a localizer that starts with a wrong pose, after some corrections by obstacles."""
-    localizer = PoseLocalizer(ROBOT, make_base_pose(TRUE_W + offset_w), PoseNoise())
+def make_localizer(error_w: Sequence[float] = NO_ERROR_W) -> PoseLocalizer:
+    """Return a localizer whose estimate differs from the true pose by this error (x, y, heading)."""
+    localizer = PoseLocalizer(ROBOT, make_base_pose(TRUE_W + np.array(error_w)), PoseNoise())
     localizer.covariance = np.diag([0.02, 0.02, 0.03]) ** 2
+    return localizer
+
+
+def correct_pose_repeatedly(
+    localizer: PoseLocalizer,
+    *,
+    obstacles: list[KnownObstacle],
+    contacts: list[Contact],
+    trust: GapTrust = ESTIMATED_CONTACT_TRUST,
+    updates: int = 20,
+) -> None:
+    """Correct the estimate of a localizer by obstacles and contacts, in several updates."""
     anchors = ObstacleAnchors(ROBOT, obstacles)
     for _ in range(updates):
         anchors.correct_pose(localizer, SHAPE, contacts, trust)
-    return localizer
 
 
 @pytest.mark.parametrize(
     ("trust", "updates"), [(ESTIMATED_CONTACT_TRUST, 20), (MEASURED_CONTACT_TRUST, 1000)]
 )
-@pytest.mark.parametrize("offset_w", [(0.0, 0.02, 0.0), (0.015, -0.01, 0.02)])
-def test_anchoring_by_three_known_pegs_corrects_the_pose(trust, updates, offset_w):
-    localizer = localize(np.array(offset_w), make_pegs(), make_contacts(), trust, updates)
+@pytest.mark.parametrize("error_w", [(0.0, 0.02, 0.0), (0.015, -0.01, 0.02)])
+def test_anchoring_by_three_known_pegs_corrects_the_pose(trust, updates, error_w):
+    localizer = make_localizer(error_w)
+    correct_pose_repeatedly(
+        localizer,
+        obstacles=make_pegs(),
+        contacts=make_contacts_on_links_at_pegs(),
+        trust=trust,
+        updates=updates,
+    )
     assert np.abs(localizer.base.planar_w - TRUE_W).max() < 0.006
     assert localizer.position_sd_m < 0.02
 
 
 def test_anchoring_without_contacts_reduces_overlap_with_pegs():
-    offset_w = np.array([0.0, 0.02, 0.0])
-    error_before_m, error_after_m = (
-        np.linalg.norm(
-            (localize(offset_w, make_pegs(), [], updates=updates).base.planar_w - TRUE_W)[:2]
-        )
-        for updates in (0, 20)
-    )
+    localizer = make_localizer(error_w=(0.0, 0.02, 0.0))
+    error_before_m = np.linalg.norm((localizer.base.planar_w - TRUE_W)[:2])
+    correct_pose_repeatedly(localizer, obstacles=make_pegs(), contacts=[])
+    error_after_m = np.linalg.norm((localizer.base.planar_w - TRUE_W)[:2])
     assert error_after_m < 0.7 * error_before_m
 
 
 @pytest.mark.parametrize(
     "contacts",
-    [[], make_contacts(side=-1), make_contacts(force_n=0.1)],
+    [
+        [],
+        make_contacts_on_links_at_pegs(is_on_side_of_peg=False),
+        make_contacts_on_links_at_pegs(force_n=0.1 * MIN_FORCE_N),
+    ],
     ids=["none", "other side", "weak"],
 )
 def test_anchoring_without_matching_contacts_changes_nothing(contacts):
-    start = localize(np.zeros(3), make_pegs(gap_m=0.02), contacts, updates=0)
-    later = localize(np.zeros(3), make_pegs(gap_m=0.02), contacts)
-    assert later.base.planar_w.tolist() == start.base.planar_w.tolist() == TRUE_W.tolist()
-    assert np.array_equal(later.covariance, start.covariance)
+    """A contact matches a peg if it pushes the body away from it with more than MIN_FORCE_N."""
+    pegs_beside_body = make_pegs(gap_m=0.02)  # they do not overlap it, which would correct the pose
+    localizer = make_localizer(error_w=NO_ERROR_W)
+    covariance_before = localizer.covariance.copy()
+    assert localizer.base.planar_w.tolist() == TRUE_W.tolist()
+
+    correct_pose_repeatedly(localizer, obstacles=pegs_beside_body, contacts=contacts, updates=20)
+
+    assert localizer.base.planar_w.tolist() == TRUE_W.tolist()
+    assert np.array_equal(localizer.covariance, covariance_before)
 
 
 def test_anchoring_without_obstacles_changes_nothing():
-    localizer = localize(np.zeros(3), [], make_contacts())
+    localizer = make_localizer(error_w=NO_ERROR_W)
+    correct_pose_repeatedly(localizer, obstacles=[], contacts=make_contacts_on_links_at_pegs())
     assert localizer.base.planar_w.tolist() == TRUE_W.tolist()
