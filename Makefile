@@ -41,7 +41,7 @@ demo: $(stamp) ## Run the simulated snake along a row of pegs, into runs/demo, w
 	  '  docs/tutorials/write-a-controller.md                          push it your way'
 
 # All folders together, because the unit tests, which wait for nothing, use the time in which tests with processes wait.
-test: compiled ## Run the tests of a contributor (8 minutes on two slow cores); CI also runs the heavy ones
+test: compiled ## Run the tests of a contributor (6 minutes on two slow cores); CI also runs the heavy ones
 	@mkdir -p build; \
 	$(MAKE) --no-print-directory test-can > build/test-can.log 2>&1 & can=$$!; \
 	trap 'kill $$can' INT TERM; \
