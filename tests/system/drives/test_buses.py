@@ -321,6 +321,8 @@ def test_bus_after_expired_lease_ignores_setpoints_of_armed_tick(open_robot: Ope
     robot.assert_all_drives(enabled=False)
 
 
+# In real time, with watchdogs of 0.2 s. The contract has a clause for it in lockstep.
+@pytest.mark.quiet
 @pytest.mark.parametrize("body", ["odrive", "moteus"])
 def test_drives_that_stop_while_driver_is_frozen_stay_off(open_robot: OpenRobot, body: str) -> None:
     """The bus reads its drives before it disables them, because disabling clears the fault of a watchdog."""

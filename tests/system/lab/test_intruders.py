@@ -28,7 +28,7 @@ from snakesim_operator.features.lab.certificates import (
     load_or_create_authority,
 )
 from snakesim_operator.features.lab.identities import CertificateIdentity
-from snakesim_testing.lab.router_waits import eventually, settle
+from snakesim_testing.lab.router_waits import LIMIT_S, eventually, settle
 from snakesim_testing.lab.small_lab import OTHER_ROBOT, OWN_ROBOT, RunningLab, open_zenoh_session
 
 COMMAND_KEY = f"{OWN_ROBOT}/actuator/joints"
@@ -199,7 +199,9 @@ def test_router_log_contains_only_admissions_and_refusals(lab: RunningLab) -> No
     with lab.open_session(administrator) as session:
         for _ in range(100):
             session.put(COMMAND_KEY, "x")
-        session.get(f"{OWN_ROBOT}/hal/lifecycle", timeout=0.2)
+        settle(session)
+        # A query that expires before it is sent is not sent. Nothing here waits for its answer.
+        session.get(f"{OWN_ROBOT}/hal/lifecycle", timeout=LIMIT_S)
         settle(session)
     name = administrator.common_name
     assert_logged(lab, f"let in: {name} from 127.0.0.1")
