@@ -77,6 +77,7 @@ class SlowServoRig:
         try:
             bring_up(self.servos, self.port, SETTINGS)
         except BackendError as error:
+            assert error.code == "drive/not-complete"
             report = str(error)
             if NO_ANSWER in report:
                 pytest.skip(f"the computer was too busy for the emulated servos: {report}")

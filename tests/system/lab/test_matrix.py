@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from snakesim_hal.wire.roles import ACCESS_RULES, OWN_NAME_ONLY, Role
-from snakesim_testing.lab.router_waits import eventually, settle
+from snakesim_testing.lab.router_waits import LIMIT_S, eventually, settle
 from snakesim_testing.lab.small_lab import OTHER_ROBOT, OWN_ROBOT, RunningLab
 
 # Maps the key of each rule to one example. `control` is a service of the role gnc, `hal` is not.
@@ -129,7 +129,7 @@ def test_wildcard_key_without_right_does_not_pass(
         settle(session, witness)
         for key in wildcard_keys:
             session.put(key, "x")
-            session.get(key, timeout=0.2)
+            session.get(key, timeout=LIMIT_S)  # a query that expires before it is sent is not sent
         settle(session, witness)
         queryable.undeclare()
         subscriber.undeclare()
@@ -161,7 +161,7 @@ def test_wildcard_stop_reaches_only_robots_of_the_certificate(lab: RunningLab) -
             (operator_of_all, [OTHER_ROBOT, OWN_ROBOT]),
         ):
             stopped.clear()
-            session.get("**/hal/estop", target=zenoh.QueryTarget.ALL, timeout=0.5)
+            session.get("**/hal/estop", target=zenoh.QueryTarget.ALL, timeout=LIMIT_S)
             settle(operator_of_all)
             assert sorted(stopped) == sorted(robots)
         alive_keys = {
