@@ -1,6 +1,7 @@
 """The benches with which our own backends run the contract suite."""
 
 import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -131,24 +132,32 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     # Pytest passes the tests of all folders.
     contract_items = [item for item in items if item.path.is_relative_to(Path(__file__).parent)]
     for item in contract_items:
-        is_needed = DRIVER_FAILURE_CLAUSES in item.name and "[moteus" in item.name
-        if any(f"[{bench}" in item.name for bench in COVERED_BENCHES) and not is_needed:
+        is_special_for_moteus = DRIVER_FAILURE_CLAUSES in item.name and is_of_bench(item, "moteus")
+        if is_of_bench(item, *COVERED_BENCHES) and not is_special_for_moteus:
             item.add_marker(pytest.mark.slow)
-        if f"[{REAL_TIME_BENCH}" in item.name:
+        if is_of_bench(item, REAL_TIME_BENCH):
             item.add_marker(pytest.mark.quiet)
-        if any(f"[{bench}" in item.name for bench in HEAVY_BENCHES):
+        if is_of_bench(item, *HEAVY_BENCHES):
             item.add_marker(pytest.mark.heavy)
-        if "sim-camera" in item.name and not any(
-            name_part in item.name for name_part in SENSOR_CLAUSES
-        ):
+        if is_of_bench(item, "sim-camera") and not has_name_part(item, SENSOR_CLAUSES):
             item.add_marker(pytest.mark.slow)
     if os.environ.get(VCAN_VARIABLE) != "guest":
         return
-    for item in items:
-        if item.path.name == "test_contract.py" and not any(
-            name_part in item.name for name_part in EMULATED_MACHINE_CLAUSES
+    for item in contract_items:
+        if item.path.name == "test_contract.py" and not has_name_part(
+            item, EMULATED_MACHINE_CLAUSES
         ):
             item.add_marker(pytest.mark.slow)
+
+
+def is_of_bench(item: pytest.Item, *benches: str) -> bool:
+    """Return whether a clause runs on one of these benches, whose name begins its parameters."""
+    return any(f"[{bench}" in item.name for bench in benches)
+
+
+def has_name_part(item: pytest.Item, name_parts: Collection[str]) -> bool:
+    """Return whether the name of a clause contains one of these parts."""
+    return any(name_part in item.name for name_part in name_parts)
 
 
 def find_reason_against_firmware() -> str | None:
