@@ -46,7 +46,6 @@ class SupervisedProcess:
     may_restart: bool
     child: ChildProcess
     vital: bool = True  # whether the run ends when this process ends
-    written_file: Path | None = None  # which it completes before it ends
     started_s: float = field(default_factory=time.monotonic)
     delay_s: float = MIN_RESTART_DELAY_S
     restart_due_s: float | None = None  # monotonic time of its restart; None while it runs
@@ -136,9 +135,7 @@ class RunSupervisor:
                 killed while this file grows.
         """
         child = self._launch(name, arguments, written_file)
-        self._processes[name] = SupervisedProcess(
-            name, arguments, may_restart, child, vital, written_file
-        )
+        self._processes[name] = SupervisedProcess(name, arguments, may_restart, child, vital)
 
     def _launch(
         self, name: str, arguments: Sequence[str], written_file: Path | None
@@ -255,7 +252,9 @@ class RunSupervisor:
                 if not self._handle_end(process, how):
                     return False
             elif process.is_restart_due():
-                process.child = self._launch(process.name, process.arguments, process.written_file)
+                process.child = self._launch(
+                    process.name, process.arguments, process.child.written_file
+                )
                 process.restart_due_s = None
                 process.started_s = time.monotonic()
         return True
