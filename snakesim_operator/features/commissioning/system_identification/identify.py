@@ -214,14 +214,14 @@ def _write_robot_file(
     for result in results:
         if not result.fields or result.fails:
             continue
+        estimates = dict(result.fields)
+        if TORQUE_CONSTANT in estimates and result.joint not in joints_that_use_constant:
+            del estimates[TORQUE_CONSTANT]
+            joints_with_old_constant.append(result.joint)
         # An estimate of a small friction or latency may be below zero, which no robot file may hold.
         values[result.joint] = {
-            field: max(estimate.value, 0.0) for field, estimate in result.fields.items()
+            field: max(estimate.value, 0.0) for field, estimate in estimates.items()
         }
-        if result.joint not in joints_that_use_constant:
-            withheld_constant = values[result.joint].pop(TORQUE_CONSTANT, None)
-            if withheld_constant is not None:
-                joints_with_old_constant.append(result.joint)
     unchanged = [result.joint for result in results if result.joint not in values]
     if not values:
         print_line(f"{path}: nothing was written: the values of no joint are sure")
