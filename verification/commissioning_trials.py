@@ -13,11 +13,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from verification.identification_trials import make_identification_table
+from verification.recorded_trials import run_missing_trials
 from verification.start_check_results import (
     RobotResult,
     append_trial,
     format_tables,
-    read_results,
     summarize_trial,
 )
 from verification.start_check_trials import (
@@ -49,25 +49,21 @@ def check_robots(
         record: File to which each robot is appended, with its signals in a folder next to it. Robots that it already
             contains are not checked again.
     """
-    known_results: dict[int, RobotResult] = {}
-    if record is not None:
-        known_results = {r.number: r for r in read_results(record) if r.backend == backend}
-    results: list[RobotResult] = []
-    for number in numbers:
-        result = known_results.get(number)
-        if result is None:
-            fault = faults[number % len(faults)]
-            trial = check_trial(number, fault, *options, backend=backend, joint_count=joint_count)
-            result = summarize_trial(trial)
-            if record is not None:
-                append_trial(record, trial)
-            print(
-                f"robot {number}, {fault}: {result.outcome}; {result.reported}; blamed {result.blamed}; "
-                f"unsure {result.unsure}",
-                flush=True,
-            )
-        results.append(result)
-    return results
+
+    def check_robot(number: int) -> RobotResult:
+        fault = faults[number % len(faults)]
+        trial = check_trial(number, fault, *options, backend=backend, joint_count=joint_count)
+        result = summarize_trial(trial)
+        if record is not None:
+            append_trial(record, trial)
+        print(
+            f"robot {number}, {fault}: {result.outcome}; {result.reported}; blamed {result.blamed}; "
+            f"unsure {result.unsure}",
+            flush=True,
+        )
+        return result
+
+    return run_missing_trials(numbers, backend, record, RobotResult, check_robot)
 
 
 def main() -> int:

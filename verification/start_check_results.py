@@ -21,6 +21,7 @@ from pathlib import Path
 import msgspec
 
 from snakesim_operator.results.metrics.intervals import compute_wilson_interval
+from verification.recorded_trials import append_result, read_results
 from verification.start_check_signals import find_signals_path, load_signals, save_signals
 from verification.start_check_trials import JOINT_MODULES, NONE, CheckTrial, Outcome, judge_trial
 
@@ -76,8 +77,7 @@ def summarize_trial(trial: CheckTrial) -> RobotResult:
 def append_trial(path: Path, trial: CheckTrial) -> None:
     """Write the signals of a robot, and append it to the results file."""
     save_signals(find_signals_path(path, trial.backend, trial.number), trial.measurements)
-    with path.open("ab") as file:
-        file.write(msgspec.json.encode(summarize_trial(trial)) + b"\n")
+    append_result(path, summarize_trial(trial))
 
 
 def judge_again(path: Path, results: Iterable[RobotResult]) -> Iterator[RobotResult]:
@@ -98,13 +98,6 @@ def judge_again(path: Path, results: Iterable[RobotResult]) -> Iterator[RobotRes
             measurements,
         )
         yield summarize_trial(trial)
-
-
-def read_results(path: Path) -> list[RobotResult]:
-    """Return all robots of a results file; none if it does not exist."""
-    if not path.exists():
-        return []
-    return msgspec.json.Decoder(RobotResult).decode_lines(path.read_bytes())
 
 
 def format_tables(results: Sequence[RobotResult]) -> Iterator[str]:
@@ -223,7 +216,7 @@ def main() -> int:
         help="judge the recorded signals with the present check, and leave the file as it is",
     )
     arguments = parser.parse_args()
-    results = read_results(arguments.path)
+    results = read_results(arguments.path, RobotResult)
     if arguments.judge_again:
         recorded_results = results
         results = list(judge_again(arguments.path, recorded_results))

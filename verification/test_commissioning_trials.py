@@ -13,11 +13,11 @@ from snakesim_hal.model.robot_file.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.joint_check.gear_rules import IS_LOOSE
 from snakesim_operator.features.commissioning.joint_check.measurements import CheckMeasurements
 from verification.identification_trials import identify_hidden_robot
-from verification.start_check_results import append_trial, judge_again, read_results
+from verification.recorded_trials import append_result, read_results, run_missing_trials
+from verification.start_check_results import RobotResult, append_trial, judge_again
 from verification.start_check_signals import load_signals, save_signals
 from verification.start_check_trials import NONE, check_trial
-from verification.torque_constant_results import append_result
-from verification.torque_constant_results import read_results as read_torque_constant_results
+from verification.torque_constant_results import TorqueConstantResult
 from verification.torque_constant_trials import draw_fault, identify_torque_constants
 
 
@@ -26,7 +26,7 @@ def test_hidden_fault_is_named_without_blaming_sound_joints(tmp_path: Path, faul
     trial = check_trial(4, fault, joint_count=4)
     results_path = tmp_path / "trials.jsonl"
     append_trial(results_path, trial)
-    recorded = read_results(results_path)
+    recorded = read_results(results_path, RobotResult)
     assert list(judge_again(results_path, recorded)) == recorded
     assert not trial.blamed and not trial.unsure, (trial.blamed, trial.unsure)
     assert fault == NONE or trial.found, [row.summary for row in trial.rows]
@@ -73,12 +73,33 @@ def test_wrong_torque_constants_are_reported_and_no_right_one() -> None:
 def test_wrong_torque_constant_of_whole_chain_is_named(tmp_path: Path, backend: str) -> None:
     result = identify_torque_constants(1, backend)
     append_result(tmp_path / "trials.jsonl", result)
-    assert read_torque_constant_results(tmp_path / "trials.jsonl") == [result]
+    assert read_results(tmp_path / "trials.jsonl", TorqueConstantResult) == [result]
     assert result.faulty_joint == "joint_2"
     assert result.is_named, result
     assert not result.falsely_reported
     assert not result.unknown
     assert all(abs(joint.relative_error or 0.0) < 0.05 for joint in result.joints)
+
+
+def make_torque_constant_result(number: int, backend: str = "odrive") -> TorqueConstantResult:
+    return TorqueConstantResult(
+        backend=backend, number=number, file_nm_per_a=0.5, faulty_joint=None, joints=[]
+    )
+
+
+def test_only_missing_trials_of_the_backend_are_run(tmp_path: Path) -> None:
+    record = tmp_path / "trials.jsonl"
+    append_result(record, make_torque_constant_result(1))
+    append_result(record, make_torque_constant_result(2, "moteus"))
+    run_numbers: list[int] = []
+
+    def run_trial(number: int) -> TorqueConstantResult:
+        run_numbers.append(number)
+        return make_torque_constant_result(number)
+
+    results = run_missing_trials(range(1, 4), "odrive", record, TorqueConstantResult, run_trial)
+    assert run_numbers == [2, 3]
+    assert [result.number for result in results] == [1, 2, 3]
 
 
 def test_servos_without_torque_have_unknown_constants() -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from snakesim_operator.features.evaluate.table import compute_wilson_interval
+from verification.recorded_trials import read_results
 
 HEADER = (
     "| drive type | robots | with a wrong constant | named | 95 % interval | with a sound joint reported "
@@ -76,19 +77,6 @@ class TorqueConstantResult(msgspec.Struct, frozen=True, kw_only=True):
         return [joint.joint for joint in self.joints if joint.value_nm_per_a is None]
 
 
-def append_result(path: Path, result: TorqueConstantResult) -> None:
-    """Append a robot to the results file."""
-    with path.open("ab") as file:
-        file.write(msgspec.json.encode(result) + b"\n")
-
-
-def read_results(path: Path) -> list[TorqueConstantResult]:
-    """Return all robots of a results file; none if the file does not exist."""
-    if not path.exists():
-        return []
-    return msgspec.json.Decoder(TorqueConstantResult).decode_lines(path.read_bytes())
-
-
 def format_table(results: Sequence[TorqueConstantResult]) -> Iterator[str]:
     """Yield the table of drive types as lines of Markdown."""
     yield HEADER
@@ -136,7 +124,7 @@ def main() -> int:
     """Print the table and the failures of a results file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("path", type=Path)
-    results = read_results(parser.parse_args().path)
+    results = read_results(parser.parse_args().path, TorqueConstantResult)
     print("\n".join(format_table(results)))
     print("\n".join(format_failures(results)))
     return 0

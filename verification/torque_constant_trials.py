@@ -29,14 +29,13 @@ from snakesim_operator.features.commissioning.system_identification.identificati
     JointIdentification,
 )
 from snakesim_operator.features.commissioning.system_identification.identify import identify_run
+from verification.recorded_trials import append_result, run_missing_trials
 from verification.start_check_trials import JOINT_MODULES, TURN_LIMIT_S
 from verification.torque_constant_results import (
     JointResult,
     TorqueConstantResult,
-    append_result,
     format_failures,
     format_table,
-    read_results,
 )
 
 JOINT_COUNT = 5
@@ -177,23 +176,19 @@ def identify_robots(
         *options: Further options, as `--set` of a run.
         record: File to which each result is appended. Robots that it already contains are not identified again.
     """
-    known_results: dict[int, TorqueConstantResult] = {}
-    if record is not None:
-        known_results = {r.number: r for r in read_results(record) if r.backend == backend}
-    results: list[TorqueConstantResult] = []
-    for number in numbers:
-        result = known_results.get(number)
-        if result is None:
-            result = identify_torque_constants(number, backend, *options)
-            if record is not None:
-                append_result(record, result)
-            print(
-                f"{backend} robot {number}: fault in {result.faulty_joint}, named {result.is_named}, reported falsely "
-                f"{result.falsely_reported}, unknown {result.unknown}",
-                flush=True,
-            )
-        results.append(result)
-    return results
+
+    def identify_robot(number: int) -> TorqueConstantResult:
+        result = identify_torque_constants(number, backend, *options)
+        if record is not None:
+            append_result(record, result)
+        print(
+            f"{backend} robot {number}: fault in {result.faulty_joint}, named {result.is_named}, reported falsely "
+            f"{result.falsely_reported}, unknown {result.unknown}",
+            flush=True,
+        )
+        return result
+
+    return run_missing_trials(numbers, backend, record, TorqueConstantResult, identify_robot)
 
 
 def main() -> int:
