@@ -68,7 +68,10 @@ class ThreadedBus(InlineBus):
         # Shared by both threads, and guarded by the condition.
         self._condition = threading.Condition()
         self._is_close_requested = False
+        # The first error of a cycle, and whether the host has got it; later cycles usually fail in the same way.
         self._bus_error: Exception | None = None
+        self._is_bus_error_reported = False
+        self._close_error: Exception | None = None
         # Readings.
         self._published_readings = DriveReadings([joints[j] for j in spec.joints], clock_ns)
         # Also which drives are not ready yet.
@@ -148,12 +151,15 @@ class ThreadedBus(InlineBus):
         """Request that the bus thread sends what is queued, switches its drives off, closes the bus and ends."""
         with self._condition:
             self._is_close_requested = True
-            self._bus_error = None
             self._request_time_s = None
             self._condition.notify_all()
 
     def close(self, deadline_s: float) -> None:
-        """Wait until the thread has ended. A thread that hangs is left: then the drives stop by their watchdogs."""
+        """Wait until the thread has ended. A thread that hangs is left: then the drives stop by their watchdogs.
+
+        Raises:
+            BackendError: The bus cannot be closed, or it has failed and the host has not got this error yet.
+        """
         if self._thread is None:
             self.drives.close()
             return
@@ -165,10 +171,14 @@ class ThreadedBus(InlineBus):
             )
             return
         with self._condition:
-            self._raise_bus_error()
+            if self._close_error is not None:
+                raise self._close_error
+            if not self._is_bus_error_reported:
+                self._raise_bus_error()
 
     def _raise_bus_error(self) -> None:
         if self._bus_error is not None:
+            self._is_bus_error_reported = True
             raise self._bus_error
 
     # --- in the bus thread ------------------------------------------------------------------------------------
@@ -195,7 +205,7 @@ class ThreadedBus(InlineBus):
             self.drives.close()
         except Exception as error:  # noqa: BLE001 - raised by `close`
             with self._condition:
-                self._bus_error = error
+                self._close_error = error
 
     def _run_cycle(self) -> None:
         """Wait for requests of the host and execute them, in the bus thread.

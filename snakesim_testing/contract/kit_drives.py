@@ -4,8 +4,8 @@ Pass `KitDrives` to `--snakesim-drives` or to a `Bench`, and `mute_joint` as `mu
 attribute `emulator`, a `DriveEmulator` that implements `list_enabled`.
 """
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
@@ -22,7 +22,7 @@ class KitDrives:
     """The emulated drives on all buses of a backend, as `snakesim_testing.contract.bench.EmulatedDrives`."""
 
     def __init__(self, backend: Any) -> None:
-        """Log from now on which drives are enabled, in every step of their physics."""
+        """Log from now on which drives are enabled, in every step of their physics. Make one object for a backend."""
         self._backend = backend
         self._buses = backend._drives.buses
         self._log: list[TorqueSwitch] = []
@@ -51,14 +51,24 @@ class KitDrives:
 
     def freeze_driver(self, seconds: float, sleep: Callable[[float], None]) -> None:
         """Let time pass at the drives while nothing of the driver runs."""
+        with self.hold_driver():
+            self.pass_time(seconds, sleep)
+
+    @contextmanager
+    def hold_driver(self) -> Iterator[None]:
+        """Let no thread of a bus begin another cycle."""
         with ExitStack() as held_locks:
             for bus in self._buses:
                 if hasattr(bus, "_condition"):  # the thread of a bus waits for this lock
                     held_locks.enter_context(bus._condition)
-            self._backend._clock.robot_time_ns += round(seconds * 1e9)
-            sleep(seconds)
-            for bus in self._buses:
-                self.find_emulator(bus.drives)()
+            yield
+
+    def pass_time(self, seconds: float, sleep: Callable[[float], None]) -> None:
+        """Let time pass at the drives. The caller holds the driver."""
+        self._backend._clock.robot_time_ns += round(seconds * 1e9)
+        sleep(seconds)
+        for bus in self._buses:
+            self.find_emulator(bus.drives)()
 
     def read_time_s(self) -> float:
         """Return the drives' own time."""

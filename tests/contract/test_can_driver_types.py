@@ -147,6 +147,7 @@ class DriveRobot(DriveRig):
         super().__init__(
             config, driver_type.backend(config, driver_type.backend.Settings(**fixed | settings))
         )
+        self._observed_drives = DrivesOfAnyType(self.backend)
 
     @property
     def emulator(self) -> Any:
@@ -154,7 +155,7 @@ class DriveRobot(DriveRig):
 
     def pause_host(self, seconds: float) -> None:
         """Let time pass at the drives while the driver is paused."""
-        DrivesOfAnyType(self.backend).freeze_driver(seconds, lambda _seconds: None)
+        self._observed_drives.freeze_driver(seconds, lambda _seconds: None)
         self.tick += round(seconds * self.config.rate_hz)
 
     def list_following(self) -> list[bool]:

@@ -50,6 +50,7 @@ class MixedRobot(DriveRig):
         super().__init__(config, MixedBackend(config, MixedSettings(physics_model="inertia")))
         self.axes = drives_of(self.backend, 0)
         self.servos = drives_of(self.backend, 1)
+        self._observed_drives = DrivesOfAnyType(self.backend)
 
     def get_ages_ms(self, joints: list[int]) -> list[float]:
         """Return the ages of the published joint states."""
@@ -90,7 +91,7 @@ class MixedRobot(DriveRig):
 
     def list_enabled(self) -> list[bool]:
         """Return the true state of every drive: whether it is enabled."""
-        return DrivesOfAnyType(self.backend).list_enabled()
+        return self._observed_drives.list_enabled()
 
     def arm(self) -> None:
         """Arm until every drive is enabled and the driver resets no more faults, which a busy computer causes."""
@@ -113,9 +114,22 @@ class MixedRobot(DriveRig):
 
         wait_until(run_and_check, "the drives are enabled")
 
-    def freeze_driver(self, seconds: float) -> None:
-        """Stop the driver's threads for this time, while the time of its drives passes."""
-        DrivesOfAnyType(self.backend).freeze_driver(seconds, time.sleep)
+    def arm_and_freeze_driver(self, seconds: float) -> None:
+        """Arm, and then stop the driver's threads for this time, while the time of its drives passes.
+
+        The drives are enabled when the threads stop. On a busy computer, the lease may expire before, so that the
+        driver disables them; then this arms again.
+        """
+
+        def is_frozen_while_enabled() -> bool:
+            self.arm()
+            with self._observed_drives.hold_driver():
+                if not all(self.list_enabled()):
+                    return False
+                self._observed_drives.pass_time(seconds, time.sleep)
+            return True
+
+        wait_until(is_frozen_while_enabled, "the driver is frozen while its drives are enabled")
 
 
 OpenRobot = Callable[..., MixedRobot]
@@ -196,14 +210,14 @@ def test_bus_at_half_rate_is_polled_every_second_tick(open_robot: OpenRobot) -> 
     robot.assert_all_drives(enabled=False)
 
 
-class BlockableServoReads:
-    """Blocks the bus of the servos in its next read until it may continue."""
+class BlockableReads:
+    """Blocks the bus of some drives in its next read until it may continue."""
 
-    def __init__(self, robot: MixedRobot) -> None:
+    def __init__(self, drives: Any) -> None:
         self.is_blocked = threading.Event()
         self.may_continue = threading.Event()
         self.may_continue.set()
-        read = robot.servos.read
+        read = drives.read
 
         def wait_and_read() -> None:
             if not self.may_continue.is_set():
@@ -211,13 +225,13 @@ class BlockableServoReads:
                 self.may_continue.wait()
             read()
 
-        robot.servos.read = wait_and_read
+        drives.read = wait_and_read
 
 
 def test_bus_that_blocks_ages_alone_while_others_stop(open_robot: OpenRobot) -> None:
     robot = open_robot("realtime")
     robot.disable_watchdogs()
-    reads = BlockableServoReads(robot)
+    reads = BlockableReads(robot.servos)
     for _ in range(10):
         robot.run(1, "armed")
         time.sleep(0.005)
@@ -331,8 +345,7 @@ def test_drives_that_stop_while_driver_is_frozen_stay_off(open_robot: OpenRobot,
         body,
         **{body: {"watchdog_s": SHORT_WATCHDOG_S}, "dynamixel": {"watchdog_s": SHORT_WATCHDOG_S}},
     )
-    robot.arm()
-    robot.freeze_driver(3 * SHORT_WATCHDOG_S)
+    robot.arm_and_freeze_driver(3 * SHORT_WATCHDOG_S)
     assert robot.list_enabled() == [False] * 4
     robot.damps = True
     joints_with_fault: set[str | None] = set()
@@ -368,6 +381,23 @@ def test_bus_thread_error_ends_run_and_disables_all_drives(open_robot: OpenRobot
         robot.run(1, "armed")
     robot.backend.close()
     assert robot.get_servo_enable_states() == {False}
+
+
+def test_bus_error_that_host_has_got_is_not_raised_again_by_close(open_robot: OpenRobot) -> None:
+    """Also if the bus fails again between the request to close and its last cycle."""
+    robot = open_robot("realtime")
+    robot.disable_watchdogs()
+    reads = BlockableReads(robot.axes)
+    robot.axes.wire._bus.shutdown()
+    with raises_error(BackendError, code="bus/io-failed"):
+        wait_until(lambda: robot.run(1, "armed") and False, "the error of the bus", 10.0)
+    reads.may_continue.clear()
+    bus_of_axes = robot.backend._drives.buses[0]
+    assert bus_of_axes.request_reading()
+    assert reads.is_blocked.wait(10.0)
+    bus_of_axes.request_close()
+    reads.may_continue.set()  # this reading fails like those before
+    robot.backend.close()
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,7 @@ class ServoRobot(DriveRig):
         config = apply_backend_modes(config, FeetechBackend)
         settings = settings or FeetechSettings(physics_model="inertia", bring_up_limit_s=0.5)
         super().__init__(config, FeetechBackend(config, settings))
+        self._observed_drives = DrivesOfAnyType(self.backend)
 
     @property
     def emulator(self) -> EmulatedFeetech:
@@ -58,7 +59,7 @@ class ServoRobot(DriveRig):
 
     def pause_driver(self, seconds: float) -> None:
         """Let time pass at the servos while the driver is paused."""
-        DrivesOfAnyType(self.backend).freeze_driver(seconds, lambda _seconds: None)
+        self._observed_drives.freeze_driver(seconds, lambda _seconds: None)
         self.tick += round(seconds * RATE_HZ)
 
 
