@@ -248,8 +248,8 @@ class SerialServos(Drives, Generic[ServoT, StatusT]):
                 self._port.wire.run_emulated_drives()
         finally:
             self._port.wire.close()
-        if self._emulator is not None:
-            self._emulator.close()
+            if self._emulator is not None:
+                self._emulator.close()
 
 
 def _find_response_problem(i: int, servo: SerialServo[Any]) -> FaultFinding | None:

@@ -267,9 +267,11 @@ class DriveBackend(Backend):
         if not self._is_open:
             return
         self._is_open = False
-        self._drives.close()
-        if self._mocap is not None:
-            self._mocap.close()
+        try:
+            self._drives.close()
+        finally:
+            if self._mocap is not None:
+                self._mocap.close()
 
     # --- inside -----------------------------------------------------------------------------------------------
 

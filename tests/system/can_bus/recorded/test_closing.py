@@ -75,6 +75,28 @@ def test_closing_with_broken_bus_closes_everything_else(monkeypatch: pytest.Monk
             next_program.bind((host, int(port)))  # raises an error if the port is still in use
 
 
+def test_closing_error_of_drives_is_raised_after_mocap_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with open_driver_loop(
+        make_can_config(robot__sensors__pose__rate_hz=100.0), pose_listen="127.0.0.1:0"
+    ) as run:
+        mocap = run.backend._mocap
+        assert mocap is not None
+        host, _, port = mocap.address.rpartition(":")
+        close_drives = run.backend._drives.close
+
+        def close_and_raise() -> None:
+            close_drives()
+            raise BackendError("a drive was not switched off")
+
+        monkeypatch.setattr(run.backend._drives, "close", close_and_raise)
+        with pytest.raises(BackendError, match="a drive was not switched off"):
+            run.backend.close()
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as next_program:
+            next_program.bind((host, int(port)))  # raises an error if the port is still in use
+
+
 def test_check_requires_delay_of_the_pose_in_robot_file() -> None:
     with raises_error(ConfigError, code="config/missing-key"):
         CanBackend.check(make_can_config(), CanSettings(pose_listen="127.0.0.1:0"))

@@ -366,3 +366,26 @@ def test_second_servo_with_same_id_stops_robot_and_blocks_start(
     assert robot.list_torque_states() == ALL_OFF
     with raises_error(BackendError, code="drive/not-complete", field="joint_2"):
         robot.backend._drives.bring_up()
+
+
+def test_closing_whose_last_write_fails_closes_emulated_servos(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = ServoRobot()
+    robot.run(ARM_TICKS, "armed")
+    is_emulator_closed = False
+
+    def note_closed() -> None:
+        nonlocal is_emulator_closed
+        is_emulator_closed = True
+        close_emulator()
+
+    def raise_write_error(*_arguments: object) -> None:
+        raise BackendError("the port is gone")
+
+    close_emulator = robot.emulator.close
+    monkeypatch.setattr(robot.emulator, "close", note_closed)
+    monkeypatch.setattr(drives_of(robot.backend), "_write_to_servos", raise_write_error)
+    with pytest.raises(BackendError, match="the port is gone"):
+        robot.backend.close()
+    assert is_emulator_closed
