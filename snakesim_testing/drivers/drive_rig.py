@@ -9,9 +9,14 @@ from snakesim_hal.model.scenario import RunConfig
 from snakesim_hal.wire.messages import Fault, JointMode, JointState, LifecycleState
 
 
+def bus_of(backend: Any, bus_index: int = 0) -> Any:
+    """Return one bus of a backend."""
+    return backend._drives.buses[bus_index]
+
+
 def drives_of(backend: Any, bus_index: int = 0) -> Any:
     """Return the drives on one bus of a backend."""
-    return backend._drives.buses[bus_index].drives
+    return bus_of(backend, bus_index).drives
 
 
 class DriveRig:

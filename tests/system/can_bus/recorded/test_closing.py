@@ -52,13 +52,20 @@ def test_closing_disarms_modules_and_may_be_repeated() -> None:
         assert len(wire.sent) == sent_count
 
 
+def check_port_is_free(address: str) -> None:
+    """Open a socket at an address, as the next program would; this raises an error if the port is still in use."""
+    host, _, port = address.rpartition(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as next_program:
+        next_program.bind((host, int(port)))
+
+
 def test_closing_with_broken_bus_closes_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
     with open_driver_loop(
         make_can_config(robot__sensors__pose__rate_hz=100.0), pose_listen="127.0.0.1:0"
     ) as run:
         mocap = run.backend._mocap
         assert mocap is not None
-        host, _, port = mocap.address.rpartition(":")
+        mocap_address = mocap.address
 
         def raise_send_error(_frame: CanFrame) -> bool:
             raise BackendError("the bus is broken")
@@ -71,8 +78,7 @@ def test_closing_with_broken_bus_closes_everything_else(monkeypatch: pytest.Monk
             patched.setattr(WIRES[0]._bus, "shutdown", raise_shutdown_error)
             run.backend.close()
         assert WIRES[0].close_count == 1
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as next_program:
-            next_program.bind((host, int(port)))  # raises an error if the port is still in use
+        check_port_is_free(mocap_address)
 
 
 def test_closing_error_of_drives_is_raised_after_mocap_is_closed(
@@ -83,7 +89,7 @@ def test_closing_error_of_drives_is_raised_after_mocap_is_closed(
     ) as run:
         mocap = run.backend._mocap
         assert mocap is not None
-        host, _, port = mocap.address.rpartition(":")
+        mocap_address = mocap.address
         close_drives = run.backend._drives.close
 
         def close_and_raise() -> None:
@@ -93,8 +99,7 @@ def test_closing_error_of_drives_is_raised_after_mocap_is_closed(
         monkeypatch.setattr(run.backend._drives, "close", close_and_raise)
         with pytest.raises(BackendError, match="a drive was not switched off"):
             run.backend.close()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as next_program:
-            next_program.bind((host, int(port)))  # raises an error if the port is still in use
+        check_port_is_free(mocap_address)
 
 
 def test_check_requires_delay_of_the_pose_in_robot_file() -> None:

@@ -373,19 +373,18 @@ def test_closing_whose_last_write_fails_closes_emulated_servos(
 ) -> None:
     robot = ServoRobot()
     robot.run(ARM_TICKS, "armed")
-    is_emulator_closed = False
+    close_emulator = robot.emulator.close
+    closed_parts: list[str] = []
 
-    def note_closed() -> None:
-        nonlocal is_emulator_closed
-        is_emulator_closed = True
+    def close_and_note() -> None:
         close_emulator()
+        closed_parts.append("emulator")
 
     def raise_write_error(*_arguments: object) -> None:
         raise BackendError("the port is gone")
 
-    close_emulator = robot.emulator.close
-    monkeypatch.setattr(robot.emulator, "close", note_closed)
+    monkeypatch.setattr(robot.emulator, "close", close_and_note)
     monkeypatch.setattr(drives_of(robot.backend), "_write_to_servos", raise_write_error)
     with pytest.raises(BackendError, match="the port is gone"):
         robot.backend.close()
-    assert is_emulator_closed
+    assert closed_parts == ["emulator"]
