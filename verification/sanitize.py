@@ -30,6 +30,7 @@ TESTS = (
     "tests/system/physics",
     "tests/system/native",
 )
+MARKS = "not (slow or quiet)"  # also the heavy tests, which pytest leaves out otherwise
 LIBRARIES_TO_PRELOAD = ("libasan.so", "libubsan.so")
 
 
@@ -64,6 +65,8 @@ def main() -> int:
         "1200",
         "-p",
         "no:cacheprovider",
+        "-m",
+        MARKS,
         *arguments.tests,
     ]
     return subprocess.call(command, cwd=ROOT, env=make_child_environment(environment))

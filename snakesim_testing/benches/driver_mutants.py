@@ -21,6 +21,7 @@ from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
 DRIVER_MUTANTS: list[Mutant] = []
 LATE_CYCLES = 10
 
+BRAKES = "a_fault_brakes_a_moving_joint"
 IN_TIME = "torque_is_off_in_time_by_the_drives_own_log"
 AFTER_WATCHDOG = "torque_is_off_after_watchdog_by_the_drives_own_log"
 RESTARTED = "a_drive_restarted_in_motion_stays_off_until_reset"
@@ -121,6 +122,22 @@ class SwitchesOffLate(MinimalDrives):
         still_following = frozenset(i for i in self.all_drives if self.emulator.drives[i].enabled)
         if self.late_cycles < LATE_CYCLES:
             command = command._replace(enabled_drives=still_following)
+        super().send_setpoints(command)
+
+
+@register_driver_mutant(BRAKES)
+class FollowsOldSetpointsAfterFault(MinimalDrives):
+    """Sends the last setpoints from before a fault again, instead of those that brake."""
+
+    armed_command: BusCommand | None = None
+
+    def send_setpoints(self, command: BusCommand) -> None:
+        if command.may_enable:
+            self.armed_command = command
+        elif self.armed_command is not None and not command.emergency:
+            command = self.armed_command._replace(
+                enabled_drives=command.enabled_drives, may_enable=False
+            )
         super().send_setpoints(command)
 
 

@@ -521,6 +521,14 @@ class MovesAfterLeavingArmed(Workbench):
             super().enact(setpoints, lifecycle)
 
 
+@register_mutant("a_fault_brakes_a_moving_joint")
+class CoastsAfterFault(Workbench):
+    """Switches off the torque of all joints at a fault, instead of braking."""
+
+    def enact(self, setpoints, lifecycle):
+        super().enact(make_passive(setpoints) if lifecycle == "fault" else setpoints, lifecycle)
+
+
 @register_mutant("arming_again_goes_on_from_where_the_robot_is")
 class ResumesOldTarget(Workbench):
     """Resumes the setpoints of the last arm session when it is armed again."""

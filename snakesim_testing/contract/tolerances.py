@@ -61,6 +61,8 @@ INTEGRATION_TOLERANCE_RAD = 0.03
 # Of the commanded torque; gauges and motor constants are not better.
 TORQUE_TOLERANCE_FRACTION = 0.15
 TORQUE_TOLERANCE_NM = 0.06  # besides: friction between motor and gauge, noise, quantisation (1e-3 N·m, limits 1e-2 N·m)
+# At MOTION_SPEED_RAD_S, bench4 brakes with about 0.4 N·m; without braking, 0.06 N·m or less is measured.
+MIN_BRAKING_TORQUE_NM = 0.12
 # Of full torque, in a tick, with small targets. The limiter's start is up to two periods old on a bus: at
 # these speeds that is a tenth. A target that is not bumpless, or a motor that restarts, makes several tenths.
 MAX_TORQUE_STEP_FRACTION = 0.25
