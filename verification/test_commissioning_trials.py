@@ -32,6 +32,14 @@ def test_hidden_fault_is_named_without_blaming_sound_joints(tmp_path: Path, faul
     assert fault == NONE or trial.found, [row.summary for row in trial.rows]
 
 
+def test_coupling_that_slips_only_while_its_drive_holds_is_named() -> None:
+    """The coupling of joint_1 carries its own link, and slips when joint_3 swings the links."""
+    trial = check_trial(9042, "coupling")
+    assert trial.found, [row.summary for row in trial.rows]
+    assert "while its drive held still" in trial.rows[0].findings["gear"].reason
+    assert not trial.blamed, trial.blamed
+
+
 def test_recorded_signals_are_read_without_a_rounding_error(tmp_path: Path) -> None:
     random = np.random.default_rng(1).standard_normal
     motor = JointMotor(

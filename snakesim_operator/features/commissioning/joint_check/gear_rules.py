@@ -8,7 +8,7 @@ from snakesim_operator.features.commissioning.joint_check.joint_verdict import (
     CONFIRMED,
     PropertyFinding,
 )
-from snakesim_operator.features.commissioning.joint_check.lost_motion import LostMotion
+from snakesim_operator.features.commissioning.joint_check.lost_motion import HeldMotion, LostMotion
 from snakesim_operator.features.commissioning.joint_check.property_rules import NO_LINK
 from snakesim_operator.features.commissioning.tolerances import MAX_RATIO_ERROR
 
@@ -22,6 +22,7 @@ NO_BACKLASH = "no backlash above"  # and then the angle above which the torque e
 def judge_gear_by_links(
     motion_ratio: float,
     lost_motion: LostMotion | None,
+    held_motion: HeldMotion | None,
     small_motion_ratio: float | None,
     drive: JointDrive,
     allowed_backlash_rad: float,
@@ -33,6 +34,7 @@ def judge_gear_by_links(
     Args:
         motion_ratio: Motion of the links divided by the motion by the encoder, with its sign.
         lost_motion: Backlash of the joint; None if it is not known.
+        held_motion: Motion of its links while its drive held still; None if it is not known.
         small_motion_ratio: The same ratio as `motion_ratio` in the small motion; None if it is not known.
         drive: The drive as the robot file has it.
         allowed_backlash_rad: Largest backlash that is not judged as wrong.
@@ -51,12 +53,15 @@ def judge_gear_by_links(
             f"{IS_LOOSE}: its drive turns and no link does. Either the coupling slips, or the backlash is wider than "
             "the motion; fasten the coupling, and check the gear",
         )
+    # Within backlash a link does not move at all, so it does not follow a small motion either.
+    follows_small_motion = (
+        small_motion_ratio is not None and abs(small_motion_ratio) > MIN_SLIPPING_RATIO
+    )
     reasons: list[str] = []
     if lost_motion is not None and lost_motion.lost_rad > max(
         allowed_backlash_rad, lost_motion.noise_rad
     ):
-        # Within backlash a link does not move at all, so it does not follow a small motion either.
-        if small_motion_ratio is not None and abs(small_motion_ratio) > MIN_SLIPPING_RATIO:
+        if follows_small_motion:
             return PropertyFinding(
                 "wrong",
                 f"its coupling slips: its link follows a small motion, and stays behind by {lost_motion.lost_rad:.3f} "
@@ -70,6 +75,10 @@ def judge_gear_by_links(
             f"backlash of {backlash}: its drive turns that much further than its link when the load reverses, "
             f"{allowed_backlash_rad:g} rad are allowed; repair the gear, or allow more with --allow-backlash"
         )
+    elif held_motion is not None and held_motion.turned_rad > max(
+        allowed_backlash_rad, held_motion.noise_rad
+    ):
+        return _make_held_motion_finding(held_motion, follows_small_motion=follows_small_motion)
     if abs(ratio - 1) >= MAX_RATIO_ERROR:
         other_cause = ""
         if lost_motion is None:
@@ -91,6 +100,25 @@ def judge_gear_by_links(
             f"{allowed_backlash_rad:g} rad are allowed: {SHAKE_LINK}",
         )
     return CONFIRMED
+
+
+def _make_held_motion_finding(
+    held_motion: HeldMotion, *, follows_small_motion: bool
+) -> PropertyFinding:
+    """Return the finding on a gear whose links turned while its drive held still."""
+    turned = (
+        f"its links turned against each other by {held_motion.turned_rad:.3f} rad while its drive held still and "
+        "another joint moved"
+    )
+    if follows_small_motion:
+        return PropertyFinding(
+            "wrong", f"its coupling slips: {turned}; fasten the coupling, and check the gear"
+        )
+    return PropertyFinding(
+        "wrong",
+        f"{IS_LOOSE}: {turned}. Either the coupling slips, or the gear has backlash; fasten the coupling, and check "
+        "the gear",
+    )
 
 
 def judge_gear_by_torque(play: GearPlay, allowed_backlash_rad: float) -> PropertyFinding:

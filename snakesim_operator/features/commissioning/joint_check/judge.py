@@ -44,6 +44,7 @@ from snakesim_operator.features.commissioning.joint_check.link_shares import (
 )
 from snakesim_operator.features.commissioning.joint_check.load_response import measure_load_response
 from snakesim_operator.features.commissioning.joint_check.lost_motion import (
+    measure_held_motion,
     measure_lost_motion,
     measure_small_motion_ratio,
 )
@@ -196,9 +197,12 @@ class _JointEvaluator:
         """Judge the gear of a joint: from the links if they were measured, otherwise from its torque."""
         response = self._load_responses[joint_index]
         if not np.isnan(motion_ratio):
+            lost_motion = measure_lost_motion(self._reordered_measurements, joint_index)
+            ratio = motion_ratio if lost_motion is None else lost_motion.ratio
             return judge_gear_by_links(
                 motion_ratio,
-                measure_lost_motion(self._reordered_measurements, joint_index),
+                lost_motion,
+                measure_held_motion(self._reordered_measurements, joint_index, ratio),
                 measure_small_motion_ratio(self._reordered_measurements, joint_index),
                 self._measurements.drives[joint_index],
                 self._allowed_backlash_rad,

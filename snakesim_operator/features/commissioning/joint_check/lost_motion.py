@@ -1,4 +1,6 @@
-"""Measures how much motion of a drive is lost in its gear when its load reverses: backlash. Pure.
+"""Measures how much motion is lost between a drive and its link, by the gyros of the links. Pure.
+
+Backlash is measured while the joint moves:
 
     rate of the link = ratio * rate of the drive       while the teeth of the gear touch
 
@@ -6,6 +8,9 @@ A gear of another ratio loses a fraction of every motion: the link's rate is pro
 Backlash loses the same angle at each reversal, however long the motion: the rates are proportional except while the
 drive crosses the backlash. So the ratio is the one that most samples agree on. With that ratio, the range of the
 drive angle minus the link angle is the backlash. A delay between IMU and encoder is estimated along with the ratio.
+
+A coupling that slips may carry its own link, and slip only while the joint holds still and others move: then it must
+also carry the links beyond its own. So the motion of held joints is measured as well.
 """
 
 from dataclasses import dataclass
@@ -30,6 +35,9 @@ RATIO_STEP = 0.01
 MIN_AGREEING_FRACTION = 0.2  # fraction of the fast samples
 MAX_DELAY_S = 0.03  # between IMU and encoder
 NOISE_FACTOR = 4.0  # standard deviations; less lost motion may be noise
+# Of a joint that holds still: each of them is judged as often as other joints move.
+HELD_NOISE_FACTOR = 6.0  # standard deviations
+MAX_GYRO_SCALE_ERROR = 0.03  # of the rotation of a link; two gyros differ by that much
 MIN_SQUARES = 1e-12  # of a drive that does not move at all
 MAD_TO_SD = 1.4826  # standard deviation of a normal distribution, of its median absolute deviation
 
@@ -42,6 +50,19 @@ class LostMotion:
     # That much would be measured without any backlash, by the noise of gyros and encoder.
     noise_rad: float
     ratio: float  # of the link's rate to the drive's, while the teeth touch
+
+
+@dataclass(frozen=True)
+class HeldMotion:
+    """The motion of a joint's links against each other while its drive held still, and another joint moved."""
+
+    turned_rad: float  # by which the links turned against each other, from end to end
+    noise_rad: float  # that much would be measured with a sound gear
+
+    @property
+    def excess_rad(self) -> float:
+        """By how much the motion exceeds what a sound gear would show; negative if it does not."""
+        return self.turned_rad - self.noise_rad
 
 
 def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> LostMotion | None:
@@ -83,8 +104,7 @@ def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> Lo
 
     # Difference of drive and link, as a moving average, and its noise.
     difference_rad = encoder_rad[window] - delay_s * drive_rate - link_rad[window] / ratio
-    mean_window = np.full(2 * half_window - 1, 1 / (2 * half_window - 1))
-    difference_rad = np.convolve(difference_rad, mean_window, "valid")
+    difference_rad = _smooth(difference_rad, half_window)
     duration_s = len(difference_rad) * measurements.period_s
     gyro_drift_rad = drift_rad_per_sqrt_s * np.sqrt(duration_s) / abs(ratio)
     encoder_noise_rad = _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
@@ -106,6 +126,47 @@ def measure_small_motion_ratio(measurements: CheckMeasurements, joint_index: int
     drive_rad = measurements.angle_rad[small, joint_index]
     centered_rad = drive_rad - np.mean(drive_rad)
     return float(link_rad @ centered_rad / max(float(centered_rad @ centered_rad), MIN_SQUARES))
+
+
+def measure_held_motion(
+    measurements: CheckMeasurements, joint_index: int, ratio: float
+) -> HeldMotion | None:
+    """Measure how far the links of a joint turned against each other while its drive held still.
+
+    Args:
+        measurements: Measurements of the check.
+        joint_index: Index of the joint.
+        ratio: Ratio of the link's rate to the drive's. The drive hardly moves, so it need not be exact.
+
+    Returns:
+        The largest motion, of those while another joint moved; None if no gyro measured the joint's link.
+    """
+    link_angle = _integrate_link_angle(measurements, joint_index)
+    if link_angle is None:
+        return None
+    link_rad, drift_rad_per_sqrt_s = link_angle
+    difference_rad = link_rad - ratio * measurements.angle_rad[:, joint_index]
+    gyro_ahead = _read_gyro(
+        measurements, joint_index + 1, measurements.find_axis_component(joint_index)
+    )
+    assert gyro_ahead is not None  # it is a part of the link angle
+    link_ahead_rad = _integrate_rate(gyro_ahead[0], measurements.period_s)
+    half_window = max(round(SLOPE_HALF_WINDOW_S / measurements.period_s), 1)
+    encoder_noise_rad = _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
+
+    motions: list[HeldMotion] = []
+    for other in range(len(measurements.joint_names)):
+        moved_rows = np.flatnonzero(measurements.is_moved_by_target(other))
+        if other == joint_index or len(moved_rows) < MIN_SAMPLES:
+            continue
+        window = slice(moved_rows[0], moved_rows[-1] + 1)
+        duration_s = len(difference_rad[window]) * measurements.period_s
+        gyro_drift_rad = drift_rad_per_sqrt_s * np.sqrt(duration_s)
+        scale_error_rad = MAX_GYRO_SCALE_ERROR * float(np.ptp(link_ahead_rad[window]))
+        random_noise_rad = HELD_NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
+        turned_rad = float(np.ptp(_smooth(difference_rad[window], half_window)))
+        motions.append(HeldMotion(turned_rad, random_noise_rad + scale_error_rad))
+    return max(motions, key=lambda motion: motion.excess_rad, default=None)
 
 
 def _measure_encoder_noise(measurements: CheckMeasurements, joint_index: int) -> float:
@@ -204,6 +265,12 @@ def _integrate_rate(rate: Floats, period_s: float) -> Floats:
     """Return the integral of a rate from the first tick, by trapezoids, (n,)."""
     steps = (rate[1:] + rate[:-1]) * period_s / 2
     return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+def _smooth(signal: Floats, half_window: int) -> Floats:
+    """Return the moving average of a signal, without the ends at which it is not complete."""
+    mean_window = np.full(2 * half_window - 1, 1 / (2 * half_window - 1))
+    return np.convolve(signal, mean_window, "valid")
 
 
 def _compute_slopes(signal: Floats, half_window: int, period_s: float) -> Floats:

@@ -3,22 +3,68 @@
 import pytest
 
 from snakesim_hal.model.robot_file.joints import JointDrive
-from snakesim_operator.features.commissioning.joint_check.gear_rules import judge_gear_by_links
+from snakesim_operator.features.commissioning.joint_check.gear_rules import (
+    IS_LOOSE,
+    judge_gear_by_links,
+)
 from snakesim_operator.features.commissioning.joint_check.joint_verdict import PropertyFinding
-from snakesim_operator.features.commissioning.joint_check.lost_motion import LostMotion
+from snakesim_operator.features.commissioning.joint_check.lost_motion import (
+    HeldMotion,
+    LostMotion,
+)
 
 ALLOWED_BACKLASH_RAD = 0.01
 
+NO_BACKLASH = LostMotion(lost_rad=0.004, noise_rad=0.005, ratio=1.0)
 
-def judge(lost_motion: LostMotion | None) -> PropertyFinding:
+
+def judge(
+    lost_motion: LostMotion | None,
+    held_motion: HeldMotion | None = None,
+    *,
+    small_motion_ratio: float | None = 1.0,
+) -> PropertyFinding:
     """Judge a gear whose links turn exactly as far as its drive."""
     return judge_gear_by_links(
-        1.0, lost_motion, 1.0, JointDrive(), ALLOWED_BACKLASH_RAD, is_load_passed_on=True
+        1.0,
+        lost_motion,
+        held_motion,
+        small_motion_ratio,
+        JointDrive(),
+        ALLOWED_BACKLASH_RAD,
+        is_load_passed_on=True,
     )
 
 
 def test_gear_with_little_lost_motion_is_confirmed() -> None:
-    assert judge(LostMotion(lost_rad=0.004, noise_rad=0.005, ratio=1.0)).state == "confirmed"
+    assert judge(NO_BACKLASH).state == "confirmed"
+
+
+@pytest.mark.parametrize(
+    "held_motion",
+    [
+        HeldMotion(turned_rad=0.009, noise_rad=0.005),
+        HeldMotion(turned_rad=0.02, noise_rad=0.025),
+    ],
+    ids=["less than the allowed backlash", "less than the noise"],
+)
+def test_gear_whose_held_links_hardly_turn_is_confirmed(held_motion: HeldMotion) -> None:
+    assert judge(NO_BACKLASH, held_motion).state == "confirmed"
+
+
+@pytest.mark.parametrize(
+    ("small_motion_ratio", "beginning"),
+    [(0.9, "its coupling slips"), (0.1, IS_LOOSE), (None, IS_LOOSE)],
+    ids=["follows the small motion", "stays in the small motion", "no small motion"],
+)
+def test_gear_whose_held_links_turn_is_wrong(
+    small_motion_ratio: float | None, beginning: str
+) -> None:
+    held_motion = HeldMotion(turned_rad=0.08, noise_rad=0.01)
+    finding = judge(NO_BACKLASH, held_motion, small_motion_ratio=small_motion_ratio)
+    assert finding.state == "wrong"
+    assert finding.reason.startswith(beginning)
+    assert "0.080 rad while its drive held still" in finding.reason
 
 
 @pytest.mark.parametrize(

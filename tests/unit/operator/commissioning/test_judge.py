@@ -47,7 +47,7 @@ MOTION_RAD = np.concatenate((SWING_AND_REST_RAD, -SWING_AND_REST_RAD))
 
 
 def make_measurements(
-    backlash_rad: float = 0.0, gear: float = 1.0, pitch_rad: float = 0.0
+    backlash_rad: float = 0.0, gear: float = 1.0, pitch_rad: float = 0.0, held_slip_rad: float = 0.0
 ) -> CheckMeasurements:
     """Make the measurements of joints that swing one after the other to both sides.
 
@@ -57,6 +57,7 @@ def make_measurements(
         backlash_rad: true backlash of joint_1.
         gear: true gear ratio of joint_1.
         pitch_rad: true angle of joint_2 when its encoder measures 0.
+        held_slip_rad: angle by which the coupling of joint_1 slips to either side while joint_3 moves.
     """
     angle = np.zeros((TICKS, JOINTS))
     for joint in range(JOINTS):
@@ -64,6 +65,7 @@ def make_measurements(
         angle[start_tick : start_tick + MOTION_TICKS, joint] = MOTION_RAD
     true_angle = angle.copy()
     true_angle[:, 0] = add_backlash(angle[:, 0], backlash_rad) / gear
+    true_angle[:, 0] += held_slip_rad / SWING_RAD * angle[:, 2]
     true_rate: Floats = np.diff(true_angle, axis=0, append=0.0) / PERIOD_S
     # Each joint turns all links after it, about the z axis (yaw) or the y axis (pitch).
     link_rates = np.zeros((TICKS, JOINTS + 1, 3))
@@ -186,10 +188,18 @@ def test_judge_joint_whose_links_never_turn_is_loose() -> None:
     assert "its coupling slips" not in summary
 
 
+def test_judge_link_that_turns_while_its_drive_holds_is_loose() -> None:
+    """While the joint itself moves, its link follows, so only the motion of another joint shows the fault."""
+    summary, *others = summarize_verdicts(make_measurements(held_slip_rad=0.03))
+    assert summary.startswith(f"{IS_LOOSE}: its links turned against each other by 0.05")
+    assert "while its drive held still" in summary
+    assert others == [MATCHES_FILE] * (JOINTS - 1)
+
+
 @pytest.mark.parametrize("is_load_passed_on", [True, False])
 def test_judge_gear_names_slipping_coupling_only_with_passed_load(is_load_passed_on: bool) -> None:
     finding = judge_gear_by_links(
-        0.02, None, None, JointDrive(), 0.01, is_load_passed_on=is_load_passed_on
+        0.02, None, None, None, JointDrive(), 0.01, is_load_passed_on=is_load_passed_on
     )
     assert finding.state == "wrong"
     assert finding.reason.startswith("its coupling slips" if is_load_passed_on else IS_LOOSE)
