@@ -1,5 +1,7 @@
 """Rules for the gear of a joint: ratio, backlash and coupling, by the motion of its links or by torques. Pure."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from snakesim_hal.model.robot_file.joints import JointDrive
@@ -13,112 +15,128 @@ from snakesim_operator.features.commissioning.joint_check.property_rules import 
 from snakesim_operator.features.commissioning.tolerances import MAX_RATIO_ERROR
 
 IS_LOOSE = "its gear or coupling is loose"  # which of them is not clear
-MIN_SLIPPING_RATIO = 0.5  # of link and drive in the small motion; within backlash it is near 0
+FASTEN_COUPLING = "fasten the coupling, and check the gear"
 SHAKE_LINK = "shake the link, then add --gear-by-hand"
 CONFIRM_GEAR_BY_HAND = NO_LINK + f"measure it with `snakesim robot calibrate gear`, {SHAKE_LINK}"
 NO_BACKLASH = "no backlash above"  # and then the angle above which the torque excludes it
+# Of link and drive in the small motion. The link follows it behind a coupling that slips, but not within backlash.
+# In between, one side of the backlash may have been loaded for a part of the motion.
+MIN_FOLLOWING_RATIO = 0.8
+MAX_BACKLASH_RATIO = 0.5
+
+
+@dataclass(frozen=True)
+class LinkMotions:
+    """How the links of a joint moved by their gyros, compared with its encoder. None: not measured."""
+
+    motion_ratio: float  # motion of the links divided by that of the drive, with its sign
+    lost_motion: LostMotion | None  # while the joint moved
+    held_motion: HeldMotion | None  # while its drive held still
+    small_motion_ratio: float | None  # as `motion_ratio`, in the small motion
+    is_load_passed_on: bool  # whether the torque of other joints changes with the small motion
 
 
 def judge_gear_by_links(
-    motion_ratio: float,
-    lost_motion: LostMotion | None,
-    held_motion: HeldMotion | None,
-    small_motion_ratio: float | None,
-    drive: JointDrive,
-    allowed_backlash_rad: float,
-    *,
-    is_load_passed_on: bool,
+    motions: LinkMotions, drive: JointDrive, allowed_backlash_rad: float
 ) -> PropertyFinding:
     """Judge whether a joint's links turn as far as its encoder measures.
 
     Args:
-        motion_ratio: Motion of the links divided by the motion by the encoder, with its sign.
-        lost_motion: Backlash of the joint; None if it is not known.
-        held_motion: Motion of its links while its drive held still; None if it is not known.
-        small_motion_ratio: The same ratio as `motion_ratio` in the small motion; None if it is not known.
+        motions: Motions of the links.
         drive: The drive as the robot file has it.
         allowed_backlash_rad: Largest backlash that is not judged as wrong.
-        is_load_passed_on: Whether the torque of other joints changes with the small motion of this one.
     """
-    ratio = abs(motion_ratio)
-    if ratio < MAX_RATIO_ERROR:
-        if is_load_passed_on:
-            return PropertyFinding(
-                "wrong",
-                "its coupling slips: its drive turns and no link does, but it passes a torque on; fasten the coupling, "
-                "and check the gear",
-            )
-        return PropertyFinding(
-            "wrong",
-            f"{IS_LOOSE}: its drive turns and no link does. Either the coupling slips, or the backlash is wider than "
-            "the motion; fasten the coupling, and check the gear",
-        )
-    # Within backlash a link does not move at all, so it does not follow a small motion either.
-    follows_small_motion = (
-        small_motion_ratio is not None and abs(small_motion_ratio) > MIN_SLIPPING_RATIO
-    )
-    reasons: list[str] = []
-    if lost_motion is not None and lost_motion.lost_rad > max(
-        allowed_backlash_rad, lost_motion.noise_rad
-    ):
-        if follows_small_motion:
-            return PropertyFinding(
-                "wrong",
-                f"its coupling slips: its link follows a small motion, and stays behind by {lost_motion.lost_rad:.3f} "
-                "rad in a large one; fasten the coupling, and check the gear",
-            )
-        ratio = abs(lost_motion.ratio)  # not reduced by the backlash
-        backlash = (
-            f"{lost_motion.lost_rad:.3f} rad ({np.rad2deg(lost_motion.lost_rad):.1f} degrees)"
-        )
-        reasons.append(
-            f"backlash of {backlash}: its drive turns that much further than its link when the load reverses, "
-            f"{allowed_backlash_rad:g} rad are allowed; repair the gear, or allow more with --allow-backlash"
-        )
-    elif held_motion is not None and held_motion.turned_rad > max(
-        allowed_backlash_rad, held_motion.noise_rad
-    ):
-        return _make_held_motion_finding(held_motion, follows_small_motion=follows_small_motion)
-    if abs(ratio - 1) >= MAX_RATIO_ERROR:
+    if abs(motions.motion_ratio) < MAX_RATIO_ERROR:
+        return _judge_motionless_link(motions)
+    lost = motions.lost_motion
+    if lost is not None and lost.lost_rad > max(allowed_backlash_rad, lost.noise_rad):
+        return _judge_lost_motion(motions, lost, drive, allowed_backlash_rad)
+    held = motions.held_motion
+    if held is not None and held.turned_rad > max(allowed_backlash_rad, held.noise_rad):
+        return _judge_held_motion(motions, held)
+    if wrong_ratio := _describe_wrong_ratio(motions.motion_ratio, drive):
         other_cause = ""
-        if lost_motion is None:
+        if lost is None:
             other_cause = ", or backlash, as it moved to one side only or its gyros are noisy"
-        reasons.append(
-            f"turns {ratio:.2f} as far as its drive measures: gear = {drive.gear / ratio:.3g}{other_cause}"
-        )
-    if reasons:
-        return PropertyFinding("wrong", "; ".join(reasons))
-    if lost_motion is None:
+        return PropertyFinding("wrong", wrong_ratio + other_cause)
+    if lost is None:
         return PropertyFinding(
             "unknown",
             f"backlash unknown, as it moved to one side only or its gyros are noisy: {SHAKE_LINK}",
         )
-    if lost_motion.noise_rad > allowed_backlash_rad:
+    if lost.noise_rad > allowed_backlash_rad:
         return PropertyFinding(
             "unknown",
-            f"backlash unknown, as the noise of gyros and encoder allows {lost_motion.noise_rad:.3f} rad, and "
+            f"backlash unknown, as the noise of gyros and encoder allows {lost.noise_rad:.3f} rad, and "
             f"{allowed_backlash_rad:g} rad are allowed: {SHAKE_LINK}",
         )
     return CONFIRMED
 
 
-def _make_held_motion_finding(
-    held_motion: HeldMotion, *, follows_small_motion: bool
-) -> PropertyFinding:
-    """Return the finding on a gear whose links turned while its drive held still."""
-    turned = (
-        f"its links turned against each other by {held_motion.turned_rad:.3f} rad while its drive held still and "
-        "another joint moved"
-    )
-    if follows_small_motion:
+def _judge_motionless_link(motions: LinkMotions) -> PropertyFinding:
+    """Judge a gear whose drive turns while no link does."""
+    if motions.is_load_passed_on:
         return PropertyFinding(
-            "wrong", f"its coupling slips: {turned}; fasten the coupling, and check the gear"
+            "wrong",
+            "its coupling slips: its drive turns and no link does, but it passes a torque on; "
+            f"{FASTEN_COUPLING}",
         )
     return PropertyFinding(
         "wrong",
-        f"{IS_LOOSE}: {turned}. Either the coupling slips, or the gear has backlash; fasten the coupling, and check "
-        "the gear",
+        f"{IS_LOOSE}: its drive turns and no link does. Either the coupling slips, or the backlash is wider than "
+        f"the motion; {FASTEN_COUPLING}",
     )
+
+
+def _judge_lost_motion(
+    motions: LinkMotions, lost: LostMotion, drive: JointDrive, allowed_backlash_rad: float
+) -> PropertyFinding:
+    """Judge a gear whose drive turns further than its link: by its small motion, it has backlash or slips."""
+    ratio = motions.small_motion_ratio
+    if ratio is not None and abs(ratio) > MIN_FOLLOWING_RATIO:
+        return PropertyFinding(
+            "wrong",
+            f"its coupling slips: its link follows a small motion, and stays behind by {lost.lost_rad:.3f} rad in a "
+            f"large one; {FASTEN_COUPLING}",
+        )
+    if ratio is not None and abs(ratio) > MAX_BACKLASH_RATIO:
+        return PropertyFinding(
+            "wrong",
+            f"{IS_LOOSE}: its link stays behind by {lost.lost_rad:.3f} rad, and follows only {abs(ratio):.2f} of a "
+            f"small motion. Either the gear has backlash, or the coupling slips; {FASTEN_COUPLING}",
+        )
+    reasons = [
+        f"backlash of {lost.lost_rad:.3f} rad ({np.rad2deg(lost.lost_rad):.1f} degrees): its drive turns that much "
+        f"further than its link when the load reverses, {allowed_backlash_rad:g} rad are allowed; repair the gear, or "
+        "allow more with --allow-backlash"
+    ]
+    # While the teeth touch, the ratio is not reduced by the backlash.
+    if wrong_ratio := _describe_wrong_ratio(lost.ratio, drive):
+        reasons.append(wrong_ratio)
+    return PropertyFinding("wrong", "; ".join(reasons))
+
+
+def _judge_held_motion(motions: LinkMotions, held: HeldMotion) -> PropertyFinding:
+    """Judge a gear whose links turned while its drive held still."""
+    turned = (
+        f"its links turned against each other by {held.turned_rad:.3f} rad while its drive held still and another "
+        "joint moved"
+    )
+    ratio = motions.small_motion_ratio
+    if ratio is not None and abs(ratio) > MIN_FOLLOWING_RATIO:
+        return PropertyFinding("wrong", f"its coupling slips: {turned}; {FASTEN_COUPLING}")
+    return PropertyFinding(
+        "wrong",
+        f"{IS_LOOSE}: {turned}. Either the coupling slips, or the gear has backlash; {FASTEN_COUPLING}",
+    )
+
+
+def _describe_wrong_ratio(motion_ratio: float, drive: JointDrive) -> str:
+    """Return which gear ratio the motion of the links shows; empty if it is that of the robot file."""
+    ratio = abs(motion_ratio)
+    if abs(ratio - 1) < MAX_RATIO_ERROR:
+        return ""
+    return f"turns {ratio:.2f} as far as its drive measures: gear = {drive.gear / ratio:.3g}"
 
 
 def judge_gear_by_torque(play: GearPlay, allowed_backlash_rad: float) -> PropertyFinding:

@@ -28,6 +28,7 @@ from snakesim_operator.features.commissioning.joint_check.gear_play import (
     passes_load,
 )
 from snakesim_operator.features.commissioning.joint_check.gear_rules import (
+    LinkMotions,
     judge_gear_by_links,
     judge_gear_by_torque,
 )
@@ -199,13 +200,16 @@ class _JointEvaluator:
         if not np.isnan(motion_ratio):
             lost_motion = measure_lost_motion(self._reordered_measurements, joint_index)
             ratio = motion_ratio if lost_motion is None else lost_motion.ratio
-            return judge_gear_by_links(
-                motion_ratio,
-                lost_motion,
-                measure_held_motion(self._reordered_measurements, joint_index, ratio),
-                measure_small_motion_ratio(self._reordered_measurements, joint_index),
-                self._measurements.drives[joint_index],
-                self._allowed_backlash_rad,
+            motions = LinkMotions(
+                motion_ratio=motion_ratio,
+                lost_motion=lost_motion,
+                held_motion=measure_held_motion(self._reordered_measurements, joint_index, ratio),
+                small_motion_ratio=measure_small_motion_ratio(
+                    self._reordered_measurements, joint_index
+                ),
                 is_load_passed_on=response is not None and passes_load(response),
+            )
+            return judge_gear_by_links(
+                motions, self._measurements.drives[joint_index], self._allowed_backlash_rad
             )
         return judge_gear_by_torque(self._gear_plays[joint_index], self._allowed_backlash_rad)

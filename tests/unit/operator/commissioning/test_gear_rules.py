@@ -5,6 +5,7 @@ import pytest
 from snakesim_hal.model.robot_file.joints import JointDrive
 from snakesim_operator.features.commissioning.joint_check.gear_rules import (
     IS_LOOSE,
+    LinkMotions,
     judge_gear_by_links,
 )
 from snakesim_operator.features.commissioning.joint_check.joint_verdict import PropertyFinding
@@ -25,15 +26,14 @@ def judge(
     small_motion_ratio: float | None = 1.0,
 ) -> PropertyFinding:
     """Judge a gear whose links turn exactly as far as its drive."""
-    return judge_gear_by_links(
-        1.0,
-        lost_motion,
-        held_motion,
-        small_motion_ratio,
-        JointDrive(),
-        ALLOWED_BACKLASH_RAD,
+    motions = LinkMotions(
+        motion_ratio=1.0,
+        lost_motion=lost_motion,
+        held_motion=held_motion,
+        small_motion_ratio=small_motion_ratio,
         is_load_passed_on=True,
     )
+    return judge_gear_by_links(motions, JointDrive(), ALLOWED_BACKLASH_RAD)
 
 
 def test_gear_with_little_lost_motion_is_confirmed() -> None:
@@ -82,3 +82,17 @@ def test_gear_with_unknown_backlash_is_not_confirmed(
     assert finding.state == "unknown"
     assert reason in finding.reason
     assert "--gear-by-hand" in finding.reason
+
+
+@pytest.mark.parametrize(
+    ("small_motion_ratio", "beginning"),
+    [(0.9, "its coupling slips"), (0.65, IS_LOOSE), (0.1, "backlash of 0.030 rad")],
+    ids=["follows the small motion", "follows a part of it", "stays in the small motion"],
+)
+def test_gear_that_loses_motion_is_named_by_its_small_motion(
+    small_motion_ratio: float, beginning: str
+) -> None:
+    lost_motion = LostMotion(lost_rad=0.03, noise_rad=0.005, ratio=1.0)
+    finding = judge(lost_motion, small_motion_ratio=small_motion_ratio)
+    assert finding.state == "wrong"
+    assert finding.reason.startswith(beginning)

@@ -12,6 +12,7 @@ from snakesim_operator.features.commissioning.joint_check.check import format_re
 from snakesim_operator.features.commissioning.joint_check.gear_play import GearPlay
 from snakesim_operator.features.commissioning.joint_check.gear_rules import (
     IS_LOOSE,
+    LinkMotions,
     judge_gear_by_links,
     judge_gear_by_torque,
 )
@@ -198,9 +199,14 @@ def test_judge_link_that_turns_while_its_drive_holds_is_loose() -> None:
 
 @pytest.mark.parametrize("is_load_passed_on", [True, False])
 def test_judge_gear_names_slipping_coupling_only_with_passed_load(is_load_passed_on: bool) -> None:
-    finding = judge_gear_by_links(
-        0.02, None, None, None, JointDrive(), 0.01, is_load_passed_on=is_load_passed_on
+    motions = LinkMotions(
+        motion_ratio=0.02,
+        lost_motion=None,
+        held_motion=None,
+        small_motion_ratio=None,
+        is_load_passed_on=is_load_passed_on,
     )
+    finding = judge_gear_by_links(motions, JointDrive(), 0.01)
     assert finding.state == "wrong"
     assert finding.reason.startswith("its coupling slips" if is_load_passed_on else IS_LOOSE)
 
