@@ -86,7 +86,7 @@ def test_leaving_armed_brings_a_moving_joint_to_rest(
 def test_a_fault_brakes_a_moving_joint(rig: BackendRig) -> None:
     """If a robot with stop mode `damp` or `hold` has a fault, the motor of a moving joint pushes against its motion.
 
-    A joint without torque comes to rest as well, because of friction, but later, and not at all on a slope.
+    A joint without torque comes to rest as well, because of friction, but later, and on a slope perhaps not at all.
     """
     if rig.robot.stop_mode == "passive":
         pytest.skip("the robot is described with stop mode passive: no joint brakes after a fault")
@@ -98,7 +98,8 @@ def test_a_fault_brakes_a_moving_joint(rig: BackendRig) -> None:
     )
     min_torque_nm = record.torque_nm[:, 0].min()  # the joint moves in positive direction
     assert min_torque_nm < -tolerances.MIN_BRAKING_TORQUE_NM, (
-        f"the lowest torque after the fault is {min_torque_nm:.2f} N·m, so the moving joint is not braked"
+        f"the lowest torque after the fault is {min_torque_nm:.2f} N·m, so the moving joint is not braked; at most "
+        f"{-tolerances.MIN_BRAKING_TORQUE_NM} N·m is required"
     )
 
 

@@ -50,9 +50,6 @@ MIN_UNLOADED_FRACTION = 0.3
 MIN_LOAD_RATIO = 2.0
 NO_CLEAR_LOAD = "its torque hardly follows its angle"
 NO_REVERSAL = "the load of its gear does not reverse in the small motion"
-# Of the torque that a joint passes on to its neighbors in the direction of its small motion; less proves nothing.
-MIN_PASSED_NM = 0.003
-MIN_PASSED_ERRORS = 6.0  # standard deviations
 # "loose": it has backlash or slips, which of them is not clear.
 PlayKind = Literal["tight", "backlash", "slipping", "loose", "unknown"]
 
@@ -129,17 +126,13 @@ def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: 
     min_slipping_nm = MIN_SLIPPING_NEIGHBOR_RATIO * large_nm
     is_load_alike_in_both_motions = small_nm >= max(min_slipping_nm, response.noise_nm)
     if are_neighbors_never_loaded or is_load_alike_in_both_motions:
-        return GearPlay("slipping" if passes_load(response) else "loose")
+        # A coupling that slips passes a torque on, and backlash does not.
+        return GearPlay("slipping" if response.passed_in_small_motion.is_certain else "loose")
     if _has_backlash(response, min_change_nm):
         return GearPlay("backlash", min_backlash_rad=response.small_motion_rad)
     if response.noise_nm > MAX_LOOSE_FRACTION * typical_nm:
         return GearPlay("unknown", NO_CLEAR_LOAD)
     return GearPlay("loose")
-
-
-def passes_load(response: LoadResponse) -> bool:
-    """Return whether a torque passes through the gear in the small motion, as it does through a coupling that slips."""
-    return response.passed_nm >= max(MIN_PASSED_NM, MIN_PASSED_ERRORS * response.passed_error_nm)
 
 
 def _has_backlash(response: LoadResponse, min_change_nm: float) -> bool:

@@ -1,5 +1,6 @@
 """Rules for the gear of a joint: ratio, backlash and coupling, by the motion of its links or by torques. Pure."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,21 +20,53 @@ FASTEN_COUPLING = "fasten the coupling, and check the gear"
 SHAKE_LINK = "shake the link, then add --gear-by-hand"
 CONFIRM_GEAR_BY_HAND = NO_LINK + f"measure it with `snakesim robot calibrate gear`, {SHAKE_LINK}"
 NO_BACKLASH = "no backlash above"  # and then the angle above which the torque excludes it
-# Of link and drive in the small motion. The link follows it behind a coupling that slips, but not within backlash.
-# In between, one side of the backlash may have been loaded for a part of the motion.
-MIN_FOLLOWING_RATIO = 0.8
-MAX_BACKLASH_RATIO = 0.5
+# By how much of its ratio a link follows the small motion of its drive. Behind a coupling that slips, it follows nearly
+# all of it, and within backlash nearly nothing. In between, the teeth may have touched for a part of the motion.
+MIN_FOLLOWED_FRACTION = 0.8
+MAX_FOLLOWED_FRACTION_IN_BACKLASH = 0.5
+NO_LOST_MOTION = "it moved to one side only, or its gyros are noisy"
 
 
 @dataclass(frozen=True)
 class LinkMotions:
-    """How the links of a joint moved by their gyros, compared with its encoder. None: not measured."""
+    """The motions of a joint's links by their gyros, compared with those of its drive by its encoder."""
 
     motion_ratio: float  # motion of the links divided by that of the drive, with its sign
-    lost_motion: LostMotion | None  # while the joint moved
-    held_motion: HeldMotion | None  # while its drive held still
-    small_motion_ratio: float | None  # as `motion_ratio`, in the small motion
-    is_load_passed_on: bool  # whether the torque of other joints changes with the small motion
+    lost_motion: LostMotion | None  # while the joint moved; None if it could not be measured
+    held_motions: Sequence[HeldMotion]  # while its drive held still
+    small_motion_ratio: float | None  # as `motion_ratio`, in the small motion; None if not measured
+    passes_torque_on: (
+        bool  # whether the torque of other joints changes with the direction of its motions
+    )
+
+    @property
+    def tooth_ratio(self) -> float:
+        """Ratio of link and drive while the teeth touch. Backlash reduces `motion_ratio`, so the larger one counts."""
+        if self.lost_motion is None:
+            return self.motion_ratio
+        return max(self.motion_ratio, self.lost_motion.ratio, key=abs)
+
+    @property
+    def followed_fraction(self) -> float | None:
+        """How much of the small motion the link followed, 0 to about 1; None if not measured."""
+        if self.small_motion_ratio is None:
+            return None
+        # Without the ratio of the teeth, that of the robot file counts.
+        ratio = 1.0 if self.lost_motion is None else self.lost_motion.ratio
+        return abs(self.small_motion_ratio / ratio)
+
+    def find_held_motion(self, allowed_backlash_rad: float) -> HeldMotion | None:
+        """Return the largest motion of the links while the drive held still; None if no motion is certain.
+
+        Args:
+            allowed_backlash_rad: A motion counts only if it is larger.
+        """
+        certain_motions = [
+            held
+            for held in self.held_motions
+            if held.turned_rad > max(allowed_backlash_rad, held.noise_rad)
+        ]
+        return max(certain_motions, key=lambda held: held.turned_rad, default=None)
 
 
 def judge_gear_by_links(
@@ -51,19 +84,16 @@ def judge_gear_by_links(
     lost = motions.lost_motion
     if lost is not None and lost.lost_rad > max(allowed_backlash_rad, lost.noise_rad):
         return _judge_lost_motion(motions, lost, drive, allowed_backlash_rad)
-    held = motions.held_motion
-    if held is not None and held.turned_rad > max(allowed_backlash_rad, held.noise_rad):
+    held = motions.find_held_motion(allowed_backlash_rad)
+    if held is not None:
         return _judge_held_motion(motions, held)
-    if wrong_ratio := _describe_wrong_ratio(motions.motion_ratio, drive):
+    if wrong_ratio := _describe_wrong_ratio(motions.tooth_ratio, drive):
         other_cause = ""
         if lost is None:
-            other_cause = ", or backlash, as it moved to one side only or its gyros are noisy"
+            other_cause = f"; or it has backlash, which was not measured, as {NO_LOST_MOTION}"
         return PropertyFinding("wrong", wrong_ratio + other_cause)
     if lost is None:
-        return PropertyFinding(
-            "unknown",
-            f"backlash unknown, as it moved to one side only or its gyros are noisy: {SHAKE_LINK}",
-        )
+        return PropertyFinding("unknown", f"backlash unknown, as {NO_LOST_MOTION}: {SHAKE_LINK}")
     if lost.noise_rad > allowed_backlash_rad:
         return PropertyFinding(
             "unknown",
@@ -75,7 +105,7 @@ def judge_gear_by_links(
 
 def _judge_motionless_link(motions: LinkMotions) -> PropertyFinding:
     """Judge a gear whose drive turns while no link does."""
-    if motions.is_load_passed_on:
+    if motions.passes_torque_on:
         return PropertyFinding(
             "wrong",
             "its coupling slips: its drive turns and no link does, but it passes a torque on; "
@@ -92,25 +122,30 @@ def _judge_lost_motion(
     motions: LinkMotions, lost: LostMotion, drive: JointDrive, allowed_backlash_rad: float
 ) -> PropertyFinding:
     """Judge a gear whose drive turns further than its link: by its small motion, it has backlash or slips."""
-    ratio = motions.small_motion_ratio
-    if ratio is not None and abs(ratio) > MIN_FOLLOWING_RATIO:
+    followed = motions.followed_fraction
+    if followed is None:
+        return PropertyFinding(
+            "wrong",
+            f"{IS_LOOSE}: its link stays behind by {lost.lost_rad:.3f} rad. Either the gear has backlash, or the "
+            f"coupling slips; {FASTEN_COUPLING}",
+        )
+    if followed > MIN_FOLLOWED_FRACTION:
         return PropertyFinding(
             "wrong",
             f"its coupling slips: its link follows a small motion, and stays behind by {lost.lost_rad:.3f} rad in a "
             f"large one; {FASTEN_COUPLING}",
         )
-    if ratio is not None and abs(ratio) > MAX_BACKLASH_RATIO:
+    if followed > MAX_FOLLOWED_FRACTION_IN_BACKLASH:
         return PropertyFinding(
             "wrong",
-            f"{IS_LOOSE}: its link stays behind by {lost.lost_rad:.3f} rad, and follows only {abs(ratio):.2f} of a "
+            f"{IS_LOOSE}: its link stays behind by {lost.lost_rad:.3f} rad, and follows only {followed:.2f} of a "
             f"small motion. Either the gear has backlash, or the coupling slips; {FASTEN_COUPLING}",
         )
     reasons = [
         f"backlash of {lost.lost_rad:.3f} rad ({np.rad2deg(lost.lost_rad):.1f} degrees): its drive turns that much "
-        f"further than its link when the load reverses, {allowed_backlash_rad:g} rad are allowed; repair the gear, or "
+        f"further than its link when the load reverses; {allowed_backlash_rad:g} rad are allowed. Repair the gear, or "
         "allow more with --allow-backlash"
     ]
-    # While the teeth touch, the ratio is not reduced by the backlash.
     if wrong_ratio := _describe_wrong_ratio(lost.ratio, drive):
         reasons.append(wrong_ratio)
     return PropertyFinding("wrong", "; ".join(reasons))
@@ -122,8 +157,8 @@ def _judge_held_motion(motions: LinkMotions, held: HeldMotion) -> PropertyFindin
         f"its links turned against each other by {held.turned_rad:.3f} rad while its drive held still and another "
         "joint moved"
     )
-    ratio = motions.small_motion_ratio
-    if ratio is not None and abs(ratio) > MIN_FOLLOWING_RATIO:
+    followed = motions.followed_fraction
+    if followed is not None and followed > MIN_FOLLOWED_FRACTION:
         return PropertyFinding("wrong", f"its coupling slips: {turned}; {FASTEN_COUPLING}")
     return PropertyFinding(
         "wrong",

@@ -25,7 +25,6 @@ from snakesim_operator.features.commissioning.joint_check.encoder_dead_zone impo
 )
 from snakesim_operator.features.commissioning.joint_check.gear_play import (
     judge_gear_plays,
-    passes_load,
 )
 from snakesim_operator.features.commissioning.joint_check.gear_rules import (
     LinkMotions,
@@ -45,7 +44,7 @@ from snakesim_operator.features.commissioning.joint_check.link_shares import (
 )
 from snakesim_operator.features.commissioning.joint_check.load_response import measure_load_response
 from snakesim_operator.features.commissioning.joint_check.lost_motion import (
-    measure_held_motion,
+    measure_held_motions,
     measure_lost_motion,
     measure_small_motion_ratio,
 )
@@ -203,11 +202,11 @@ class _JointEvaluator:
             motions = LinkMotions(
                 motion_ratio=motion_ratio,
                 lost_motion=lost_motion,
-                held_motion=measure_held_motion(self._reordered_measurements, joint_index, ratio),
+                held_motions=measure_held_motions(self._reordered_measurements, joint_index, ratio),
                 small_motion_ratio=measure_small_motion_ratio(
                     self._reordered_measurements, joint_index
                 ),
-                is_load_passed_on=response is not None and passes_load(response),
+                passes_torque_on=response is not None and response.passed_in_all_motions.is_certain,
             )
             return judge_gear_by_links(
                 motions, self._measurements.drives[joint_index], self._allowed_backlash_rad

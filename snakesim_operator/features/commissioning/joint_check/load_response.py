@@ -31,6 +31,22 @@ from snakesim_operator.features.commissioning.joint_check.tooth_contact import (
 SMOOTHING_TICKS = 5  # of torques; shorter than any change of the load
 MIN_STEP = 1e-9  # less is a rounding error
 SETTLING_TICKS = 5  # after a motion, in which the torque still changes
+# Of the torque that a joint passes on to its neighbors; less proves nothing.
+MIN_PASSED_NM = 0.003
+MIN_PASSED_ERRORS = 6.0  # standard deviations
+
+
+@dataclass(frozen=True)
+class PassedTorque:
+    """The torque that a joint passes on to a neighbor in the direction of its motion."""
+
+    torque_nm: float
+    error_nm: float  # standard deviation
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is surely a torque, and not noise."""
+        return self.torque_nm >= max(MIN_PASSED_NM, MIN_PASSED_ERRORS * self.error_nm)
 
 
 @dataclass(frozen=True)
@@ -45,9 +61,10 @@ class LoadResponse:
     neighbor_large_range_nm: float
     neighbor_small_range_nm: float
     noise_nm: float  # largest range while the robot rested, or resolution of the torque if that is coarser
-    # Torque that the joint passes on to a neighbor in the direction of its small motion.
-    passed_nm: float
-    passed_error_nm: float  # standard deviation of `passed_nm`
+    # Passed on to a neighbor in the direction of the small motion, or of all motions. In the large motion, links that
+    # turn need a torque in this direction as well.
+    passed_in_small_motion: PassedTorque
+    passed_in_all_motions: PassedTorque
     contact: ToothContact  # of the teeth of its gear
 
     @property
@@ -76,10 +93,15 @@ def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> 
     stiffness_nm_per_rad = _fit_slope(angle_rad, torque_nm[small, joint_index])
     neighbors = find_neighbors_of_same_axis(measurements.axes, joint_index)
     small_ticks = np.flatnonzero(measurements.is_in_small_motion(joint_index))
-    both_small = slice(small_ticks[0], small_ticks[-1] + 1)
-    passed_nm, passed_error_nm = _measure_passed_torque(
-        measurements.angle_rad[both_small, joint_index],
-        estimated_torque_nm[both_small][:, neighbors],
+    all_small = slice(small_ticks[0], small_ticks[-1] + 1)
+    all_motions = slice(
+        min(small_ticks[0], large_ticks[0]), max(small_ticks[-1], large_ticks[-1]) + 1
+    )
+    passed_in_small_motion, passed_in_all_motions = (
+        _measure_passed_torque(
+            measurements.angle_rad[ticks, joint_index], estimated_torque_nm[ticks][:, neighbors]
+        )
+        for ticks in (all_small, all_motions)
     )
     resolution_nm = max(
         _find_resolution_nm(measurements, estimated_torque_nm, i) for i in [joint_index, *neighbors]
@@ -92,8 +114,8 @@ def measure_load_response(measurements: CheckMeasurements, joint_index: int) -> 
         neighbor_large_range_nm=_find_max_range(torque_nm[large][:, neighbors]),
         neighbor_small_range_nm=_find_max_range(torque_nm[small][:, neighbors]),
         noise_nm=max(resolution_nm, _find_max_range(torque_nm[rest][:, [joint_index, *neighbors]])),
-        passed_nm=passed_nm,
-        passed_error_nm=passed_error_nm,
+        passed_in_small_motion=passed_in_small_motion,
+        passed_in_all_motions=passed_in_all_motions,
         contact=_measure_contact(measurements, joint_index, small, estimated_torque_nm),
     )
 
@@ -154,11 +176,11 @@ def find_neighbors_of_same_axis(axes: Sequence[str], joint_index: int) -> list[i
     return [*same[max(position - 1, 0) : position], *same[position + 1 : position + 2]]
 
 
-def _measure_passed_torque(angle_rad: Floats, neighbor_torque_nm: Floats) -> tuple[float, float]:
-    """Return the torque that a joint passes on in the direction of its motion, and its standard deviation.
+def _measure_passed_torque(angle_rad: Floats, neighbor_torque_nm: Floats) -> PassedTorque:
+    """Measure the torque that a joint passes on in the direction of its motion.
 
     Args:
-        angle_rad: Angle of the joint in its small motion, (n,).
+        angle_rad: Angle of the joint in its motion, (n,).
         neighbor_torque_nm: Torque of each neighbor, (n, neighbors). The one that is most certainly large counts.
     """
     ticks = np.arange(len(angle_rad), dtype=np.float64)
@@ -167,14 +189,18 @@ def _measure_passed_torque(angle_rad: Floats, neighbor_torque_nm: Floats) -> tup
         (np.ones_like(ticks), ticks - np.mean(ticks), angle_rad - np.mean(angle_rad), direction)
     )
     normalized_covariance = np.linalg.pinv(regressors.T @ regressors)
-    estimates: list[tuple[float, float]] = []
+    estimates: list[PassedTorque] = []
     for torque_nm in neighbor_torque_nm.T:
         coefficients = normalized_covariance @ regressors.T @ torque_nm
         residual_nm = torque_nm - regressors @ coefficients
         variance = float(residual_nm @ residual_nm) / max(len(ticks) - regressors.shape[1], 1)
         error_nm = float(np.sqrt(variance * normalized_covariance[-1, -1]))
-        estimates.append((abs(float(coefficients[-1])), error_nm))
-    return max(estimates, key=lambda estimate: estimate[0] - estimate[1], default=(0.0, 0.0))
+        estimates.append(PassedTorque(abs(float(coefficients[-1])), error_nm))
+    return max(
+        estimates,
+        key=lambda passed: passed.torque_nm - passed.error_nm,
+        default=PassedTorque(0.0, 0.0),
+    )
 
 
 def _estimate_torques_nm(measurements: CheckMeasurements) -> Floats:

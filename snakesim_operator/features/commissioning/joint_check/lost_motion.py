@@ -9,8 +9,8 @@ Backlash loses the same angle at each reversal, however long the motion: the rat
 drive crosses the backlash. So the ratio is the one that most samples agree on. With that ratio, the range of the
 drive angle minus the link angle is the backlash. A delay between IMU and encoder is estimated along with the ratio.
 
-A coupling that slips may carry its own link, and slip only while the joint holds still and others move: then it must
-also carry the links beyond its own. So the motion of held joints is measured as well.
+A coupling that slips may carry one link, but not several. At an end of the robot, it then follows its own motion, and
+slips while its drive holds still and another joint moves. So the motion of held joints is measured as well.
 """
 
 from dataclasses import dataclass
@@ -35,10 +35,13 @@ RATIO_STEP = 0.01
 MIN_AGREEING_FRACTION = 0.2  # fraction of the fast samples
 MAX_DELAY_S = 0.03  # between IMU and encoder
 NOISE_FACTOR = 4.0  # standard deviations; less lost motion may be noise
-# Of a joint that holds still: each of them is judged as often as other joints move.
-HELD_NOISE_FACTOR = 6.0  # standard deviations
-MAX_GYRO_SCALE_ERROR = 0.03  # of the rotation of a link; two gyros differ by that much
-MIN_SQUARES = 1e-12  # of a drive that does not move at all
+# Standard deviations. A held joint is measured once for each other joint, so false alarms add up.
+HELD_NOISE_FACTOR = 6.0
+MAX_GYRO_SCALE_ERROR = 0.03  # of the rotation of a link; two gyros may differ by that much
+MIN_SMALL_MOTION_RAD = (
+    0.002  # range of a drive in its small motion; with less, its link shows nothing
+)
+MEDIAN_ERROR_FACTOR = 1.25  # standard deviation of a median, of that of a mean
 MAD_TO_SD = 1.4826  # standard deviation of a normal distribution, of its median absolute deviation
 
 
@@ -59,10 +62,25 @@ class HeldMotion:
     turned_rad: float  # by which the links turned against each other, from end to end
     noise_rad: float  # that much would be measured with a sound gear
 
-    @property
-    def excess_rad(self) -> float:
-        """By how much the motion exceeds what a sound gear would show; negative if it does not."""
-        return self.turned_rad - self.noise_rad
+
+@dataclass(frozen=True)
+class GyroNoise:
+    """The noise of a gyro, or of the difference of two."""
+
+    random_walk_rad_per_sqrt_s: float  # of its angle, standard deviation after one second
+    bias_error_rad_s: float  # standard deviation of its bias, which was measured at rest
+
+    def combine(self, other: "GyroNoise") -> "GyroNoise":
+        """Return the noise of the difference of two gyros."""
+        return GyroNoise(
+            float(np.hypot(self.random_walk_rad_per_sqrt_s, other.random_walk_rad_per_sqrt_s)),
+            float(np.hypot(self.bias_error_rad_s, other.bias_error_rad_s)),
+        )
+
+    def compute_drift_rad(self, duration_s: float) -> float:
+        """Return the standard deviation by which the integrated angle drifts in a time."""
+        random_walk_rad = self.random_walk_rad_per_sqrt_s * np.sqrt(duration_s)
+        return float(np.hypot(random_walk_rad, self.bias_error_rad_s * duration_s))
 
 
 def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> LostMotion | None:
@@ -76,13 +94,14 @@ def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> Lo
         joint_index: Index of the joint.
 
     Returns:
-        The backlash and its noise; None if the joint moved too little, or no gyro measured its link.
+        The backlash and its noise; None if the joint moved too little, no gyro measured its link, or the rates of link
+        and drive agree on no ratio.
     """
     moved_rows = np.flatnonzero(measurements.is_in_large_motion(joint_index))
     link_angle = _integrate_link_angle(measurements, joint_index)
     if link_angle is None or len(moved_rows) < MIN_SAMPLES:
         return None
-    link_rad, drift_rad_per_sqrt_s = link_angle
+    link_rad, gyro_noise = link_angle
     encoder_rad = measurements.angle_rad[:, joint_index]
 
     # The part of the record in which the joint moved, where the slopes are valid.
@@ -106,7 +125,7 @@ def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> Lo
     difference_rad = encoder_rad[window] - delay_s * drive_rate - link_rad[window] / ratio
     difference_rad = _smooth(difference_rad, half_window)
     duration_s = len(difference_rad) * measurements.period_s
-    gyro_drift_rad = drift_rad_per_sqrt_s * np.sqrt(duration_s) / abs(ratio)
+    gyro_drift_rad = gyro_noise.compute_drift_rad(duration_s) / abs(ratio)
     encoder_noise_rad = _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
     noise_rad = NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
     return LostMotion(float(np.ptp(difference_rad)), noise_rad, ratio)
@@ -116,7 +135,8 @@ def measure_small_motion_ratio(measurements: CheckMeasurements, joint_index: int
     """Return the motion of a joint's links divided by that of its drive, in the second cycle of its small motion.
 
     Returns:
-        The ratio, which is near 0 within backlash; None if the joint made no small motion, or a link was not measured.
+        The ratio, which is near 0 within backlash; None if the drive did not make the small motion, or a link was not
+        measured.
     """
     small = measurements.find_second_small_cycle(joint_index)
     link_angle = _integrate_link_angle(measurements, joint_index)
@@ -124,13 +144,15 @@ def measure_small_motion_ratio(measurements: CheckMeasurements, joint_index: int
         return None
     link_rad = link_angle[0][small]
     drive_rad = measurements.angle_rad[small, joint_index]
+    if float(np.ptp(drive_rad)) < MIN_SMALL_MOTION_RAD:
+        return None
     centered_rad = drive_rad - np.mean(drive_rad)
-    return float(link_rad @ centered_rad / max(float(centered_rad @ centered_rad), MIN_SQUARES))
+    return float(link_rad @ centered_rad / (centered_rad @ centered_rad))
 
 
-def measure_held_motion(
+def measure_held_motions(
     measurements: CheckMeasurements, joint_index: int, ratio: float
-) -> HeldMotion | None:
+) -> list[HeldMotion]:
     """Measure how far the links of a joint turned against each other while its drive held still.
 
     Args:
@@ -139,39 +161,50 @@ def measure_held_motion(
         ratio: Ratio of the link's rate to the drive's. The drive hardly moves, so it need not be exact.
 
     Returns:
-        The largest motion, of those while another joint moved; None if no gyro measured the joint's link.
+        A motion for each other joint that moved meanwhile; empty if no gyro measured the joint's link.
     """
     link_angle = _integrate_link_angle(measurements, joint_index)
-    if link_angle is None:
-        return None
-    link_rad, drift_rad_per_sqrt_s = link_angle
-    difference_rad = link_rad - ratio * measurements.angle_rad[:, joint_index]
+    coarse_link_angle = _integrate_link_angle(measurements, joint_index, sample_step=2)
     gyro_ahead = _read_gyro(
         measurements, joint_index + 1, measurements.find_axis_component(joint_index)
     )
-    assert gyro_ahead is not None  # it is a part of the link angle
+    if link_angle is None or coarse_link_angle is None or gyro_ahead is None:
+        return []
+    link_rad, gyro_noise = link_angle
+    # The drive yields a little to its load, and its link with it.
+    difference_rad = link_rad - ratio * measurements.angle_rad[:, joint_index]
+    # A drive that jerks turns the links in less time than a gyro needs from one sample to the next.
+    sampling_error_rad = link_rad - coarse_link_angle[0]
     link_ahead_rad = _integrate_rate(gyro_ahead[0], measurements.period_s)
     half_window = max(round(SLOPE_HALF_WINDOW_S / measurements.period_s), 1)
-    encoder_noise_rad = _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
+    encoder_noise_rad = (
+        abs(ratio) * _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
+    )
+    own_motion = measurements.is_moved_by_target(joint_index)
 
-    motions: list[HeldMotion] = []
+    held_motions: list[HeldMotion] = []
     for other in range(len(measurements.joint_names)):
         moved_rows = np.flatnonzero(measurements.is_moved_by_target(other))
         if other == joint_index or len(moved_rows) < MIN_SAMPLES:
             continue
         window = slice(moved_rows[0], moved_rows[-1] + 1)
+        if own_motion[window].any():
+            continue
         duration_s = len(difference_rad[window]) * measurements.period_s
-        gyro_drift_rad = drift_rad_per_sqrt_s * np.sqrt(duration_s)
+        gyro_drift_rad = gyro_noise.compute_drift_rad(duration_s)
         scale_error_rad = MAX_GYRO_SCALE_ERROR * float(np.ptp(link_ahead_rad[window]))
-        random_noise_rad = HELD_NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
+        random_error_rad = HELD_NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
+        noise_rad = random_error_rad + scale_error_rad + float(np.ptp(sampling_error_rad[window]))
         turned_rad = float(np.ptp(_smooth(difference_rad[window], half_window)))
-        motions.append(HeldMotion(turned_rad, random_noise_rad + scale_error_rad))
-    return max(motions, key=lambda motion: motion.excess_rad, default=None)
+        held_motions.append(HeldMotion(turned_rad, noise_rad))
+    return held_motions
 
 
 def _measure_encoder_noise(measurements: CheckMeasurements, joint_index: int) -> float:
     """Return the standard deviation of the noise of a joint's encoder in rad, measured while the robot was at rest."""
-    differences_rad = np.diff(measurements.angle_rad[measurements.is_at_rest(), joint_index])
+    at_rest = measurements.is_at_rest()
+    both_at_rest = at_rest[1:] & at_rest[:-1]  # not from one rest to the next
+    differences_rad = np.diff(measurements.angle_rad[:, joint_index])[both_at_rest]
     return float(np.std(differences_rad)) / np.sqrt(2)
 
 
@@ -179,6 +212,8 @@ def _find_ratio(drive_rate: Floats, link_rate: Floats) -> float | None:
     """Return the ratio on which most of the fast samples agree; None if too few do."""
     max_rate = float(np.max(np.abs(drive_rate)))
     is_fast = np.abs(drive_rate) > FAST_FRACTION * max_rate
+    if not is_fast.any():
+        return None
     magnitudes = np.arange(MIN_RATIO, MAX_RATIO, RATIO_STEP)
     candidates = np.concatenate((magnitudes, -magnitudes))
     # (samples, candidates).
@@ -213,42 +248,42 @@ def _refine_ratio(
 
 
 def _integrate_link_angle(
-    measurements: CheckMeasurements, joint_index: int
-) -> tuple[Floats, float] | None:
-    """Return a joint's angle by the gyros of its two links, and the drift of that angle by the gyros' noise.
+    measurements: CheckMeasurements, joint_index: int, sample_step: int = 1
+) -> tuple[Floats, GyroNoise] | None:
+    """Return a joint's angle by the gyros of its two links, and the gyros' noise.
 
     For the joint at the tail, motion capture may replace a missing gyro on the tail link.
 
     Args:
         measurements: Measurements of the check.
         joint_index: Index of the joint.
+        sample_step: Every how many samples of the gyros are used, to see whether they are frequent enough.
 
     Returns:
-        (ticks,) angle in rad up to a constant, and the standard deviation of its drift after one second in rad, which
-        grows with the square root of time; None if a link was not measured.
+        (ticks,) angle in rad up to a constant, and its noise; None if a link was not measured.
     """
     component = measurements.find_axis_component(joint_index)
-    gyro_behind = _read_gyro(measurements, joint_index, component)
-    gyro_ahead = _read_gyro(measurements, joint_index + 1, component)
+    gyro_behind = _read_gyro(measurements, joint_index, component, sample_step)
+    gyro_ahead = _read_gyro(measurements, joint_index + 1, component, sample_step)
     if gyro_ahead is None:
         return None
-    rate_ahead, drift_ahead = gyro_ahead
+    rate_ahead, noise_ahead = gyro_ahead
     if gyro_behind is not None:
-        rate_behind, drift_behind = gyro_behind
+        rate_behind, noise_behind = gyro_behind
         angle_rad = _integrate_rate(rate_ahead - rate_behind, measurements.period_s)
-        return angle_rad, float(np.hypot(drift_ahead, drift_behind))
+        return angle_rad, noise_ahead.combine(noise_behind)
     base_rad = measurements.base_rotation_rad[:, component]
     if joint_index == 0 and not np.isnan(base_rad).all():
         known_rows = np.flatnonzero(~np.isnan(base_rad))
         base_rad = np.interp(np.arange(len(base_rad)), known_rows, base_rad[known_rows])
-        return _integrate_rate(rate_ahead, measurements.period_s) - base_rad, drift_ahead
+        return _integrate_rate(rate_ahead, measurements.period_s) - base_rad, noise_ahead
     return None
 
 
 def _read_gyro(
-    measurements: CheckMeasurements, link_index: int, component: int
-) -> tuple[Floats, float] | None:
-    """Return a link's rate at every tick, (n,), without its bias, and its drift after a second; None without a gyro."""
+    measurements: CheckMeasurements, link_index: int, component: int, sample_step: int = 1
+) -> tuple[Floats, GyroNoise] | None:
+    """Return a link's rate at every tick, (n,), without its bias, and its noise; None without a gyro."""
     rate = measurements.link_rate_rad_s[:, link_index, component]
     known = np.flatnonzero(~np.isnan(rate))
     at_rest = known[measurements.is_at_rest()[known]]
@@ -257,8 +292,13 @@ def _read_gyro(
     bias = np.median(rate[at_rest])
     noise = MAD_TO_SD * np.median(np.abs(rate[at_rest] - bias))  # a few outliers do not change it
     sample_period_s = float(np.median(np.diff(known))) * measurements.period_s
-    rate_at_ticks = np.interp(np.arange(len(rate)), known, rate[known] - bias)
-    return rate_at_ticks, float(noise * np.sqrt(sample_period_s))
+    used = known[::sample_step]
+    rate_at_ticks = np.interp(np.arange(len(rate)), used, rate[used] - bias)
+    bias_error_rad_s = MEDIAN_ERROR_FACTOR * noise / np.sqrt(len(at_rest))
+    return rate_at_ticks, GyroNoise(
+        random_walk_rad_per_sqrt_s=float(noise * np.sqrt(sample_period_s)),
+        bias_error_rad_s=float(bias_error_rad_s),
+    )
 
 
 def _integrate_rate(rate: Floats, period_s: float) -> Floats:

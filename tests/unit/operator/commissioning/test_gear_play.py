@@ -10,16 +10,17 @@ from snakesim_operator.features.commissioning.joint_check.gear_play import (
     GearPlay,
     PlayKind,
     judge_gear_plays,
-    passes_load,
 )
 from snakesim_operator.features.commissioning.joint_check.load_response import (
     LoadResponse,
+    PassedTorque,
     find_neighbors_of_same_axis,
 )
 from snakesim_operator.features.commissioning.joint_check.tooth_contact import ToothContact
 
 JOINTS = 5
 AXES = ["yaw"] * JOINTS
+NOTHING_PASSED = PassedTorque(0.0, error_nm=0.001)
 # These are typical measurements of emulated joints on a floor.
 TIGHT = LoadResponse(
     small_motion_rad=0.011,
@@ -29,8 +30,8 @@ TIGHT = LoadResponse(
     neighbor_large_range_nm=0.9,
     neighbor_small_range_nm=0.25,
     noise_nm=0.005,
-    passed_nm=0.0,
-    passed_error_nm=0.001,
+    passed_in_small_motion=NOTHING_PASSED,
+    passed_in_all_motions=NOTHING_PASSED,
     contact=ToothContact(
         min_load_nm=0.06,
         reversal_rad=0.005,
@@ -77,7 +78,7 @@ SLIPPING = replace(
     elastic_nm=0.003,
     neighbor_large_range_nm=0.04,
     neighbor_small_range_nm=0.03,
-    passed_nm=0.013,
+    passed_in_small_motion=PassedTorque(0.013, error_nm=0.001),
     contact=NO_CONTACT,
 )
 HARDLY_LOADED = replace(
@@ -176,15 +177,24 @@ def test_joint_that_passes_no_load_is_loose(neighbor_large_range_nm: float) -> N
         SLIPPING,
         neighbor_large_range_nm=neighbor_large_range_nm,
         neighbor_small_range_nm=0.007,
-        passed_nm=0.0,
+        passed_in_small_motion=NOTHING_PASSED,
     )
-    assert not passes_load(response)
     assert judge_among_tight(response) == "loose"
 
 
-def test_load_of_slipping_coupling_within_noise_does_not_count() -> None:
-    assert passes_load(SLIPPING)
-    assert not passes_load(replace(SLIPPING, passed_error_nm=0.01))
+@pytest.mark.parametrize(
+    ("passed", "is_certain"),
+    [
+        (PassedTorque(0.013, error_nm=0.001), True),
+        (PassedTorque(0.013, error_nm=0.01), False),
+        (PassedTorque(0.002, error_nm=0.0001), False),
+    ],
+    ids=["clear", "within noise", "too small"],
+)
+def test_passed_torque_counts_only_above_noise_and_minimum(
+    passed: PassedTorque, is_certain: bool
+) -> None:
+    assert passed.is_certain == is_certain
 
 
 def test_joint_between_both_patterns_is_loose() -> None:

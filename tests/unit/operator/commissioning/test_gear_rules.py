@@ -29,9 +29,9 @@ def judge(
     motions = LinkMotions(
         motion_ratio=1.0,
         lost_motion=lost_motion,
-        held_motion=held_motion,
+        held_motions=[] if held_motion is None else [held_motion],
         small_motion_ratio=small_motion_ratio,
-        is_load_passed_on=True,
+        passes_torque_on=True,
     )
     return judge_gear_by_links(motions, JointDrive(), ALLOWED_BACKLASH_RAD)
 
