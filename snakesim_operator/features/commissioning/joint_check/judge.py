@@ -5,8 +5,8 @@ Five properties of a joint are judged, each from its own evidence, and each is c
     drive   it follows its targets, its encoder does not stick, and it measures no torque that brakes while it drives
     order   the links on both sides of it turn, and not those of a joint whose module may be exchanged with its own
     sign    they turn in the direction in which its encoder counts
-    gear    they turn as far as its encoder counts, and lose nothing when the load reverses; without IMUs, the torque
-            shows backlash and a coupling that slips, but not the ratio
+    gear    they turn as far as its encoder counts, also when the load reverses, and do not turn while its drive holds
+            still; without IMUs, the torque shows backlash and a coupling that slips, but not the ratio
     zero    its angle agrees with gravity, or is 0 on a robot that was laid straight
 
 A property without evidence is unknown, with a sentence on how it could be confirmed. It never counts as confirmed.
@@ -63,7 +63,7 @@ from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH
 
 
 def judge_joints(
-    run: CheckMeasurements,
+    measurements: CheckMeasurements,
     *,
     was_laid_straight: bool = False,
     allowed_backlash_rad: float = ALLOWED_BACKLASH_RAD,
@@ -71,14 +71,14 @@ def judge_joints(
     """Judge every joint, tail to head.
 
     Args:
-        run: Measurements of the joint check.
+        measurements: Measurements of the joint check.
         was_laid_straight: Whether the robot lay straight at the start, so that all angles should have been zero.
         allowed_backlash_rad: Motion that may be lost in a gear when its load reverses.
     """
     evaluator = _JointEvaluator(
-        run, was_laid_straight=was_laid_straight, allowed_backlash_rad=allowed_backlash_rad
+        measurements, was_laid_straight=was_laid_straight, allowed_backlash_rad=allowed_backlash_rad
     )
-    return [evaluator.check_joint(joint) for joint in range(len(run.joint_names))]
+    return [evaluator.judge_joint(joint) for joint in range(len(measurements.joint_names))]
 
 
 class _JointEvaluator:
@@ -105,7 +105,7 @@ class _JointEvaluator:
         self._dead_zones_rad = [find_dead_zone_rad(measurements, joint) for joint in joints]
         self._load_responses = [measure_load_response(measurements, joint) for joint in joints]
         self._gear_plays = judge_gear_plays(self._load_responses, measurements.axes)
-        # A joint that brakes while it drives moves all the same, so its links can be judged.
+        # The verdict on the drive is no condition: a joint whose torque has the wrong sign moves all the same.
         self._motion_fractions: list[LinkMotionFractions | None] = [
             measure_link_motion_fractions(measurements, joint)
             if self._dead_zones_rad[joint] is None and has_followed_target(measurements, joint)
@@ -113,16 +113,16 @@ class _JointEvaluator:
             for joint in joints
         ]
         self._module_order: ModuleOrder = find_module_order(self._motion_fractions)
+        # Give every IMU to the link on which its module really is.
         link_order = [0, *(self._module_order + 1)]
-        # Every IMU is on the link on which its module really is.
         self._reordered_measurements = replace(
             measurements,
             link_rate_rad_s=measurements.link_rate_rad_s[:, link_order],
             link_force_m_s2=measurements.link_force_m_s2[:, link_order],
         )
 
-    def check_joint(self, joint_index: int) -> JointVerdict:
-        """Check the drive of a joint and how it is mounted: its order, sign, gear ratio and zero offset.
+    def judge_joint(self, joint_index: int) -> JointVerdict:
+        """Judge the drive of a joint and how it is mounted: its order, sign, gear ratio and zero offset.
 
         Args:
             joint_index: Index of the joint.
