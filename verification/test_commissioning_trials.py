@@ -11,12 +11,13 @@ import pytest
 
 from snakesim_hal.model.robot_file.joints import JointDrive, JointMotor
 from snakesim_operator.features.commissioning.joint_check.gear_rules import IS_LOOSE
+from snakesim_operator.features.commissioning.joint_check.judge import judge_joints
 from snakesim_operator.features.commissioning.joint_check.measurements import CheckMeasurements
 from verification.identification_trials import identify_hidden_robot
 from verification.recorded_trials import append_result, read_results, run_missing_trials
 from verification.start_check_results import RobotResult, append_trial, judge_again
 from verification.start_check_signals import load_signals, save_signals
-from verification.start_check_trials import NONE, check_trial
+from verification.start_check_trials import NONE, check_trial, run_start_check
 from verification.torque_constant_results import TorqueConstantResult
 from verification.torque_constant_trials import draw_fault, identify_torque_constants
 
@@ -50,6 +51,18 @@ def test_sound_joint_beside_a_jerking_drive_is_not_reported() -> None:
     trial = check_trial(9137, "dead zone")
     assert trial.found, [row.summary for row in trial.rows]
     assert not trial.blamed, trial.blamed
+
+
+@pytest.mark.slow
+def test_no_sound_joint_of_a_long_robot_is_loose_at_a_low_rate() -> None:
+    """At 50 Hz, the rates of links and drives give an inaccurate ratio, and heavy loads push some joints back."""
+    measurements = run_start_check(
+        *("backend=can", "robot=mamba", "seed=3", "duration_s=80", "scene.ground.friction=0.3"),
+        *("rate_hz=50", "backends.can.imu_rate_hz=50"),
+    )
+    rows = judge_joints(measurements, was_laid_straight=True)
+    assert len(rows) == 18
+    assert [row.summary for row in rows if row.list_properties("wrong")] == []
 
 
 def test_recorded_signals_are_read_without_a_rounding_error(tmp_path: Path) -> None:

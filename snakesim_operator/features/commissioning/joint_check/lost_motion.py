@@ -6,8 +6,10 @@ Backlash is measured while the joint moves:
 
 A gear of another ratio loses a fraction of every motion: the link's rate is proportional to the drive's all the time.
 Backlash loses the same angle at each reversal, however long the motion: the rates are proportional except while the
-drive crosses the backlash. So the ratio is the one that most samples agree on. With that ratio, the range of the
-drive angle minus the link angle is the backlash. A delay between IMU and encoder is estimated along with the ratio.
+drive crosses the backlash. So the ratio is the one that more samples agree on than on any other. With that ratio, the
+range of the drive angle minus the link angle is the backlash. A delay between IMU and encoder is estimated along with
+the ratio. Noisy rates give an inaccurate ratio, which looks like backlash. The angles give an accurate one, but only
+without backlash. With the wrong one of the two, more motion seems to be lost, so the other one counts.
 
 A coupling that slips may carry one link, but not several. At an end of the robot, it then follows its own motion, and
 slips while its drive holds still and another joint moves. So the motion of held joints is measured as well.
@@ -119,16 +121,25 @@ def measure_lost_motion(measurements: CheckMeasurements, joint_index: int) -> Lo
     approximate_ratio = _find_ratio(drive_rate, link_rate)
     if approximate_ratio is None:
         return None
-    ratio, delay_s = _refine_ratio(approximate_ratio, drive_rate, link_rate, acceleration)
+    ratio_by_rates, delay_s = _refine_ratio(approximate_ratio, drive_rate, link_rate, acceleration)
 
-    # Difference of drive and link, as a moving average, and its noise.
-    difference_rad = encoder_rad[window] - delay_s * drive_rate - link_rad[window] / ratio
-    difference_rad = _smooth(difference_rad, half_window)
-    duration_s = len(difference_rad) * measurements.period_s
+    # Lost motion with the ratio of the rates, or with that of the angles if less motion is lost with it.
+    delayed_drive_rad = encoder_rad[window] - delay_s * drive_rate
+    ratios = [ratio_by_rates]
+    ratio_by_angles = _fit_ratio_of_angles(delayed_drive_rad, link_rad[window])
+    if abs(ratio_by_angles) >= MIN_RATIO:
+        ratios.append(ratio_by_angles)
+    lost_rad, ratio = min(
+        (float(np.ptp(_smooth(delayed_drive_rad - link_rad[window] / ratio, half_window))), ratio)
+        for ratio in ratios
+    )
+
+    # Its noise.
+    duration_s = len(delayed_drive_rad) * measurements.period_s
     gyro_drift_rad = gyro_noise.compute_drift_rad(duration_s) / abs(ratio)
     encoder_noise_rad = _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
     noise_rad = NOISE_FACTOR * float(np.hypot(gyro_drift_rad, encoder_noise_rad))
-    return LostMotion(float(np.ptp(difference_rad)), noise_rad, ratio)
+    return LostMotion(lost_rad, noise_rad, ratio)
 
 
 def measure_small_motion_ratio(measurements: CheckMeasurements, joint_index: int) -> float | None:
@@ -245,6 +256,13 @@ def _refine_ratio(
     coefficients = np.linalg.lstsq(regressors, link_rate[agrees], rcond=None)[0]
     delay_s = float(np.clip(-coefficients[1] / coefficients[0], -MAX_DELAY_S, MAX_DELAY_S))
     return float(coefficients[0]), delay_s
+
+
+def _fit_ratio_of_angles(drive_rad: Floats, link_rad: Floats) -> float:
+    """Return the ratio of the angles of link and drive by least squares, 0 if the drive does not move."""
+    centered_rad = drive_rad - np.mean(drive_rad)
+    variance = float(centered_rad @ centered_rad)
+    return float(centered_rad @ link_rad) / variance if variance > 0.0 else 0.0
 
 
 def _integrate_link_angle(

@@ -25,6 +25,9 @@ MIN_MOVED_RAD = 0.012  # a fifth of the default motion to one side
 MIN_FOLLOWED_FRACTION = 0.3
 # Mean along the motion; a light link's inertia may be a tenth of it against the motion.
 MIN_TORQUE_NM = 0.1
+MIN_LAG_RAD = (
+    0.005  # of an angle behind its target, so that the servo surely pushes in this direction
+)
 MAX_STRAIGHT_ERROR_RAD = 0.08  # a robot that was laid straight by hand is straight within that
 MAX_GRAVITY_ERROR_RAD = 0.05  # accuracy of an angle from the direction of gravity
 MIN_GRAVITY_M_S2 = 5.0  # across the axis of a joint; with less, gravity does not give its angle
@@ -72,6 +75,19 @@ def compute_mean_driving_torque_nm(
     )
 
 
+def pushes_towards_target(measurements: CheckMeasurements, joint_index: int) -> bool:
+    """Return whether a joint's measured torque points from its angle towards its target.
+
+    The torque of a sound drive does, also if the load is so large that the joint is moved against it.
+    """
+    lag_rad = measurements.target_rad[:, joint_index] - measurements.angle_rad[:, joint_index]
+    is_lagging = measurements.is_in_large_motion(joint_index) & (np.abs(lag_rad) > MIN_LAG_RAD)
+    if not is_lagging.any():
+        return False
+    torque_nm = measurements.torque_nm[is_lagging, joint_index]
+    return float(np.mean(torque_nm * np.sign(lag_rad[is_lagging]))) > 0.0
+
+
 def judge_drive(
     measurements: CheckMeasurements,
     joint_index: int,
@@ -96,7 +112,8 @@ def judge_drive(
         )
     if not has_followed_target(measurements, joint_index):
         return PropertyFinding("wrong", "did not move: motor, brake, power, or a link that is held")
-    if torque_nm is not None and torque_nm < -MIN_TORQUE_NM:
+    is_braking = torque_nm is not None and torque_nm < -MIN_TORQUE_NM
+    if is_braking and not pushes_towards_target(measurements, joint_index):
         return PropertyFinding(
             "wrong", "its torque has the wrong sign: it measures a brake while it drives"
         )

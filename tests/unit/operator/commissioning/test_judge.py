@@ -236,6 +236,26 @@ def test_judge_gravity_reveals_zero_of_a_bent_pitch_joint() -> None:
     assert summarize_verdicts(corrected) == [MATCHES_FILE] * JOINTS
 
 
+@pytest.mark.parametrize(
+    ("lag_sign", "state"),
+    [(-1.0, "confirmed"), (1.0, "wrong")],
+    ids=["a load pushes it away from its target", "it moves towards its target"],
+)
+def test_judge_torque_against_motion_is_wrong_only_towards_target(
+    lag_sign: float, state: str
+) -> None:
+    measured = make_measurements()
+    directions = np.sign(measured.velocity_rad_s[:, 0])
+    torque_nm = measured.torque_nm.copy()
+    torque_nm[:, 0] = -0.5 * directions
+    target_rad = measured.target_rad.copy()
+    target_rad[:, 0] += 0.01 * lag_sign * directions
+    verdicts = judge_joints(
+        replace(measured, torque_nm=torque_nm, target_rad=target_rad), was_laid_straight=True
+    )
+    assert verdicts[0].findings["drive"].state == state
+
+
 def test_judge_torque_against_its_motion_has_wrong_sign() -> None:
     measured = make_measurements()
     wrong = replace(measured, torque_nm=measured.torque_nm * np.array((-1.0, 1.0, 1.0)))
