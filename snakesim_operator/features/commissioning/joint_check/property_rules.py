@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from snakesim_hal.base.arrays import Floats
 from snakesim_hal.model.robot_file.checked import JointProperty
 from snakesim_hal.model.robot_file.joints import JointDrive
 from snakesim_operator.features.commissioning.joint_check.joint_verdict import (
@@ -75,17 +76,14 @@ def compute_mean_driving_torque_nm(
     )
 
 
-def pushes_towards_target(measurements: CheckMeasurements, joint_index: int) -> bool:
-    """Return whether a joint's measured torque points from its angle towards its target.
+def list_torques_towards_target(measurements: CheckMeasurements, joint_index: int) -> Floats:
+    """Return a joint's torques while it was behind its target, (n,); positive if they point towards the target.
 
-    The torque of a sound drive does, also if the load is so large that the joint is moved against it.
+    Those of a sound drive do, also if the load is so large that the joint is moved against them.
     """
     lag_rad = measurements.target_rad[:, joint_index] - measurements.angle_rad[:, joint_index]
     is_lagging = measurements.is_in_large_motion(joint_index) & (np.abs(lag_rad) > MIN_LAG_RAD)
-    if not is_lagging.any():
-        return False
-    torque_nm = measurements.torque_nm[is_lagging, joint_index]
-    return float(np.mean(torque_nm * np.sign(lag_rad[is_lagging]))) > 0.0
+    return measurements.torque_nm[is_lagging, joint_index] * np.sign(lag_rad[is_lagging])
 
 
 def judge_drive(
@@ -111,13 +109,27 @@ def judge_drive(
             f"({np.rad2deg(dead_zone_rad):.1f} degrees); fasten the encoder and its magnet, or replace it",
         )
     if not has_followed_target(measurements, joint_index):
-        return PropertyFinding("wrong", "did not move: motor, brake, power, or a link that is held")
+        return PropertyFinding("wrong", _describe_stuck_joint(measurements, joint_index))
     is_braking = torque_nm is not None and torque_nm < -MIN_TORQUE_NM
-    if is_braking and not pushes_towards_target(measurements, joint_index):
+    torques_towards_target_nm = list_torques_towards_target(measurements, joint_index)
+    if is_braking and np.sum(torques_towards_target_nm) <= 0.0:
         return PropertyFinding(
             "wrong", "its torque has the wrong sign: it measures a brake while it drives"
         )
     return CONFIRMED
+
+
+def _describe_stuck_joint(measurements: CheckMeasurements, joint_index: int) -> str:
+    """Return that a joint did not move, and whether its motor pushed."""
+    measures_torque = "torque" in measurements.drives[joint_index].measures
+    torques_nm = list_torques_towards_target(measurements, joint_index)
+    max_torque_nm = float(np.max(torques_nm, initial=0.0))
+    if measures_torque and max_torque_nm >= MIN_TORQUE_NM:
+        return (
+            f"did not move, although its motor pushed with up to {max_torque_nm:.2f} N·m: a brake, a link that is "
+            "held, or a load that is too heavy"
+        )
+    return "did not move: motor, brake, power, or a link that is held"
 
 
 def make_swapped_findings(joint: str, other: str) -> dict[JointProperty, PropertyFinding]:

@@ -237,6 +237,30 @@ def test_judge_gravity_reveals_zero_of_a_bent_pitch_joint() -> None:
 
 
 @pytest.mark.parametrize(
+    ("torque_nm", "cause"),
+    [(0.0, "did not move: motor, brake, power"), (2.5, "its motor pushed with up to 2.50 N·m")],
+    ids=["no torque", "torque towards the target"],
+)
+def test_judge_joint_that_does_not_move_is_described_by_its_torque(
+    torque_nm: float, cause: str
+) -> None:
+    measured = make_measurements()
+    angle_rad = measured.angle_rad.copy()
+    angle_rad[:, 0] = 0.0
+    torques_nm = measured.torque_nm.copy()
+    torques_nm[:, 0] = torque_nm * np.sign(measured.target_rad[:, 0])
+    stuck = replace(
+        measured,
+        angle_rad=angle_rad,
+        velocity_rad_s=np.where([True, False, False], 0.0, measured.velocity_rad_s),
+        torque_nm=torques_nm,
+    )
+    drive = judge_joints(stuck, was_laid_straight=True)[0].findings["drive"]
+    assert drive.state == "wrong"
+    assert cause in drive.reason
+
+
+@pytest.mark.parametrize(
     ("lag_sign", "state"),
     [(-1.0, "confirmed"), (1.0, "wrong")],
     ids=["a load pushes it away from its target", "it moves towards its target"],
