@@ -1,6 +1,7 @@
 """Clients control a running robot: the examples of docs/how-to/client.md, and `snakesim.Robot`."""
 
 import ast
+import re
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ import pytest
 import snakesim
 from snakesim_hal.base.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_hal.network.session import ConnectionSettings, Session, open_session
+from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointState, RobotStatus
 from snakesim_operator.playback.info import inspect_recording
@@ -88,6 +90,18 @@ def read_status(session: Session) -> RobotStatus:
     return status
 
 
+def receive_states_until(reader: SampleReader[JointState], tick: int) -> list[JointState]:
+    """Return all joint states up to that of a tick, some of which may not have arrived yet."""
+    states: list[JointState] = []
+
+    def has_received_tick() -> bool:
+        states.extend(reader.drain())
+        return bool(states) and states[-1].tick >= tick
+
+    wait_until(has_received_tick, f"the joint state of tick {tick}")
+    return states
+
+
 def raise_priority() -> None:
     """Give a client the priority of control where that is allowed, because a busy computer would delay it."""
     set_realtime_priority(SERVICE_PRIORITY)
@@ -107,14 +121,18 @@ def test_example_client_arms_moves_one_joint_and_disarms(waiting_run: RunningCom
             preexec_fn=raise_priority,
         )
         assert completed.code == 0, completed.out + completed.err
-        angles = [state.angle_rad for state in joints.drain()]
+        turned = re.search(r"joint_3 turned by ([+-]\d\.\d+) rad", completed.out)
+        assert turned is not None, completed.out
+        assert 0.09 < float(turned[1]) < 0.11, completed.out
+        end_status = read_status(session)
+        states = receive_states_until(joints, end_status.tick)
+        angles = [state.angle_rad for state in states]
         motions_rad = [
             max(abs(angle - joint_angles[0]) for angle in joint_angles)
             for joint_angles in zip(*angles, strict=True)
         ]
         assert 0.09 < motions_rad[2] < 0.11, motions_rad
         assert max(motions_rad[:2] + motions_rad[3:]) < 0.03, motions_rad
-        end_status = read_status(session)
         assert end_status.lifecycle == "disarmed"
         assert set(end_status.commands_rejected) <= {"no_lease"}
         # The last commands are rejected if the host first notices that the client has left.
