@@ -24,7 +24,10 @@ NO_BACKLASH = "no backlash above"  # and then the angle above which the torque e
 # all of it, and within backlash nearly nothing. In between, the teeth may have touched for a part of the motion.
 MIN_FOLLOWED_FRACTION = 0.8
 MAX_FOLLOWED_FRACTION_IN_BACKLASH = 0.5
-NO_LOST_MOTION = "it moved to one side only, or its gyros are noisy"
+NO_LOST_MOTION = (
+    "the motions of its link and its drive fit no ratio: it moved too little or to one side only, its gyros are noisy "
+    "or silent, or its coupling slips"
+)
 
 
 @dataclass(frozen=True)
@@ -55,18 +58,17 @@ class LinkMotions:
         ratio = 1.0 if self.lost_motion is None else self.lost_motion.ratio
         return abs(self.small_motion_ratio / ratio)
 
-    def find_held_motion(self, allowed_backlash_rad: float) -> HeldMotion | None:
-        """Return the largest motion of the links while the drive held still; None if no motion is certain.
+    def find_largest_held_motion(self, allowed_backlash_rad: float) -> HeldMotion | None:
+        """Return the largest motion of the links while the drive held still, a certain one if there is any.
 
         Args:
             allowed_backlash_rad: A motion counts only if it is larger.
         """
-        certain_motions = [
-            held
-            for held in self.held_motions
-            if held.turned_rad > max(allowed_backlash_rad, held.noise_rad)
-        ]
-        return max(certain_motions, key=lambda held: held.turned_rad, default=None)
+        return max(
+            (held for held in self.held_motions if held.turned_rad > allowed_backlash_rad),
+            key=lambda held: (held.is_certain, held.turned_rad),
+            default=None,
+        )
 
 
 def judge_gear_by_links(
@@ -84,8 +86,8 @@ def judge_gear_by_links(
     lost = motions.lost_motion
     if lost is not None and lost.lost_rad > max(allowed_backlash_rad, lost.noise_rad):
         return _judge_lost_motion(motions, lost, drive, allowed_backlash_rad)
-    held = motions.find_held_motion(allowed_backlash_rad)
-    if held is not None:
+    held = motions.find_largest_held_motion(allowed_backlash_rad)
+    if held is not None and held.is_certain:
         return _judge_held_motion(motions, held)
     if wrong_ratio := _describe_wrong_ratio(motions.tooth_ratio, drive):
         other_cause = ""
@@ -99,6 +101,12 @@ def judge_gear_by_links(
             "unknown",
             f"backlash unknown, as the noise of gyros and encoder allows {lost.noise_rad:.3f} rad, and "
             f"{allowed_backlash_rad:g} rad are allowed: {SHAKE_LINK}",
+        )
+    if held is not None:
+        return PropertyFinding(
+            "unknown",
+            f"coupling unknown, as {_describe_held_motion(held)}, and the noise of gyros and encoder allows "
+            f"{held.noise_rad:.3f} rad: {SHAKE_LINK}",
         )
     return CONFIRMED
 
@@ -153,16 +161,20 @@ def _judge_lost_motion(
 
 def _judge_held_motion(motions: LinkMotions, held: HeldMotion) -> PropertyFinding:
     """Judge a gear whose links turned while its drive held still."""
-    turned = (
-        f"its links turned against each other by {held.turned_rad:.3f} rad while its drive held still and another "
-        "joint moved"
-    )
+    turned = _describe_held_motion(held)
     followed = motions.followed_fraction
     if followed is not None and followed > MIN_FOLLOWED_FRACTION:
         return PropertyFinding("wrong", f"its coupling slips: {turned}; {FASTEN_COUPLING}")
     return PropertyFinding(
         "wrong",
         f"{IS_LOOSE}: {turned}. Either the coupling slips, or the gear has backlash; {FASTEN_COUPLING}",
+    )
+
+
+def _describe_held_motion(held: HeldMotion) -> str:
+    return (
+        f"its links turned against each other by {held.turned_rad:.3f} rad while its drive held still and another "
+        "joint moved"
     )
 
 

@@ -39,6 +39,7 @@ MAX_DELAY_S = 0.03  # between IMU and encoder
 NOISE_FACTOR = 4.0  # standard deviations; less lost motion may be noise
 # Standard deviations. A held joint is measured once for each other joint, so false alarms add up.
 HELD_NOISE_FACTOR = 6.0
+MAX_GYRO_GAP_S = 0.3  # between two samples; a gyro that is silent for longer is not used
 MAX_GYRO_SCALE_ERROR = 0.03  # of the rotation of a link; two gyros may differ by that much
 MIN_SMALL_MOTION_RAD = (
     0.002  # range of a drive in its small motion; with less, its link shows nothing
@@ -62,7 +63,12 @@ class HeldMotion:
     """The motion of a joint's links against each other while its drive held still, and another joint moved."""
 
     turned_rad: float  # by which the links turned against each other, from end to end
-    noise_rad: float  # that much would be measured with a sound gear
+    noise_rad: float  # that much may be measured with a sound gear
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is surely a motion, and not noise."""
+        return self.turned_rad > self.noise_rad
 
 
 @dataclass(frozen=True)
@@ -301,9 +307,15 @@ def _integrate_link_angle(
 def _read_gyro(
     measurements: CheckMeasurements, link_index: int, component: int, sample_step: int = 1
 ) -> tuple[Floats, GyroNoise] | None:
-    """Return a link's rate at every tick, (n,), without its bias, and its noise; None without a gyro."""
+    """Return a link's rate at every tick, (n,), without its bias, and its noise.
+
+    None if there is no gyro, or if it was silent for some time.
+    """
     rate = measurements.link_rate_rad_s[:, link_index, component]
     known = np.flatnonzero(~np.isnan(rate))
+    gaps = np.diff(np.concatenate(([0], known, [len(rate) - 1])))
+    if np.max(gaps) * measurements.period_s > MAX_GYRO_GAP_S:
+        return None
     at_rest = known[measurements.is_at_rest()[known]]
     if len(at_rest) < MIN_SAMPLES:
         return None

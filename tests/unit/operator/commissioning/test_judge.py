@@ -211,6 +211,15 @@ def test_judge_link_that_turns_while_its_drive_holds_is_loose() -> None:
     assert others == [MATCHES_FILE] * (JOINTS - 1)
 
 
+def test_judge_gyro_that_falls_silent_leaves_backlash_unknown() -> None:
+    measured = make_measurements()
+    rates = measured.link_rate_rad_s.copy()
+    rates[-100:, 1] = np.nan
+    verdict = judge_joints(replace(measured, link_rate_rad_s=rates), was_laid_straight=True)[0]
+    assert list_unconfirmed(verdict) == {"gear": "unknown"}
+    assert "silent" in verdict.findings["gear"].reason
+
+
 @pytest.mark.parametrize("passes_torque_on", [True, False])
 def test_judge_gear_names_slipping_coupling_only_with_passed_load(passes_torque_on: bool) -> None:
     motions = LinkMotions(
