@@ -206,7 +206,7 @@ class _ResumedAuthority(CommandAuthority):
         # `joints` were measured under the last setpoints but one, and the state that follows under the last ones.
         previous_setpoints, last_setpoints = applied
         self._last_setpoints = previous_setpoints
-        self.observe_joints(joints)
+        self.observe_joints(joints, joints.timestamp_ns)
         self._last_setpoints = last_setpoints
         if power is not None:
             self.observe_power(power, joints.timestamp_ns)

@@ -132,17 +132,15 @@ class CommandAuthority:
 
     # --- inputs: measured values -----------------------------------------------------------------------------
 
-    def observe_joints(self, joints: JointState, now_ns: int | None = None) -> None:
+    def observe_joints(self, joints: JointState, now_ns: int) -> None:
         """Check the newest joint state, and store its plausible values.
 
         An implausible value is rejected: the last good value of that joint stays.
 
         Args:
             joints: Newest joint state.
-            now_ns: Safety time in ns. None means the timestamp of the state.
+            now_ns: Safety time in ns.
         """
-        if now_ns is None:
-            now_ns = joints.timestamp_ns
         applied = None
         if self.state == "armed":
             applied = self._last_setpoints

@@ -120,7 +120,7 @@ def find_far_targets(
             continue
         match mode:
             case JointMode.PASSIVE:
-                continue
+                pass
             case JointMode.POSITION:
                 if abs(target - measured_rad) > max_step_rad:
                     reasons.append(

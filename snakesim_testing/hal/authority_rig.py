@@ -45,7 +45,8 @@ class AuthorityRig:
         """Let the authority observe a joint state 1 s later than the last one, so that any angle is plausible."""
         self.timestamp_ns += 10**9
         self.authority.observe_joints(
-            make_joint_state(self.robot, *values, timestamp_ns=self.timestamp_ns, **other)
+            make_joint_state(self.robot, *values, timestamp_ns=self.timestamp_ns, **other),
+            self.timestamp_ns,
         )
 
     def acquire(self, holder: str = "control", priority: int = 100) -> Answer:

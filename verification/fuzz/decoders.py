@@ -116,7 +116,7 @@ def pass_to_hal(hal: AuthorityRig, message: Message) -> str:
             )
             return rejection or "accepted"
         case JointState():
-            authority.observe_joints(message)
+            authority.observe_joints(message, message.timestamp_ns)
             return "observed"
         case LeaseRequest():
             answer = authority.handle_lease_request(message, hal.now_ns)

@@ -358,7 +358,8 @@ def test_host_ignores_commands_with_wrong_lease_epoch() -> None:
     with connected_sessions("worm") as (session,):
         host = Host(make_run_config(), GuardedBackend(LagBackend(make_run_config())), session)
         control = host.participants["control"]
-        host.authority.observe_joints(make_joint_state(host.description))
+        joints = make_joint_state(host.description)
+        host.authority.observe_joints(joints, joints.timestamp_ns)
         host.authority.handle_lease_request(LeaseRequest(action="acquire", holder="control"), 0)
         holder_epoch = host.authority.lease.epoch
 

@@ -270,7 +270,8 @@ def test_host_expired_lease_is_a_fault_despite_new_request() -> None:
     with connected_sessions("worm") as (session,):
         host = Host(config, GuardedBackend(LagBackend(config)), session)
         host.on_request(LeaseRequest(action="acquire", holder="control"), answers.append)
-        host.authority.observe_joints(make_joint_state(ROBOT))
+        joints = make_joint_state(ROBOT)
+        host.authority.observe_joints(joints, joints.timestamp_ns)
         host.authority.state = "armed"
         # The lease expires, and another client requests it before the next tick of the host.
         time.sleep(1.5e-9 * host.description.lease_ns)

@@ -279,6 +279,17 @@ def test_command_of_another_arm_session_neither_moves_nor_renews() -> None:
     assert rig.authority.rejected_counts == {"before_arming": 5}
 
 
+@pytest.mark.parametrize("other_session", [0, 2, 7])
+def test_command_of_any_arm_session_is_kept_while_disarmed(other_session: int) -> None:
+    """A client cannot know the next session, and its commands must flow before the robot is armed."""
+    rig = make_armed_rig()
+    assert rig.authority.handle_lifecycle_request(DISARM, rig.now_ns).ok
+    assert rig.authority.arm_session == 1
+
+    assert rig.send(0.1, arm_session=other_session) is None
+    assert rig.authority.rejected_counts == {}
+
+
 def test_command_under_way_at_arming_is_not_counted_as_rejected() -> None:
     rig = AuthorityRig()
     rig.tick = 5
@@ -615,10 +626,9 @@ def test_constant_angles_are_implausible_only_while_commanded_to_move(
 
     for tick in range(1, 400):  # 4 s, many times as long as a joint may be frozen
         rig.run_tick_with_command(0.1 + 0.001 * tick)
+        measured_ns = rig.timestamp_ns + tick * PERIOD_NS
         rig.authority.observe_joints(
-            make_joint_state(
-                rig.robot, 0.1, tick=tick, timestamp_ns=rig.timestamp_ns + tick * PERIOD_NS
-            )
+            make_joint_state(rig.robot, 0.1, tick=tick, timestamp_ns=measured_ns), measured_ns
         )
         rig.authority.latch_faults_and_expire_lease(rig.now_ns, rig.tick)
 

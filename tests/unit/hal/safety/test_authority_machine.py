@@ -185,7 +185,7 @@ class AuthorityMachine(AuthorityModel):
             tick=self.tick,
             timestamp_ns=self.timestamp_ns,
         )
-        self.authority.observe_joints(joint_state)
+        self.authority.observe_joints(joint_state, self.timestamp_ns)
         self.seen_tick = self.tick
         if failure in ("short", "long", "no_valid", "no_age"):
             self.doubtful_joints = None

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from snakesim_hal.safety.joint_limits import JointLimits
-from snakesim_hal.safety.stop_ramp import StopRamp
-from snakesim_hal.wire.messages import JointMode
+from snakesim_hal.safety.stop_ramp import StopRamp, StopReaction
+from snakesim_hal.wire.messages import JointMode, StopMode
 from snakesim_testing.hal.limiter_rig import (
     ANGLE_STEP_RAD,
     JOINT_COUNT,
@@ -91,3 +91,11 @@ def test_stop_ramp_from_any_state_never_jumps_or_leaves_range(
     rest_rad = np.clip(angle, -1.5, 1.5) + np.sign(velocity) * min(abs(velocity), 5.0) ** 2 / 200.0
     # The ramp decelerates in whole periods.
     assert abs(targets_rad[-1] - np.clip(rest_rad, -1.5, 1.5)) <= ANGLE_STEP_RAD / 2
+
+
+@pytest.mark.parametrize("stop_mode", ["passive", "damp", "hold"])
+def test_stop_reaction_to_fault_of_a_robot_that_was_never_armed_is_passive(
+    stop_mode: StopMode,
+) -> None:
+    setpoints = StopReaction(LIMITS, stop_mode).make_setpoints("fault", LIMITS.torque_nm)
+    assert set(setpoints.mode.tolist()) == {int(JointMode.PASSIVE)}
