@@ -14,3 +14,6 @@
 """
 
 import snakesim_testing.isolation  # noqa: F401 - first: it fixes the arithmetic before NumPy is imported
+
+# Options of pytest for tools that run the tests of a change. Without them, pytest leaves out the heavy tests.
+TESTS_OF_A_CHANGE = ("-m", "not (slow or quiet)")

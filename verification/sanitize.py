@@ -14,6 +14,7 @@ from snakesim_hal.base.process import make_child_environment
 from snakesim_native.compile import CannotCompileError, compile_library, list_compilers
 from snakesim_native.libraries import LIBRARIES
 from snakesim_native.load import SWITCH_VARIABLE
+from verification import TESTS_OF_A_CHANGE
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "build" / "sanitized"
@@ -30,7 +31,6 @@ TESTS = (
     "tests/system/physics",
     "tests/system/native",
 )
-MARKS = "not (slow or quiet)"  # also the heavy tests, which pytest leaves out otherwise
 LIBRARIES_TO_PRELOAD = ("libasan.so", "libubsan.so")
 
 
@@ -65,8 +65,7 @@ def main() -> int:
         "1200",
         "-p",
         "no:cacheprovider",
-        "-m",
-        MARKS,
+        *TESTS_OF_A_CHANGE,
         *arguments.tests,
     ]
     return subprocess.call(command, cwd=ROOT, env=make_child_environment(environment))

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -43,6 +43,8 @@ from snakesim_testing.hal.small_robots import make_pose
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 
+TickMessageT = TypeVar("TickMessageT", Clock, JointState)
+
 LIMIT_S = 20.0
 
 
@@ -68,6 +70,20 @@ def wait_for_messages(
         return len(messages) >= count
 
     wait_until(has_enough, description)
+    return messages
+
+
+def wait_for_tick(
+    reader: SampleReader[TickMessageT], tick: int, description: str
+) -> list[TickMessageT]:
+    """Wait until a reader has received the message of a tick or a later one, and return all that it has received."""
+    messages: list[TickMessageT] = []
+
+    def has_received_tick() -> bool:
+        messages.extend(reader.drain())
+        return bool(messages) and messages[-1].tick >= tick
+
+    wait_until(has_received_tick, description)
     return messages
 
 

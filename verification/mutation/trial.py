@@ -14,6 +14,8 @@ from typing import NoReturn
 
 import pytest
 
+from verification import TESTS_OF_A_CHANGE
+
 ROOT = Path(__file__).resolve().parents[2]
 TEST_FOLDER = Path("tests/unit/hal")
 
@@ -49,7 +51,6 @@ TESTS_BY_FILE = {
     "thermal.py": ("test_thermal.py",),
 }
 
-MARKS = ("-m", "not slow and not quiet")  # also the heavy tests, which pytest leaves out otherwise
 # Exit codes of pytest.
 SURVIVED = int(pytest.ExitCode.OK)
 KILLED = int(pytest.ExitCode.TESTS_FAILED)
@@ -127,8 +128,7 @@ def run_tests_on_mutant(file: str, source: str, folder: str) -> NoReturn:
     os.dup2(log, 2)
     sys.meta_path.insert(0, MutantImporter(file, source))
     tests = [str(next(TEST_FOLDER.rglob(name))) for name in TESTS_BY_FILE[file]]
-    exit_code = pytest.main(
-        ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "pytest_timeout", *MARKS, *tests]
-    )
+    options = ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-p", "pytest_timeout"]
+    exit_code = pytest.main([*options, *TESTS_OF_A_CHANGE, *tests])
     sys.stdout.flush()
     os._exit(exit_code)

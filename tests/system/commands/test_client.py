@@ -12,10 +12,10 @@ import pytest
 import snakesim
 from snakesim_hal.base.process import SERVICE_PRIORITY, set_realtime_priority
 from snakesim_hal.network.session import ConnectionSettings, Session, open_session
-from snakesim_hal.network.streams import SampleReader
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import JointState, RobotStatus
 from snakesim_operator.playback.info import inspect_recording
+from snakesim_testing.hal.local_network import wait_for_tick
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.messages import raises_error
 from snakesim_testing.runs.command import (
@@ -90,18 +90,6 @@ def read_status(session: Session) -> RobotStatus:
     return status
 
 
-def receive_states_until(reader: SampleReader[JointState], tick: int) -> list[JointState]:
-    """Return all joint states up to that of a tick, some of which may not have arrived yet."""
-    states: list[JointState] = []
-
-    def has_received_tick() -> bool:
-        states.extend(reader.drain())
-        return bool(states) and states[-1].tick >= tick
-
-    wait_until(has_received_tick, f"the joint state of tick {tick}")
-    return states
-
-
 def raise_priority() -> None:
     """Give a client the priority of control where that is allowed, because a busy computer would delay it."""
     set_realtime_priority(SERVICE_PRIORITY)
@@ -125,7 +113,7 @@ def test_example_client_arms_moves_one_joint_and_disarms(waiting_run: RunningCom
         assert turned is not None, completed.out
         assert 0.09 < float(turned[1]) < 0.11, completed.out
         end_status = read_status(session)
-        states = receive_states_until(joints, end_status.tick)
+        states = wait_for_tick(joints, end_status.tick, "the last joint state")
         angles = [state.angle_rad for state in states]
         motions_rad = [
             max(abs(angle - joint_angles[0]) for angle in joint_angles)

@@ -21,6 +21,7 @@ from snakesim_operator.playback.play import play_recording
 from snakesim_operator.recording.message import RECORDING_FILENAME
 from snakesim_operator.recording.reader import RecordingReader
 from snakesim_operator.results.run_log import RunRecord
+from snakesim_testing.hal.local_network import wait_for_tick
 from snakesim_testing.harness.endpoint import find_free_endpoint
 from snakesim_testing.harness.wait import wait_until
 from snakesim_testing.runs import in_process_command as command
@@ -148,13 +149,8 @@ def test_played_recording_keeps_its_timing_at_half_rate(tmp_path: Path) -> None:
         descriptions = session.declare_latched_reader(keys.DESCRIPTION, RobotDescription)
         clock_reader = session.declare_reader(keys.CLOCK, Clock)
         start_s = time.monotonic()
-        clocks: list[Clock] = []
-
-        def has_received_last_tick() -> bool:
-            clocks.extend(clock_reader.drain())
-            return bool(clocks) and clocks[-1].tick == 99
-
-        wait_until(has_received_last_tick, "the last tick")
+        clocks = wait_for_tick(clock_reader, 99, "the last tick")
+        assert clocks[-1].tick == 99
         assert time.monotonic() - start_s > 1.0
         assert len(clocks) > 50
         assert descriptions.drain()[-1].robot == "planar13"

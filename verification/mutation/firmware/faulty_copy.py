@@ -20,13 +20,13 @@ import pytest
 
 from snakesim_native.compile import SHIPPED_FOLDER
 from snakesim_native.libraries import PACKAGE
+from verification import TESTS_OF_A_CHANGE
 
 ROOT = Path(__file__).resolve().parents[3]
 FIRMWARE_FOLDER = Path("joint_module", "firmware")  # in the package
 COMPILED_FIRMWARE_PATTERN = "joint_module*"  # names of the compiled programs
 TIME_LIMIT_S = 400.0  # of one run of pytest; a fault may let tests wait for a long time
 TEST_TIME_LIMIT_S = 60
-MARKS = "not (slow or quiet)"  # also the heavy tests, which pytest leaves out otherwise
 OUTCOME_PATTERN = re.compile(r"^(?:FAILED|ERROR) \S+::(\w+)", re.MULTILINE)
 KILLED_BY_TIME_LIMIT = "(time limit)"  # stands for the name of a test
 
@@ -137,7 +137,7 @@ def find_failing_test(copy: Path, tests: SelectedTests) -> str | None:
         *(sys.executable, "-P", "-m", "pytest", "-x", "-q", "--tb=no", "-rfE"),
         # The root of the repository must not come before the copy.
         *("-o", "pythonpath=", "-p", "no:cacheprovider", "--timeout", str(TEST_TIME_LIMIT_S)),
-        *("-m", MARKS),
+        *TESTS_OF_A_CHANGE,
         *tests.arguments,
     ]
     exit_code, output = _run_with_time_limit(command, _make_environment(copy))

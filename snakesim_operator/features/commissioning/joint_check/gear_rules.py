@@ -22,8 +22,8 @@ CONFIRM_GEAR_BY_HAND = NO_LINK + f"measure it with `snakesim robot calibrate gea
 NO_BACKLASH = "no backlash above"  # and then the angle above which the torque excludes it
 # By how much of its ratio a link follows the small motion of its drive. Behind a coupling that slips, it follows nearly
 # all of it, and within backlash nearly nothing. In between, the teeth may have touched for a part of the motion.
-MIN_FOLLOWED_FRACTION = 0.8
-MAX_FOLLOWED_FRACTION_IN_BACKLASH = 0.5
+MIN_FRACTION_BEHIND_COUPLING = 0.8
+MAX_FRACTION_WITHIN_BACKLASH = 0.5
 NO_LOST_MOTION = (
     "the motions of its link and its drive fit no ratio: it moved too little or to one side only, its gyros are noisy "
     "or silent, or its coupling slips"
@@ -38,9 +38,8 @@ class LinkMotions:
     lost_motion: LostMotion | None  # while the joint moved; None if it could not be measured
     held_motions: Sequence[HeldMotion]  # while its drive held still
     small_motion_ratio: float | None  # as `motion_ratio`, in the small motion; None if not measured
-    passes_torque_on: (
-        bool  # whether the torque of other joints changes with the direction of its motions
-    )
+    # Whether the torque of other joints changes with the direction of its motions.
+    passes_torque_on: bool
 
     @property
     def tooth_ratio(self) -> float:
@@ -137,13 +136,13 @@ def _judge_lost_motion(
             f"{IS_LOOSE}: its link stays behind by {lost.lost_rad:.3f} rad. Either the gear has backlash, or the "
             f"coupling slips; {FASTEN_COUPLING}",
         )
-    if followed > MIN_FOLLOWED_FRACTION:
+    if followed > MIN_FRACTION_BEHIND_COUPLING:
         return PropertyFinding(
             "wrong",
             f"its coupling slips: its link follows a small motion, and stays behind by {lost.lost_rad:.3f} rad in a "
             f"large one; {FASTEN_COUPLING}",
         )
-    if followed > MAX_FOLLOWED_FRACTION_IN_BACKLASH:
+    if followed > MAX_FRACTION_WITHIN_BACKLASH:
         return PropertyFinding(
             "wrong",
             f"{IS_LOOSE}: its link stays behind by {lost.lost_rad:.3f} rad, and follows only {followed:.2f} of a "
@@ -163,7 +162,7 @@ def _judge_held_motion(motions: LinkMotions, held: HeldMotion) -> PropertyFindin
     """Judge a gear whose links turned while its drive held still."""
     turned = _describe_held_motion(held)
     followed = motions.followed_fraction
-    if followed is not None and followed > MIN_FOLLOWED_FRACTION:
+    if followed is not None and followed > MIN_FRACTION_BEHIND_COUPLING:
         return PropertyFinding("wrong", f"its coupling slips: {turned}; {FASTEN_COUPLING}")
     return PropertyFinding(
         "wrong",
@@ -206,13 +205,13 @@ def judge_gear_by_torque(play: GearPlay, allowed_backlash_rad: float) -> Propert
             return PropertyFinding(
                 "wrong",
                 "its coupling slips: its torque stays low and does not follow its angle, unlike that of other joints; "
-                "fasten the coupling, and check the gear",
+                f"{FASTEN_COUPLING}",
             )
         case "loose":
             return PropertyFinding(
                 "wrong",
                 f"{IS_LOOSE}: its torque does not follow its angle. Either the coupling slips, or the gear has "
-                "backlash; fasten the coupling, and check the gear",
+                f"backlash; {FASTEN_COUPLING}",
             )
         case "tight" if play.max_backlash_rad <= allowed_backlash_rad:
             return PropertyFinding(

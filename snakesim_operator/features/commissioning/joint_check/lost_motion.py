@@ -197,16 +197,9 @@ def measure_held_motions(
     encoder_noise_rad = (
         abs(ratio) * _measure_encoder_noise(measurements, joint_index) / np.sqrt(half_window)
     )
-    own_motion = measurements.is_moved_by_target(joint_index)
 
     held_motions: list[HeldMotion] = []
-    for other in range(len(measurements.joint_names)):
-        moved_rows = np.flatnonzero(measurements.is_moved_by_target(other))
-        if other == joint_index or len(moved_rows) < MIN_SAMPLES:
-            continue
-        window = slice(moved_rows[0], moved_rows[-1] + 1)
-        if own_motion[window].any():
-            continue
+    for window in _list_held_windows(measurements, joint_index):
         duration_s = len(difference_rad[window]) * measurements.period_s
         gyro_drift_rad = gyro_noise.compute_drift_rad(duration_s)
         scale_error_rad = MAX_GYRO_SCALE_ERROR * float(np.ptp(link_ahead_rad[window]))
@@ -215,6 +208,20 @@ def measure_held_motions(
         turned_rad = float(np.ptp(_smooth(difference_rad[window], half_window)))
         held_motions.append(HeldMotion(turned_rad, noise_rad))
     return held_motions
+
+
+def _list_held_windows(measurements: CheckMeasurements, joint_index: int) -> list[slice]:
+    """Return the ticks of the motions of each other joint, if the joint itself did not move meanwhile."""
+    own_motion = measurements.is_moved_by_target(joint_index)
+    windows: list[slice] = []
+    for other in range(len(measurements.joint_names)):
+        moved_rows = np.flatnonzero(measurements.is_moved_by_target(other))
+        if len(moved_rows) < MIN_SAMPLES:
+            continue
+        window = slice(moved_rows[0], moved_rows[-1] + 1)
+        if not own_motion[window].any():
+            windows.append(window)
+    return windows
 
 
 def _measure_encoder_noise(measurements: CheckMeasurements, joint_index: int) -> float:

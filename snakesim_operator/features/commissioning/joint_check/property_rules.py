@@ -26,9 +26,8 @@ MIN_MOVED_RAD = 0.012  # a fifth of the default motion to one side
 MIN_FOLLOWED_FRACTION = 0.3
 # Mean along the motion; a light link's inertia may be a tenth of it against the motion.
 MIN_TORQUE_NM = 0.1
-MIN_LAG_RAD = (
-    0.005  # of an angle behind its target, so that the servo surely pushes in this direction
-)
+# Of an angle behind its target, so that the servo surely pushes in this direction.
+MIN_LAG_RAD = 0.005
 MAX_STRAIGHT_ERROR_RAD = 0.08  # a robot that was laid straight by hand is straight within that
 MAX_GRAVITY_ERROR_RAD = 0.05  # accuracy of an angle from the direction of gravity
 MIN_GRAVITY_M_S2 = 5.0  # across the axis of a joint; with less, gravity does not give its angle
@@ -111,8 +110,8 @@ def judge_drive(
     if not has_followed_target(measurements, joint_index):
         return PropertyFinding("wrong", _describe_stuck_joint(measurements, joint_index))
     is_braking = torque_nm is not None and torque_nm < -MIN_TORQUE_NM
-    torques_towards_target_nm = list_torques_towards_target(measurements, joint_index)
-    if is_braking and np.sum(torques_towards_target_nm) <= 0.0:
+    # A load may push a sound joint back; its torque points towards the target all the same.
+    if is_braking and np.sum(list_torques_towards_target(measurements, joint_index)) <= 0.0:
         return PropertyFinding(
             "wrong", "its torque has the wrong sign: it measures a brake while it drives"
         )

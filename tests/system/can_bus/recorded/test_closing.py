@@ -1,6 +1,8 @@
 """The complete driver disables its modules when it is closed, publishes poses, and logs its bus."""
 
+import contextlib
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -18,7 +20,12 @@ from snakesim_can_backend.settings import CanSettings
 from snakesim_hal.base.errors import BackendError, ConfigError
 from snakesim_hal.wire import keys
 from snakesim_hal.wire.messages import Pose
-from snakesim_testing.can.driver_loop import arm_and_wave, make_can_config, open_driver_loop
+from snakesim_testing.can.driver_loop import (
+    DriverLoop,
+    arm_and_wave,
+    make_can_config,
+    open_driver_loop,
+)
 from snakesim_testing.can.recording_bus import (
     DISARMED,
     WIRES,
@@ -52,6 +59,17 @@ def test_closing_disarms_modules_and_may_be_repeated() -> None:
         assert len(wire.sent) == sent_count
 
 
+@contextlib.contextmanager
+def open_loop_with_mocap() -> Iterator[tuple[DriverLoop, str]]:
+    """Open a driver that receives poses. Yields its loop, and the address of the socket for poses."""
+    with open_driver_loop(
+        make_can_config(robot__sensors__pose__rate_hz=100.0), pose_listen="127.0.0.1:0"
+    ) as run:
+        mocap = run.backend._mocap
+        assert mocap is not None
+        yield run, mocap.address
+
+
 def check_port_is_free(address: str) -> None:
     """Open a socket at an address, as the next program would; this raises an error if the port is still in use."""
     host, _, port = address.rpartition(":")
@@ -60,12 +78,7 @@ def check_port_is_free(address: str) -> None:
 
 
 def test_closing_with_broken_bus_closes_everything_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    with open_driver_loop(
-        make_can_config(robot__sensors__pose__rate_hz=100.0), pose_listen="127.0.0.1:0"
-    ) as run:
-        mocap = run.backend._mocap
-        assert mocap is not None
-        mocap_address = mocap.address
+    with open_loop_with_mocap() as (run, mocap_address):
 
         def raise_send_error(_frame: CanFrame) -> bool:
             raise BackendError("the bus is broken")
@@ -84,12 +97,7 @@ def test_closing_with_broken_bus_closes_everything_else(monkeypatch: pytest.Monk
 def test_closing_error_of_drives_is_raised_after_mocap_is_closed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with open_driver_loop(
-        make_can_config(robot__sensors__pose__rate_hz=100.0), pose_listen="127.0.0.1:0"
-    ) as run:
-        mocap = run.backend._mocap
-        assert mocap is not None
-        mocap_address = mocap.address
+    with open_loop_with_mocap() as (run, mocap_address):
         close_drives = run.backend._drives.close
 
         def close_and_raise() -> None:
