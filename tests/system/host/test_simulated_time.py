@@ -33,7 +33,9 @@ def wait_for_pause(run: RunningHost) -> int:
     return run.backend.advanced
 
 
-@pytest.mark.parametrize("clock_mode", ["realtime", "lockstep"])
+@pytest.mark.parametrize(
+    "clock_mode", [pytest.param("realtime", marks=pytest.mark.quiet), "lockstep"]
+)
 def test_pause_lets_no_lease_expire_and_steps_are_exact(clock_mode: ClockMode) -> None:
     with running_commanded_host(make_run_config(clock_mode=clock_mode, **LONG_LEASE)) as (
         run,
@@ -84,6 +86,7 @@ def test_pause_emergency_stop_is_immediate_and_remains_after_resume() -> None:
         assert not run.request_lifecycle("arm").ok
 
 
+@pytest.mark.quiet
 def test_simulated_speed_scales_real_time_and_reset_ends_disarmed() -> None:
     with running_commanded_host(make_run_config(clock_mode="realtime", **LONG_LEASE)) as (run, _):
         request_action(run, "speed", speed=SIMULATED_SPEED)

@@ -62,9 +62,8 @@ def test_service_of_a_run_ignores_forged_description(
 def test_host_arms_on_request_over_private_channel() -> None:
     starter_socket, host_socket = socket_pair()
     starter = StarterEnd(starter_socket)
-    config = make_run_config(clock_mode="realtime")
     with (
-        running_host(config, starter_channel=HostEnd(host_socket)) as run,
+        running_host(make_run_config(), starter_channel=HostEnd(host_socket)) as run,
         running_follower(run.link, SineFollower()),
     ):
 
