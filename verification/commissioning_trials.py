@@ -25,6 +25,7 @@ from verification.start_check_trials import (
     JOINT_COUNT,
     JOINT_MODULES,
     NONE,
+    LinkWeights,
     check_trial,
     list_possible_faults,
 )
@@ -36,6 +37,7 @@ def check_robots(
     backend: str,
     faults: Sequence[str],
     joint_count: int,
+    weights: LinkWeights,
     record: Path | None,
 ) -> list[RobotResult]:
     """Check robots with each of these faults in turn, print a line for each robot, and return the results.
@@ -46,13 +48,16 @@ def check_robots(
         backend: Backend of the runs, which is the type of the drives.
         faults: Hidden faults, of `list_possible_faults`.
         joint_count: Number of joints of each robot.
+        weights: Weights on the links of each robot.
         record: File to which each robot is appended, with its signals in a folder next to it. Robots that it already
             contains are not checked again.
     """
 
     def check_robot(number: int) -> RobotResult:
         fault = faults[number % len(faults)]
-        trial = check_trial(number, fault, *options, backend=backend, joint_count=joint_count)
+        trial = check_trial(
+            number, fault, *options, backend=backend, joint_count=joint_count, weights=weights
+        )
         result = summarize_trial(trial)
         if record is not None:
             append_trial(record, trial)
@@ -78,6 +83,7 @@ def main() -> int:
             backend=arguments.backend,
             faults=arguments.faults or list_possible_faults(arguments.backend),
             joint_count=arguments.joints,
+            weights=LinkWeights(arguments.end_weights, arguments.other_weights),
             record=arguments.record,
         )
         lines = list(format_tables(results))
@@ -108,6 +114,20 @@ def _parse_arguments() -> argparse.Namespace:
         type=int,
         default=JOINT_COUNT,
         help=f"number of joints of the checked robots (default: {JOINT_COUNT})",
+    )
+    parser.add_argument(
+        "--end-weights",
+        type=float,
+        default=0.0,
+        metavar="KG",
+        help="mass that lies on the first and on the last link (default: none)",
+    )
+    parser.add_argument(
+        "--other-weights",
+        type=float,
+        default=0.0,
+        metavar="KG",
+        help="mass that lies on each link between them (default: none)",
     )
     parser.add_argument(
         "--fault",

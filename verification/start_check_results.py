@@ -23,7 +23,15 @@ import msgspec
 from snakesim_operator.results.metrics.intervals import compute_wilson_interval
 from verification.recorded_trials import append_result, read_results
 from verification.start_check_signals import find_signals_path, load_signals, save_signals
-from verification.start_check_trials import JOINT_MODULES, NONE, CheckTrial, Outcome, judge_trial
+from verification.start_check_trials import (
+    JOINT_MODULES,
+    NO_WEIGHTS,
+    NONE,
+    CheckTrial,
+    LinkWeights,
+    Outcome,
+    judge_trial,
+)
 
 FAULT_HEADER = (
     "| drive type | hidden fault | robots | found by name | 95 % interval | found at an end | both causes | wrong name "
@@ -45,6 +53,7 @@ class RobotResult(msgspec.Struct, frozen=True, kw_only=True):
     fault: str
     settings: list[str]  # of the emulated drives that make the fault
     joints: list[int]  # that have the fault
+    weights: LinkWeights = NO_WEIGHTS  # that lay on the links
     outcome: Outcome | None  # None if the robot has no fault
     is_at_end: bool  # whether the joint with the fault is the first or the last one
     reported: list[str]  # of each joint with the fault
@@ -64,6 +73,7 @@ def summarize_trial(trial: CheckTrial) -> RobotResult:
         fault=trial.fault,
         settings=list(trial.settings),
         joints=list(trial.joints),
+        weights=trial.weights,
         outcome=trial.outcome,
         is_at_end=trial.is_at_end,
         reported=trial.reported,
@@ -95,6 +105,7 @@ def judge_again(path: Path, results: Iterable[RobotResult]) -> Iterator[RobotRes
             result.fault,
             result.settings,
             result.joints,
+            result.weights,
             measurements,
         )
         yield summarize_trial(trial)
@@ -149,13 +160,17 @@ def _format_alarms(label: str, results: Sequence[RobotResult]) -> str:
 def format_failures(results: Sequence[RobotResult]) -> Iterator[str]:
     """Yield the table of robots whose fault was not found by name, or with a sound joint that was reported as wrong.
 
-    Faults at an end of a robot that stay unknown are left out, because the check does not judge these joints.
+    Faults at an end of a robot that stay unknown are left out if no weight lay there, because the check does not judge
+    these joints.
     """
     yield FAILURE_HEADER
     yield "|" + "---|" * FAILURE_HEADER.count(" |")
     for result in results:
-        is_unknown_at_end = result.outcome == "unknown" and result.is_at_end
-        if (result.outcome in ("named", None) or is_unknown_at_end) and not result.blamed:
+        is_not_judged = result.is_at_end and not result.weights.ends_kg
+        is_expected = result.outcome in ("named", None) or (
+            is_not_judged and result.outcome == "unknown"
+        )
+        if is_expected and not result.blamed:
             continue
         yield (
             f"| {result.backend} {result.number} | {result.fault} | {', '.join(result.settings)} | {result.outcome} "

@@ -24,6 +24,8 @@ class SignalHeader(msgspec.Struct, frozen=True, kw_only=True):
     axes: list[str]
     drives: list[JointDrive]
     motors: list[JointMotor]
+    link_lengths_m: list[float]
+    link_masses_kg: list[float]
 
 
 ARRAY_NAMES = [
@@ -46,6 +48,8 @@ def save_signals(path: Path, measurements: CheckMeasurements) -> None:
         axes=list(measurements.axes),
         drives=list(measurements.drives),
         motors=list(measurements.motors),
+        link_lengths_m=list(measurements.link_lengths_m),
+        link_masses_kg=list(measurements.link_masses_kg),
     )
     arrays = {name: getattr(measurements, name) for name in ARRAY_NAMES}
     arrays[HEADER] = np.frombuffer(msgspec.json.encode(header), dtype=np.uint8)
@@ -63,5 +67,7 @@ def load_signals(path: Path) -> CheckMeasurements:
             axes=header.axes,
             drives=header.drives,
             motors=header.motors,
+            link_lengths_m=header.link_lengths_m,
+            link_masses_kg=header.link_masses_kg,
             **{name: arrays[name] for name in ARRAY_NAMES},
         )

@@ -6,10 +6,11 @@ the floor, and how straight a person laid the robot. A robot has the same number
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from snakesim_hal.model.robot_file.checked import JointProperty
+from snakesim_hal.model.robot_file.robot import RobotFile
 from snakesim_hal.model.scenario import load_scenario, parse_set_option
 from snakesim_hal.programs.single_process import InProcessRun
 from snakesim_hal.wire import keys
@@ -42,6 +43,8 @@ BACKLASHES_RAD = (0.0175, 0.025, 0.035, 0.045)  # 1 to 2.6 degrees
 DEAD_ZONES_RAD = (0.01, 0.015, 0.025, 0.035)  # 0.6 to 2 degrees
 # Below the load of a joint between others on a slippery floor; a coupling that slips at more may not slip in the check.
 SLIP_TORQUES_NM = (0.005, 0.04)  # lowest and highest
+# Of the weights that a person lays on the links: lowest and highest, divided by their nominal mass.
+WEIGHT_FACTORS = (0.8, 1.2)
 NONE = "none"
 # Hidden fault -> the property that should be found wrong, and words of its verdict.
 FAULTS: Mapping[str, tuple[JointProperty, str]] = {
@@ -65,6 +68,17 @@ Outcome = Literal["named", "either", "misnamed", "unknown", "unnoticed"]
 
 
 @dataclass(frozen=True)
+class LinkWeights:
+    """Nominal masses of the weights that a person lays on the links of a robot, in kg; 0 for none."""
+
+    ends_kg: float = 0.0  # on each of the first and the last link
+    others_kg: float = 0.0  # on each link between them
+
+
+NO_WEIGHTS = LinkWeights()
+
+
+@dataclass(frozen=True)
 class CheckTrial:
     """One robot, and what was found of it."""
 
@@ -75,6 +89,7 @@ class CheckTrial:
         str
     ]  # of the emulated drives that make the fault, such as "joint_1.backlash_rad=0.025"
     joints: Sequence[int]  # that have the fault
+    weights: LinkWeights  # that lay on the links
     measurements: CheckMeasurements
     rows: Sequence[JointVerdict]
 
@@ -160,6 +175,7 @@ def check_trial(
     *sets: str,
     backend: str = JOINT_MODULES,
     joint_count: int = JOINT_COUNT,
+    weights: LinkWeights = NO_WEIGHTS,
 ) -> CheckTrial:
     """Check a robot with a hidden fault.
 
@@ -169,6 +185,7 @@ def check_trial(
         *sets: As `--set` of a run.
         backend: Backend of the run, which is the type of its drives.
         joint_count: Number of joints.
+        weights: Weights on the links.
     """
     pick = random.Random(number)
     zeros = [pick.uniform(-LAID_RAD, LAID_RAD) for _ in range(joint_count)]
@@ -200,11 +217,35 @@ def check_trial(
         f"scene.ground.friction={pick.uniform(0.2, 0.8)}",
         f"robot.chain.modules={joint_count}",
     ]
+    if weights != NO_WEIGHTS:
+        run.append(_describe_weighted_links(joint_count, weights, pick))
     seconds = SECONDS_PER_JOINT * joint_count
     run += [f"duration_s={seconds}", *(f"backends.{backend}.mounted.{text}" for text in truth)]
     with_fault = {NONE: [], "order": [joint, other]}.get(fault, [joint])
     measurements = run_start_check(f"backend={backend}", *sets, *run)
-    return judge_trial(backend, number, fault, settings, with_fault, measurements)
+    # The robot file of the person does not contain the weights.
+    link_masses_kg = _load_robot(joint_count).link_masses_kg
+    measurements = replace(measurements, link_masses_kg=link_masses_kg)
+    return judge_trial(backend, number, fault, settings, with_fault, weights, measurements)
+
+
+def _describe_weighted_links(joint_count: int, weights: LinkWeights, pick: random.Random) -> str:
+    """Return the `--set` option of the links of a robot, whose masses contain the weights that lie on them."""
+    robot = _load_robot(joint_count)
+    links: list[str] = []
+    for i, (length_m, mass_kg) in enumerate(
+        zip(robot.link_lengths_m, robot.link_masses_kg, strict=True)
+    ):
+        weight_kg = weights.ends_kg if i in (0, joint_count) else weights.others_kg
+        weight_kg *= pick.uniform(*WEIGHT_FACTORS)
+        links.append(f"{{length_m={length_m}, mass_kg={mass_kg + weight_kg}}}")
+    return f"robot.links=[{', '.join(links)}]"
+
+
+def _load_robot(joint_count: int) -> RobotFile:
+    """Return the robot of the trials, without weights."""
+    settings = [parse_set_option(f"robot.chain.modules={joint_count}")]
+    return load_scenario("joint_check", settings).config.robot
 
 
 def judge_trial(
@@ -213,11 +254,12 @@ def judge_trial(
     fault: str,
     settings: Sequence[str],
     joints: Sequence[int],
+    weights: LinkWeights,
     measurements: CheckMeasurements,
 ) -> CheckTrial:
     """Judge the measurements of one robot, which the person laid straight. The arguments: see `CheckTrial`."""
-    rows = judge_joints(measurements, was_laid_straight=True)
-    return CheckTrial(backend, number, fault, settings, joints, measurements, rows)
+    rows = judge_joints(measurements, was_laid_straight=True, end_weights_kg=weights.ends_kg)
+    return CheckTrial(backend, number, fault, settings, joints, weights, measurements, rows)
 
 
 def run_start_check(*sets: str) -> CheckMeasurements:

@@ -17,7 +17,7 @@ from verification.identification_trials import identify_hidden_robot
 from verification.recorded_trials import append_result, read_results, run_missing_trials
 from verification.start_check_results import RobotResult, append_trial, judge_again
 from verification.start_check_signals import load_signals, save_signals
-from verification.start_check_trials import NONE, check_trial, run_start_check
+from verification.start_check_trials import NONE, LinkWeights, check_trial, run_start_check
 from verification.torque_constant_results import TorqueConstantResult
 from verification.torque_constant_trials import draw_fault, identify_torque_constants
 
@@ -44,6 +44,22 @@ def test_coupling_whose_own_small_motion_shows_no_slip_is_named(number: int, rea
     assert trial.found, row.summary
     assert reason in row.findings["gear"].reason
     assert not trial.blamed, trial.blamed
+
+
+@pytest.mark.parametrize(
+    ("number", "fault"), [(32, "backlash"), (6, "coupling"), (29, "dead zone")]
+)
+def test_weights_make_faults_of_end_joints_known_and_blame_no_sound_joint(
+    tmp_path: Path, number: int, fault: str
+) -> None:
+    """The faults are in joint_1 and joint_5. The sound joint_1 of robot 29 slides on a slippery floor."""
+    trial = check_trial(number, fault, backend="odrive", weights=LinkWeights(ends_kg=1.0))
+    assert trial.found, [row.summary for row in trial.rows]
+    assert not trial.blamed, trial.blamed
+    results_path = tmp_path / "trials.jsonl"
+    append_trial(results_path, trial)
+    recorded = read_results(results_path, RobotResult)
+    assert list(judge_again(results_path, recorded)) == recorded
 
 
 def test_sound_joint_beside_a_jerking_drive_is_not_reported() -> None:
@@ -80,6 +96,8 @@ def test_recorded_signals_are_read_without_a_rounding_error(tmp_path: Path) -> N
         axes=["yaw", "pitch"],
         drives=[JointDrive(gear=1 / 3), JointDrive(sign=-1)],
         motors=[motor, motor],
+        link_lengths_m=[0.05, 0.1, 1 / 3],
+        link_masses_kg=[0.1, 0.3, 0.2],
         angle_rad=random((9, 2)),
         velocity_rad_s=random((9, 2)),
         torque_nm=random((9, 2)),

@@ -14,6 +14,7 @@ from snakesim_operator.base.robot_selection import select_robots
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
 DEFAULT_DRAWING = "shapes.pdf"
+MAX_WEIGHT_KG = 50.0  # that a person lays on a link
 PAPER_NAMES = ("a4", "a3", "letter")
 ROBOT_FILE_HELP = "the robot file that the host was started with, into which the values are written"
 
@@ -114,6 +115,14 @@ def _add_check_arguments(parser: argparse.ArgumentParser) -> None:
         help="the robot lay straight at its start: judge all zeros",
     )
     parser.add_argument(
+        "--end-weights",
+        type=make_number_parser(0.0, MAX_WEIGHT_KG, "kg"),
+        default=0.0,
+        metavar="KG",
+        help="a weight of this mass lay on the first and on the last link: without IMUs, also judge whether the joints "
+        "there are loose (default: none)",
+    )
+    parser.add_argument(
         "--allow-backlash",
         type=make_number_parser(0.0, 0.5, "rad"),
         default=ALLOWED_BACKLASH_RAD,
@@ -195,6 +204,7 @@ def _run_check(arguments: argparse.Namespace) -> int:
 
     request = CheckStatement(
         straight=arguments.straight,
+        end_weights_kg=arguments.end_weights,
         direction_by_hand=arguments.by_hand,
         gear_by_hand=arguments.gear_by_hand,
         allowed_backlash_rad=arguments.allow_backlash,

@@ -50,6 +50,24 @@ def test_joint_check_of_sound_robot_passes(tmp_path: Path) -> None:
     assert f"{JOINT_COUNT} of {JOINT_COUNT} joints match the robot file" in lines, lines
 
 
+@pytest.mark.heavy
+def test_loose_end_joint_without_imus_is_reported_with_end_weights(tmp_path: Path) -> None:
+    """Without weights, the torque of joint_1 could be that of a sound joint whose light link slides."""
+    settings = ("robot.chain.modules=4", "backends.odrive.mounted.joint_1.coupling_slip_nm=0.02")
+    run_to_summary(
+        tmp_path / "run",
+        *("joint_check", "--backend", "odrive", "--duration", "14"),
+        *(argument for setting in settings for argument in ("--set", setting)),
+    )
+    judge = ("robot", "check", "run", "--straight")
+    light_ends = snakesim(*judge, cwd=tmp_path)
+    weighted_ends = snakesim(*judge, "--end-weights", "1", cwd=tmp_path)
+    assert re.search("joint_1 .*unknown: order, sign, gear$", light_ends.out, re.MULTILINE)
+    assert "add --end-weights" in light_ends.out
+    assert re.search("joint_1 .*(coupling slips|loose)", weighted_ends.out)
+    assert "; 1 wrong; 3 unknown" in weighted_ends.out
+
+
 def test_check_and_identify_of_other_scenario_are_refused(tmp_path: Path) -> None:
     run_to_summary(tmp_path / "run", "triplet", "--duration", "0.1")
     for arguments, scenario in (

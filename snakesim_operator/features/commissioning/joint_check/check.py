@@ -43,6 +43,7 @@ class CheckStatement:
     """What a person states about the robot that was checked, in addition to the run."""
 
     straight: bool = False  # the robot lay straight at the start
+    end_weights_kg: float = 0.0  # a weight of this mass lay on the first and on the last link
     direction_by_hand: bool = False  # a person confirmed order and sign where the check could not
     gear_by_hand: bool = False  # likewise the gear
     allowed_backlash_rad: float = ALLOWED_BACKLASH_RAD
@@ -90,6 +91,7 @@ def report_joint_check(
     verdicts = judge_joints(
         measurements,
         was_laid_straight=statement.straight,
+        end_weights_kg=statement.end_weights_kg,
         allowed_backlash_rad=statement.allowed_backlash_rad,
     )
     verdicts = [verdict.confirm_by_hand(statement.by_hand) for verdict in verdicts]

@@ -17,8 +17,12 @@ any other load. `tooth_contact` computes how much backlash a reversal could stil
 A coupling that slips passes its torque on also in the small motion, and backlash does not. So the coupling is named
 only if the neighbors measure such a torque. Otherwise backlash that is wider than both motions is as likely.
 
-The joints at both ends carry only one link, which may slide without any such torque. So they may be found tight, but
-not loose. A pitch joint is not judged: the weight of its links presses the teeth to one side.
+A joint is found loose only if it turned with less torque than its links need to slide (`sliding_torque`). The joints at
+both ends carry only one link, which slides with little torque. So they may be found tight, but are found loose only if
+a person laid weights on both end links. Beside a loose joint, an end joint is not found loose, because its load may
+slip there.
+
+A pitch joint is not judged: the weight of its links presses the teeth to one side.
 """
 
 from collections.abc import Sequence
@@ -27,7 +31,10 @@ from typing import Literal
 
 import numpy as np
 
-from snakesim_operator.features.commissioning.joint_check.load_response import LoadResponse
+from snakesim_operator.features.commissioning.joint_check.load_response import (
+    LoadResponse,
+    find_neighbors_of_same_axis,
+)
 from snakesim_operator.features.commissioning.joint_check.tooth_contact import ToothContact
 
 # Limits on the torques of emulated joints on a floor. A smaller change of a torque does not prove a load.
@@ -40,6 +47,8 @@ MAX_LOOSE_FRACTION = 0.1
 # The neighbors' range of torque in the small motion, divided by that in the large one.
 MAX_BACKLASH_NEIGHBOR_RATIO = 0.25
 MIN_SLIPPING_NEIGHBOR_RATIO = 0.4
+# The load of a joint with backlash in the large motion, divided by the neighbors' range of torque.
+MIN_OWN_LOAD_RATIO = 0.4
 # The neighbors' range of torque in the large motion, divided by the elastic torque of a typical joint. Behind a gear
 # that holds, it is larger.
 MAX_SLIPPING_LOAD_RATIO = 0.5
@@ -49,9 +58,17 @@ MIN_UNLOADED_FRACTION = 0.3
 # The load at the other end, divided by the smallest torque that proves a load.
 MIN_LOAD_RATIO = 2.0
 NO_CLEAR_LOAD = "its torque hardly follows its angle"
+# The torque of a loose joint in the small motion, divided by that with which its links slide. On emulated robots, sound
+# joints at an end have 0.93 or more.
+MAX_LOOSE_SLIDING_RATIO = 0.85
 NO_REVERSAL = "the load of its gear does not reverse in the small motion"
+LIGHT_END = (
+    "the floor may hardly hold its only link (lay a heavy weight on it, and add --end-weights)"
+)
+BESIDE_LOOSE_JOINT = "the joint beside it is loose, and may be the only cause"
 # "loose": it has backlash or slips, which of them is not clear.
 PlayKind = Literal["tight", "backlash", "slipping", "loose", "unknown"]
+LOOSE_KINDS: Sequence[PlayKind] = ("backlash", "slipping", "loose")
 
 
 @dataclass(frozen=True)
@@ -65,20 +82,45 @@ class GearPlay:
 
 
 def judge_gear_plays(
-    responses: Sequence[LoadResponse | None], axes: Sequence[str]
+    responses: Sequence[LoadResponse | None],
+    axes: Sequence[str],
+    sliding_torques_nm: Sequence[float],
 ) -> list[GearPlay]:
     """Judge the gears of all joints, tail to head.
 
     Args:
         responses: Response of the torques to the motions of each joint; None if it was not measured.
         axes: Axis of each joint, "yaw" or "pitch".
+        sliding_torques_nm: Torque with which each joint turns its links on a slippery floor.
     """
-    return [_judge_gear_play(responses, axes, joint) for joint in range(len(responses))]
+    plays = [
+        _judge_gear_play(responses, axes, joint, sliding_torques_nm[joint])
+        for joint in range(len(responses))
+    ]
+    for end in (0, len(plays) - 1):
+        neighbors = find_neighbors_of_same_axis(axes, end)
+        is_beside_loose_joint = any(plays[i].kind in LOOSE_KINDS for i in neighbors)
+        if plays[end].kind in LOOSE_KINDS and is_beside_loose_joint:
+            plays[end] = GearPlay("unknown", BESIDE_LOOSE_JOINT)
+    return plays
+
+
+def _is_end(joint_index: int, joint_count: int) -> bool:
+    """Return whether a joint is the first or the last one."""
+    return joint_index in (0, joint_count - 1)
 
 
 def _judge_gear_play(
-    responses: Sequence[LoadResponse | None], axes: Sequence[str], joint_index: int
+    responses: Sequence[LoadResponse | None],
+    axes: Sequence[str],
+    joint_index: int,
+    sliding_nm: float,
 ) -> GearPlay:
+    """Judge the gear of one joint. The other arguments are those of `judge_gear_plays`.
+
+    Args:
+        sliding_nm: Torque with which this joint turns its links on a slippery floor.
+    """
     response = responses[joint_index]
     if response is None:
         return GearPlay("unknown", "it made no small motion, or the robot did not rest before")
@@ -94,15 +136,43 @@ def _judge_gear_play(
     follows_angle = response.elastic_nm >= max(MIN_TIGHT_FRACTION * typical_nm, min_change_nm)
     if follows_angle and contact.reversal_rad is not None:
         return GearPlay("tight", max_backlash_rad=contact.reversal_rad)
-    if joint_index in (0, len(responses) - 1):
-        return GearPlay("unknown", "the floor hardly loads its only link")
+    is_end = _is_end(joint_index, len(responses))
+    if is_end and not _turns_without_its_link(response, sliding_nm):
+        return GearPlay("unknown", LIGHT_END)
     if _leaves_teeth_at_one_end(contact):
         return GearPlay("backlash", min_backlash_rad=contact.unloaded_travel_rad)
     if follows_angle:
         return GearPlay("unknown", NO_REVERSAL)
     if response.elastic_nm > MAX_LOOSE_FRACTION * typical_nm:
         return GearPlay("unknown", NO_CLEAR_LOAD)
+    # The torques of the neighbors do not contain the friction of this drive.
+    if not is_end and not _is_too_weak_to_slide(
+        min(response.small_range_nm, response.neighbor_small_range_nm), sliding_nm
+    ):
+        return GearPlay("unknown", NO_CLEAR_LOAD)
     return _judge_loose_gear(response, typical_nm, min_change_nm)
+
+
+def _is_too_weak_to_slide(torque_range_nm: float, sliding_nm: float) -> bool:
+    """Return whether a torque is clearly smaller than that with which links slide.
+
+    Args:
+        torque_range_nm: Range of the torque in a motion in both directions.
+        sliding_nm: Torque with which the links slide.
+    """
+    return torque_range_nm < 2 * MAX_LOOSE_SLIDING_RATIO * sliding_nm
+
+
+def _turns_without_its_link(response: LoadResponse, sliding_nm: float) -> bool:
+    """Return whether the drive of an end joint turned with less torque than its only link needs to slide.
+
+    Args:
+        response: Response of the torques to its motions.
+        sliding_nm: Torque with which the link slides.
+    """
+    contact = response.contact
+    is_unloaded_at_one_end = contact.min_load_nm < sliding_nm and _leaves_teeth_at_one_end(contact)
+    return is_unloaded_at_one_end or _is_too_weak_to_slide(response.small_range_nm, sliding_nm)
 
 
 def _leaves_teeth_at_one_end(contact: ToothContact) -> bool:
@@ -128,17 +198,20 @@ def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: 
     if are_neighbors_never_loaded or is_load_alike_in_both_motions:
         # A coupling that slips passes a torque on, and backlash does not.
         return GearPlay("slipping" if response.passed_in_small_motion.is_certain else "loose")
+    is_noisy = response.noise_nm > MAX_LOOSE_FRACTION * typical_nm
+    if response.contact.reversal_rad is not None:
+        return GearPlay("unknown", NO_CLEAR_LOAD)  # teeth on both sides carry a load
     if _has_backlash(response, min_change_nm):
         return GearPlay("backlash", min_backlash_rad=response.small_motion_rad)
-    if response.noise_nm > MAX_LOOSE_FRACTION * typical_nm:
-        return GearPlay("unknown", NO_CLEAR_LOAD)
-    return GearPlay("loose")
+    return GearPlay("unknown", NO_CLEAR_LOAD) if is_noisy else GearPlay("loose")
 
 
 def _has_backlash(response: LoadResponse, min_change_nm: float) -> bool:
     """Return whether the load of a joint is missing in the small motion, and comes in the large one."""
     large_nm = response.neighbor_large_range_nm
-    is_loaded_in_large_motion = min(large_nm, response.load_nm) >= min_change_nm
+    # The neighbors are loaded through this gear, which is therefore loaded as well.
+    min_load_nm = max(min_change_nm, MIN_OWN_LOAD_RATIO * large_nm)
+    is_loaded_in_large_motion = large_nm >= min_change_nm and response.load_nm >= min_load_nm
     max_small_nm = MAX_BACKLASH_NEIGHBOR_RATIO * large_nm
     # Noise as large as this could hide a load.
     is_load_missing_in_small_motion = (
@@ -156,6 +229,7 @@ def _compute_typical_elastic_nm(
         for joint, (response, axis) in enumerate(zip(responses, axes, strict=True))
         if response is not None
         and axis == "yaw"
-        and joint not in (0, joint_index, len(responses) - 1)
+        and joint != joint_index
+        and not _is_end(joint, len(responses))
     ]
     return float(np.median(elastic_nm)) if elastic_nm else 0.0

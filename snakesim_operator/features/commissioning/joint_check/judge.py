@@ -59,6 +59,9 @@ from snakesim_operator.features.commissioning.joint_check.property_rules import 
     make_swapped_findings,
     make_unmoved_finding,
 )
+from snakesim_operator.features.commissioning.joint_check.sliding_torque import (
+    compute_sliding_torques_nm,
+)
 from snakesim_operator.features.commissioning.tolerances import ALLOWED_BACKLASH_RAD
 
 
@@ -66,6 +69,7 @@ def judge_joints(
     measurements: CheckMeasurements,
     *,
     was_laid_straight: bool = False,
+    end_weights_kg: float = 0.0,
     allowed_backlash_rad: float = ALLOWED_BACKLASH_RAD,
 ) -> list[JointVerdict]:
     """Judge every joint, tail to head.
@@ -73,10 +77,14 @@ def judge_joints(
     Args:
         measurements: Measurements of the joint check.
         was_laid_straight: Whether the robot lay straight at the start, so that all angles should have been zero.
+        end_weights_kg: Mass of the weight that lay on each of the first and the last link; 0 for none.
         allowed_backlash_rad: Motion that may be lost in a gear when its load reverses.
     """
     evaluator = _JointEvaluator(
-        measurements, was_laid_straight=was_laid_straight, allowed_backlash_rad=allowed_backlash_rad
+        measurements,
+        was_laid_straight=was_laid_straight,
+        end_weights_kg=end_weights_kg,
+        allowed_backlash_rad=allowed_backlash_rad,
     )
     return [evaluator.judge_joint(joint) for joint in range(len(measurements.joint_names))]
 
@@ -89,6 +97,7 @@ class _JointEvaluator:
         measurements: CheckMeasurements,
         *,
         was_laid_straight: bool,
+        end_weights_kg: float,
         allowed_backlash_rad: float,
     ) -> None:
         """Measure the motion of the links for each joint, and find modules whose ids are swapped.
@@ -96,6 +105,7 @@ class _JointEvaluator:
         Args:
             measurements: Measurements of the joint check.
             was_laid_straight: Whether a person states that the robot lay straight at the start.
+            end_weights_kg: Mass of the weight on each of the first and the last link, as a person states.
             allowed_backlash_rad: Largest backlash that is not judged as wrong.
         """
         self._measurements = measurements
@@ -104,7 +114,12 @@ class _JointEvaluator:
         joints = range(len(measurements.joint_names))
         self._dead_zones_rad = [find_dead_zone_rad(measurements, joint) for joint in joints]
         self._load_responses = [measure_load_response(measurements, joint) for joint in joints]
-        self._gear_plays = judge_gear_plays(self._load_responses, measurements.axes)
+        sliding_torques_nm = compute_sliding_torques_nm(
+            measurements.link_lengths_m, measurements.link_masses_kg, end_weights_kg
+        )
+        self._gear_plays = judge_gear_plays(
+            self._load_responses, measurements.axes, sliding_torques_nm
+        )
         # The verdict on the drive is no condition: a joint whose torque has the wrong sign moves all the same.
         self._motion_fractions: list[LinkMotionFractions | None] = [
             measure_link_motion_fractions(measurements, joint)

@@ -35,6 +35,10 @@ class CheckMeasurements:
     axes: Sequence[str]  # "yaw" or "pitch"
     drives: Sequence[JointDrive]  # from the robot file
     motors: Sequence[JointMotor]  # from the robot file
+    link_lengths_m: Sequence[float]  # from the robot file
+    link_masses_kg: Sequence[
+        float
+    ]  # from the robot file, without weights that a person laid on the links
     angle_rad: Floats  # (n, joints)
     velocity_rad_s: Floats  # (n, joints)
     torque_nm: Floats  # (n, joints)
@@ -184,6 +188,8 @@ def collect_measurements(
         axes=[joint.axis for joint in robot.joints],
         drives=[joint.drive for joint in config.robot.joint_table],
         motors=[joint.motor for joint in config.robot.joint_table],
+        link_lengths_m=config.robot.link_lengths_m,
+        link_masses_kg=config.robot.link_masses_kg,
         angle_rad=columns["angle_rad"],
         velocity_rad_s=columns["velocity_rad_s"],
         torque_nm=columns["torque_nm"],

@@ -5,7 +5,10 @@ from dataclasses import replace
 import pytest
 
 from snakesim_operator.features.commissioning.joint_check.gear_play import (
+    BESIDE_LOOSE_JOINT,
+    LIGHT_END,
     MIN_CHANGE_NM,
+    NO_CLEAR_LOAD,
     NO_REVERSAL,
     GearPlay,
     PlayKind,
@@ -84,6 +87,9 @@ SLIPPING = replace(
 HARDLY_LOADED = replace(
     SLIPPING, elastic_nm=0.007, neighbor_large_range_nm=0.025, neighbor_small_range_nm=0.02
 )
+# Torques with which the joints of the trial's robot turn their links, without weights and with 1 kg on each end link.
+LIGHT_ENDS_NM = [0.008, 0.07, 0.19, 0.07, 0.008]
+HEAVY_ENDS_NM = [0.06, 0.34, 0.68, 0.34, 0.06]
 END_JOINT = 0
 MIDDLE_JOINT = 2
 
@@ -92,7 +98,7 @@ def judge_play(response: LoadResponse | None, joint: int = MIDDLE_JOINT) -> Gear
     """Judge one joint with this response among tight joints, which must be judged as tight."""
     responses: list[LoadResponse | None] = [TIGHT] * JOINTS
     responses[joint] = response
-    plays = judge_gear_plays(responses, AXES)
+    plays = judge_gear_plays(responses, AXES, LIGHT_ENDS_NM)
     other_kinds = [play.kind for i, play in enumerate(plays) if i != joint]
     assert other_kinds == ["tight"] * (JOINTS - 1)
     return plays[joint]
@@ -208,6 +214,81 @@ def test_joint_at_an_end_is_unknown(response: LoadResponse) -> None:
     assert judge_among_tight(response, END_JOINT) == "unknown"
 
 
+@pytest.mark.parametrize("end", [0, JOINTS - 1])
+@pytest.mark.parametrize(
+    ("response", "kind"),
+    [
+        (replace(TIGHT, contact=ONE_END_CONTACTS[0]), "backlash"),
+        (BACKLASH, "backlash"),
+        (SLIPPING, "slipping"),
+        (TIGHT, "tight"),
+    ],
+    ids=["one end", "backlash", "slipping", "tight"],
+)
+def test_end_joint_with_a_weight_is_judged_like_others(
+    response: LoadResponse, kind: PlayKind, end: int
+) -> None:
+    responses = [TIGHT] * JOINTS
+    responses[end] = response
+    kinds = [play.kind for play in judge_gear_plays(responses, AXES, HEAVY_ENDS_NM)]
+    assert kinds.pop(end) == kind
+    assert kinds == ["tight"] * (JOINTS - 1)
+
+
+@pytest.mark.parametrize("neighbor", [BACKLASH, SLIPPING])
+def test_weighted_end_joint_beside_a_loose_joint_is_unknown(neighbor: LoadResponse) -> None:
+    responses = [BACKLASH, neighbor, TIGHT, TIGHT, TIGHT]
+    plays = judge_gear_plays(responses, AXES, HEAVY_ENDS_NM)
+    assert plays[0] == GearPlay("unknown", BESIDE_LOOSE_JOINT)
+    assert plays[1].kind in ("backlash", "slipping")
+
+
+def test_end_joint_that_turns_with_enough_torque_to_slide_its_link_is_unknown() -> None:
+    """The sound joint_1 of robot 29 of the trials turned with 0.93 times this torque in both directions."""
+    sound = replace(SLIPPING, small_range_nm=2 * 0.93 * HEAVY_ENDS_NM[0])
+    plays = judge_gear_plays([sound, *[TIGHT] * (JOINTS - 1)], AXES, HEAVY_ENDS_NM)
+    assert plays[0] == GearPlay("unknown", LIGHT_END)
+
+
+def test_joint_that_turns_with_enough_torque_to_slide_its_links_is_unknown() -> None:
+    """The sound joint_2 of robot 9117 of the trials slid on a slippery floor, beside an encoder with a dead zone."""
+    sound = replace(
+        SLIPPING,
+        small_range_nm=0.188,
+        neighbor_large_range_nm=0.239,
+        neighbor_small_range_nm=0.203,
+    )
+    plays = judge_gear_plays([TIGHT, sound, *[TIGHT] * (JOINTS - 2)], AXES, LIGHT_ENDS_NM)
+    assert plays[1] == GearPlay("unknown", NO_CLEAR_LOAD)
+
+
+@pytest.mark.parametrize("response", [BACKLASH, SLIPPING])
+def test_joint_whose_load_reverses_is_not_loose(response: LoadResponse) -> None:
+    """The sound joint_3 of robot 46 of the trials carried loads in both directions, which did not follow its angle."""
+    reversing = replace(response, contact=TIGHT.contact, neighbor_small_range_nm=0.0)
+    assert judge_among_tight(replace(reversing, neighbor_large_range_nm=0.9)) == "unknown"
+
+
+def test_joint_with_less_load_than_its_neighbors_has_no_backlash() -> None:
+    """The coupling of joint_4 of robot 26 of the trials slipped. Its neighbors measured a load of the heavy ends."""
+    response = replace(BACKLASH, large_range_nm=0.10, neighbor_large_range_nm=0.20)
+    assert judge_among_tight(response) == "loose"
+
+
+def test_weighted_end_joint_with_coarse_torque_does_not_leave_its_teeth() -> None:
+    """The smallest load that can be proven could slide the link."""
+    contact = replace(ONE_END_CONTACTS[0], min_load_nm=1.01 * HEAVY_ENDS_NM[0], max_load_nm=0.2)
+    responses = [replace(TIGHT, contact=contact), *[TIGHT] * (JOINTS - 1)]
+    plays = judge_gear_plays(responses, AXES, HEAVY_ENDS_NM)
+    assert plays[0] == GearPlay("unknown", LIGHT_END)
+
+
+def test_weighted_end_joint_beside_a_loose_joint_may_be_tight() -> None:
+    responses = [TIGHT, BACKLASH, TIGHT, TIGHT, TIGHT]
+    plays = judge_gear_plays(responses, AXES, HEAVY_ENDS_NM)
+    assert plays[0].kind == "tight"
+
+
 def test_joint_without_small_motion_is_unknown() -> None:
     assert judge_among_tight(None) == "unknown"
 
@@ -218,7 +299,7 @@ def test_joint_whose_torque_hardly_follows_its_angle_is_unknown() -> None:
 
 def test_pitch_joint_is_unknown() -> None:
     axes = ["yaw", "pitch", "yaw", "pitch", "yaw", "pitch", "yaw"]
-    kinds = [play.kind for play in judge_gear_plays([TIGHT] * len(axes), axes)]
+    kinds = [play.kind for play in judge_gear_plays([TIGHT] * len(axes), axes, [0.1] * len(axes))]
     assert kinds == ["tight" if axis == "yaw" else "unknown" for axis in axes]
 
 
@@ -226,13 +307,15 @@ def test_pitch_joint_is_unknown() -> None:
 def test_robot_without_floor_load_is_unknown(response: LoadResponse) -> None:
     """The check does not judge a suspended robot, or a robot in which every joint is loose."""
     assert response.elastic_nm < MIN_CHANGE_NM
-    plays = judge_gear_plays([response] * JOINTS, AXES)
+    plays = judge_gear_plays([response] * JOINTS, AXES, LIGHT_ENDS_NM)
     assert [play.kind for play in plays] == ["unknown"] * JOINTS
 
 
 def test_load_that_may_be_noise_is_unknown() -> None:
     noisy = replace(TIGHT, noise_nm=TIGHT.elastic_nm)
-    assert {play.kind for play in judge_gear_plays([noisy] * JOINTS, AXES)} == {"unknown"}
+    assert {play.kind for play in judge_gear_plays([noisy] * JOINTS, AXES, LIGHT_ENDS_NM)} == {
+        "unknown"
+    }
 
 
 @pytest.mark.parametrize(("joint", "neighbors"), [(0, [2]), (1, [3]), (2, [0, 4]), (4, [2])])
@@ -244,5 +327,5 @@ def test_neighbors_have_the_same_axis(joint: int, neighbors: list[int]) -> None:
 def test_heavy_pitch_joints_do_not_change_verdict_of_yaw_joint() -> None:
     axes = ["yaw", "yaw", "pitch", "pitch", "yaw"]
     heavy = replace(TIGHT, elastic_nm=100.0)
-    plays = judge_gear_plays([TIGHT, TIGHT, heavy, heavy, TIGHT], axes)
+    plays = judge_gear_plays([TIGHT, TIGHT, heavy, heavy, TIGHT], axes, LIGHT_ENDS_NM)
     assert plays[0].kind == "tight"

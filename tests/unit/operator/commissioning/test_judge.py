@@ -98,6 +98,8 @@ def make_measurements(
         axes=["yaw", "pitch", "yaw"],
         drives=[JointDrive(), JointDrive(sign=-1, zero_rad=0.3), JointDrive()],
         motors=[MOTOR] * JOINTS,
+        link_lengths_m=[0.1] * (JOINTS + 1),
+        link_masses_kg=[0.3] * (JOINTS + 1),
         angle_rad=angle,
         velocity_rad_s=velocity,
         torque_nm=0.5 * np.sign(velocity),
