@@ -1,15 +1,16 @@
 """Judges from torques alone whether the gear of a joint is tight, has backlash, or slips in its coupling. Pure.
 
 In the small motion, the torque of a tight joint follows its angle, because the floor holds the links. The joints of a
-robot are compared with each other, because the friction of the floor is unknown:
+robot are compared with each other, because the friction of the floor is unknown. The first row that fits counts:
 
-    torque in the small motion          torque of the neighbors                       verdict
-    follows the angle, and reverses     any                                           tight, up to a computed angle
-    missing at one end of the stroke    any                                           backlash
-    follows the angle, never reverses   any                                           unknown
-    does not follow it                  changes only in the large motion              backlash
-    does not follow it                  hardly changes, or alike in both motions      the coupling slips, or loose
-    does not follow it                  between these                                 loose
+    torque in the small motion               torque of the neighbors                  verdict
+    follows the angle, and reverses          any                                      tight, up to a computed angle
+    only at one end of the stroke            any                                      backlash
+    follows the angle, never reverses        any                                      unknown
+    hardly follows it, or slides the links   any                                      unknown
+    does not follow it                       hardly changes, or alike in both motions the coupling slips, or loose
+    does not follow it                       changes only in the large motion         backlash
+    does not follow it                       between these                            loose
 
 A torque that follows the angle excludes backlash only if the load reverses, because teeth that touch on one side carry
 any other load. `tooth_contact` computes how much backlash a reversal could still hide.
@@ -17,10 +18,10 @@ any other load. `tooth_contact` computes how much backlash a reversal could stil
 A coupling that slips passes its torque on also in the small motion, and backlash does not. So the coupling is named
 only if the neighbors measure such a torque. Otherwise backlash that is wider than both motions is as likely.
 
-A joint is found loose only if it turned with less torque than its links need to slide (`sliding_torque`). The joints at
-both ends carry only one link, which slides with little torque. So they may be found tight, but are found loose only if
-a person laid weights on both end links. Beside a loose joint, an end joint is not found loose, because its load may
-slip there.
+A drive that turns its links slides them on the floor, which needs a certain torque (`sliding_torque`). With less, it
+turns without its links. The outermost yaw joints carry only a light end of the robot, which slides with hardly any
+torque. So they may be found tight, but are usually found loose only if a person laid weights on both end links. Beside
+a loose joint, an outermost joint is not found loose, because its load may slip there.
 
 A pitch joint is not judged: the weight of its links presses the teeth to one side.
 """
@@ -58,13 +59,11 @@ MIN_UNLOADED_FRACTION = 0.3
 # The load at the other end, divided by the smallest torque that proves a load.
 MIN_LOAD_RATIO = 2.0
 NO_CLEAR_LOAD = "its torque hardly follows its angle"
-# The torque of a loose joint in the small motion, divided by that with which its links slide. On emulated robots, sound
-# joints at an end have 0.93 or more.
+# Half the range of a loose joint's torque in the small motion, divided by the torque with which its links slide. On
+# emulated robots, sound outermost joints have 0.93 or more. Others may have less, because the whole body bends.
 MAX_LOOSE_SLIDING_RATIO = 0.85
 NO_REVERSAL = "the load of its gear does not reverse in the small motion"
-LIGHT_END = (
-    "the floor may hardly hold its only link (lay a heavy weight on it, and add --end-weights)"
-)
+LIGHT_END = "the floor may hardly hold the end of the robot (lay a weight on its last link, and add --end-weights)"
 BESIDE_LOOSE_JOINT = "the joint beside it is loose, and may be the only cause"
 # "loose": it has backlash or slips, which of them is not clear.
 PlayKind = Literal["tight", "backlash", "slipping", "loose", "unknown"]
@@ -97,17 +96,27 @@ def judge_gear_plays(
         _judge_gear_play(responses, axes, joint, sliding_torques_nm[joint])
         for joint in range(len(responses))
     ]
-    for end in (0, len(plays) - 1):
-        neighbors = find_neighbors_of_same_axis(axes, end)
-        is_beside_loose_joint = any(plays[i].kind in LOOSE_KINDS for i in neighbors)
-        if plays[end].kind in LOOSE_KINDS and is_beside_loose_joint:
-            plays[end] = GearPlay("unknown", BESIDE_LOOSE_JOINT)
-    return plays
+    return [
+        GearPlay("unknown", BESIDE_LOOSE_JOINT)
+        if play.kind in LOOSE_KINDS
+        and _is_outermost(axes, joint)
+        and _is_beside_loose_joint(plays, axes, joint)
+        else play
+        for joint, play in enumerate(plays)
+    ]
 
 
-def _is_end(joint_index: int, joint_count: int) -> bool:
-    """Return whether a joint is the first or the last one."""
-    return joint_index in (0, joint_count - 1)
+def _is_outermost(axes: Sequence[str], joint_index: int) -> bool:
+    """Return whether a joint is the first or the last one with its axis."""
+    return len(find_neighbors_of_same_axis(axes, joint_index)) < 2
+
+
+def _is_beside_loose_joint(
+    plays: Sequence[GearPlay], axes: Sequence[str], joint_index: int
+) -> bool:
+    """Return whether a neighbor of a joint is loose."""
+    neighbors = find_neighbors_of_same_axis(axes, joint_index)
+    return any(plays[neighbor].kind in LOOSE_KINDS for neighbor in neighbors)
 
 
 def _judge_gear_play(
@@ -136,20 +145,22 @@ def _judge_gear_play(
     follows_angle = response.elastic_nm >= max(MIN_TIGHT_FRACTION * typical_nm, min_change_nm)
     if follows_angle and contact.reversal_rad is not None:
         return GearPlay("tight", max_backlash_rad=contact.reversal_rad)
-    is_end = _is_end(joint_index, len(responses))
-    if is_end and not _turns_without_its_link(response, sliding_nm):
+    is_outermost = _is_outermost(axes, joint_index)
+    if is_outermost and not _turns_without_its_links(response, sliding_nm):
         return GearPlay("unknown", LIGHT_END)
-    if _leaves_teeth_at_one_end(contact):
+    if _is_loaded_at_one_end_only(contact):
         return GearPlay("backlash", min_backlash_rad=contact.unloaded_travel_rad)
     if follows_angle:
         return GearPlay("unknown", NO_REVERSAL)
     if response.elastic_nm > MAX_LOOSE_FRACTION * typical_nm:
         return GearPlay("unknown", NO_CLEAR_LOAD)
-    # The torques of the neighbors do not contain the friction of this drive.
-    if not is_end and not _is_too_weak_to_slide(
-        min(response.small_range_nm, response.neighbor_small_range_nm), sliding_nm
-    ):
+    # The smaller range counts, because the torque of the joint contains the friction of its own drive.
+    range_nm = min(response.small_range_nm, response.neighbor_small_range_nm)
+    range_nm = max(range_nm, response.noise_nm)
+    if not is_outermost and not _is_too_weak_to_slide(range_nm, sliding_nm):
         return GearPlay("unknown", NO_CLEAR_LOAD)
+    if contact.reversal_rad is not None:
+        return GearPlay("unknown", NO_CLEAR_LOAD)  # teeth on both sides carry a load
     return _judge_loose_gear(response, typical_nm, min_change_nm)
 
 
@@ -157,33 +168,34 @@ def _is_too_weak_to_slide(torque_range_nm: float, sliding_nm: float) -> bool:
     """Return whether a torque is clearly smaller than that with which links slide.
 
     Args:
-        torque_range_nm: Range of the torque in a motion in both directions.
+        torque_range_nm: Range of the torque in a motion in both directions, or its noise if that is larger.
         sliding_nm: Torque with which the links slide.
     """
     return torque_range_nm < 2 * MAX_LOOSE_SLIDING_RATIO * sliding_nm
 
 
-def _turns_without_its_link(response: LoadResponse, sliding_nm: float) -> bool:
-    """Return whether the drive of an end joint turned with less torque than its only link needs to slide.
+def _turns_without_its_links(response: LoadResponse, sliding_nm: float) -> bool:
+    """Return whether the drive of an outermost joint turned with less torque than its links need to slide.
 
     Args:
         response: Response of the torques to its motions.
-        sliding_nm: Torque with which the link slides.
+        sliding_nm: Torque with which the links slide.
     """
     contact = response.contact
-    is_unloaded_at_one_end = contact.min_load_nm < sliding_nm and _leaves_teeth_at_one_end(contact)
-    return is_unloaded_at_one_end or _is_too_weak_to_slide(response.small_range_nm, sliding_nm)
+    if _is_loaded_at_one_end_only(contact) and contact.load_threshold_nm < sliding_nm:
+        return True
+    return _is_too_weak_to_slide(max(response.small_range_nm, response.noise_nm), sliding_nm)
 
 
-def _leaves_teeth_at_one_end(contact: ToothContact) -> bool:
+def _is_loaded_at_one_end_only(contact: ToothContact) -> bool:
     """Return whether a joint is loaded at one end of its small stroke, and not at all at the other."""
-    is_loaded_at_one_end = contact.max_load_nm >= MIN_LOAD_RATIO * contact.min_load_nm
+    is_loaded_at_one_end = contact.max_load_nm >= MIN_LOAD_RATIO * contact.load_threshold_nm
     is_unloaded_at_other_end = contact.unloaded_fraction >= MIN_UNLOADED_FRACTION
     return is_loaded_at_one_end and is_unloaded_at_other_end and contact.reversal_rad is None
 
 
 def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: float) -> GearPlay:
-    """Judge a joint between others whose torque does not follow its angle in the small motion.
+    """Judge a joint whose torque does not follow its angle in the small motion, and does not slide its links.
 
     Args:
         response: Response of the torques to its motions.
@@ -192,26 +204,25 @@ def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: 
     """
     large_nm, small_nm = response.neighbor_large_range_nm, response.neighbor_small_range_nm
     max_slipping_nm = MAX_SLIPPING_LOAD_RATIO * typical_nm
-    are_neighbors_never_loaded = max(large_nm, response.noise_nm) <= max_slipping_nm
+    are_neighbors_lightly_loaded = max(large_nm, response.noise_nm) <= max_slipping_nm
     min_slipping_nm = MIN_SLIPPING_NEIGHBOR_RATIO * large_nm
     is_load_alike_in_both_motions = small_nm >= max(min_slipping_nm, response.noise_nm)
-    if are_neighbors_never_loaded or is_load_alike_in_both_motions:
+    if are_neighbors_lightly_loaded or is_load_alike_in_both_motions:
         # A coupling that slips passes a torque on, and backlash does not.
         return GearPlay("slipping" if response.passed_in_small_motion.is_certain else "loose")
-    is_noisy = response.noise_nm > MAX_LOOSE_FRACTION * typical_nm
-    if response.contact.reversal_rad is not None:
-        return GearPlay("unknown", NO_CLEAR_LOAD)  # teeth on both sides carry a load
     if _has_backlash(response, min_change_nm):
         return GearPlay("backlash", min_backlash_rad=response.small_motion_rad)
-    return GearPlay("unknown", NO_CLEAR_LOAD) if is_noisy else GearPlay("loose")
+    if response.noise_nm > MAX_LOOSE_FRACTION * typical_nm:
+        return GearPlay("unknown", NO_CLEAR_LOAD)
+    return GearPlay("loose")
 
 
 def _has_backlash(response: LoadResponse, min_change_nm: float) -> bool:
     """Return whether the load of a joint is missing in the small motion, and comes in the large one."""
     large_nm = response.neighbor_large_range_nm
     # The neighbors are loaded through this gear, which is therefore loaded as well.
-    min_load_nm = max(min_change_nm, MIN_OWN_LOAD_RATIO * large_nm)
-    is_loaded_in_large_motion = large_nm >= min_change_nm and response.load_nm >= min_load_nm
+    min_own_load_nm = max(min_change_nm, MIN_OWN_LOAD_RATIO * large_nm)
+    is_loaded_in_large_motion = large_nm >= min_change_nm and response.load_nm >= min_own_load_nm
     max_small_nm = MAX_BACKLASH_NEIGHBOR_RATIO * large_nm
     # Noise as large as this could hide a load.
     is_load_missing_in_small_motion = (
@@ -223,13 +234,13 @@ def _has_backlash(response: LoadResponse, min_change_nm: float) -> bool:
 def _compute_typical_elastic_nm(
     responses: Sequence[LoadResponse | None], axes: Sequence[str], joint_index: int
 ) -> float:
-    """Return the median elastic torque of the other yaw joints, without those at the ends; 0 if there are none."""
+    """Return the median elastic torque of the other yaw joints, without the outermost ones; 0 if there are none."""
     elastic_nm = [
         response.elastic_nm
         for joint, (response, axis) in enumerate(zip(responses, axes, strict=True))
         if response is not None
         and axis == "yaw"
         and joint != joint_index
-        and not _is_end(joint, len(responses))
+        and not _is_outermost(axes, joint)
     ]
     return float(np.median(elastic_nm)) if elastic_nm else 0.0

@@ -5,8 +5,8 @@ links of this part slide on the floor, so the joint must overcome their friction
 
     torque = friction coefficient * gravity * sum over the links (mass * distance between its middle and the joint)
 
-An end joint whose drive turns with less torque does not turn its link. A joint between two others may turn with less
-torque in a small motion, because the other joints bend before all links slide.
+An outermost joint that turns with less torque turns without its links. A joint between others may turn with less torque
+and be sound, because in a small motion the other joints bend before all links slide.
 """
 
 from collections.abc import Sequence

@@ -37,7 +37,7 @@ MIN_TARGET_STEP_RAD = 1e-9  # from tick to tick; less is a rounding error
 class ToothContact:
     """What the torque of a joint shows of the contact of its teeth."""
 
-    min_load_nm: float  # a smaller torque does not prove a load
+    load_threshold_nm: float  # a smaller torque does not prove a load
     # Angle in which the load reversed in the small motion, for the slowest of all reversals. None if the load did not
     # reverse in both directions.
     reversal_rad: float | None
@@ -78,17 +78,17 @@ def measure_tooth_contact(
         window_ticks: Length of the moving average.
     """
     friction_nm = FRICTION_FACTOR * estimate_friction_nm(small)
-    min_load_nm = MIN_LOAD_NM + noise_nm + friction_nm
+    load_threshold_nm = MIN_LOAD_NM + noise_nm + friction_nm
     max_unloaded_nm = MAX_UNLOADED_NM + noise_nm + friction_nm
-    reversal_rad = measure_reversal_rad(small, min_load_nm, margin_ticks=window_ticks // 2)
+    reversal_rad = measure_reversal_rad(small, load_threshold_nm, margin_ticks=window_ticks // 2)
     if reversal_rad is not None:
         reversal_rad += angle_step_rad
     return ToothContact(
-        min_load_nm=min_load_nm,
+        load_threshold_nm=load_threshold_nm,
         reversal_rad=reversal_rad,
         unloaded_fraction=measure_unloaded_fraction(second_cycle, max_unloaded_nm),
         max_load_nm=float(np.max(np.abs(second_cycle.torque_nm))),
-        unloaded_travel_rad=measure_unloaded_travel_rad(large, min_load_nm),
+        unloaded_travel_rad=measure_unloaded_travel_rad(large, load_threshold_nm),
     )
 
 
@@ -110,19 +110,19 @@ def estimate_friction_nm(motion: JointMotion) -> float:
 
 
 def measure_reversal_rad(
-    motion: JointMotion, min_load_nm: float, *, margin_ticks: int
+    motion: JointMotion, load_threshold_nm: float, *, margin_ticks: int
 ) -> float | None:
     """Return the angle through which the joint moved while its load reversed, for the slowest of all reversals.
 
     Args:
         motion: The motion of the joint.
-        min_load_nm: A smaller torque does not prove a load.
+        load_threshold_nm: A smaller torque does not prove a load.
         margin_ticks: By which each reversal is extended, because the torque is a moving average.
 
     Returns:
         The angle; None if the load did not reverse in both directions.
     """
-    sides = np.where(np.abs(motion.torque_nm) >= min_load_nm, np.sign(motion.torque_nm), 0.0)
+    sides = np.where(np.abs(motion.torque_nm) >= load_threshold_nm, np.sign(motion.torque_nm), 0.0)
     loaded_ticks = np.flatnonzero(sides)
     largest_rad = {1.0: 0.0, -1.0: 0.0}  # by the sign of the load after the reversal
     has_reversed = {1.0: False, -1.0: False}
@@ -154,14 +154,14 @@ def measure_unloaded_fraction(motion: JointMotion, max_unloaded_nm: float) -> fl
     return max(at_start_rad, at_end_rad) / stroke_rad
 
 
-def measure_unloaded_travel_rad(motion: JointMotion, min_load_nm: float) -> float:
+def measure_unloaded_travel_rad(motion: JointMotion, load_threshold_nm: float) -> float:
     """Return the longest angle through which the joint moved in one direction without a load, shortened by its error.
 
     Args:
         motion: The motion of the joint.
-        min_load_nm: A smaller torque does not prove a load.
+        load_threshold_nm: A smaller torque does not prove a load.
     """
-    is_unloaded = np.abs(_compute_moving_median(motion.torque_nm)) < min_load_nm
+    is_unloaded = np.abs(_compute_moving_median(motion.torque_nm)) < load_threshold_nm
     longest_rad = 0.0
     start: int | None = None  # of the present stretch without a load
     last_direction = 0.0  # of the target, before it came to rest if it rests

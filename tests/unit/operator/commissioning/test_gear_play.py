@@ -36,7 +36,7 @@ TIGHT = LoadResponse(
     passed_in_small_motion=NOTHING_PASSED,
     passed_in_all_motions=NOTHING_PASSED,
     contact=ToothContact(
-        min_load_nm=0.06,
+        load_threshold_nm=0.06,
         reversal_rad=0.005,
         unloaded_fraction=0.0,
         max_load_nm=0.2,
@@ -44,7 +44,7 @@ TIGHT = LoadResponse(
     ),
 )
 NO_CONTACT = ToothContact(
-    min_load_nm=0.03,
+    load_threshold_nm=0.03,
     reversal_rad=None,
     unloaded_fraction=1.0,
     max_load_nm=0.009,
@@ -53,14 +53,14 @@ NO_CONTACT = ToothContact(
 # The teeth touch at one end of the small motion: numbers of robots 100 (ODrive) and 140 (Dynamixel) of the trials.
 ONE_END_CONTACTS = [
     ToothContact(
-        min_load_nm=0.031,
+        load_threshold_nm=0.031,
         reversal_rad=None,
         unloaded_fraction=0.79,
         max_load_nm=0.102,
         unloaded_travel_rad=0.023,
     ),
     ToothContact(
-        min_load_nm=0.037,
+        load_threshold_nm=0.037,
         reversal_rad=None,
         unloaded_fraction=0.50,
         max_load_nm=0.304,
@@ -235,6 +235,22 @@ def test_end_joint_with_a_weight_is_judged_like_others(
     assert kinds == ["tight"] * (JOINTS - 1)
 
 
+def test_last_yaw_joint_is_an_end_joint_also_before_a_pitch_joint() -> None:
+    axes = [*AXES, "pitch"]
+    responses = [*[TIGHT] * (JOINTS - 1), SLIPPING, TIGHT]
+    light = judge_gear_plays(responses, axes, [*LIGHT_ENDS_NM, 0.008])
+    weighted = judge_gear_plays(responses, axes, [*HEAVY_ENDS_NM, 0.06])
+    assert light[JOINTS - 1] == GearPlay("unknown", LIGHT_END)
+    assert weighted[JOINTS - 1].kind == "slipping"
+
+
+def test_weighted_end_joint_with_a_coarse_torque_is_unknown() -> None:
+    """The drive may report 0 up to a torque at which its link slides."""
+    coarse = replace(SLIPPING, small_range_nm=0.0, noise_nm=2 * HEAVY_ENDS_NM[0])
+    plays = judge_gear_plays([coarse, *[TIGHT] * (JOINTS - 1)], AXES, HEAVY_ENDS_NM)
+    assert plays[0] == GearPlay("unknown", LIGHT_END)
+
+
 @pytest.mark.parametrize("neighbor", [BACKLASH, SLIPPING])
 def test_weighted_end_joint_beside_a_loose_joint_is_unknown(neighbor: LoadResponse) -> None:
     responses = [BACKLASH, neighbor, TIGHT, TIGHT, TIGHT]
@@ -277,7 +293,9 @@ def test_joint_with_less_load_than_its_neighbors_has_no_backlash() -> None:
 
 def test_weighted_end_joint_with_coarse_torque_does_not_leave_its_teeth() -> None:
     """The smallest load that can be proven could slide the link."""
-    contact = replace(ONE_END_CONTACTS[0], min_load_nm=1.01 * HEAVY_ENDS_NM[0], max_load_nm=0.2)
+    contact = replace(
+        ONE_END_CONTACTS[0], load_threshold_nm=1.01 * HEAVY_ENDS_NM[0], max_load_nm=0.2
+    )
     responses = [replace(TIGHT, contact=contact), *[TIGHT] * (JOINTS - 1)]
     plays = judge_gear_plays(responses, AXES, HEAVY_ENDS_NM)
     assert plays[0] == GearPlay("unknown", LIGHT_END)

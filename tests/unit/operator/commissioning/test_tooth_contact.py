@@ -131,7 +131,7 @@ def test_friction_that_cannot_be_estimated_bounds_nothing() -> None:
         motion, motion, motion, noise_nm=0.0, angle_step_rad=0.0, window_ticks=5
     )
     assert contact.reversal_rad is None
-    assert contact.min_load_nm == float("inf")
+    assert contact.load_threshold_nm == float("inf")
 
 
 @pytest.mark.parametrize("friction_nm", [0.0, 0.05])
