@@ -20,8 +20,10 @@ only if the neighbors measure such a torque. Otherwise backlash that is wider th
 
 A drive that turns its links slides them on the floor, which needs a certain torque (`sliding_torque`). With less, it
 turns without its links. The outermost yaw joints carry only a light end of the robot, which slides with hardly any
-torque. So they may be found tight, but are usually found loose only if a person laid weights on both end links. Beside
-a loose joint, an outermost joint is not found loose, because its load may slip there.
+torque. So they may be found tight, but are usually found loose only if a person laid weights on both end links.
+
+Beside a loose joint, a sound joint may lose its load there. So an outermost joint, and a joint that is loaded only at
+one end of the stroke, is not found loose beside a loose joint.
 
 A pitch joint is not judged: the weight of its links presses the teeth to one side.
 """
@@ -98,25 +100,34 @@ def judge_gear_plays(
     ]
     return [
         GearPlay("unknown", BESIDE_LOOSE_JOINT)
-        if play.kind in LOOSE_KINDS
-        and _is_outermost(axes, joint)
-        and _is_beside_loose_joint(plays, axes, joint)
+        if _may_loose_neighbor_be_the_cause(responses, plays, axes, joint)
         else play
         for joint, play in enumerate(plays)
     ]
 
 
+def _may_loose_neighbor_be_the_cause(
+    responses: Sequence[LoadResponse | None],
+    plays: Sequence[GearPlay],
+    axes: Sequence[str],
+    joint_index: int,
+) -> bool:
+    """Return whether a joint seems loose, and may be sound, because it is loaded only through a loose neighbor.
+
+    This concerns outermost joints, and joints that are loaded at one end of the small motion.
+    """
+    response = responses[joint_index]
+    if response is None or plays[joint_index].kind not in LOOSE_KINDS:
+        return False
+    neighbors = find_neighbors_of_same_axis(axes, joint_index)
+    is_beside_loose_joint = any(plays[neighbor].kind in LOOSE_KINDS for neighbor in neighbors)
+    is_in_doubt = _is_outermost(axes, joint_index) or _is_loaded_at_one_end_only(response.contact)
+    return is_beside_loose_joint and is_in_doubt
+
+
 def _is_outermost(axes: Sequence[str], joint_index: int) -> bool:
     """Return whether a joint is the first or the last one with its axis."""
     return len(find_neighbors_of_same_axis(axes, joint_index)) < 2
-
-
-def _is_beside_loose_joint(
-    plays: Sequence[GearPlay], axes: Sequence[str], joint_index: int
-) -> bool:
-    """Return whether a neighbor of a joint is loose."""
-    neighbors = find_neighbors_of_same_axis(axes, joint_index)
-    return any(plays[neighbor].kind in LOOSE_KINDS for neighbor in neighbors)
 
 
 def _judge_gear_play(

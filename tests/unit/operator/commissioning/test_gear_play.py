@@ -251,6 +251,14 @@ def test_weighted_end_joint_with_a_coarse_torque_is_unknown() -> None:
     assert plays[0] == GearPlay("unknown", LIGHT_END)
 
 
+def test_joint_with_load_at_one_end_beside_a_loose_joint_is_unknown() -> None:
+    """The sound joint_3 of Dynamixel robot 9166 of the trials with weights was loaded so."""
+    one_end = replace(TIGHT, contact=ONE_END_CONTACTS[0])
+    plays = judge_gear_plays([TIGHT, SLIPPING, one_end, TIGHT, TIGHT], AXES, HEAVY_ENDS_NM)
+    assert plays[1].kind == "slipping"
+    assert plays[2] == GearPlay("unknown", BESIDE_LOOSE_JOINT)
+
+
 @pytest.mark.parametrize("neighbor", [BACKLASH, SLIPPING])
 def test_weighted_end_joint_beside_a_loose_joint_is_unknown(neighbor: LoadResponse) -> None:
     responses = [BACKLASH, neighbor, TIGHT, TIGHT, TIGHT]
