@@ -3,27 +3,30 @@
 In the small motion, the torque of a tight joint follows its angle, because the floor holds the links. The joints of a
 robot are compared with each other, because the friction of the floor is unknown. The first row that fits counts:
 
-    torque in the small motion               torque of the neighbors                  verdict
-    follows the angle, and reverses          any                                      tight, up to a computed angle
-    only at one end of the stroke            any                                      backlash
-    follows the angle, never reverses        any                                      unknown
-    hardly follows it, or slides the links   any                                      unknown
-    does not follow it                       hardly changes, or alike in both motions the coupling slips, or loose
-    does not follow it                       changes only in the large motion         backlash
-    does not follow it                       between these                            loose
+    torque in the small motion               torques of its neighbors                  verdict
+    follows the angle, and reverses          any                                       tight, up to a computed angle
+    may slide the only link of an end joint  any                                       unknown
+    only at one end of the stroke            any                                       backlash
+    follows the angle, never reverses        any                                       unknown
+    hardly follows it, may slide the links,  any                                       unknown
+    or reverses
+    does not follow it                       low, or alike in both motions             the coupling slips, or loose
+    does not follow it                       change only in the large motion           backlash
+    does not follow it                       between these                             loose; unknown if noisy
 
 A torque that follows the angle excludes backlash only if the load reverses, because teeth that touch on one side carry
 any other load. `tooth_contact` computes how much backlash a reversal could still hide.
 
-A coupling that slips passes its torque on also in the small motion, and backlash does not. So the coupling is named
-only if the neighbors measure such a torque. Otherwise backlash that is wider than both motions is as likely.
+A coupling that slips transmits its friction also in the small motion, and backlash transmits nothing. So the coupling
+is named only if the neighbors measure a torque in the small motion. Otherwise backlash that is wider than both motions
+is as likely.
 
 A drive that turns its links slides them on the floor, which needs a certain torque (`sliding_torque`). With less, it
 turns without its links. The outermost yaw joints carry only a light end of the robot, which slides with hardly any
-torque. So they may be found tight, but are usually found loose only if a person laid weights on both end links.
+torque. They can be found tight, but are usually found loose only if a person laid weights on both end links.
 
-Beside a loose joint, a sound joint may lose its load there. So an outermost joint, and a joint that is loaded only at
-one end of the stroke, is not found loose beside a loose joint.
+Beside a loose joint, a sound joint may be unloaded, because the loose gear transmits nothing. So an outermost joint,
+and a joint that is loaded only at one end of the stroke, is not found loose beside a loose joint.
 
 A pitch joint is not judged: the weight of its links presses the teeth to one side.
 """
@@ -58,7 +61,7 @@ MAX_SLIPPING_LOAD_RATIO = 0.5
 # Of the small stroke, at one of its ends, without a load. On emulated drives that report a torque, sound joints have
 # 0.12 or less, and loose ones whose teeth touch at the other end have 0.40 or more.
 MIN_UNLOADED_FRACTION = 0.3
-# The load at the other end, divided by the smallest torque that proves a load.
+# The load at the loaded end, divided by the smallest torque that proves a load.
 MIN_LOAD_RATIO = 2.0
 NO_CLEAR_LOAD = "its torque hardly follows its angle"
 # Half the range of a loose joint's torque in the small motion, divided by the torque with which its links slide. On
@@ -100,13 +103,13 @@ def judge_gear_plays(
     ]
     return [
         GearPlay("unknown", BESIDE_LOOSE_JOINT)
-        if _may_loose_neighbor_be_the_cause(responses, plays, axes, joint)
+        if _may_be_sound_beside_loose_joint(responses, plays, axes, joint)
         else play
         for joint, play in enumerate(plays)
     ]
 
 
-def _may_loose_neighbor_be_the_cause(
+def _may_be_sound_beside_loose_joint(
     responses: Sequence[LoadResponse | None],
     plays: Sequence[GearPlay],
     axes: Sequence[str],
@@ -114,7 +117,7 @@ def _may_loose_neighbor_be_the_cause(
 ) -> bool:
     """Return whether a joint seems loose, and may be sound, because it is loaded only through a loose neighbor.
 
-    This concerns outermost joints, and joints that are loaded at one end of the small motion.
+    This concerns outermost joints, and joints that are loaded only at one end of the small motion.
     """
     response = responses[joint_index]
     if response is None or plays[joint_index].kind not in LOOSE_KINDS:
@@ -206,7 +209,7 @@ def _is_loaded_at_one_end_only(contact: ToothContact) -> bool:
 
 
 def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: float) -> GearPlay:
-    """Judge a joint whose torque does not follow its angle in the small motion, and does not slide its links.
+    """Judge a joint whose torque does not follow its angle in the small motion, and is too small to slide its links.
 
     Args:
         response: Response of the torques to its motions.

@@ -3,7 +3,9 @@
 A joint turns the part of the robot that is easier to turn: the one towards the tail, or the one towards the head. The
 links of this part slide on the floor, so the joint must overcome their friction:
 
-    torque = friction coefficient * gravity * sum over the links (mass * distance between its middle and the joint)
+    torque = friction coefficient * gravity * sum over these links (mass * distance between link's middle and joint)
+
+The robot lies straight.
 
 An outermost joint that turns with less torque turns without its links. A joint between others may turn with less torque
 and be sound, because in a small motion the other joints bend before all links slide.
