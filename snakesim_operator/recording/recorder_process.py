@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
@@ -25,7 +26,7 @@ if __name__ == "__main__":
 
 import msgspec
 
-from snakesim_hal.base.errors import ConfigError, NotConnectedError
+from snakesim_hal.base.errors import ConfigError, NotConnectedError, WireError
 from snakesim_hal.base.terminal import print_stderr, run_tool
 from snakesim_hal.model.fault_kinds import HAL
 from snakesim_hal.network.process_entries import make_own_entry, publish_process_entry
@@ -41,8 +42,8 @@ from snakesim_hal.programs.arguments import (
 from snakesim_hal.programs.service_program import ProcessOptions, read_process_options
 from snakesim_hal.service import SERVICE_START_LIMIT_S
 from snakesim_hal.wire import keys
-from snakesim_hal.wire.codec import UNDECODABLE
-from snakesim_hal.wire.messages import Answer, RobotDescription
+from snakesim_hal.wire.codec import UNDECODABLE, MessageDecoder
+from snakesim_hal.wire.messages import Answer, RobotDescription, TickDone
 from snakesim_hal.wire.roles import RECORDER
 from snakesim_operator.recording.foxglove_messages.file_writer import OnViewerMessage
 from snakesim_operator.recording.log_clock import LogTimeClock
@@ -290,7 +291,7 @@ def _record_until_stopped(
         ) from error
     tap = MessageTap(session)
     present_hosts = _track_present_hosts(session)
-    session.on_query(keys.RECEIVED, _confirm_receipt)
+    session.on_query(keys.RECEIVED, partial(_confirm_receipt, MessageDecoder(TickDone)))
     session.declare_alive(RECORDER)
     publish_process_entry(session, make_own_entry(RECORDER))
     while should_continue() and not recorder.writer.failure:
@@ -307,12 +308,21 @@ def _record_until_stopped(
     return recorder
 
 
-def _confirm_receipt(query: IncomingQuery) -> None:
+def _confirm_receipt(decoder: MessageDecoder[TickDone], query: IncomingQuery) -> None:
     """Answer a host that has ended its run, and waits until its messages have arrived.
 
     Zenoh's thread calls this after all earlier messages of the host, so that the tap has them.
+
+    Args:
+        decoder: Decoder of the query's payload, the last tick of the host.
+        query: The query. It is refused if its payload cannot be decoded.
     """
-    query.reply(Answer(ok=True, reason="all messages have arrived"))
+    try:
+        decoder.decode(query.payload, query.encoding)
+    except WireError as error:
+        query.reply(Answer(ok=False, reason=str(error), refusal=error.reason))
+    else:
+        query.reply(Answer(ok=True, reason="all messages have arrived"))
 
 
 def _track_present_hosts(session: Session) -> set[str]:

@@ -21,6 +21,7 @@ from snakesim_hal.wire.messages import (
     LifecycleRequest,
     Message,
     RobotStatus,
+    SimulatorRequest,
 )
 
 CONTROLLER_PRIORITY = 100  # of the lease of a controller that requests no other priority
@@ -66,6 +67,8 @@ class EffectDetector:
             case LifecycleRequest(action="disarm" | "finish" | "reset"):
                 # A reset would hide a fault.
                 return f"a request to {message.action}"
+            case SimulatorRequest():  # any client may change the time of a simulator
+                return f"a request to {message.action} the simulator"
             case LeaseRequest(action="acquire") if message.priority > CONTROLLER_PRIORITY:
                 return "a claim of higher priority"
             case LeaseRequest(action="release" | "renew") if message.epoch == held.epoch:

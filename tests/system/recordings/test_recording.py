@@ -26,6 +26,7 @@ from snakesim_hal.wire.custom_sample import make_message_schema
 from snakesim_hal.wire.messages import (
     Clock,
     CustomSample,
+    EstopRequest,
     LocomotionIntent,
     RobotDescription,
     TickDone,
@@ -287,6 +288,15 @@ def test_recorder_confirms_receipt_of_all_earlier_messages(tmp_path: Path) -> No
         stop_requested.set()
     expected = [make_clock_sample(tick).payload for tick in range(tick_count)]
     assert read_clock_payloads(path) == expected
+
+
+def test_recorder_refuses_receipt_request_that_it_cannot_decode(tmp_path: Path) -> None:
+    with recorded_host(tmp_path / "a.mcap") as (host, stop_requested):
+        other_message = EstopRequest(requester="a client")
+        answers = list(host.send_request_to_all(keys.RECEIVED, other_message, 60.0))
+        assert [answer.ok for _, answer in answers] == [False]
+        assert [answer.refusal for _, answer in answers] == ["unknown_message"]
+        stop_requested.set()
 
 
 def test_recording_at_its_end_continues_as_long_as_messages_arrive(tmp_path: Path) -> None:

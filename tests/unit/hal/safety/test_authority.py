@@ -527,6 +527,26 @@ def test_faults_since_start_survive_a_reset() -> None:
     assert [fault.what for fault in rig.authority.faults_since_start.faults] == ["hot"]
 
 
+# --- names of active limits ------------------------------------------------------------------------------------
+
+
+def test_limited_target_is_named_and_counted() -> None:
+    rig = make_armed_rig()
+    rig.observe(0.0)
+    rig.send(3.0)  # beyond the limits of all joints
+    decision = rig.pass_tick()
+    assert decision.limit_by_joint == dict.fromkeys(range(JOINT_COUNT), "angle")
+    assert rig.authority.limited_counts == {"angle": JOINT_COUNT}
+
+
+def test_unlimited_command_has_no_active_limit() -> None:
+    rig = make_armed_rig()
+    measured_rad = 0.1
+    decision = rig.run_tick_with_command(measured_rad)
+    assert decision.limit_by_joint == {}
+    assert not rig.authority.limited_counts
+
+
 # --- heat, supply and measured states --------------------------------------------------------------------------
 
 
