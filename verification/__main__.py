@@ -74,7 +74,7 @@ PARTS = {
     ),
     "heavy": CampaignPart(
         "tests that need more than a second of processor time; CI runs them with each change",
-        5,
+        3,
         (*PYTEST, *ALL_TESTS, "-n", "4", "--dist", "worksteal", "-m", HEAVY),
     ),
     "quiet": CampaignPart(
@@ -89,7 +89,7 @@ PARTS = {
     ),
     "trials": CampaignPart(
         "all random trials; with each change, a tenth of them runs",
-        4,
+        2,
         (*PYTEST, "tests/unit", "-n", "2", "-m", "(hypothesis or trials) and not (slow or quiet)"),
     ),
     "can": CampaignPart(
@@ -137,10 +137,10 @@ PARTS = {
         ),
     ),
     "attack": CampaignPart(
-        "every attack of an unauthorized client, once", 5, (*PYTEST, "verification/attack")
+        "every attack of an unauthorized client, once", 4, (*PYTEST, "verification/attack")
     ),
     "links": CampaignPart(
-        "bad links between machines (root)", 4, (*PYTEST, "verification/links", "-m", "")
+        "bad links between machines (root)", 1, (*PYTEST, "verification/links", "-m", "")
     ),
     "faults": CampaignPart(
         "the fault table, two trials of each row", 6, ("verification.faults", "--trials", "2")
@@ -151,14 +151,14 @@ PARTS = {
         ("verification.fuzz", "--network", "--payloads", "200000"),
     ),
     "kills": CampaignPart(
-        "processes killed and frozen at random", 3, ("verification.soak.kills", "--trials", "20")
+        "processes killed and frozen at random", 1, ("verification.soak.kills", "--trials", "20")
     ),
     "soak": CampaignPart(
         "random faults for three minutes", 4, ("verification.soak", "--minutes", "3")
     ),
     "mutation": CampaignPart(
         "mutants of the rest of the safety core",
-        12,
+        6,
         (
             "verification.mutation",
             "--files",
