@@ -58,15 +58,16 @@ MIN_OWN_LOAD_RATIO = 0.4
 # The neighbors' range of torque in the large motion, divided by the elastic torque of a typical joint. Behind a gear
 # that holds, it is larger.
 MAX_SLIPPING_LOAD_RATIO = 0.5
-# Of the small stroke, at one of its ends, without a load. On emulated drives that report a torque, sound joints have
-# 0.12 or less, and loose ones whose teeth touch at the other end have 0.40 or more.
+# Of the small stroke, at one of its ends, without a load. On emulated drives, loose joints whose teeth touch at the
+# other end have that much or more. Most sound joints have 0.12 or less; a few have more, most of them beside a joint
+# with a fault.
 MIN_UNLOADED_FRACTION = 0.3
 # The load at the loaded end, divided by the smallest torque that proves a load.
 MIN_LOAD_RATIO = 2.0
-NO_CLEAR_LOAD = "its torque hardly follows its angle"
 # Half the range of a loose joint's torque in the small motion, divided by the torque with which its links slide. On
 # emulated robots, sound outermost joints have 0.93 or more. Others may have less, because the whole body bends.
 MAX_LOOSE_SLIDING_RATIO = 0.85
+NO_CLEAR_LOAD = "its torque hardly follows its angle"
 NO_REVERSAL = "the load of its gear does not reverse in the small motion"
 LIGHT_END = "the floor may hardly hold the end of the robot (lay a weight on its last link, and add --end-weights)"
 BESIDE_LOOSE_JOINT = "the joint beside it is loose, and may be the only cause"
@@ -170,22 +171,22 @@ def _judge_gear_play(
         return GearPlay("unknown", NO_CLEAR_LOAD)
     # The smaller range counts, because the torque of the joint contains the friction of its own drive.
     range_nm = min(response.small_range_nm, response.neighbor_small_range_nm)
-    range_nm = max(range_nm, response.noise_nm)
-    if not is_outermost and not _is_too_weak_to_slide(range_nm, sliding_nm):
+    if not is_outermost and not _is_too_weak_to_slide(range_nm, response.noise_nm, sliding_nm):
         return GearPlay("unknown", NO_CLEAR_LOAD)
     if contact.reversal_rad is not None:
         return GearPlay("unknown", NO_CLEAR_LOAD)  # teeth on both sides carry a load
     return _judge_loose_gear(response, typical_nm, min_change_nm)
 
 
-def _is_too_weak_to_slide(torque_range_nm: float, sliding_nm: float) -> bool:
+def _is_too_weak_to_slide(range_nm: float, noise_nm: float, sliding_nm: float) -> bool:
     """Return whether a torque is clearly smaller than that with which links slide.
 
     Args:
-        torque_range_nm: Range of the torque in a motion in both directions, or its noise if that is larger.
+        range_nm: Range of the torque in a motion in both directions.
+        noise_nm: Noise of the torque, which may hide as much.
         sliding_nm: Torque with which the links slide.
     """
-    return torque_range_nm < 2 * MAX_LOOSE_SLIDING_RATIO * sliding_nm
+    return max(range_nm, noise_nm) < 2 * MAX_LOOSE_SLIDING_RATIO * sliding_nm
 
 
 def _turns_without_its_links(response: LoadResponse, sliding_nm: float) -> bool:
@@ -198,7 +199,7 @@ def _turns_without_its_links(response: LoadResponse, sliding_nm: float) -> bool:
     contact = response.contact
     if _is_loaded_at_one_end_only(contact) and contact.load_threshold_nm < sliding_nm:
         return True
-    return _is_too_weak_to_slide(max(response.small_range_nm, response.noise_nm), sliding_nm)
+    return _is_too_weak_to_slide(response.small_range_nm, response.noise_nm, sliding_nm)
 
 
 def _is_loaded_at_one_end_only(contact: ToothContact) -> bool:
