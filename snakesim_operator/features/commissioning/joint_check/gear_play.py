@@ -22,8 +22,9 @@ is named only if the neighbors measure a torque in the small motion. Otherwise b
 is as likely.
 
 A drive that turns its links slides them on the floor, which needs a certain torque (`sliding_torque`). With less, it
-turns without its links. The outermost yaw joints carry only a light end of the robot, which slides with hardly any
-torque. They can be found tight, but are usually found loose only if a person laid weights on both end links.
+turns without its links. A torque of the neighbors is low if it is less than half of a typical load, and too small to
+slide the links. The outermost yaw joints carry only a light end of the robot, which slides with hardly any torque. They
+can be found tight, but are usually found loose only if a person laid weights on both end links.
 
 Beside a loose joint, a sound joint may be unloaded, because the loose gear transmits nothing. So an outermost joint,
 and a joint that is loaded only at one end of the stroke, is not found loose beside a loose joint.
@@ -171,22 +172,21 @@ def _judge_gear_play(
         return GearPlay("unknown", NO_CLEAR_LOAD)
     # The smaller range counts, because the torque of the joint contains the friction of its own drive.
     range_nm = min(response.small_range_nm, response.neighbor_small_range_nm)
-    if not is_outermost and not _is_too_weak_to_slide(range_nm, response.noise_nm, sliding_nm):
+    if not is_outermost and not _is_too_weak_to_slide(max(range_nm, response.noise_nm), sliding_nm):
         return GearPlay("unknown", NO_CLEAR_LOAD)
     if contact.reversal_rad is not None:
         return GearPlay("unknown", NO_CLEAR_LOAD)  # teeth on both sides carry a load
-    return _judge_loose_gear(response, typical_nm, min_change_nm)
+    return _judge_loose_gear(response, typical_nm, sliding_nm, min_change_nm)
 
 
-def _is_too_weak_to_slide(range_nm: float, noise_nm: float, sliding_nm: float) -> bool:
+def _is_too_weak_to_slide(range_nm: float, sliding_nm: float) -> bool:
     """Return whether a torque is clearly smaller than that with which links slide.
 
     Args:
         range_nm: Range of the torque in a motion in both directions.
-        noise_nm: Noise of the torque, which may hide as much.
         sliding_nm: Torque with which the links slide.
     """
-    return max(range_nm, noise_nm) < 2 * MAX_LOOSE_SLIDING_RATIO * sliding_nm
+    return range_nm < 2 * MAX_LOOSE_SLIDING_RATIO * sliding_nm
 
 
 def _turns_without_its_links(response: LoadResponse, sliding_nm: float) -> bool:
@@ -199,7 +199,8 @@ def _turns_without_its_links(response: LoadResponse, sliding_nm: float) -> bool:
     contact = response.contact
     if _is_loaded_at_one_end_only(contact) and contact.load_threshold_nm < sliding_nm:
         return True
-    return _is_too_weak_to_slide(response.small_range_nm, response.noise_nm, sliding_nm)
+    # Noise as large as this may hide a torque.
+    return _is_too_weak_to_slide(max(response.small_range_nm, response.noise_nm), sliding_nm)
 
 
 def _is_loaded_at_one_end_only(contact: ToothContact) -> bool:
@@ -209,17 +210,26 @@ def _is_loaded_at_one_end_only(contact: ToothContact) -> bool:
     return is_loaded_at_one_end and is_unloaded_at_other_end and contact.reversal_rad is None
 
 
-def _judge_loose_gear(response: LoadResponse, typical_nm: float, min_change_nm: float) -> GearPlay:
+def _judge_loose_gear(
+    response: LoadResponse, typical_nm: float, sliding_nm: float, min_change_nm: float
+) -> GearPlay:
     """Judge a joint whose torque does not follow its angle in the small motion, and is too small to slide its links.
 
     Args:
         response: Response of the torques to its motions.
         typical_nm: Elastic torque of a typical joint.
+        sliding_nm: Torque with which the links slide.
         min_change_nm: Change of a torque that proves a load.
     """
     large_nm, small_nm = response.neighbor_large_range_nm, response.neighbor_small_range_nm
     max_slipping_nm = MAX_SLIPPING_LOAD_RATIO * typical_nm
-    are_neighbors_lightly_loaded = max(large_nm, response.noise_nm) <= max_slipping_nm
+    # A part of the range may be noise.
+    does_large_motion_slide_links = not _is_too_weak_to_slide(
+        large_nm - NOISE_FACTOR * response.noise_nm, sliding_nm
+    )
+    are_neighbors_lightly_loaded = (
+        max(large_nm, response.noise_nm) <= max_slipping_nm and not does_large_motion_slide_links
+    )
     min_slipping_nm = MIN_SLIPPING_NEIGHBOR_RATIO * large_nm
     is_load_alike_in_both_motions = small_nm >= max(min_slipping_nm, response.noise_nm)
     if are_neighbors_lightly_loaded or is_load_alike_in_both_motions:

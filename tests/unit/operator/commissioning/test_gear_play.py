@@ -274,6 +274,31 @@ def test_end_joint_that_turns_with_enough_torque_to_slide_its_link_is_unknown() 
     assert plays[0] == GearPlay("unknown", LIGHT_END)
 
 
+@pytest.mark.parametrize(
+    ("neighbor_large_range_nm", "noise_nm", "kind"),
+    [
+        (1.1 * 2 * HEAVY_ENDS_NM[0], 0.005, "backlash"),
+        (0.75 * 2 * HEAVY_ENDS_NM[0], 0.005, "loose"),  # a coupling may slip with this torque
+        (1.1 * 2 * HEAVY_ENDS_NM[0], 0.03, "loose"),
+    ],
+    ids=["slides", "may slip", "noisy"],
+)
+def test_weighted_end_joint_whose_large_motion_slides_its_link_has_backlash(
+    neighbor_large_range_nm: float, noise_nm: float, kind: PlayKind
+) -> None:
+    """A coupling that slips cannot slide the link. The link of joint_1 of robot 9248 slid, with half a typical load."""
+    response = replace(
+        BACKLASH,
+        large_range_nm=0.17,
+        small_range_nm=0.034,
+        neighbor_large_range_nm=neighbor_large_range_nm,
+        neighbor_small_range_nm=0.02,
+        noise_nm=noise_nm,
+    )
+    plays = judge_gear_plays([response, *[TIGHT] * (JOINTS - 1)], AXES, HEAVY_ENDS_NM)
+    assert plays[0].kind == kind
+
+
 def test_joint_that_turns_with_enough_torque_to_slide_its_links_is_unknown() -> None:
     """The sound joint_2 of robot 9117 of the trials slid on a slippery floor, beside an encoder with a dead zone."""
     sound = replace(
