@@ -1,5 +1,6 @@
 """Processes that never outlive their parent, and that shut down in order on a signal."""
 
+import atexit
 import contextlib
 import ctypes
 import gc
@@ -111,13 +112,24 @@ def restart_process() -> NoReturn:
 
 
 def call_on_stop_signals(stop: Callable[[], None]) -> None:
-    """Call a function on SIGTERM, on SIGINT and when the terminal is closed, instead of ending the process at once."""
+    """Call a function on SIGTERM, on SIGINT and when the terminal is closed, instead of ending the process at once.
+
+    While the program ends, these signals are ignored. Otherwise a late signal would replace its exit code, because
+    Python restores the default handlers before it has ended.
+    """
 
     def handle(_number: int, _frame: FrameType | None) -> None:
         stop()
 
-    for number in list_stop_signals():
+    def ignore_late_signals() -> None:
+        for number in numbers:
+            if signal.getsignal(number) is handle:
+                signal.signal(number, signal.SIG_IGN)
+
+    numbers = list_stop_signals()
+    for number in numbers:
         signal.signal(number, handle)
+    atexit.register(ignore_late_signals)
     accept_interrupts()
 
 

@@ -100,3 +100,22 @@ def test_closed_terminal_is_a_stop_signal_except_under_nohup() -> None:
     assert "SIGHUP" in in_terminal.stdout
     assert "SIGTERM" in under_nohup.stdout
     assert "SIGHUP" not in under_nohup.stdout
+
+
+def test_stop_signal_while_program_ends_keeps_its_exit_code() -> None:
+    """Python restores the default handlers before it deletes the last objects, such as the one that sends SIGTERM."""
+    code = """
+import os, signal, sys
+from snakesim_hal.base.process import call_on_stop_signals
+
+class SentWhileProgramEnds:
+    def __del__(self, kill=os.kill, own_pid=os.getpid()):
+        kill(own_pid, signal_number)
+
+signal_number = signal.SIGTERM
+sender = SentWhileProgramEnds()
+call_on_stop_signals(lambda: None)
+sys.exit(4)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], timeout=30, check=False)
+    assert ended.returncode == 4
