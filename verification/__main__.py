@@ -97,7 +97,8 @@ PARTS = {
         7,
         (
             *(WITH_VCAN, "--", *PYTHON_MODULE, *PYTEST),
-            *("tests/system/can", "tests/contract", "-m", ""),
+            *("tests/system/can", "tests/contract", "--ignore", "tests/contract/test_suite.py"),
+            *("-m", ""),
         ),
         is_script=True,
     ),

@@ -210,17 +210,17 @@ class BusWorkbench(DrivesWorkbench):
         """Apply the newest setpoints. A joint stays passive until its wake-up time after arming has passed."""
         if self.setpoints_on_bus is None:
             return
-        if self.lifecycle == "armed":
-            self.armed_periods += 1
-        else:
+        super().enact(self.setpoints_on_bus, self.lifecycle)
+        self.limit = np.round(self.limit, TORQUE_LIMIT_DECIMALS)
+        if self.lifecycle != "armed":
             self.armed_periods = 0
+            return
+        self.armed_periods += 1
         # (joints,) periods from arming until each joint follows.
         wake_up_periods = self.WAKE_UP_PERIODS + np.arange(len(self.angle))
-        super().enact(self.setpoints_on_bus, self.lifecycle)
         self.mode = np.where(
             self.armed_periods < wake_up_periods, int(JointMode.PASSIVE), self.mode
         )
-        self.limit = np.round(self.limit, TORQUE_LIMIT_DECIMALS)
 
     def enact(self, setpoints: SafeSetpoints, lifecycle: LifecycleState) -> None:
         """Keep the setpoints on the bus until the next sample applies them."""

@@ -47,7 +47,7 @@ def test_other_sensors_are_stamped_when_they_were_read(rig: BackendRig, healthy:
                 timestamps_ns.append(timestamp_ns)
                 age_ns = sample.joints.timestamp_ns - timestamp_ns
                 assert 0 <= age_ns <= max_age_ns, (
-                    f"a sample of {sensor.key} is {age_ns * 1e-6} ms old; allowed are {max_age_ns * 1e-6} ms"
+                    f"a sample of {sensor.key} is {age_ns * 1e-6:g} ms old; allowed are 0 to {max_age_ns * 1e-6:g} ms"
                 )
         assert all(before < after for before, after in pairwise(timestamps_ns)), (
             f"the samples of {sensor.key} are out of order"

@@ -2,9 +2,10 @@
 
 import ast
 import os
+import re
 import subprocess
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -117,16 +118,16 @@ def test_contract_example_of_the_docs_passes_in_any_folder(tmp_path) -> None:
     ]
     completed = run_suite(*options, "--snakesim-table", "table.md", "-q", cwd=tmp_path)
     assert completed.returncode == 0, completed.stdout
-    assert completed.stdout.count("skipped:") == 3
-    assert "joint_1 is described with every mode" in completed.stdout  # so no mode is missing
-    assert "on Workbench: this bench has no access to emulated drives" in completed.stdout
-    assert "2 clauses, on Workbench: this robot has no power sensor" in completed.stdout
-    rows = [
-        line
-        for line in (tmp_path / "table.md").read_text().splitlines()
-        if line.endswith("| pass |")
+    skip_reasons = re.findall(r"^skipped: .*: (.*)", completed.stdout, re.MULTILINE)
+    assert skip_reasons == [
+        "this robot has no power sensor",
+        "joint_1 is described with every mode",
+        "this bench has no access to emulated drives; give --snakesim-drives",
     ]
-    assert len(rows) == len(list_clauses()) - 10
+    table = (tmp_path / "table.md").read_text()
+    outcomes = Counter(re.findall(r"\| (pass|skip|fail|-) \|$", table, re.MULTILINE))
+    assert set(outcomes) == {"pass", "skip"}
+    assert outcomes.total() == len(list_clauses())
 
 
 @pytest.mark.slow

@@ -113,7 +113,7 @@ def test_external_drives_are_driven_as_mounted_in_robot_file(
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["path_distance_m"] > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.quiet
 def test_external_modules_stop_when_controller_holds_the_interpreter(
     machine: NamespaceMachine, tmp_path: Path
 ) -> None:

@@ -98,6 +98,7 @@ def format_lab_file(folder: Path, backend: str) -> str:
         flags=re.M,
     )
     text = text.replace("10.0.0.1", f"{NET}.1").replace('backend = "sim"', f'backend = "{backend}"')
+    text = re.sub(r"^can = .*", "emulated = true", text, flags=re.M)
     return re.sub(
         r'\[\[roles\]\]\nmachine = "ws1"\nrole = "recorder"\nrobot = "planar13"\n', "", text
     )

@@ -276,7 +276,7 @@ def test_record_with_fault_on_full_disk_keeps_fault_exit_code(tmp_path: Path) ->
     assert "joint_3" in result.out.partition("\nfault: ")[2].partition("\n")[0]
 
 
-@pytest.mark.slow
+@pytest.mark.quiet
 def test_record_on_full_disk_delays_no_tick_in_realtime(tmp_path: Path) -> None:
     arguments = [*LONG_RUN, "--duration", "5"]
     result, run_folder = run_in_file_system(tmp_path, "size=100k", "", *arguments)

@@ -100,7 +100,7 @@ def test_controller_with_invalid_command_is_named_at_once(tmp_path: Path, clock_
     )
 
 
-@pytest.mark.slow  # a quicker test: tests/system/host/test_control_service.py
+@pytest.mark.quiet  # a quicker test: tests/system/host/test_control_service.py
 def test_slow_controller_is_named_as_cause_of_stop(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(
         "import time\n\n"

@@ -97,7 +97,7 @@ def test_fault_requested_by_command_is_injected_or_refused(tmp_path: Path, backe
     assert "begins" in guidance_log
 
 
-@pytest.mark.slow  # the fault table measures this fault, too
+@pytest.mark.quiet  # the fault table measures this fault, too
 def test_control_with_busy_interpreter_loses_its_lease(tmp_path: Path) -> None:
     flags = ["--clock-mode", "realtime", "--controller", "hold", "--fault", "hang:control@1"]
     result, summary = run_to_summary(tmp_path / "run", "triplet", *flags)
@@ -106,7 +106,7 @@ def test_control_with_busy_interpreter_loses_its_lease(tmp_path: Path) -> None:
     assert "hang:control@1 begins" in (tmp_path / "run" / "control.log").read_text()
 
 
-@pytest.mark.slow  # the attack on it is in verification/attack
+@pytest.mark.quiet  # the attack on it is in verification/attack
 def test_faults_are_refused_if_backend_may_move_real_motors(tmp_path: Path) -> None:
     """A backend that does not declare itself emulated counts as real."""
     (tmp_path / "bench.py").write_text(

@@ -67,7 +67,7 @@ def starving_process(pid: int) -> Iterator[None]:
             process.wait()
 
 
-@pytest.mark.slow  # the test takes a core from every other test
+@pytest.mark.quiet  # the test takes a core from every other test
 def test_run_on_slow_computer_names_it_before_expired_lease(tmp_path: Path) -> None:
     arguments = [
         "triplet",

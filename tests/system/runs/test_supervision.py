@@ -174,7 +174,7 @@ def test_supervisor_after_killed_controller_waits_for_reset_by_operator(tmp_path
     assert "continue with `snakesim robot reset`" in run.printed()
 
 
-@pytest.mark.slow  # the fault table measures this fault, too
+@pytest.mark.quiet  # the fault table measures this fault, too
 def test_supervisor_after_killed_router_does_not_arm_robot(tmp_path: Path) -> None:
     with running_armed_snakesim(
         tmp_path / "run", *LONG_RUN, "--clock-mode", "realtime", "--stay", "--with-router"
@@ -212,7 +212,7 @@ def test_supervisor_ends_run_if_service_may_not_restart(tmp_path: Path) -> None:
         assert "guidance was ended by SIGKILL" in run.printed()
 
 
-@pytest.mark.slow  # the fault table measures these faults, too
+@pytest.mark.quiet  # the fault table measures these faults, too
 def test_requested_process_faults_are_injected_or_refused(tmp_path: Path) -> None:
     with running_armed_snakesim(
         tmp_path / "run", *LONG_RUN, "--clock-mode", "realtime", "--stay"
