@@ -15,7 +15,8 @@ DriveCommand = Literal["follow", "idle", "stop"]
 
 # Report periods after a command, from which on reports surely show its effect.
 MIN_RESPONSE_REPORT_PERIODS = 1.5
-MAX_ENABLE_REPORT_PERIODS = 5  # report periods after a command, within which a drive has to be on
+# Report periods after a command, within which a drive has to be on, if its type states no time.
+MAX_ENABLE_REPORT_PERIODS = 5
 
 
 @dataclass
@@ -42,7 +43,11 @@ class DriveStates:
     """The states of several drives, from tail to head."""
 
     def __init__(
-        self, labels: Sequence[str], report_period_ns: int, clock_ns: Callable[[], int]
+        self,
+        labels: Sequence[str],
+        report_period_ns: int,
+        clock_ns: Callable[[], int],
+        max_enable_s: float | None = None,
     ) -> None:
         """Create the states of drives that should be off and have not reported anything.
 
@@ -50,10 +55,13 @@ class DriveStates:
             labels: Names of the drives for messages, from tail to head.
             report_period_ns: Time from one report of a drive to the next.
             clock_ns: Function that returns the driver's time in ns.
+            max_enable_s: Time within which a drive switches on, over all its states. None: five report periods.
         """
         self.drives = [DriveState(label) for label in labels]
         self._min_response_delay_ns = round(MIN_RESPONSE_REPORT_PERIODS * report_period_ns)
         self._max_enable_duration_ns = MAX_ENABLE_REPORT_PERIODS * report_period_ns
+        if max_enable_s is not None:
+            self._max_enable_duration_ns = round(max_enable_s * 1e9)
         self._clock_ns = clock_ns
 
     def record_report(self, i: int, *, enabled: bool, state: str) -> None:

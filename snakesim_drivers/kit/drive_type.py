@@ -267,13 +267,18 @@ def make_bus_specs_by_port(
     Args:
         joints: The joints of a driver type, by their indices in the robot, from tail to head.
         settings: Settings of the driver type.
-        ports: Names of the ports.
+        ports: Names of the ports, at least one. Drives that are emulated in this process have one with any name.
         open_drives: Function that opens the bus on a port. Its arguments are the name of the port, the indices of its
             joints in the robot, and the readings that its drives fill.
 
     Returns:
         The buses in the order of `ports`, without the ports to which no joint is assigned.
+
+    Raises:
+        ValueError: There is no port.
     """
+    if not ports:
+        raise ValueError('no port for the drives; for emulated drives, pass one such as ["memory"]')
     port_indices = assign_port_indices(list(joints.values()), ports)
     specs: list[BusSpec] = []
     for port_index, port in enumerate(ports):

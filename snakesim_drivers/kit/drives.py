@@ -31,7 +31,8 @@ Errors
 
 All drives are numbered by their place on this bus, from tail to head. All values are those at the shafts of the drives,
 in SI units (rad, rad/s, N·m): `mounting` converts them from and to joint values. What drives measure is stored in the
-`DriveReadings` that the driver type gets when the bus is opened. A value that is not finite counts as not measured.
+`DriveReadings` that the driver type gets when the bus is opened. If a value is not finite, the call that stores it is
+ignored, with its other values.
 """
 
 from abc import ABC, abstractmethod
@@ -49,7 +50,8 @@ class BusCommand(NamedTuple):
 
     # Indices of the drives that follow setpoints; all others are switched off.
     enabled_drives: frozenset[int]
-    modes: list[JointMode]  # of every drive
+    # Of every drive. An enabled drive may get PASSIVE, whatever modes its type has: it stays on, without a torque.
+    modes: list[JointMode]
     # (n_drives,) in rad, rad/s or N·m, by the mode of each drive (0 for passive drives).
     targets: Floats
     limits_nm: Floats  # (n_drives,) torque limits, not negative
@@ -77,8 +79,9 @@ class Drives(ABC):
         """Request motion and torque of every drive, and put the answers into the readings.
 
         Do not wait for drives that were silent before: the readings of the drives contain whether waiting is useful.
-        Request also the state of the drives in `DriveReadings.drives_to_check`, and call `mark_checked` for each that
-        reports it: these may have stopped by themselves.
+        The drives in `DriveReadings.drives_to_check` may have stopped by themselves. If your drives do not report with
+        every answer whether they are on, request this state of these drives. Call `mark_checked` for each drive that
+        has reported it.
 
         Raises:
             BackendError: The bus cannot be used any more.
@@ -88,8 +91,9 @@ class Drives(ABC):
     def send_setpoints(self, command: BusCommand) -> None:
         """Send setpoints to the enabled drives, and switch off all others.
 
-        A drive that is switched on gets its setpoint first. A drive that should be off but reports that it is on is
-        switched off again. `drive_states.DriveStates` decides both.
+        A drive that is switched on gets its setpoint first. `drive_states.DriveStates` decides which drives get a
+        command to switch on or off. While a drive reports that it is still off, it gets the command to switch on again.
+        So a drive that reaches operation over several states can get its next state each time.
 
         Args:
             command: Setpoints, and which drives are enabled. It replaces the command of the cycle before.
@@ -129,7 +133,7 @@ class Drives(ABC):
     def poll(self) -> None:
         """Receive what has arrived, without waiting. Drives that are emulated here simulate up to the current time.
 
-        The default is for drives that only answer requests.
+        Real drives that only answer requests need nothing here, which is the default.
 
         Raises:
             BackendError: The bus cannot be used any more.

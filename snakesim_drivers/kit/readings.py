@@ -1,8 +1,8 @@
 """What the drives of a robot measured, at their shafts, and when: joint states with ages, supply and temperatures.
 
 A joint whose drive is silent keeps its last values, and their age grows; no value is invented. Silence is counted in
-requests without an answer rather than in time, because a computer that pauses also sends its requests late. A value
-that is not finite is ignored, as if the drive had not sent it.
+requests without an answer rather than in time, because a computer that pauses also sends its requests late. If a value
+is not finite, the call that stores it is ignored, as if the drive had not sent any of its values.
 """
 
 import math
@@ -83,7 +83,7 @@ class DriveReadings:
         self.not_ready_reasons[i] = reason
 
     def start_request(self) -> None:
-        """Note that all drives are requested to send motion and torque."""
+        """Note that all drives are requested to send motion and torque. The kit calls this before `Drives.read`."""
         self._request_number += 1
 
     def skip_request(self, i: int) -> None:
@@ -125,7 +125,7 @@ class DriveReadings:
         Args:
             i: Index of the drive.
             voltage_v: Voltage at the drive.
-            current_a: Current that the drive draws.
+            current_a: Current that the drive draws; 0 if it does not measure it.
         """
         if math.isfinite(voltage_v) and math.isfinite(current_a):
             self._voltage_v[i] = voltage_v
@@ -137,7 +137,7 @@ class DriveReadings:
         Args:
             i: Index of the drive.
             motor_c: Temperature of the motor in °C.
-            board_c: Temperature of the electronics in °C.
+            board_c: Temperature of the electronics in °C; that of the motor again if the drive has only one sensor.
         """
         if math.isfinite(motor_c) and math.isfinite(board_c):
             self._motor_temperature_c[i] = motor_c

@@ -2,7 +2,7 @@
 
 See docs/hardware/write-a-driver.md. Try it:
 
-snakesim run triplet --backend ./examples/minimal_driver.py:MinimalBackend --duration 3
+snakesim run scales --backend ./examples/minimal_driver.py:MinimalBackend --duration 3
 """
 
 from collections.abc import Callable, Collection, Sequence

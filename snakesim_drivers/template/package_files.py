@@ -36,7 +36,7 @@ README_TEMPLATE = """\
 
 ```sh
 python -m pytest                                  # the contract suite of SnakeSIM, on the emulated drives
-snakesim run triplet --backend ./{package}/driver.py:{title}Backend --duration 3
+snakesim run scales --backend ./{package}/driver.py:{title}Backend --duration 3
 pip install --editable .                          # then `--backend {name}` is enough
 ```
 
@@ -46,7 +46,7 @@ Not tested on hardware.
 INIT_TEMPLATE = '''"""{title} drives for SnakeSIM."""
 '''
 
-CONFTEST_TEMPLATE = '''"""The bench on which the contract suite of SnakeSIM tests this driver type."""
+CONFTEST_TEMPLATE = '''"""The benches on which the contract suite of SnakeSIM tests this driver type."""
 
 import pytest
 
@@ -54,11 +54,26 @@ from {package}.driver import {title}Backend
 from snakesim_testing.contract.bench import Bench
 from snakesim_testing.contract.kit_drives import KitDrives, mute_joint
 
+MOUNTINGS = ("joint_2.sign=-1", "joint_3.zero_rad=0.3", "joint_4.gear=1.5")
+
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_snakesim_benches():
-    """Return the driver type with its emulated drives."""
-    return [Bench("{name}", {title}Backend, mute_joint=mute_joint, make_emulated_drives=KitDrives)]
+    """Return the driver type with emulated drives: mounted as usual, and in other ways that the robot file states."""
+    real_mounting = [f"backend.mounted.{{mounting}}" for mounting in MOUNTINGS]
+    stated_mounting = [f"robot.joints.{{mounting}}" for mounting in MOUNTINGS]
+    return [make_bench("{name}"), make_bench("mounted", *real_mounting, *stated_mounting)]
+
+
+def make_bench(name, *overrides):
+    """Return a bench with this name, and with changed values of its scenario."""
+    return Bench(
+        name,
+        {title}Backend,
+        overrides=overrides,
+        mute_joint=mute_joint,
+        make_emulated_drives=KitDrives,
+    )
 '''
 
 CONTRACT_TEST_TEMPLATE = '''"""The contract suite of SnakeSIM; see its page docs/hardware/contract-suite.md."""

@@ -190,8 +190,8 @@ def find_missing_capability(
                 ]
                 return (
                     f"controller {name!r} needs {mode.name.lower()} mode of every joint, and {joint.name} has "
-                    f"{', '.join(available)}. Choose another controller; or correct `modes` in [drive] or "
-                    f"[joints.{joint.name}] of the robot file"
+                    f"{', '.join(available)}. Choose another controller or scenario. If the drives have this mode, "
+                    f"correct `modes` in [drive] or [joints.{joint.name}] of the robot file"
                 )
         for measurement in controller.required_measurements:
             if measurement not in joint.measures:

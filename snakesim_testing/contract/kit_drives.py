@@ -34,7 +34,16 @@ class KitDrives:
             )
 
     def find_emulator(self, drives: Any) -> Any:
-        """Return the emulated drives of a bus."""
+        """Return the emulated drives of a bus.
+
+        Raises:
+            AttributeError: The drives have no attribute `emulator`.
+        """
+        if not hasattr(drives, "emulator"):
+            raise AttributeError(
+                f"{type(drives).__name__} has no attribute `emulator` with its emulated drives. Add it, or pass a "
+                "subclass of KitDrives with another `find_emulator`"
+            )
         return drives.emulator
 
     def list_enabled_of_bus(self, emulator: Any) -> list[bool]:
