@@ -149,9 +149,8 @@ class MyBackend(DriverTypeBackend):
         def open_drives(port, indices, readings):
             raise NotImplementedError("return your subclass of Drives")
 
-        return make_bus_specs_by_port(
-            context.joints, context.settings, context.settings.ports, open_drives
-        )
+        ports = context.settings.ports or ["memory"]  # without ports: emulated in this process
+        return make_bus_specs_by_port(context.joints, context.settings, ports, open_drives)
 """
 
 PAGES = (
@@ -287,13 +286,15 @@ PAGES = (
                 "DriverTypeContext",
                 "make_bus_specs_by_port",
             ),
-            "snakesim_drivers.kit.drive_settings": ("DriveSettings",),
+            "snakesim_drivers.kit.bus": ("BusSpec",),
+            "snakesim_drivers.kit.drive_settings": ("DriveSettings", "compute_response_timeout_s"),
             "snakesim_drivers.kit.start_up": ("StartUp", "StartUpStep", "StepFailedError"),
             "snakesim_drivers.kit.holding_brakes": ("HoldingBrakes", "BrakePlan"),
             "snakesim_drivers.kit.limit_switches": ("LimitSwitches",),
             "snakesim_drivers.kit.findings": ("FaultFinding",),
             "snakesim_drivers.kit.readings": ("DriveReadings",),
-            "snakesim_drivers.kit.drive_states": ("DriveStates",),
+            "snakesim_drivers.kit.drive_states": ("DriveStates", "DriveState"),
+            "snakesim_drivers.kit.drive_probe": ("DriveProbe", "DriveStatus", "ReadBack"),
             "snakesim_drivers.emulation.drive_emulator": ("DriveEmulator",),
             "snakesim_drivers.emulation.emulated_body": ("EmulatedBody",),
         },

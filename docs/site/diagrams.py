@@ -286,6 +286,27 @@ def draw_backend() -> Drawing:
     return drawing
 
 
+def draw_start_up() -> Drawing:
+    """Return the states of a drive from bring-up until the robot can be armed."""
+    drawing = Drawing(920, 230, "A drive after bring-up: its steps, ready, and failed")
+    drawing.box(20, 40, 170, 70, "bring_up\nfound, checked,\nnot enabled", "yours")
+    drawing.box(250, 40, 170, 70, "first step\nstart, then is_done\nin every cycle", "yours")
+    drawing.box(480, 40, 170, 70, "last step\nsuch as homing", "yours")
+    drawing.box(710, 40, 190, 70, "ready\nthe robot can be armed", "computer")
+    for x in (190, 420, 650):
+        drawing.line((x, 75), (x + 60, 75), arrow=True)
+    drawing.box(365, 150, 170, 60, "failed\nabort, then a fault", "stop")
+    drawing.line((335, 110), (335, 165), (365, 165), arrow=True, kind="no")
+    drawing.line((565, 110), (565, 165), (535, 165), arrow=True, kind="no")
+    drawing.line((365, 195), (290, 195), (290, 110), arrow=True)
+    drawing.line((805, 110), (805, 195), (535, 195), arrow=True, kind="no")
+    drawing.text(280, 190, "after a reset,", "s", "end")
+    drawing.text(280, 205, "all steps again", "s", "end")
+    drawing.text(575, 145, "failed, or its time is over", "s", "start")
+    drawing.text(795, 187, "invalidate: its position is lost", "s", "end")
+    return drawing
+
+
 def draw_contract() -> Drawing:
     """Return one suite of tests in front of many backends."""
     drawing = Drawing(920, 260, "One contract suite tests every backend")
@@ -369,6 +390,7 @@ DIAGRAMS: dict[str, Callable[[], Drawing]] = {
     "motion-capture.svg": draw_motion_capture,
     "driver-layers.svg": draw_driver,
     "backend-calls.svg": draw_backend,
+    "drive-start-up.svg": draw_start_up,
     "contract-suite.svg": draw_contract,
     "lab-roles.svg": draw_lab,
     "tour.svg": draw_tour,

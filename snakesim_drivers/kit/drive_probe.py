@@ -21,9 +21,9 @@ class DriveStatus:
 class ReadBack:
     """A value of a drive's configuration that the driver needs, and the value that the drive reports."""
 
-    name: str
+    name: str  # of the value, as in the drive's manual
     unit: str  # "1": it has no unit
-    required: float
+    required: float  # value that the driver needs
     reported: float | None  # None: the drive does not answer the request
     tolerance: float = 0.0  # largest allowed difference
 

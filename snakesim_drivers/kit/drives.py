@@ -109,7 +109,7 @@ class Drives(ABC):
         Only the operator's reset of a fault leads to this call.
 
         Args:
-            joints: The drives.
+            joints: Indices of the drives on this bus.
 
         Raises:
             BackendError: The bus cannot be used any more.
