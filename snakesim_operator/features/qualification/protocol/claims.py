@@ -27,7 +27,7 @@ CLAIMS = (
     Claim(
         "si-units",
         "hardware/write-a-driver.md",
-        "All values are those at the drive's shaft, in SI units.",
+        "Angles, speeds and torques of the drives are those at their shafts, in SI units.",
     ),
     Claim(
         "stops-without-host",
