@@ -161,7 +161,7 @@ def test_console_page_on_phone_fits_and_keeps_stop_visible() -> None:
         wait_until(lambda: page.evaluate(TAB_LINES) == 1, "tabs in one line")
 
 
-@pytest.mark.slow
+@pytest.mark.quiet
 def test_page_needs_token_and_stops_robot_without_page_process(tmp_path: Path) -> None:
     """The page of the signals has the second stop, and draws no scene."""
     with open_chromium() as browser, running_snakesim(tmp_path / "run", *RUN) as run:
@@ -229,7 +229,7 @@ def find_console_process(run: RunningCommand, part: str = "") -> int:
     return next(pid for pid, line in processes if f"\0{run.endpoint}\0" in line)
 
 
-@pytest.mark.slow
+@pytest.mark.quiet
 def test_console_gives_control_to_one_viewer_and_stop_to_all(tmp_path: Path) -> None:
     with open_chromium() as browser, running_snakesim(tmp_path / "run", *RUN) as run:
         address = run.console()

@@ -37,6 +37,7 @@ MIN_TARGET_STEP_RAD = 1e-9  # from tick to tick; less is a rounding error
 class ToothContact:
     """What the torque of a joint shows of the contact of its teeth."""
 
+    friction_nm: float  # of the drive, an upper limit. The floor's friction may be a part of it
     load_threshold_nm: float  # a smaller torque does not prove a load
     # Angle in which the load reversed in the small motion, for the slowest of all reversals. None if the load did not
     # reverse in both directions.
@@ -84,6 +85,7 @@ def measure_tooth_contact(
     if reversal_rad is not None:
         reversal_rad += angle_step_rad
     return ToothContact(
+        friction_nm=friction_nm,
         load_threshold_nm=load_threshold_nm,
         reversal_rad=reversal_rad,
         unloaded_fraction=measure_unloaded_fraction(second_cycle, max_unloaded_nm),

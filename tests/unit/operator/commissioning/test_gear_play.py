@@ -36,6 +36,7 @@ TIGHT = LoadResponse(
     passed_in_small_motion=NOTHING_PASSED,
     passed_in_all_motions=NOTHING_PASSED,
     contact=ToothContact(
+        friction_nm=0.02,
         load_threshold_nm=0.06,
         reversal_rad=0.005,
         unloaded_fraction=0.0,
@@ -44,6 +45,7 @@ TIGHT = LoadResponse(
     ),
 )
 NO_CONTACT = ToothContact(
+    friction_nm=0.001,
     load_threshold_nm=0.03,
     reversal_rad=None,
     unloaded_fraction=1.0,
@@ -53,6 +55,7 @@ NO_CONTACT = ToothContact(
 # The teeth touch at one end of the small motion: numbers of robots 100 (ODrive) and 140 (Dynamixel) of the trials.
 ONE_END_CONTACTS = [
     ToothContact(
+        friction_nm=0.001,
         load_threshold_nm=0.031,
         reversal_rad=None,
         unloaded_fraction=0.79,
@@ -60,6 +63,7 @@ ONE_END_CONTACTS = [
         unloaded_travel_rad=0.023,
     ),
     ToothContact(
+        friction_nm=0.001,
         load_threshold_nm=0.037,
         reversal_rad=None,
         unloaded_fraction=0.50,
@@ -144,6 +148,7 @@ def test_joint_without_load_at_one_end_has_backlash(
     [
         {"unloaded_fraction": 0.15},  # the most of any sound joint of the trials with a fine torque
         {"max_load_nm": 0.05},  # too small to be sure
+        {"friction_nm": 0.06, "load_threshold_nm": 0.1, "max_load_nm": 0.25},
         {"reversal_rad": 0.005},
     ],
 )
@@ -316,6 +321,17 @@ def test_joint_whose_load_reverses_is_not_loose(response: LoadResponse) -> None:
     """The sound joint_3 of robot 46 of the trials carried loads in both directions, which did not follow its angle."""
     reversing = replace(response, contact=TIGHT.contact, neighbor_small_range_nm=0.0)
     assert judge_among_tight(replace(reversing, neighbor_large_range_nm=0.9)) == "unknown"
+
+
+def test_joint_that_carries_a_clear_load_is_not_loose() -> None:
+    """The torque of the sound joint_3 of CiA 402 robot 9493 did not follow its angle, beside an encoder's dead zone."""
+    loaded = replace(
+        SLIPPING,
+        neighbor_large_range_nm=0.2,
+        neighbor_small_range_nm=0.06,
+        contact=replace(NO_CONTACT, unloaded_fraction=0.0, max_load_nm=0.56),
+    )
+    assert judge_among_tight(loaded) == "unknown"
 
 
 def test_joint_with_less_load_than_its_neighbors_has_no_backlash() -> None:
