@@ -339,7 +339,7 @@ def test_record_on_slow_disk_is_complete_and_delays_no_tick(
     assert not hang_file.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.quiet
 def test_record_on_hanging_disk_delays_nothing(tmp_path: Path, hang_file: Path) -> None:
     with running_armed_snakesim(tmp_path / "run", *LONG_RUN, "--stay") as run:
         wait_until(lambda: (tmp_path / "run" / "host.json").is_file(), "the first numbers on disk")
