@@ -58,8 +58,8 @@ class StopReadiness:
 class _SelfTest:
     """The newest self-test of one way of stopping the robot: by datagrams, or over the network."""
 
-    completed_s: float = -SELF_TEST_VALIDITY_S
-    problem: str = "not tested yet"
+    completed_s: float
+    problem: str  # empty if it succeeded
 
     def explain_problem(self, now_s: float) -> str:
         """Return the reason why this way of stopping may fail now; empty if its self-test is recent and succeeded."""
@@ -69,6 +69,9 @@ class _SelfTest:
         if age_s > SELF_TEST_VALIDITY_S:
             return f"the last self-test that succeeded was {age_s:.0f} s ago"
         return ""
+
+
+NOT_TESTED = _SelfTest(completed_s=-SELF_TEST_VALIDITY_S, problem="not tested yet")
 
 
 @dataclass(frozen=True)
@@ -108,21 +111,27 @@ class PreparedStop:
         self._local_ports: dict[Address, RobotAddress] = {}
         self._remote_ports: dict[Address, RobotAddress] = {}
         self._session: Session | None = None
+        self._session_start_s = 0.0  # when the session could first be used
         # Requests that wait for the next stop, which begins after the present one.
         self._lock = threading.Lock()
         self._pending_requesters: list[str] = []
         self._pending_stop: Future[str] | None = None
         self._stop_start_s: float | None = None  # the present stop
         # Self-tests.
-        self._port_self_test = _SelfTest()
-        self._network_self_test = _SelfTest()
+        self._port_self_test = NOT_TESTED
+        self._network_self_test = NOT_TESTED
         self._running_self_tests: list[Future[None]] = []
         self._last_self_test_s = -SELF_TEST_PERIOD_S
         self.start_self_test_if_due()
 
     def use_session(self, session: Session) -> None:
-        """Use a session for stops over the network from now on."""
+        """Use a session for stops over the network from now on, and test it at once."""
+        self._session_start_s = time.monotonic()
         self._session = session
+        self._running_self_tests = [
+            *self._running_self_tests,
+            self._network_thread.submit(self._test_network),
+        ]
 
     def request_stop(self, requester: str) -> "Future[str]":
         """Request a stop of the robot, and return without waiting for the result.
@@ -170,7 +179,10 @@ class PreparedStop:
         ]
 
     def check_readiness(self) -> StopReadiness:
-        """Return whether a stop would reach the robot, by the newest self-test."""
+        """Return whether a stop would reach the robot, by the newest self-test.
+
+        Without a session, and until the first self-test over it has ended, this program waits for the robot.
+        """
         now_s = time.monotonic()
         began_s = self._stop_start_s
         if began_s is not None:
@@ -178,7 +190,7 @@ class PreparedStop:
             return StopReadiness(
                 not stuck, f"a stop has been under way for {now_s - began_s:.0f} s"
             )
-        if self._session is None:
+        if self._session is None or self._is_first_network_test_running(now_s):
             return StopReadiness(True, WAITING_FOR_ROBOT)
         without_network = self._network_self_test.explain_problem(now_s)
         if without_network:
@@ -190,6 +202,11 @@ class PreparedStop:
         if without_port:
             return StopReadiness(True, f"ready over the network only: {without_port}")
         return StopReadiness(True, "ready")
+
+    def _is_first_network_test_running(self, now_s: float) -> bool:
+        """Return whether no self-test over the network has ended yet, and the first one still has time."""
+        is_untested = self._network_self_test is NOT_TESTED
+        return is_untested and now_s - self._session_start_s < HOST_RESPONSE_TIMEOUT_S
 
     def _list_ports(self) -> dict[Address, RobotAddress]:
         return self._local_ports | self._remote_ports

@@ -87,20 +87,28 @@ def test_a_fault_brakes_a_moving_joint(rig: BackendRig) -> None:
     """If a robot with stop mode `damp` or `hold` has a fault, the motor of a moving joint pushes against its motion.
 
     A joint without torque comes to rest as well, because of friction, but later, and on a slope perhaps not at all.
+    In real time, the torque may have its peak between two samples. So the lowest torque of several faults counts.
     """
     if rig.robot.stop_mode == "passive":
         pytest.skip("the robot is described with stop mode passive: no joint brakes after a fault")
     rig.skip_without(JointMode.VELOCITY, torque=True)
+    fault_count = 1 if rig.clock_mode == "lockstep" else tolerances.REALTIME_BRAKING_FAULTS
+    min_torque_nm = min(measure_lowest_torque_after_fault_nm(rig) for _ in range(fault_count))
+    assert min_torque_nm < -tolerances.MIN_BRAKING_TORQUE_NM, (
+        f"the lowest torque after the fault is {min_torque_nm:.2f} N·m, so the moving joint is not braked; at most "
+        f"{-tolerances.MIN_BRAKING_TORQUE_NM} N·m is required"
+    )
+
+
+def measure_lowest_torque_after_fault_nm(rig: BackendRig) -> float:
+    """Move joint 0 in positive direction, report a fault, and return the lowest torque of the joint after it."""
+    rig.return_home()
     rig.arm_and_move_joint()
     rig.report_fault()
     record = rig.wait_periods(
         rig.count_periods(tolerances.MAX_BRAKING_S) + tolerances.TRANSPORT_PERIODS
     )
-    min_torque_nm = record.torque_nm[:, 0].min()  # the joint moves in positive direction
-    assert min_torque_nm < -tolerances.MIN_BRAKING_TORQUE_NM, (
-        f"the lowest torque after the fault is {min_torque_nm:.2f} N·m, so the moving joint is not braked; at most "
-        f"{-tolerances.MIN_BRAKING_TORQUE_NM} N·m is required"
-    )
+    return float(record.torque_nm[:, 0].min())
 
 
 def test_disarmed_joints_have_no_torque(rig: BackendRig) -> None:
