@@ -37,12 +37,12 @@ class CampaignPart:
 PARTS = {
     "lease": CampaignPart(
         "mutants of lease and lifecycle",
-        2,
+        1,
         ("verification.mutation", "--files", "lease.py", "lifecycle.py", "stop_ramp.py"),
     ),
     "decoders": CampaignPart(
         "100,000 damaged payloads into every decoder, and damaged recordings into some commands each",
-        1,
+        0.5,
         (
             "verification.fuzz",
             *("--payloads", "100000", "--recordings", "9", "--commands-per-recording", "2"),
@@ -50,17 +50,17 @@ PARTS = {
     ),
     "recordings": CampaignPart(
         "damaged recordings into every command that reads one",
-        2,
+        0.5,
         ("verification.fuzz", "--payloads", "0", "--recordings", "10"),
     ),
     "sanitizers": CampaignPart(
         "physics tests with C libraries that check their memory accesses",
-        6,
+        1,
         ("verification.sanitize",),
     ),
     "contracts": CampaignPart(
         "tests of the campaign's own tools, import rules, names in docstrings",
-        1,
+        0.5,
         (
             *PYTEST,
             "verification/test_import_contracts.py",
@@ -74,27 +74,27 @@ PARTS = {
     ),
     "heavy": CampaignPart(
         "tests that need more than a second of processor time; CI runs them with each change",
-        3,
+        2,
         (*PYTEST, *ALL_TESTS, "-n", "4", "--dist", "worksteal", "-m", HEAVY),
     ),
     "quiet": CampaignPart(
         "robots in real time, one test after the other",
-        4,
+        7,
         (*PYTEST, *ALL_TESTS, "-m", "quiet"),
     ),
     "slow": CampaignPart(
         "the long forms of the tests",
-        16,
+        11,
         (*PYTEST, *ALL_TESTS, "-n", "3", "-m", "slow and not quiet"),
     ),
     "trials": CampaignPart(
         "all random trials; with each change, a tenth of them runs",
-        2,
+        0.5,
         (*PYTEST, "tests/unit", "-n", "2", "-m", "(hypothesis or trials) and not (slow or quiet)"),
     ),
     "can": CampaignPart(
         "all CAN tests, and the contract on virtual CAN interfaces of the kernel",
-        7,
+        5,
         (
             *(WITH_VCAN, "--", *PYTHON_MODULE, *PYTEST),
             *("tests/system/can", "tests/contract", "--ignore", "tests/contract/test_suite.py"),
@@ -104,31 +104,31 @@ PARTS = {
     ),
     "joystick": CampaignPart(
         "a joystick that the kernel of a virtual machine emulates",
-        1,
+        0.5,
         (*(WITH_VCAN, "--joystick", "--", *PYTHON_MODULE, *PYTEST), JOYSTICK_TESTS),
         is_script=True,
     ),
     "documents": CampaignPart(
         "every command that the documentation prints",
-        10,
+        5,
         (*PYTEST, "verification/documents", "-m", ""),
     ),
     "installation": CampaignPart(
-        "wheels, extras and left-out packages", 5, (*PYTEST, "verification/installation", "-m", "")
+        "wheels, extras and left-out packages", 2, (*PYTEST, "verification/installation", "-m", "")
     ),
     "computers": CampaignPart(
         "digests of runs with the instructions of other processors",
-        4,
+        8,
         (*PYTEST, "verification/computers", "-m", ""),
     ),
     "aarch64": CampaignPart(
         "the wheel for ARM on an emulated processor (needs qemu-user-static)",
-        4,
+        1,
         ("verification.computers.aarch64",),
     ),
     "commissioning": CampaignPart(
         "hidden faults of joints, and system identification",
-        3,
+        1,
         (
             *PYTEST,
             "verification/test_commissioning_trials.py",
@@ -141,21 +141,21 @@ PARTS = {
         "every attack of an unauthorized client, once", 4, (*PYTEST, "verification/attack")
     ),
     "links": CampaignPart(
-        "bad links between machines (root)", 1, (*PYTEST, "verification/links", "-m", "")
+        "bad links between machines (root)", 0.5, (*PYTEST, "verification/links", "-m", "")
     ),
     "faults": CampaignPart(
-        "the fault table, two trials of each row", 6, ("verification.faults", "--trials", "2")
+        "the fault table, two trials of each row", 10, ("verification.faults", "--trials", "2")
     ),
     "fuzz": CampaignPart(
         "damaged payloads into a running robot",
-        3,
+        2,
         ("verification.fuzz", "--network", "--payloads", "200000"),
     ),
     "kills": CampaignPart(
         "processes killed and frozen at random", 1, ("verification.soak.kills", "--trials", "20")
     ),
     "soak": CampaignPart(
-        "random faults for three minutes", 4, ("verification.soak", "--minutes", "3")
+        "random faults for three minutes", 3, ("verification.soak", "--minutes", "3")
     ),
     "mutation": CampaignPart(
         "mutants of the rest of the safety core",
