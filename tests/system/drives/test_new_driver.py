@@ -30,6 +30,25 @@ def test_new_driver_passes_the_contract_suite_as_generated(tmp_path: Path) -> No
     assert "--snakesim-drives" not in result.out, result.out
 
 
+@pytest.mark.parametrize(
+    "clock_mode",
+    [
+        pytest.param("lockstep", marks=pytest.mark.heavy),
+        pytest.param("realtime", marks=pytest.mark.quiet),
+    ],
+)
+def test_new_driver_completes_a_run_as_its_page_says(tmp_path: Path, clock_mode: str) -> None:
+    """These are the commands of docs/hardware/write-a-driver.md."""
+    assert snakesim("drive", "new", "acme_servo", cwd=tmp_path).code == 0
+    backend = "./acme_servo_driver/driver.py:AcmeServoBackend"
+    result = snakesim(
+        *("run", "scales", "--backend", backend, "--duration", "3", "--clock-mode", clock_mode),
+        cwd=tmp_path / "acme_servo",
+    )
+    assert result.code == 0, result.printed
+    assert "no fault" in result.out
+
+
 def test_new_driver_with_invalid_name_writes_nothing(tmp_path: Path) -> None:
     refused = snakesim("drive", "new", "Acme-Servo", cwd=tmp_path)
     assert refused.code == 2
