@@ -94,7 +94,7 @@ PARTS = {
     ),
     "can": CampaignPart(
         "all CAN tests, and the contract on virtual CAN interfaces of the kernel",
-        5,
+        7,
         (
             *(WITH_VCAN, "--", *PYTHON_MODULE, *PYTEST),
             *("tests/system/can", "tests/contract", "--ignore", "tests/contract/test_suite.py"),
@@ -144,7 +144,7 @@ PARTS = {
         "bad links between machines (root)", 0.5, (*PYTEST, "verification/links", "-m", "")
     ),
     "faults": CampaignPart(
-        "the fault table, two trials of each row", 10, ("verification.faults", "--trials", "2")
+        "the fault table, two trials of each row", 9, ("verification.faults", "--trials", "2")
     ),
     "fuzz": CampaignPart(
         "damaged payloads into a running robot",
