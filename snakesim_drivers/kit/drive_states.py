@@ -59,8 +59,9 @@ class DriveStates:
         """
         self.drives = [DriveState(label) for label in labels]
         self._min_response_delay_ns = round(MIN_RESPONSE_REPORT_PERIODS * report_period_ns)
-        self._max_enable_duration_ns = MAX_ENABLE_REPORT_PERIODS * report_period_ns
-        if max_enable_s is not None:
+        if max_enable_s is None:
+            self._max_enable_duration_ns = MAX_ENABLE_REPORT_PERIODS * report_period_ns
+        else:
             self._max_enable_duration_ns = round(max_enable_s * 1e9)
         self._clock_ns = clock_ns
 

@@ -128,10 +128,7 @@ class PreparedStop:
         """Use a session for stops over the network from now on, and test it at once."""
         self._session_start_s = time.monotonic()
         self._session = session
-        self._running_self_tests = [
-            *self._running_self_tests,
-            self._network_thread.submit(self._test_network),
-        ]
+        self._network_thread.submit(self._test_network)
 
     def request_stop(self, requester: str) -> "Future[str]":
         """Request a stop of the robot, and return without waiting for the result.
